@@ -8,6 +8,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from sfa_localization import __version__
 from sfa_localization.errors import LocalizationError
@@ -39,6 +40,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         _prepare(commands.add_parser(command.name, help=command.summary, **_texts(command)), command)
     arguments = parser.parse_args(argv)
     return _guarded(arguments.run_command, arguments)
+
+
+def executable() -> int:
+    """Run the command that this executable is named after (console_scripts in setup.py)."""
+    name = Path(sys.argv[0]).stem
+    return _run_alone(next(command for command in COMMANDS if command.name == name))
 
 
 def _run_alone(command: Command) -> int:

@@ -1,0 +1,47 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+PYTHON ?= python3
+VENV ?= .venv
+# More requirements or version limits for pip, such as PINS='numpy==1.26.4'.
+PINS ?=
+ARGS ?=
+
+PY := $(VENV)/bin/python
+READY := $(VENV)/.ready
+CORE := $(filter-out sfa_localization/play.py sfa_localization/demo.py,$(wildcard sfa_localization/*.py))
+
+.DEFAULT_GOAL := help
+.PHONY: help env demo test lint format colcon matrix clean
+
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+env: $(READY)  ## build the environment alone, in .venv
+
+$(READY): setup.py .ci/env
+	PYTHON='$(PYTHON)' VENV='$(VENV)' PINS='$(PINS)' sh .ci/env
+
+demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (about 5 minutes)
+	$(PY) -m sfa_localization demo $(ARGS)
+
+test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
+	$(PY) -m pytest $(ARGS)
+
+lint: $(READY)  ## ruff, ruff format, mypy
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy $(CORE)
+
+format: $(READY)  ## let ruff sort imports and lay out the code
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+colcon: $(READY)  ## colcon build and colcon test in a clean environment
+	PYTHON='$(PYTHON)' sh .ci/colcon
+
+matrix: ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
+	sh .ci/matrix
+
+clean:  ## remove what the targets built, but not the environment
+	rm -rf build install log demo .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

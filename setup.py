@@ -1,0 +1,76 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The package as pip and colcon build it; dependency lists live here and nowhere else.
+
+``package.xml`` names the same dependencies by their rosdep keys. `make env` installs the extras.
+"""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'sfa_localization'
+COMMANDS = (
+    'simulate',
+    'train',
+    'evaluate',
+    'play',
+    'inspect',
+    'calibrate',
+    'filter',
+    'tune',
+    'demo',
+)
+NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Localization from one omnidirectional camera and odometry, learnt without '
+    'ground truth',
+    long_description='See README.md.',
+    author='The sfa_localization authors',
+    maintainer='The sfa_localization authors',
+    maintainer_email='sfa-localization@example.org',
+    license='Apache-2.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', glob('config/*.*')),
+        (f'share/{NAME}/bags', glob('bags/*.*')),
+    ],
+    zip_safe=False,
+    python_requires='>=3.10',
+    # The robot (the three nodes), the trainer and the evaluation.
+    install_requires=[
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'opencv-python-headless>=4.6',
+        'filterpy>=1.4.5',
+        'rosbags>=0.10',
+        'PyYAML>=5.4',
+        'tqdm>=4.60',
+        'matplotlib>=3.6',
+    ],
+    extras_require={
+        # Real ROS 2 Jazzy without a ROS installation (Linux x86-64).
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        # The simulated garden of `simulate` and `demo`.
+        'simulation': ['trimesh>=4.4', 'embreex>=2.17.7'],
+        # The reference engine of `train`, built from MDP's own nodes.
+        'mdp': ['MDP==3.6'],
+        # Several processes or machines for `train`.
+        'distributed': ['distributed>=2024.1'],
+        # colcon finds the test runner by this name.
+        'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9'],
+        'dev': ['ruff>=0.9', 'mypy>=1.11', 'types-PyYAML', 'pytest-cov>=4'],
+    },
+    entry_points={
+        'console_scripts': [
+            *(f'{command} = {NAME}.cli:executable' for command in COMMANDS),
+            *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
+        ],
+    },
+)
