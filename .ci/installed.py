@@ -1,0 +1,43 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Check an installed workspace: package, files and executables are found by the ament index."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from ament_index_python import get_package_prefix, get_package_share_directory
+
+import sfa_localization
+
+NAME = 'sfa_localization'
+SHARED = ('package.xml', 'config/localization.launch.py', 'config/localization.yaml')
+EXECUTABLES = (
+    *('simulate', 'train', 'evaluate', 'play', 'inspect', 'calibrate', 'filter', 'tune', 'demo'),
+    *('omnicam_node', 'sfa_node', 'ekf_node'),
+)
+
+
+def missing() -> list[str]:
+    """Return the shared files and executables that are not where ROS 2 looks for them."""
+    prefix, share = Path(get_package_prefix(NAME)), Path(get_package_share_directory(NAME))
+    expected = [share / name for name in SHARED]
+    expected += [prefix / 'lib' / NAME / name for name in EXECUTABLES]
+    return [str(path) for path in expected if not path.is_file()]
+
+
+def main() -> int:
+    """Print what is wrong, return the exit code."""
+    prefix = Path(get_package_prefix(NAME))
+    problems = [f'missing: {path}' for path in missing()]
+    if prefix not in Path(sfa_localization.__file__).parents:
+        problems.append(f'imported from elsewhere: {sfa_localization.__file__}')
+    train = prefix / 'lib' / NAME / 'train'
+    if not problems and subprocess.run([train, '--help'], stdout=subprocess.PIPE).returncode:
+        problems.append(f'{train} --help fails')
+    print('\n'.join(problems) or f'{prefix}: package, files and executables found')
+    return bool(problems)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
