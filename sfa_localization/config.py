@@ -280,7 +280,7 @@ class SegmentConfig(Settings):
     )
     piece_length: float = setting(3.0, 'longest piece of any drive', unit='m', low=0.2, high=100.0)
     piece_std: float = setting(
-        0.15, 'largest odometry error inside a piece', unit='m', low=0.001, high=10.0
+        0.1, 'largest odometry error inside a piece', unit='m', low=0.001, high=10.0
     )
     line_length_min: float = setting(
         2.0, 'shortest straight line', unit='m', low=0.1, high=100.0
@@ -290,7 +290,7 @@ class SegmentConfig(Settings):
     )
     segment_images_min: int = setting(5, 'fewest pictures of a segment', low=3, high=1000)
     image_step_max: float = setting(
-        1.5, 'a stretch this long without a picture ends the segment', unit='m', low=0.01, high=100.0
+        1.5, 'longest stretch without a picture inside a segment', unit='m', low=0.01, high=1e2
     )
     image_step_min: float = setting(
         0.02, 'pictures closer to the last one, and turned less, are left out', unit='m', low=0.0,
@@ -306,7 +306,7 @@ class SegmentConfig(Settings):
         0.2, 'above this yaw rate the robot turns', unit='rad/s', low=0.01, high=10.0
     )
     odometry_gap_max: float = setting(
-        0.5, 'longer pauses between odometry messages break the drive', unit='s', low=0.01, high=60.0
+        0.5, 'longer pauses of the odometry break the drive', unit='s', low=0.01, high=60.0
     )
     odometry_jump_max: float = setting(
         0.3, 'a pose this far from where the twist leads is an odometry reset', unit='m', low=0.01,
@@ -324,6 +324,7 @@ class SegmentConfig(Settings):
         0.003, 'random error of yaw, where the messages tell none', unit='rad/sqrt(s)', low=0.0,
         high=1.0,
     )
-    yaw_slip: float = setting(
-        0.01, 'error of a turn per turn', unit='rad/rad', low=0.0, high=1.0
+    yaw_slip: float = setting(0.01, 'error of a turn per turn', unit='rad/rad', low=0.0, high=1.0)
+    turn_slide: float = setting(
+        0.05, 'sideways slide of the wheels per turn', unit='m/rad', low=0.0, high=10.0
     )
