@@ -1,0 +1,99 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The report: errors by hand, and pictures that are whole, of the promised size, and not blank."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfa_localization import report
+from sfa_localization.run import Trajectory
+
+SECOND = 1_000_000_000
+
+
+def straight(seconds: list[float], poses: list[list[float]]) -> Trajectory:
+    stamps = np.array([round(second * SECOND) for second in seconds], np.int64)
+    return Trajectory(stamps, np.array(poses, float))
+
+
+@pytest.fixture
+def truth() -> Trajectory:
+    """One metre a second along x, for ten seconds."""
+    return straight([5, 15], [[0, 0, 0], [10, 0, 0]])
+
+
+@pytest.fixture
+def estimate() -> Trajectory:
+    """Two poses within the truth's time, 3-4-5 triangles away, and one before it."""
+    return straight([4, 6, 7], [[9, 9, 9], [1 + 3, 4, np.radians(190)], [2, -5, np.nan]])
+
+
+@pytest.fixture
+def scores() -> dict[str, dict[str, float]]:
+    row = {'mean': 0.12345, 'median': 0.1, 'p95': 0.2, 'rmse': 0.15, 'max': 0.3, 'n': 42}
+    return {'ekf': row, 'my filter': {**row, 'mean': 2.0}}
+
+
+def test_position_errors_by_hand(truth, estimate):
+    seconds, errors = report.position_errors(truth, estimate)
+    np.testing.assert_allclose(seconds, [1, 2])
+    np.testing.assert_allclose(errors, [5, 5])
+
+
+def test_heading_errors_wrap_and_leave_unknown_headings_out(truth, estimate):
+    seconds, errors = report.heading_errors(truth, estimate)
+    np.testing.assert_allclose(seconds, [1])
+    np.testing.assert_allclose(errors, [-170])
+
+
+def test_table_has_a_line_for_every_estimate(scores):
+    lines = report.table(scores).splitlines()
+    assert lines[0] == '| error (m) | mean | median | p95 | rmse | max | n |'
+    assert lines[2] == '| EKF: SFA + odometry | 0.123 | 0.100 | 0.200 | 0.150 | 0.300 | 42 |'
+    assert lines[3].startswith('| my filter | 2.000 |')
+    assert len(lines) == 4
+
+
+def test_report_writes_whole_pictures_and_nothing_else(tmp_path, truth, scores):
+    folder = tmp_path / 'new' / 'report'
+    positions = np.random.default_rng(0).uniform(0, 10, (50, 2))
+    features = np.column_stack([positions / 5 - 1, positions[:, 0] / 5 - 1])
+    late = straight([5, 10, 15], [[0, 1, np.nan], [5, 1, 0.1], [10, 1, 0]])
+    report.write_report(
+        folder, truth, {'ekf': late, 'my filter': late}, scores, positions, features
+    )
+    names = {'trajectories', 'errors', 'firing_maps', 'heading', 'overview'}
+    assert {path.name for path in folder.iterdir()} == {f'{n}.png' for n in names} | {'report.md'}
+    for name in names:
+        picture = cv2.imread(str(folder / f'{name}.png'))
+        assert min(picture.shape[:2]) > 600, name
+        assert picture.std() > 10, name
+    text = (folder / 'report.md').read_text()
+    assert report.table(scores) in text
+    assert all(f'({name}.png)' in text for name in names - {'overview'})
+
+
+def test_path_is_drawn_in_its_colour_and_to_scale(tmp_path, truth):
+    """A square path must come out as a square: equal axes."""
+    corners = [[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0], [0, 0, 0]]
+    square = straight([5, 6, 7, 8, 9], corners)
+    report.trajectories_figure(tmp_path / 'a.png', truth, {'ekf': square})
+    blue = cv2.imread(str(tmp_path / 'a.png')).astype(int)
+    rows, columns = np.nonzero(np.abs(blue - (0xB2, 0x72, 0x00)).sum(axis=2) < 12)
+    upper = rows < 0.85 * blue.shape[0]  # without the legend
+    assert np.ptp(columns[upper]) == pytest.approx(np.ptp(rows[upper]), rel=0.02)
+    assert np.ptp(rows[upper]) > 100
+
+
+def test_failed_picture_leaves_nothing(tmp_path: Path, truth, monkeypatch):
+    def full_disk(_figure, path, **_options):
+        path.write_bytes(b'half a picture')
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(report.Figure, 'savefig', full_disk)
+    with pytest.raises(OSError, match='No space'):
+        report.errors_figure(tmp_path / 'errors.png', truth, {})
+    assert list(tmp_path.iterdir()) == []
