@@ -174,7 +174,9 @@ class CameraConfig(Settings):
     polynomial: tuple[float, ...] = setting(
         (), 'coefficients a0 a1 ... of the ocam model, as in calib_results.txt'
     )
-    affine: tuple[float, ...] = setting((1.0, 0.0, 0.0), 'affine parameters c d e of the ocam model')
+    affine: tuple[float, ...] = setting(
+        (1.0, 0.0, 0.0), 'affine parameters c d e of the ocam model'
+    )
     radius_min: float = setting(
         40.0, 'radius about the center below which nothing is seen', unit='px', low=0.0, high=1e5
     )
@@ -201,13 +203,17 @@ class CameraConfig(Settings):
         0.0, 'dual_fisheye: turn of the second picture', unit='deg', low=-180.0, high=180.0
     )
     axis: str = setting(
-        'down',
+        'auto',
         'where the center of the picture looks before mounting angles: down (a mirror seen from '
-        'below), up, or forward; with up and down the top of the picture is forward',
-        choices=('down', 'up', 'forward'),
+        'below), up, or forward; with up and down the top of the picture is forward; auto: down '
+        'for mirror and polar, up for fisheye and ocam, forward for dual_fisheye',
+        choices=('auto', 'down', 'up', 'forward'),
     )
-    mirrored: bool = setting(
-        True, 'the picture shows the world reversed, as a picture of one mirror does'
+    mirrored: str = setting(
+        'auto',
+        'the picture shows the world reversed, as a picture of one mirror does; auto: yes for '
+        'mirror and polar',
+        choices=('auto', 'yes', 'no'),
     )
     mount_roll: float = setting(
         0.0, 'roll of the camera on the robot', unit='deg', low=-180.0, high=180.0, live=True
