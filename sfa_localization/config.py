@@ -334,3 +334,13 @@ class SegmentConfig(Settings):
     turn_slide: float = setting(
         0.05, 'sideways slide of the wheels per turn', unit='m/rad', low=0.0, high=10.0
     )
+
+
+@dataclass(frozen=True, slots=True)
+class NodeConfig(Settings):
+    """What every node has in common."""
+
+    autostart: bool = setting(True, 'configure and activate without a lifecycle manager')
+    diagnostics_period: float = setting(
+        1.0, 'time between messages on /diagnostics', unit='s', low=0.1, high=60.0
+    )

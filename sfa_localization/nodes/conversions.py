@@ -1,0 +1,224 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS messages to and from plain values; what is malformed raises MessageError with the reason.
+
+Nothing else in the package reads or fills a message. Stamps are integer nanoseconds, poses are
+(x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
+"""
+
+from __future__ import annotations
+
+import array
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import Image as ImageMessage
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+
+from sfa_localization.errors import CameraError, LocalizationError
+from sfa_localization.geometry import Array
+from sfa_localization.pictures import decode_compressed, decode_image, encode_jpeg
+from sfa_localization.run import Image
+
+UNKNOWN_VARIANCE = 1e6
+"""Variance of what a planar estimate does not know: z, roll and pitch are fixed, not unknown."""
+_FIXED_VARIANCE = 1e-6
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_NANOSECONDS = 1_000_000_000
+
+
+class MessageError(LocalizationError):
+    """A message cannot be used; the text is the reason, in short words that can be counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One odometry message: twist (v m/s, omega rad/s), its variances, and the odometry's pose."""
+
+    stamp_ns: int
+    pose: Array
+    twist: tuple[float, float]
+    variances: tuple[float, float]
+    frame: str
+    child_frame: str
+
+
+def read_stamp(stamp: Time) -> int:
+    """Nanoseconds; raises MessageError for the zero stamp and for impossible nanoseconds."""
+    if not 0 <= stamp.nanosec < _NANOSECONDS:
+        raise MessageError('impossible stamp')
+    total = stamp.sec * _NANOSECONDS + stamp.nanosec
+    if total <= 0:
+        raise MessageError('zero or negative stamp')
+    return int(total)
+
+
+def to_stamp(stamp_ns: int) -> Time:
+    """A message's stamp from nanoseconds >= 0."""
+    seconds, rest = divmod(int(stamp_ns), _NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def read_yaw(q: Quaternion) -> float:
+    """Heading of a quaternion; raises MessageError when it is not finite or not of unit length."""
+    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+    if not math.isfinite(norm):
+        raise MessageError('quaternion is not finite')
+    if abs(norm - 1.0) > 0.01:
+        raise MessageError('quaternion is not of unit length')
+    return math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+
+
+def to_quaternion(yaw_rad: float) -> Quaternion:
+    """Turn about the vertical."""
+    return Quaternion(z=float(math.sin(yaw_rad / 2)), w=float(math.cos(yaw_rad / 2)))
+
+
+def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
+    """Stamp and picture (H, W, 3) uint8 BGR of either image message."""
+    stamp_ns = read_stamp(message.header.stamp)
+    try:
+        if isinstance(message, CompressedImage):
+            return stamp_ns, decode_compressed(message.data, message.format)
+        return stamp_ns, decode_image(
+            message.data,
+            message.height,
+            message.width,
+            message.step,
+            message.encoding,
+            bool(message.is_bigendian),
+        )
+    except CameraError as error:
+        raise MessageError(str(error)) from None
+
+
+def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
+    """A bgr8 message of a picture (H, W, 3) uint8."""
+    image = np.ascontiguousarray(image, np.uint8)
+    message = ImageMessage(encoding='bgr8', is_bigendian=0)
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    message.height, message.width = int(image.shape[0]), int(image.shape[1])
+    message.step = message.width * 3
+    message.data = array.array('B', image.tobytes())
+    return message
+
+
+def to_compressed(image: Image, stamp_ns: int, frame: str, quality: int) -> CompressedImage:
+    """A JPEG message of a picture (H, W, 3) uint8 BGR."""
+    message = CompressedImage(format='bgr8; jpeg compressed bgr8')
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    message.data = array.array('B', encode_jpeg(image, quality))
+    return message
+
+
+def read_odometry(message: Odometry) -> Motion:
+    """The planar motion told by an odometry message; variances of 0 mean that it tells none."""
+    twist, covariance = message.twist.twist, message.twist.covariance
+    v, omega = float(twist.linear.x), float(twist.angular.z)
+    _require_finite('twist', [v, omega])
+    position = message.pose.pose.position
+    _require_finite('pose', [position.x, position.y])
+    yaw = read_yaw(message.pose.pose.orientation)
+    return Motion(
+        stamp_ns=read_stamp(message.header.stamp),
+        pose=np.array([position.x, position.y, yaw]),
+        twist=(v, omega),
+        variances=(_variance(covariance[0]), _variance(covariance[35])),
+        frame=message.header.frame_id,
+        child_frame=message.child_frame_id,
+    )
+
+
+def read_pose(message: PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
+    """Stamp, pose (3,) and covariance (3, 3) of [x, y, yaw]; all zeros where it tells none."""
+    position = message.pose.pose.position
+    _require_finite('position', [position.x, position.y])
+    yaw = read_yaw(message.pose.pose.orientation)
+    covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[_PLANAR]
+    _require_finite('covariance', covariance)
+    if np.any(np.diag(covariance) < 0):
+        raise MessageError('negative variance')
+    if np.abs(covariance - covariance.T).max() > 1e-6 * (1 + np.abs(covariance).max()):
+        raise MessageError('covariance is not symmetric')
+    return read_stamp(message.header.stamp), np.array([position.x, position.y, yaw]), covariance
+
+
+def to_pose(pose: ArrayLike, stamp_ns: int, frame: str) -> PoseStamped:
+    """A pose (3,) as a message; an unknown (NaN) yaw becomes 0, as a pose cannot say unknown."""
+    message = PoseStamped()
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    _fill(message.pose, np.asarray(pose, float))
+    return message
+
+
+def to_pose_with_covariance(
+    pose: ArrayLike, covariance: Array, stamp_ns: int, frame: str
+) -> PoseWithCovarianceStamped:
+    """A pose (3,) and its covariance (3, 3) as a message."""
+    message = PoseWithCovarianceStamped()
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    _fill(message.pose.pose, np.asarray(pose, float))
+    message.pose.covariance = to_covariance(covariance)
+    return message
+
+
+def to_odometry(
+    pose: ArrayLike,
+    covariance: Array,
+    twist: ArrayLike,
+    twist_covariance: Array,
+    stamp_ns: int,
+    frames: tuple[str, str],
+) -> Odometry:
+    """Pose in frames[0] and twist (v, omega) in frames[1], with (3, 3) and (2, 2) covariances."""
+    message = Odometry(child_frame_id=frames[1])
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frames[0]
+    _fill(message.pose.pose, np.asarray(pose, float))
+    message.pose.covariance = to_covariance(covariance)
+    v, omega = (float(value) for value in np.asarray(twist, float))
+    message.twist.twist.linear.x, message.twist.twist.angular.z = v, omega
+    spread = np.diag([_FIXED_VARIANCE] * 6)
+    spread[np.ix_([0, 5], [0, 5])] = twist_covariance
+    message.twist.covariance = spread.ravel()
+    return message
+
+
+def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
+    """A vector with the name of its only dimension."""
+    numbers = np.asarray(values, float).ravel()
+    message = Float64MultiArray(data=array.array('d', numbers))
+    message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
+    return message
+
+
+def to_covariance(covariance: Array) -> NDArray[np.float64]:
+    """The 36 numbers of a message from a (3, 3) covariance of [x, y, yaw]."""
+    full = np.diag([_FIXED_VARIANCE] * 6)
+    full[_PLANAR] = np.asarray(covariance, float)
+    return full.ravel()
+
+
+def _fill(message: Any, pose: Array) -> None:
+    _require_finite('output', pose[:2])
+    message.position.x, message.position.y = float(pose[0]), float(pose[1])
+    message.orientation = to_quaternion(float(pose[2]) if math.isfinite(pose[2]) else 0.0)
+
+
+def _variance(value: float) -> float:
+    """A variance, or 0 (unknown) where the message holds something that is none."""
+    return float(value) if math.isfinite(value) and 0 < value < UNKNOWN_VARIANCE else 0.0
+
+
+def _require_finite(name: str, values: ArrayLike) -> None:
+    numbers = np.asarray(values, float)
+    if not np.all(np.isfinite(numbers)):
+        raise MessageError(f'{name} is not finite')
+    if np.any(np.abs(numbers) > 1e9):
+        raise MessageError(f'{name} is absurdly large')

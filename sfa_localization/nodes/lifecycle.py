@@ -1,0 +1,281 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Base of the nodes: a lifecycle node that starts itself, guards callbacks and tells its health.
+
+A node written on it declares its Settings classes, makes its publishers and subscriptions in
+`setup`, drops what else it holds in `teardown`, and says how it is in `health`.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from sfa_localization.config import NodeConfig, Settings
+from sfa_localization.errors import LocalizationError
+from sfa_localization.nodes import parameters
+from sfa_localization.nodes.monitor import Monitor
+
+S = TypeVar('S', bound=Settings)
+_SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+def sensor_qos(depth: int = 5) -> QoSProfile:
+    """Best effort, as REP-2003 asks of those who listen to sensors."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def reliable_qos(depth: int = 10) -> QoSProfile:
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def latched_qos() -> QoSProfile:
+    """The last message reaches those who come later."""
+    return QoSProfile(
+        depth=1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+class LocalizationNode(LifecycleNode):  # type: ignore[misc]
+    """Lifecycle node with settings as parameters; `start` configures and activates it.
+
+    Raises ConfigError from the constructor for a parameter that is refused.
+    """
+
+    def __init__(self, name: str, kinds: Sequence[type[Settings]], **options: Any) -> None:
+        super().__init__(name, **options)
+        self.active = False
+        self.failure = ''
+        self.monitors: dict[str, Monitor] = {}
+        self._settings: dict[type[Settings], Settings] = {}
+        self._entities: list[tuple[Callable[[Any], Any], Any]] = []
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        for kind in (NodeConfig, *kinds):
+            self._declare(kind)
+
+    def _declare(self, kind: type[Settings]) -> None:
+        self._settings[kind] = parameters.declare(self, kind)
+
+        def apply(settings: Settings) -> None:
+            self._settings[kind] = settings
+            self.settings_changed(settings)
+
+        parameters.on_change(self, lambda: self._settings[kind], apply)
+
+    # What a node fills in.
+
+    def setup(self) -> None:
+        """Make publishers and subscriptions; a LocalizationError says why it cannot be done."""
+
+    def started(self) -> None:
+        """What is to be done once the publishers are enabled."""
+
+    def teardown(self) -> None:
+        """Let go of what `setup` made beyond publishers, subscriptions, services and timers."""
+
+    def settings_changed(self, settings: Settings) -> None:
+        """Live parameters have changed to `settings`, which are checked already."""
+
+    def health(self) -> tuple[int, str, dict[str, str]]:
+        """Diagnostic level, one line, and further values."""
+        return DiagnosticStatus.OK, 'running', {}
+
+    # What a node uses.
+
+    def settings(self, kind: type[S]) -> S:
+        """The values in force."""
+        return cast(S, self._settings[kind])
+
+    def monitor(self, name: str) -> Monitor:
+        """The counts of one input, made at its first use."""
+        return self.monitors.setdefault(name, Monitor())
+
+    def publisher(self, kind: Any, topic: str, qos: QoSProfile | None = None) -> Any:
+        """A publisher that is silent until activation; its QoS can be overridden by parameters."""
+        made = self.create_lifecycle_publisher(
+            kind,
+            topic,
+            qos or reliable_qos(),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self._entities.append((self.destroy_lifecycle_publisher, made))
+        return made
+
+    def subscribe(
+        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile | None = None
+    ) -> None:
+        """A subscription whose refused messages are counted under `topic` and end nothing."""
+        made = self.create_subscription(
+            kind,
+            topic,
+            self._guarded(topic, callback),
+            qos or sensor_qos(),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self._entities.append((self.destroy_subscription, made))
+
+    def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        """A service that answers with success and message also where its callback raises."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except LocalizationError as error:
+                response.success, response.message = False, str(error)
+                return response
+
+        self._entities.append((self.destroy_service, self.create_service(kind, name, answer)))
+
+    def every(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call at a steady period: simulated time may stop, and wall time may step back."""
+        made = self.create_timer(period_s, callback, clock=self._steady)
+        self._entities.append((self.destroy_timer, made))
+
+    def refuse(self, topic: str, reason: str) -> None:
+        """Count a refused message; log the first of a reason, then each thousandth."""
+        count = self.monitor(topic).refuse(reason)
+        if count == 1 or count % 1000 == 0:
+            self.get_logger().warning(f'{topic}: {reason} ({count} so far)')
+
+    def _guarded(self, topic: str, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+        monitor = self.monitor(topic)
+
+        def receive(message: Any) -> None:
+            if not self.active:
+                return
+            received_s = monitor.receive()
+            try:
+                callback(message)
+            except LocalizationError as error:
+                self.refuse(topic, str(error))
+            except InvalidHandle:
+                raise
+            except Exception as error:
+                # A node must outlive any message; what got here is a defect, and is shown as one.
+                self.refuse(topic, f'internal error: {type(error).__name__}')
+                self.get_logger().error(traceback.format_exc(), once=True)
+            else:
+                monitor.use(received_s)
+
+        return receive
+
+    # Life cycle.
+
+    def start(self) -> bool:
+        """Configure and activate, where `autostart` asks for it; False when that failed."""
+        if not self.settings(NodeConfig).autostart:
+            return True
+        return bool(self.trigger_configure() == _SUCCESS and self.trigger_activate() == _SUCCESS)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            self._diagnostics = self.publisher(DiagnosticArray, '/diagnostics')
+            self.every(self.settings(NodeConfig).diagnostics_period, self._tell_health)
+            self.setup()
+        except LocalizationError as error:
+            self.failure = str(error)
+            self.get_logger().error(f'cannot start: {error}')
+            self._drop()
+            return _FAILURE
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = super().on_activate(state)
+        self.active = result == _SUCCESS
+        if self.active:
+            self.started()
+            self.get_logger().info('active')
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = False
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._drop()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = False
+        self._drop()
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = False
+        self._drop()
+        return super().on_error(state)
+
+    def _drop(self) -> None:
+        self.teardown()
+        for destroy, entity in reversed(self._entities):
+            destroy(entity)
+        self._entities.clear()
+        self.monitors.clear()
+
+    def _tell_health(self) -> None:
+        if not self.active:
+            return
+        level, text, values = self.health()
+        for topic, monitor in self.monitors.items():
+            values.update(monitor.values(f'{topic}: '))
+        status = DiagnosticStatus(
+            level=level, name=f'{self.get_name()}: status', hardware_id='sfa_localization'
+        )
+        status.message = text
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+
+def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start."""
+    node = None
+    try:
+        rclpy.init(args=args)
+        node = make()
+        if not node.start():
+            return 1
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except LocalizationError as error:
+        rclpy.logging.get_logger('sfa_localization').fatal(str(error))
+        return 1
+    finally:
+        _end(node)
+    return 0
+
+
+def _spin(node: LocalizationNode) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while rclpy.ok():
+        try:
+            executor.spin()
+        except rclpy_implementation.RCLError as error:
+            # Asking a lifecycle node for a transition that its state does not have ends here.
+            node.get_logger().error(f'request refused: {error}')
+
+
+def _end(node: LocalizationNode | None) -> None:
+    """Destroy the node and the context, also when a second signal arrives meanwhile."""
+    try:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        rclpy.try_shutdown()

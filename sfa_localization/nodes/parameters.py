@@ -1,0 +1,117 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Settings classes as ROS parameters: described, ranged, and validated together."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from sfa_localization.config import Settings
+from sfa_localization.errors import ConfigError
+
+S = TypeVar('S', bound=Settings)
+_LARGEST_INTEGER = 2**63 - 1
+
+
+def declare(node: Node, kind: type[S]) -> S:
+    """Declare every field of `kind` as a parameter of `node`; return the values given to it.
+
+    Settings that are not `live` become read-only. Raises ConfigError for a value that is refused.
+    """
+    values = {item.name: _declare_field(node, item) for item in dataclasses.fields(kind)}
+    return kind.from_mapping(values, f'parameters of node {node.get_name()!r}')
+
+
+def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) -> None:
+    """Check changes of live parameters together, and hand the new settings to `apply`.
+
+    `current` returns the settings in force. A change that they cannot take is refused, with the
+    reason as the answer to whoever asked for it, and nothing is applied.
+    """
+
+    def check(changes: list[Parameter]) -> SetParametersResult:
+        try:
+            _changed(current(), changes)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def accept(changes: list[Parameter]) -> None:
+        settings = _changed(current(), changes)
+        if settings != current():
+            apply(settings)
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(accept)
+
+
+def _changed(settings: S, changes: list[Parameter]) -> S:
+    """The settings with those of `changes` that belong to them."""
+    values = {item.name: getattr(settings, item.name) for item in dataclasses.fields(settings)}
+    values.update({change.name: change.value for change in changes if change.name in values})
+    return type(settings).from_mapping(values, 'parameters')
+
+
+def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
+    default = list(item.default) if isinstance(item.default, tuple) else item.default
+    try:
+        return node.declare_parameter(item.name, default, descriptor(item)).value
+    except InvalidParameterTypeException as error:
+        return _declare_converted(node, item, error)
+    except ParameterException as error:
+        raise ConfigError(f'parameter {item.name!r}: {error}') from None
+
+
+def _declare_converted(node: Node, item: dataclasses.Field[Any], error: Exception) -> Any:
+    """Take `-p size:=3` for a parameter that is a real number: ROS reads 3 as an integer."""
+    probe = node.declare_parameter(item.name, descriptor=ParameterDescriptor(dynamic_typing=True))
+    node.undeclare_parameter(item.name)
+    kind = item.default[0] if isinstance(item.default, tuple) else item.default
+    given = list(probe.value) if isinstance(item.default, tuple) and probe.value else probe.value
+    numbers = given if isinstance(given, list) else [given]
+    if not isinstance(kind, float) or not all(type(entry) is int for entry in numbers):
+        raise ConfigError(f'parameter {item.name!r}: {error}') from None
+    value = [float(entry) for entry in given] if isinstance(given, list) else float(given)
+    try:
+        return node.declare_parameter(
+            item.name, value, descriptor(item), ignore_override=True
+        ).value
+    except ParameterException as refused:
+        raise ConfigError(f'parameter {item.name!r}: {refused}') from None
+
+
+def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
+    """Descriptor of one setting: description with unit, range, and whether it may change."""
+    meta = item.metadata
+    unit = f' [{meta["unit"]}]' if meta['unit'] else ''
+    made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
+    if meta['choices']:
+        made.additional_constraints = 'one of: ' + ', '.join(meta['choices'])
+    if meta['low'] is not None or meta['high'] is not None:
+        _bound(made, item.default, meta['low'], meta['high'])
+    return made
+
+
+def _bound(made: ParameterDescriptor, default: Any, low: float | None, high: float | None) -> None:
+    """Give a scalar its range; arrays have none in ROS and are checked by their Settings."""
+    if isinstance(default, float):
+        lowest = -sys.float_info.max if low is None else float(low)
+        highest = sys.float_info.max if high is None else float(high)
+        made.floating_point_range = [FloatingPointRange(from_value=lowest, to_value=highest)]
+    elif isinstance(default, int) and not isinstance(default, bool):
+        least = -_LARGEST_INTEGER if low is None else int(low)
+        most = _LARGEST_INTEGER if high is None else int(high)
+        made.integer_range = [IntegerRange(from_value=least, to_value=most)]

@@ -1,0 +1,302 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters from settings, message conversions, and the life cycle that all nodes share."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from sfa_localization.config import NodeConfig, Settings, setting
+from sfa_localization.errors import ConfigError
+
+rclpy = pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from sensor_msgs.msg import Image  # noqa: E402
+from std_msgs.msg import Float64, String  # noqa: E402
+
+from sfa_localization.nodes import conversions as convert  # noqa: E402
+from sfa_localization.nodes.lifecycle import LocalizationNode  # noqa: E402
+from sfa_localization.nodes.monitor import Monitor  # noqa: E402
+
+
+@dataclass(frozen=True, slots=True)
+class Knobs(Settings):
+    gain: float = setting(0.5, 'a gain', unit='m', low=0.0, high=2.0, live=True)
+    offset: float = setting(0.0, 'unbounded', live=True)
+    count: int = setting(3, 'a number', low=1, live=True)
+    mode: str = setting('a', 'a choice', choices=('a', 'b'), live=True)
+    fixed: float = setting(1.0, 'read only')
+    corner: tuple[float, ...] = setting((1.0, 2.0), 'an array')
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if self.gain > self.count:
+            raise ConfigError('gain must not exceed count')
+
+
+@pytest.fixture
+def context():
+    made = rclpy.Context()
+    rclpy.init(
+        context=made, domain_id=61, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO
+    )
+    yield made
+    rclpy.try_shutdown(context=made)
+
+
+@pytest.fixture
+def make(context):
+    nodes = []
+
+    def build(kind=LocalizationNode, *arguments, **overrides):
+        values = [Parameter(name, value=value) for name, value in overrides.items()]
+        nodes.append(kind(*arguments, context=context, parameter_overrides=values))
+        return nodes[-1]
+
+    yield build
+    for node in nodes:
+        node.destroy_node()
+
+
+def knobs(make, **overrides):
+    return make(LocalizationNode, 'knobs', [Knobs], **overrides)
+
+
+def test_every_setting_is_a_described_ranged_parameter(make):
+    node = knobs(make)
+    for item in dataclasses.fields(Knobs):
+        told = node.describe_parameter(item.name)
+        assert told.description.startswith(item.metadata['doc'])
+        assert told.read_only != item.metadata['live']
+    gain = node.describe_parameter('gain')
+    assert gain.description == 'a gain [m]'
+    assert (gain.floating_point_range[0].from_value, gain.floating_point_range[0].to_value) == (
+        0,
+        2,
+    )
+    assert node.describe_parameter('count').integer_range[0].from_value == 1
+    assert 'a, b' in node.describe_parameter('mode').additional_constraints
+
+
+def test_overrides_reach_the_settings_and_an_integer_serves_as_a_real(make):
+    settings = knobs(make, gain=2, count=4, corner=[3, 4], mode='b').settings(Knobs)
+    assert settings == Knobs(gain=2.0, count=4, corner=(3.0, 4.0), mode='b')
+
+
+@pytest.mark.parametrize(
+    'wrong',
+    [{'gain': 3.0}, {'gain': 3}, {'gain': 'x'}, {'mode': 'c'}, {'count': 0}, {'count': 1.5},
+     {'offset': math.nan}, {'corner': ['x']}, {'count': 1, 'gain': 1.5}],
+)  # fmt: skip
+def test_a_wrong_parameter_is_refused_at_start_by_name(make, wrong):
+    with pytest.raises(ConfigError, match=next(reversed(wrong))):
+        knobs(make, **wrong)
+
+
+def test_live_changes_are_checked_together_and_applied(make):
+    node = knobs(make)
+    assert node.set_parameters([Parameter('gain', value=1.5)])[0].successful
+    assert node.settings(Knobs).gain == 1.5
+    refused = node.set_parameters([Parameter('count', value=1)])[0]
+    assert not refused.successful and 'gain must not exceed count' in refused.reason
+    assert node.settings(Knobs).count == 3 and node.get_parameter('count').value == 3
+    both = [Parameter('count', value=1), Parameter('gain', value=0.5)]
+    assert node.set_parameters_atomically(both).successful
+    assert node.settings(Knobs) == Knobs(gain=0.5, count=1)
+
+
+@pytest.mark.parametrize('change', [{'fixed': 2.0}, {'offset': math.nan}, {'mode': 'c'},
+                                    {'gain': 'x'}])  # fmt: skip
+def test_a_wrong_live_change_is_refused_and_changes_nothing(make, change):
+    node = knobs(make)
+    (name, value), *_ = change.items()
+    assert not node.set_parameters([Parameter(name, value=value)])[0].successful
+    assert node.settings(Knobs) == Knobs()
+
+
+class Echo(LocalizationNode):
+    def __init__(self, **options):
+        super().__init__('echo', [], **options)
+
+    def setup(self):
+        self.out = self.publisher(String, 'out')
+        self.subscribe(Float64, 'in', self.take)
+
+    def take(self, message):
+        if message.data < 0:
+            raise convert.MessageError('negative')
+        self.out.publish(String(data=str(1 / message.data)))
+
+
+def test_a_node_starts_itself_unless_told_not_to(make):
+    node = make(Echo)
+    assert node.start() and node.active
+    waiting = make(Echo, autostart=False)
+    assert waiting.start() and not waiting.active
+
+
+def test_refused_messages_and_defects_are_counted_and_end_nothing(make):
+    node = make(Echo)
+    node.start()
+    receive = node._guarded('in', node.take)
+    for value in (-1.0, 0.0, 2.0):
+        receive(Float64(data=value))
+    monitor = node.monitor('in')
+    assert (monitor.received, monitor.used) == (3, 1)
+    assert monitor.refused == {'negative': 1, 'internal error: ZeroDivisionError': 1}
+
+
+def test_a_node_survives_its_whole_life_cycle_twice(make):
+    node = make(Echo)
+    node.start()
+    for _ in range(2):
+        node.trigger_deactivate()
+        assert not node.active
+        node.trigger_cleanup()
+        assert node.start() and node.active
+    node.trigger_shutdown()
+    assert not node.active
+
+
+class Failing(LocalizationNode):
+    def setup(self):
+        self.publisher(String, 'out')
+        raise ConfigError('no model; give one')
+
+
+def test_a_node_that_cannot_start_says_why_and_leaves_nothing(make):
+    node = make(Failing, 'failing', [NodeConfig][1:])
+    assert not node.start()
+    assert node.failure == 'no model; give one'
+    assert node.count_publishers('/out') == 0
+
+
+def test_monitor_counts_rates_and_latency():
+    monitor = Monitor()
+    assert monitor.silent_for_s() == math.inf and monitor.rate_hz() == 0
+    for _ in range(3):
+        monitor.use(monitor.receive())
+    monitor.refuse('late')
+    told = monitor.values('in: ')
+    assert told['in: received'] == '3' and told['in: refused: late'] == '1'
+    assert 0 <= monitor.latency_ms(50) <= monitor.latency_ms(99)
+    assert monitor.silent_for_s() < math.inf
+
+
+# Conversions.
+
+
+def odometry(**changes):
+    message = Odometry()
+    message.header.stamp.sec = 5
+    message.pose.pose.orientation.w = 1.0
+    for path, value in changes.items():
+        *parents, name = path.split('__')
+        target = message
+        for parent in parents:
+            target = getattr(target, parent)
+        setattr(target, name, value)
+    return message
+
+
+@pytest.mark.parametrize('stamp_ns', [1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789])
+def test_stamps_survive_the_round_trip(stamp_ns):
+    assert convert.read_stamp(convert.to_stamp(stamp_ns)) == stamp_ns
+
+
+@pytest.mark.parametrize('yaw', [0.0, 1.0, -3.0, math.pi, -math.pi + 1e-9])
+def test_yaw_survives_the_round_trip(yaw):
+    back = convert.read_yaw(convert.to_quaternion(yaw))
+    assert abs(math.remainder(back - yaw, 2 * math.pi)) < 1e-12
+
+
+def test_odometry_is_read():
+    message = odometry(twist__twist__linear__x=0.5, twist__twist__angular__z=-0.2)
+    message.twist.covariance[0], message.twist.covariance[35] = 4e-4, -1.0
+    motion = convert.read_odometry(message)
+    assert motion.stamp_ns == 5_000_000_000
+    assert motion.twist == (0.5, -0.2) and motion.variances == (4e-4, 0.0)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'twist__twist__linear__x': math.nan}, 'twist is not finite'),
+        ({'twist__twist__angular__z': math.inf}, 'twist is not finite'),
+        ({'pose__pose__orientation__w': 0.0}, 'quaternion is not of unit length'),
+        ({'pose__pose__orientation__w': 2.0}, 'quaternion is not of unit length'),
+        ({'pose__pose__orientation__w': math.nan}, 'quaternion is not finite'),
+        ({'pose__pose__position__x': math.inf}, 'pose is not finite'),
+        ({'header__stamp__sec': 0}, 'zero or negative stamp'),
+        ({'header__stamp__nanosec': 1_000_000_000}, 'impossible stamp'),
+        ({'twist__twist__linear__x': 1e308}, 'twist is absurdly large'),
+    ],
+)
+def test_malformed_odometry_is_named(changes, reason):
+    with pytest.raises(convert.MessageError, match=reason):
+        convert.read_odometry(odometry(**changes))
+
+
+def test_pose_and_covariance_survive_the_round_trip():
+    covariance = np.array([[0.2, 0.05, 0.01], [0.05, 0.3, 0.02], [0.01, 0.02, 0.1]])
+    message = convert.to_pose_with_covariance([1.0, -2.0, 3.0], covariance, 7, 'map')
+    stamp_ns, pose, back = convert.read_pose(message)
+    assert stamp_ns == 7 and message.header.frame_id == 'map'
+    assert np.allclose(pose, [1, -2, 3]) and np.allclose(back, covariance)
+
+
+@pytest.mark.parametrize(
+    ('index', 'value', 'reason'),
+    [(0, math.nan, 'not finite'), (0, -1.0, 'negative'), (1, 0.5, 'symmetric'),
+     (35, 1e308, 'absurdly')],
+)  # fmt: skip
+def test_a_malformed_covariance_is_named(index, value, reason):
+    message = PoseWithCovarianceStamped()
+    message.header.stamp.sec = 1
+    message.pose.pose.orientation = Quaternion(w=1.0)
+    message.pose.covariance[index] = value
+    with pytest.raises(convert.MessageError, match=reason):
+        convert.read_pose(message)
+
+
+def test_nothing_that_is_not_finite_gets_out():
+    with pytest.raises(convert.MessageError, match='output'):
+        convert.to_pose([math.nan, 0.0, 0.0], 1, 'map')
+    assert convert.to_pose([1.0, 2.0, math.nan], 1, 'map').pose.orientation.w == 1.0
+
+
+def test_pictures_survive_the_round_trip_and_bad_ones_are_named():
+    image = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
+    message = convert.to_image(image, 9, 'camera')
+    stamp_ns, back = convert.read_image(message)
+    assert stamp_ns == 9 and np.array_equal(back, image)
+    message.step = 5
+    with pytest.raises(convert.MessageError):
+        convert.read_image(message)
+    with pytest.raises(convert.MessageError):
+        empty = Image()
+        empty.header.stamp.sec = 1
+        convert.read_image(empty)
+
+
+def test_odometry_message_carries_both_covariances():
+    message = convert.to_odometry(
+        [1, 2, 0.5], np.diag([1, 2, 3]), [0.4, 0.1], np.diag([5, 6]), 3, ('map', 'base_link')
+    )
+    pose, twist = (np.reshape(part.covariance, (6, 6)) for part in (message.pose, message.twist))
+    assert (pose[0, 0], pose[1, 1], pose[5, 5]) == (1, 2, 3)
+    assert (twist[0, 0], twist[5, 5]) == (5, 6)
+    assert message.child_frame_id == 'base_link' and message.twist.twist.linear.x == 0.4
+
+
+def test_an_array_names_its_dimension():
+    message = convert.to_array([1, 2, 3], 'slow features')
+    assert message.layout.dim[0].label == 'slow features' and message.layout.dim[0].size == 3
+    assert list(message.data) == [1.0, 2.0, 3.0]
