@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from sfa_localization.calibration import with_calibration
+from sfa_localization.calibration_files import with_calibration
 from sfa_localization.config import CameraConfig, PanoramaConfig
 from sfa_localization.errors import CameraError
 from sfa_localization.geometry import Array
