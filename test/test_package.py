@@ -1,5 +1,270 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-def test_placeholder():
-    import sfa_localization
-    assert sfa_localization.__version__
+"""The package as a whole: who may import what, one version, docstrings, executables."""
+
+import ast
+import re
+import runpy
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+import pytest
+import setuptools
+
+import sfa_localization
+from sfa_localization.cli import COMMANDS
+
+NAME = 'sfa_localization'
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / NAME
+MODULES = {
+    '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
+    for path in PACKAGE.rglob('*.py')
+}
+NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+ROS = {
+    'rclpy',
+    'ament_index_python',
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'lifecycle_msgs',
+    'nav_msgs',
+    'rcl_interfaces',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'std_msgs',
+    'std_srvs',
+    'tf2_msgs',
+}
+# Who may import, beyond the standard library and this package, what: by the first words that fit.
+ROOMS: dict[str, set[str]] = {
+    'errors': set(),
+    'config': set(),
+    'config_file': {'yaml'},
+    'geometry': {'numpy'},
+    'run': {'numpy'},
+    'simulation': {'numpy', 'tqdm'},
+    'garden': {'numpy', 'cv2', 'trimesh'},
+    'rendering': {'numpy', 'cv2', 'trimesh', 'embreex'},
+    'textures': {'numpy', 'scipy', 'cv2'},
+    'pose_filter': {'numpy', 'scipy', 'filterpy'},
+    'mdp': {'numpy', 'scipy', 'mdp'},
+    'report': {'numpy', 'matplotlib'},
+    'bag': {'numpy', 'rosbags', 'yaml', 'zstandard', 'backports', 'compression', 'lz4', 'tqdm'},
+    'play': {'numpy', 'tqdm', 'rosbags'} | ROS,
+    'demo': {'numpy', 'tqdm'} | ROS,
+    'nodes': {'numpy', 'yaml'} | ROS,
+    'distributed': {'numpy', 'dask', 'distributed'},
+    'training': {'numpy', 'tqdm'},
+    '': {'numpy', 'scipy', 'cv2', 'yaml', 'tqdm'},
+}
+# Never at run time on the robot, nor in anything its nodes import.
+NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'dask', 'tqdm'}
+OWN_NOT_ON_THE_ROBOT = {f'{NAME}.{word}' for word in ('training', 'evaluation', 'simulation')}
+# The standard library's ways to run code that a file brings along.
+UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
+
+
+@cache
+def imports(module: str) -> frozenset[str]:
+    """Return the full names a module imports, anywhere in it, but not for type checkers only."""
+    found: set[str] = set()
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding='utf-8'))):
+        if isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test):
+            skipped.update(inner for line in node.body for inner in ast.walk(line))
+        if node in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{module}: relative import'
+            found.update(f'{node.module}.{alias.name}' for alias in node.names)
+    return frozenset(found)
+
+
+def own(module: str) -> set[str]:
+    """Return the modules of this package that a module imports."""
+    names = {name for name in imports(module) if name.split('.')[0] == NAME}
+    return {longest(name, MODULES) for name in names}
+
+
+def longest(name: str, beginnings: Iterable[str]) -> str:
+    """Return the longest of the beginnings that fits a dotted name."""
+    return max((b for b in beginnings if f'{name}.'.startswith(f'{b}.')), key=len)
+
+
+def foreign(module: str) -> set[str]:
+    """Return the top-level packages, neither own nor standard, that a module imports."""
+    tops = {name.split('.')[0] for name in imports(module)}
+    return tops - {NAME} - set(sys.stdlib_module_names)
+
+
+def reached(start: str) -> set[str]:
+    """Return the modules of this package that importing `start` brings in, itself included."""
+    seen, todo = set(), {start}
+    while todo:
+        module = todo.pop()
+        seen.add(module)
+        todo |= own(module) - seen
+    return seen
+
+
+def room(module: str) -> set[str]:
+    """Return what a module may import: the rule with the longest fitting beginning of its name."""
+    short = module.removeprefix(f'{NAME}.')
+    return ROOMS[max((word for word in ROOMS if short.startswith(word)), key=len)]
+
+
+@pytest.mark.parametrize('module', sorted(MODULES))
+def test_module_imports_only_what_its_room_may(module):
+    assert foreign(module) <= room(module)
+
+
+@pytest.mark.parametrize('module', sorted(MODULES))
+def test_nothing_runs_code_from_files(module):
+    assert not {name.split('.')[0] for name in imports(module)} & UNSAFE
+
+
+@pytest.mark.parametrize('module', sorted(MODULES))
+def test_core_does_not_know_ros(module):
+    shell = module.startswith((f'{NAME}.nodes', f'{NAME}.play', f'{NAME}.demo'))
+    assert shell or not foreign(module) & ROS
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_robot_needs_no_training_code(node):
+    modules = reached(f'{NAME}.nodes.{node}')
+    assert not modules & OWN_NOT_ON_THE_ROBOT
+    assert {
+        m: foreign(m) & NOT_ON_THE_ROBOT for m in modules if foreign(m) & NOT_ON_THE_ROBOT
+    } == {}
+
+
+def test_no_module_imports_itself_through_others():
+    circles = [m for m in MODULES if any(m in reached(other) for other in own(m) - {m})]
+    assert circles == []
+
+
+def test_one_version():
+    manifest = ET.parse(ROOT / 'package.xml').getroot()
+    assert manifest.findtext('version') == setup_arguments()['version']
+    assert setup_arguments()['version'] == sfa_localization.__version__
+    assert f'## {sfa_localization.__version__}' in (ROOT / 'CHANGELOG.md').read_text('utf-8')
+    citation = (ROOT / 'CITATION.cff').read_text('utf-8')
+    assert f'version: {sfa_localization.__version__}\n' in citation
+
+
+@cache
+def setup_arguments() -> dict:
+    """Return what setup.py hands to setuptools."""
+    arguments: dict = {}
+    original, setuptools.setup = setuptools.setup, arguments.update
+    try:
+        runpy.run_path(str(ROOT / 'setup.py'))
+    finally:
+        setuptools.setup = original
+    return arguments
+
+
+def test_every_command_and_node_is_an_executable():
+    scripts = [line.split(' = ') for line in setup_arguments()['entry_points']['console_scripts']]
+    targets = dict(scripts)
+    assert set(targets) == {command.name for command in COMMANDS} | set(NODES)
+    assert {targets[node] for node in NODES} == {f'{NAME}.nodes.{node}:main' for node in NODES}
+    assert {targets[command.name] for command in COMMANDS} == {f'{NAME}.cli:executable'}
+
+
+def test_installed_files_exist():
+    arguments = setup_arguments()
+    files = [ROOT / name for _, names in arguments['data_files'] for name in names]
+    assert ROOT / 'package.xml' in files
+    assert ROOT / f'resource/{NAME}' in files
+    assert [path for path in files if not path.is_file()] == []
+    assert (PACKAGE / 'py.typed').is_file()
+
+
+def test_rosdep_keys_cover_the_messages_used():
+    keys = {item.text for item in ET.parse(ROOT / 'package.xml').getroot().iter('exec_depend')}
+    used = set().union(*(foreign(module) & ROS for module in MODULES))
+    assert used <= keys
+
+
+def public_definitions(module: str):
+    """Yield the public classes, functions and methods of a module with their qualified names."""
+    tree = ast.parse(MODULES[module].read_text(encoding='utf-8'))
+    for node in tree.body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and not node.name.startswith('_'):
+            yield f'{module}.{node.name}', node
+        if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+            for method in node.body:
+                if isinstance(method, ast.FunctionDef) and not method.name.startswith('_'):
+                    yield f'{module}.{node.name}.{method.name}', method
+
+
+@cache
+def documented_names() -> frozenset[str]:
+    """Return the names of all methods with a docstring, in any class: the interfaces."""
+    definitions = (item for module in MODULES for item in public_definitions(module))
+    return frozenset(name.split('.')[-1] for name, node in definitions if ast.get_docstring(node))
+
+
+def speaks_for_itself(name: str, node: ast.AST) -> bool:
+    """Tell whether this is a line or two, or one of several with a documented interface."""
+    if isinstance(node, ast.ClassDef):
+        return False
+    short = name.split('.')[-1]
+    of_lifecycle = short.startswith('on_') and '.nodes.' in name
+    return node.end_lineno - node.lineno < 4 or short in documented_names() or of_lifecycle
+
+
+@pytest.mark.parametrize('module', sorted(MODULES))
+def test_public_names_have_docstrings(module):
+    assert ast.get_docstring(ast.parse(MODULES[module].read_text(encoding='utf-8')))
+    missing = [
+        name
+        for name, node in public_definitions(module)
+        if not ast.get_docstring(node) and not speaks_for_itself(name, node)
+    ]
+    assert missing == []
+
+
+ARRAY = re.compile(r'\b(Array|NDArray)\b(?! \| float)')
+SAYS_SHAPE = re.compile(
+    r'\([^()]*\b[A-Z0-9]\w*\s*(,[^()]*)?\)|picture|image|panorama|pixel|stamp', re.IGNORECASE
+)
+"""A shape such as (N, 2), or a word that names an array the whole package shares."""
+
+
+@pytest.mark.parametrize('module', sorted(MODULES))
+def test_docstrings_of_array_functions_tell_shapes(module):
+    """Functions that take arrays say, or their class says, what shape these have."""
+    silent = []
+    tree = dict(public_definitions(module))
+    for name, node in tree.items():
+        if isinstance(node, ast.ClassDef) or not ast.get_docstring(node):
+            continue
+        taken = ' '.join(ast.unparse(a.annotation) for a in node.args.args if a.annotation)
+        owner = tree.get(name.rpartition('.')[0])
+        told = ast.get_docstring(node) + (ast.get_docstring(owner) or '' if owner else '')
+        if ARRAY.search(taken) and not SAYS_SHAPE.search(told):
+            silent.append(name)
+    assert silent == []
+
+
+def test_commands_show_examples_before_their_options():
+    for command in COMMANDS:
+        assert command.summary and command.example.strip(), command.name
+        assert command.name in command.example, command.name
+
+
+def test_module_runs_as_a_program():
+    done = subprocess.run(
+        [sys.executable, '-m', NAME, '--version'], cwd=ROOT, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (0, f'{sfa_localization.__version__}\n')
