@@ -9,7 +9,7 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.errors import LocalizationError
+from sfa_localization.errors import BagError, LocalizationError
 from sfa_localization.pictures import decode_compressed, decode_image
 from sfa_localization.run import Image
 
@@ -45,24 +45,33 @@ class Decoder:
             raise Unusable(f'damaged message ({type(error).__name__})') from None
 
 
-def header_stamp(message: Any, child_frame: str = '') -> int:
-    """The stamp in nanoseconds that the sender gave; of a TFMessage its transform's."""
-    stamp = stamped(message, child_frame).header.stamp
+class TransformChooser:
+    """Picks one transform of each TFMessage: that to `child_frame`, or the only one there is."""
+
+    def __init__(self, topic: str, child_frame: str) -> None:
+        self._topic, self._wanted = topic, child_frame.lstrip('/')
+        self._seen: set[str] = set()
+
+    def __call__(self, message: Any) -> Any:
+        """The TransformStamped, or None. Raises BagError when it is not clear which is meant."""
+        for transform in message.transforms:
+            child_frame = transform.child_frame_id.lstrip('/')
+            if child_frame == self._wanted:
+                return transform
+            self._seen.add(child_frame)
+        if self._wanted:
+            return None
+        if len(self._seen) > 1:
+            names = ', '.join(sorted(self._seen))
+            raise BagError(f'{self._topic} tells of several frames: {names}; '
+                           f'choose one as {self._topic}:FRAME')  # fmt: skip
+        return message.transforms[0] if message.transforms else None
+
+
+def header_stamp(message: Any) -> int:
+    """The stamp in nanoseconds that the sender gave."""
+    stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
-def stamped(message: Any, child_frame: str = '') -> Any:
-    """The part of a message that carries the header: itself, or one transform of a TFMessage."""
-    if message.__msgtype__ != TF:
-        return message
-    for transform in message.transforms:
-        if not child_frame or _frame(transform.child_frame_id) == _frame(child_frame):
-            return transform
-    raise Unusable('another transform')
-
-
-def _frame(name: str) -> str:
-    return name.lstrip('/')
 
 
 def image_of(message: Any) -> Image:
@@ -79,9 +88,9 @@ def image_of(message: Any) -> Image:
     )
 
 
-def pose_of(message: Any, child_frame: str = '') -> tuple[float, float, float]:
-    """Planar pose x m, y m, yaw rad of any of the POSES types. Raises Unusable."""
-    position, q = _position_orientation(stamped(message, child_frame))
+def pose_of(message: Any) -> tuple[float, float, float]:
+    """Planar pose x m, y m, yaw rad of a message or transform. Raises Unusable."""
+    position, q = _position_orientation(message)
     norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
     if not (math.isfinite(position.x) and math.isfinite(position.y) and math.isfinite(norm)):
         raise Unusable('not a finite pose')
@@ -97,6 +106,11 @@ def _position_orientation(message: Any) -> tuple[Any, Any]:
         return message.transform.translation, message.transform.rotation
     pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
     return pose.position, pose.orientation
+
+
+def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
+    """Pose, and of an Odometry v, omega and their variances; other types tell no twist."""
+    return pose_of(message), twist_of(message) if message.__msgtype__ == ODOMETRY else None
 
 
 def twist_of(message: Any) -> tuple[float, float, float, float]:

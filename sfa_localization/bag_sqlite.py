@@ -1,0 +1,134 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Bag files of the sqlite3 storage, every schema from ROS 2 Crystal on, damaged ones too."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+from sfa_localization.bag_storage import Channel, Record, message_type, offered_qos
+from sfa_localization.errors import BagError
+
+MAGIC = b'SQLite format 3\x00'
+
+
+class SqliteStorage:
+    """One .db3 file. Raises BagError when not even its list of topics can be read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self.problems = path, list[str]()
+        self._copy: tempfile.TemporaryDirectory[str] | None = None
+        self._database = self._connect()
+        try:
+            self._by_id = self._read_topics()
+        except (sqlite3.Error, ValueError, TypeError) as error:
+            self.close()
+            raise BagError(f'{path}: no readable bag database ({error})') from None
+        self.channels = list(self._by_id.values())
+        self.counts = self._guarded(self._read_counts, {})
+        self.start_ns = self._guarded(self._read_start, 0)
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open read-only. Unfinished transactions are completed in a copy, never in place."""
+        path, logs = self._path, self._pending_logs()
+        if logs:
+            self._copy = tempfile.TemporaryDirectory(prefix='bag-')
+            path = Path(self._copy.name) / self._path.name
+            for file in (self._path, *logs):
+                target = path.with_name(file.name)
+                shutil.copyfile(file, target)
+            self.problems.append(f'{self._path.name}: was not closed; its -wal log is read as well')
+        access = 'mode=rw' if logs else 'mode=ro&immutable=1'
+        return sqlite3.connect(f'{path.absolute().as_uri()}?{access}', uri=True)
+
+    def _pending_logs(self) -> list[Path]:
+        logs = [self._path.with_name(self._path.name + end) for end in ('-wal', '-journal')]
+        return [log for log in logs if log.is_file() and log.stat().st_size > 0]
+
+    def _guarded(self, read: Callable[[], Any], otherwise: Any) -> Any:
+        try:
+            return read()
+        except (sqlite3.Error, ValueError, TypeError) as error:
+            self.problems.append(f'{self._path.name}: damaged database ({error})')
+            return otherwise
+
+    def _columns(self, table: str) -> set[str]:
+        return {row[1] for row in self._database.execute(f'PRAGMA table_info({table})')}
+
+    def _read_topics(self) -> dict[int, Channel]:
+        columns = self._columns('topics')
+        if not columns or not self._columns('messages'):
+            raise ValueError('it has no tables of topics and messages')
+        qos = 'offered_qos_profiles' if 'offered_qos_profiles' in columns else "''"
+        rows = self._database.execute(
+            f'SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id'
+        )
+        return {
+            int(key): Channel(str(topic), message_type(str(kind)), str(serial), offered_qos(qos))
+            for key, topic, kind, serial, qos in rows
+        }
+
+    def _read_counts(self) -> dict[str, int]:
+        counts = {channel.topic: 0 for channel in self.channels}
+        query = 'SELECT topic_id, count(*) FROM messages GROUP BY topic_id'
+        for key, count in self._database.execute(query):
+            if key in self._by_id:
+                counts[self._by_id[key].topic] += count
+        return counts
+
+    def _read_start(self) -> int:
+        (start,) = self._database.execute('SELECT min(timestamp) FROM messages').fetchone()
+        return int(start or 0)
+
+    def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
+        """Messages by reception; those on damaged pages are passed over."""
+        wanted = {key: channel for key, channel in self._by_id.items() if channel.topic in topics}
+        query = (
+            'SELECT topic_id, timestamp, data, id FROM messages '
+            f'WHERE topic_id IN ({",".join(map(str, wanted))}) AND timestamp >= {start_ns} '
+            'ORDER BY timestamp'
+        )
+        last: tuple[int, int] | None = None
+        try:
+            for key, stamp, data, row in self._database.execute(query):
+                if type(stamp) is int and type(data) is bytes:
+                    last = stamp, row
+                    yield wanted[key], stamp, data
+        except (sqlite3.Error, OverflowError) as error:
+            self.problems.append(f'{self._path.name}: damaged database ({error})')
+            yield from self._salvaged(wanted, start_ns, last)
+
+    def _salvaged(
+        self, wanted: dict[int, Channel], start_ns: int, last: tuple[int, int] | None
+    ) -> Iterator[Record]:
+        """Row by row what can still be reached, without those up to `last` (stamp, row)."""
+        query = 'SELECT topic_id, timestamp, data FROM messages NOT INDEXED WHERE id = ?'
+        for row in range(1, self._last_row() + 1):
+            try:
+                found = self._database.execute(query, (row,)).fetchone()
+            except (sqlite3.Error, OverflowError):
+                continue
+            if found is None or found[0] not in wanted or type(found[2]) is not bytes:
+                continue
+            key, stamp, data = found
+            if type(stamp) is int and stamp >= start_ns and (last is None or (stamp, row) > last):
+                yield wanted[key], stamp, data
+
+    def _last_row(self) -> int:
+        """The last row's number, no more than the file has room for."""
+        room = self._path.stat().st_size // 8
+        last = self._guarded(
+            lambda: self._database.execute('SELECT max(id) FROM messages').fetchone()[0], room
+        )
+        return min(int(last or 0), room)
+
+    def close(self) -> None:
+        """Release the file and a copy made of it."""
+        self._database.close()
+        if self._copy is not None:
+            self._copy.cleanup()

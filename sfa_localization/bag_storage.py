@@ -1,0 +1,97 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What every kind of bag file offers the reader, and the parts they share."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import IO, Any, NamedTuple, Protocol
+
+from rosbags.interfaces import Qos
+from rosbags.rosbag2.metadata import parse_qos
+
+from sfa_localization.errors import BagError
+
+if sys.version_info >= (3, 14):
+    from compression import zstd as zstd
+else:
+    from backports import zstd as zstd
+
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+PIECE = 1 << 20
+
+
+class Channel(NamedTuple):
+    """Where messages of one topic come from: message type, wire format and offered QoS."""
+
+    topic: str
+    kind: str
+    serialization: str
+    qos: tuple[Qos, ...]
+
+
+Record = tuple[Channel, int, bytes]
+"""A message: its channel, its reception in nanoseconds, its serialized bytes."""
+
+
+class Storage(Protocol):
+    """One file of a bag, open for reading and never written to."""
+
+    channels: list[Channel]
+    counts: dict[str, int]
+    """Messages per topic as the file itself tells; a topic is absent where it cannot tell."""
+    start_ns: int
+    problems: list[str]
+    """What was found damaged so far; reading may add to it."""
+
+    def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
+        """Messages of the topics received at or after `start_ns`, in order of reception."""
+
+    def close(self) -> None:
+        """Release the file."""
+
+
+def message_type(name: str) -> str:
+    """Full name of a message type: older recorders leave the middle 'msg' out."""
+    parts = name.split('/')
+    return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else name
+
+
+def offered_qos(profiles: Any) -> tuple[Qos, ...]:
+    """QoS profiles from the text or list that a recorder left; none where it is unreadable."""
+    try:
+        return tuple(parse_qos(profiles))
+    except Exception:  # foreign text; a bag is not refused for its QoS
+        return ()
+
+
+def inflate_message(data: bytes) -> bytes:
+    """Undo the recorder's compression of single messages. Raises BagError."""
+    if data[:4] != ZSTD_MAGIC:
+        return data
+    try:
+        return bytes(zstd.decompress(data))
+    except zstd.ZstdError:
+        raise BagError('a compressed message is damaged') from None
+
+
+def inflate_file(source: Path, target: Path) -> str:
+    """Decompress a file; return what is wrong with it ('' when whole). Raises OSError."""
+    decompressor = zstd.ZstdDecompressor()
+    with source.open('rb') as packed, target.open('wb') as plain:
+        return _inflate(packed, plain, decompressor)
+
+
+def _inflate(packed: IO[bytes], plain: IO[bytes], decompressor: Any) -> str:
+    while piece := packed.read(PIECE):
+        while piece:
+            try:
+                plain.write(decompressor.decompress(piece))
+            except zstd.ZstdError:
+                return 'damaged zstd data; read up to the damage'
+            piece = decompressor.unused_data
+            if decompressor.eof and piece:
+                decompressor = zstd.ZstdDecompressor()
+    return '' if decompressor.eof else 'cut-off zstd data; read up to the cut'
