@@ -1,0 +1,54 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The three nodes in one launch: camera picture -> panorama -> pose -> fused pose.
+
+ros2 launch sfa_localization localization.launch.py model:=/path/to/model.npz
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node, PushROSNamespace
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+PACKAGE = 'sfa_localization'
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Declare the arguments, and start the nodes with them."""
+    parameters = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'localization.yaml'])
+    arguments = [
+        DeclareLaunchArgument('model', description='model file, as `train` writes it'),
+        DeclareLaunchArgument('config', default_value=parameters, description='parameter file'),
+        DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
+        DeclareLaunchArgument('image', default_value='image_raw', description="camera's topic"),
+        DeclareLaunchArgument('odom', default_value='/odom', description="odometry's topic"),
+        DeclareLaunchArgument(
+            'use_sim_time', default_value='false', description='time from /clock (bags, simulators)'
+        ),
+        PushROSNamespace(LaunchConfiguration('namespace')),
+    ]
+    return LaunchDescription(
+        [
+            *arguments,
+            _node('omnicam_node', [('image_raw', LaunchConfiguration('image'))]),
+            _node('sfa_node', [], {'model': LaunchConfiguration('model')}),
+            _node('ekf_node', [('/odom', LaunchConfiguration('odom'))]),
+        ]
+    )
+
+
+def _node(name: str, remappings: list, parameters: dict | None = None) -> Node:
+    sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
+    return Node(
+        package=PACKAGE,
+        executable=name,
+        name=name,
+        output='screen',
+        parameters=[
+            LaunchConfiguration('config'),
+            {'use_sim_time': sim_time, **(parameters or {})},
+        ],
+        remappings=remappings,
+    )
