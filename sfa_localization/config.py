@@ -58,7 +58,9 @@ class Settings:
         known = {item.name for item in dataclasses.fields(cls)}
         for name in mapping:
             if name not in known:
-                raise ConfigError(f'{where}: unknown parameter {name!r}{_did_you_mean(name, known)}')
+                raise ConfigError(
+                    f'{where}: unknown parameter {name!r}{_did_you_mean(name, known)}'
+                )
         try:
             return cls(**mapping)
         except ConfigError as error:
@@ -288,9 +290,7 @@ class SegmentConfig(Settings):
     piece_std: float = setting(
         0.1, 'largest odometry error inside a piece', unit='m', low=0.001, high=10.0
     )
-    line_length_min: float = setting(
-        2.0, 'shortest straight line', unit='m', low=0.1, high=100.0
-    )
+    line_length_min: float = setting(2.0, 'shortest straight line', unit='m', low=0.1, high=100.0)
     line_bend_max: float = setting(
         8.0, 'heading change at which a straight line ends', unit='deg', low=0.1, high=90.0
     )
@@ -299,7 +299,10 @@ class SegmentConfig(Settings):
         1.5, 'longest stretch without a picture inside a segment', unit='m', low=0.01, high=1e2
     )
     image_step_min: float = setting(
-        0.02, 'pictures closer to the last one, and turned less, are left out', unit='m', low=0.0,
+        0.02,
+        'pictures closer to the last one, and turned less, are left out',
+        unit='m',
+        low=0.0,
         high=10.0,
     )
     image_turn_min: float = setting(
@@ -315,7 +318,10 @@ class SegmentConfig(Settings):
         0.5, 'longer pauses of the odometry break the drive', unit='s', low=0.01, high=60.0
     )
     odometry_jump_max: float = setting(
-        0.3, 'a pose this far from where the twist leads is an odometry reset', unit='m', low=0.01,
+        0.3,
+        'a pose this far from where the twist leads is an odometry reset',
+        unit='m',
+        low=0.01,
         high=100.0,
     )
     yaw_source: str = setting(
@@ -327,7 +333,10 @@ class SegmentConfig(Settings):
         0.02, 'random error of driven distance', unit='m/sqrt(m)', low=0.0, high=1.0
     )
     yaw_noise: float = setting(
-        0.003, 'random error of yaw, where the messages tell none', unit='rad/sqrt(s)', low=0.0,
+        0.003,
+        'random error of yaw, where the messages tell none',
+        unit='rad/sqrt(s)',
+        low=0.0,
         high=1.0,
     )
     yaw_slip: float = setting(0.01, 'error of a turn per turn', unit='rad/rad', low=0.0, high=1.0)
@@ -343,4 +352,418 @@ class NodeConfig(Settings):
     autostart: bool = setting(True, 'configure and activate without a lifecycle manager')
     diagnostics_period: float = setting(
         1.0, 'time between messages on /diagnostics', unit='s', low=0.1, high=60.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationConfig(Settings):
+    """The simulated garden, the robot in it, and the errors of its sensors."""
+
+    trajectory: str = setting(
+        'coverage',
+        'coverage (criss-crossing straight legs), lines (straight lines, no pictures between), '
+        'mower (a grid of lanes), test (one smooth closed curve), curves (wandering, no straight '
+        'line)',
+        choices=('coverage', 'lines', 'mower', 'test', 'curves'),
+    )
+    seed: int = setting(1, 'drive, sensor errors and light', low=0, high=2**63 - 1)
+    world: int = setting(1, 'garden', low=0, high=2**63 - 1)
+    area: tuple[float, ...] = setting(
+        (16.0, 18.0), 'driven area along x and y', unit='m', low=6.0, high=100.0
+    )
+    length: float = setting(
+        0.0, 'length of coverage, test and curves; 0: by the area', unit='m', low=0.0, high=1e5
+    )
+    images: str = setting(
+        'raw', 'picture of the mirror, or the panorama itself', choices=('raw', 'panorama')
+    )
+    images_every: float = setting(0.2, 'way between pictures', unit='m', low=0.02, high=10.0)
+    images_every_turn: float = setting(
+        20.0, 'turn on the spot between pictures', unit='deg', low=1.0, high=360.0
+    )
+    compression: str = setting(
+        'none', 'of the pictures, published below /compressed', choices=('none', 'jpeg', 'png')
+    )
+    storage: str = setting('mcap', 'storage of the bag', choices=('mcap', 'sqlite3'))
+    camera_height: float = setting(0.45, 'camera above the lawn', unit='m', low=0.1, high=2.0)
+    image_noise: float = setting(1.5, 'deviation of pixels', unit='grey levels', low=0.0, high=50.0)
+    illumination: float = setting(
+        0.1, 'change of light: 0 none, 1 clouds and exposure at their worst', low=0.0, high=1.0
+    )
+    speed: float = setting(1.0, 'driving speed', unit='m/s', low=0.05, high=3.0)
+    turn_rate: float = setting(0.6, 'turning speed on the spot', unit='rad/s', low=0.05, high=3.0)
+    odometry_rate: float = setting(
+        50.0, 'odometry, gyroscope, truth', unit='Hz', low=5.0, high=500.0
+    )
+    scale_error: float = setting(
+        0.005, "deviation of a run's factor of wheel radius and of gyroscope", low=0.0, high=0.2
+    )
+    slip: float = setting(0.02, 'deviation of wheel slip, about 2 s long', low=0.0, high=0.5)
+    speed_noise: float = setting(0.01, 'white noise of the speed', unit='m/s', low=0.0, high=1.0)
+    gyro_bias: float = setting(
+        0.0016, 'deviation of the wandering gyroscope bias', unit='rad/s', low=0.0, high=0.1
+    )
+    gyro_bias_time: float = setting(
+        40.0, 'time in which the bias wanders off', unit='s', low=0.1, high=1e5
+    )
+    gyro_noise: float = setting(
+        0.005, 'white noise of the yaw rate', unit='rad/s', low=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class MetricConfig(Settings):
+    """How metres are learnt from slow features and segments of odometry."""
+
+    solver: str = setting(
+        'certified',
+        'certified: global optimum with proof; paper: momentum descent on equations 1-8',
+        choices=('certified', 'paper'),
+    )
+    metric_map: str = setting(
+        'gp', 'Gaussian process, or monomials up to degree 2', choices=('gp', 'monomials')
+    )
+    slow_features: int = setting(
+        0, 'slowest features used; 0: chosen by leaving out segments', low=0, high=1000
+    )
+    ridge: float = setting(
+        -1.0, 'penalty of the monomials; -1: chosen by leaving out segments', low=-1.0, high=1e6
+    )
+    gp_length: float = setting(
+        0.0, 'length of the process in standardized features; 0: chosen', low=0.0, high=1e3
+    )
+    gp_noise: float = setting(
+        0.0, 'variance of a picture over the variance of the process; 0: chosen', low=0.0, high=1e3
+    )
+    inducing_points: int = setting(1000, 'pictures that span the process', low=10, high=20000)
+    use_turns: bool = setting(True, 'use signed turns between segments')
+    use_displacements: bool = setting(True, 'use displacements between segments')
+    yaw_bias_std: float = setting(
+        0.003,
+        'yaw-rate bias to expect, estimated per run; 0: none',
+        unit='rad/s',
+        low=0.0,
+        high=1.0,
+    )
+    robust: bool = setting(True, 'give pictures and turns that fit badly less weight')
+    left_out_folds: int = setting(8, 'parts of the drive left out in turn', low=2, high=100)
+    left_out_length: float = setting(
+        10.0, 'length of a drive that is left out as a whole', unit='m', low=0.1, high=1e4
+    )
+    angle_std_max: float = setting(
+        10.0,
+        'uncertainty of a direction beyond which the data do not suffice',
+        unit='deg',
+        low=0.01,
+        high=180.0,
+    )
+    require_certificate: bool = setting(True, 'refuse a map whose optimality is not proven')
+    use_anchor: bool = setting(False, 'start the map at the anchor, not at the odometry frame')
+    anchor_x: float = setting(0.0, 'where the first run starts in the map', unit='m')
+    anchor_y: float = setting(0.0, 'where the first run starts in the map', unit='m')
+    anchor_yaw: float = setting(0.0, 'heading at the start of the first run', unit='rad')
+    paper_start: str = setting(
+        'odometry', 'where the descent starts', choices=('odometry', 'random')
+    )
+    paper_iterations: int = setting(1000, 'most iterations of the descent', low=1, high=10000000)
+    paper_learning_rate: float = setting(1e-5, 'beta of equation 7', low=1e-12, high=1.0)
+    paper_momentum: float = setting(0.95, 'gamma of equation 7', low=0.0, high=1.0)
+    paper_change_min: float = setting(
+        0.0, 'the descent stops when the cost changes less', low=0.0, high=1e6
+    )
+    paper_turns: bool = setting(True, "use the turns' cosines, equation 5, not equation 1")
+    metric_seed: int = setting(0, 'seed of random starts and of the left-out parts', low=0)
+
+
+@dataclass(frozen=True, slots=True)
+class FilterConfig(Settings):
+    """The filter that fuses odometry with positions, or poses, seen in pictures."""
+
+    set_initial_pose: bool = setting(
+        False, 'start from the pose below; else from the pictures alone'
+    )
+    initial_x: float = setting(0.0, 'start in the map', unit='m', low=-1e6, high=1e6)
+    initial_y: float = setting(0.0, 'start in the map', unit='m', low=-1e6, high=1e6)
+    initial_yaw: float = setting(0.0, 'heading at the start', unit='rad', low=-7.0, high=7.0)
+    initial_position_std: float = setting(
+        0.1, 'standard deviation of the start along x and y', unit='m', low=1e-4, high=1e3
+    )
+    initial_yaw_std: float = setting(
+        0.1, 'standard deviation of the heading at the start', unit='rad', low=1e-4, high=3.2
+    )
+    estimate_bias: bool = setting(True, "estimate the bias of the odometry's turn rate")
+    bias_std: float = setting(
+        0.01, 'deviation of the bias before any is learnt', unit='rad/s', low=0.0, high=1.0
+    )
+    bias_walk: float = setting(
+        1e-4, 'random walk of the bias', unit='rad/s per sqrt(s)', low=0.0, high=1.0, live=True
+    )
+    estimate_scale: bool = setting(True, 'estimate true speed over wheel speed')
+    scale_std: float = setting(
+        0.03, 'deviation of the wheel scale before any is learnt', low=0.0, high=0.5
+    )
+    scale_walk: float = setting(
+        1e-3, 'random walk of the scale', unit='1/sqrt(m)', low=0.0, high=1.0, live=True
+    )
+    odometry_factor: float = setting(
+        1.0, "factor on the odometry's own variances", low=1e-3, high=1e4, live=True
+    )
+    speed_std_floor: float = setting(
+        0.01, 'least deviation of a speed reading', unit='m/s', low=1e-4, high=10.0, live=True
+    )
+    rate_std_floor: float = setting(
+        0.005,
+        'least deviation of a turn-rate reading',
+        unit='rad/s',
+        low=1e-4,
+        high=10.0,
+        live=True,
+    )
+    speed_std: float = setting(
+        0.05,
+        'deviation of a speed reading whose message tells none',
+        unit='m/s',
+        low=1e-4,
+        high=10.0,
+        live=True,
+    )
+    rate_std: float = setting(
+        0.02,
+        'deviation of a turn-rate reading whose message tells none',
+        unit='rad/s',
+        low=1e-4,
+        high=10.0,
+        live=True,
+    )
+    odometry_correlation: float = setting(
+        0.1, 'time for which odometry readings err alike', unit='s', low=0.0, high=100.0, live=True
+    )
+    slip_per_metre: float = setting(
+        0.02, 'slip of the wheels', unit='m per sqrt(m)', low=0.0, high=10.0, live=True
+    )
+    yaw_per_metre: float = setting(
+        0.005, 'turn that goes unnoticed', unit='rad per sqrt(m)', low=0.0, high=10.0, live=True
+    )
+    yaw_per_radian: float = setting(
+        0.02, 'error of turns', unit='rad per sqrt(rad)', low=0.0, high=10.0, live=True
+    )
+    acceleration: float = setting(
+        1.0,
+        'change of speed to expect between odometry messages',
+        unit='m/s per sqrt(s)',
+        low=0.0,
+        high=100.0,
+        live=True,
+    )
+    angular_acceleration: float = setting(
+        1.0,
+        'change of turn rate to expect between odometry messages',
+        unit='rad/s per sqrt(s)',
+        low=0.0,
+        high=100.0,
+        live=True,
+    )
+    standstill_speed: float = setting(
+        1e-3, 'a robot slower and turning slower than this stands', unit='m/s', low=0.0, high=1.0
+    )
+    standstill_rate: float = setting(
+        2e-3, 'a robot slower and turning slower than this stands', unit='rad/s', low=0.0, high=1.0
+    )
+    odometry_timeout: float = setting(
+        0.5,
+        'silence of the odometry that is worth a warning',
+        unit='s',
+        low=0.01,
+        high=60.0,
+        live=True,
+    )
+    coast_time: float = setting(
+        2.0, 'silence for which the last speed is believed', unit='s', low=0.0, high=60.0, live=True
+    )
+    unknown_speed: float = setting(
+        0.5,
+        'speed to reckon with when odometry is silent',
+        unit='m/s',
+        low=0.0,
+        high=50.0,
+        live=True,
+    )
+    unknown_rate: float = setting(
+        0.5, 'turning to reckon with then', unit='rad per sqrt(s)', low=0.0, high=10.0, live=True
+    )
+    turn_radius: float = setting(
+        0.25, 'way that one radian of turning counts as', unit='m/rad', low=0.0, high=10.0
+    )
+    measurement_factor: float = setting(
+        1.0, "factor on the pictures' variances", low=1e-3, high=1e4, live=True
+    )
+    position_std: float = setting(
+        0.3,
+        'deviation of a position whose message tells none',
+        unit='m',
+        low=1e-3,
+        high=1e3,
+        live=True,
+    )
+    position_std_floor: float = setting(
+        0.05, 'least deviation of a measured position', unit='m', low=1e-4, high=1e2, live=True
+    )
+    yaw_std_floor: float = setting(
+        0.02, 'least deviation of a measured heading', unit='rad', low=1e-4, high=3.0, live=True
+    )
+    yaw_std_limit: float = setting(
+        1.0, 'a heading less sure than this is not used', unit='rad', low=0.01, high=3.2, live=True
+    )
+    correlated_share: float = setting(
+        0.7,
+        'share of the picture error that neighbouring places have in common (variance)',
+        low=0.0,
+        high=0.99,
+        live=True,
+    )
+    decorrelation: float = setting(
+        0.6, 'way over which the picture error changes', unit='m', low=1e-3, high=1e3
+    )
+    novelty_limit: float = setting(
+        3.0, 'pictures more unlike training than this are not used', low=1.0, high=1e6, live=True
+    )
+    gate_probability: float = setting(
+        0.997,
+        'share of right measurements that the gate lets in',
+        low=0.5,
+        high=0.999999,
+        live=True,
+    )
+    history: float = setting(5.0, 'how late a measurement may come', unit='s', low=0.1, high=120.0)
+    time_jump: float = setting(
+        60.0,
+        'a stamp this far ahead needs others like it to be believed',
+        unit='s',
+        low=1.0,
+        high=1e6,
+    )
+    start_yaw_std: float = setting(
+        0.3,
+        'deviation of the heading from which a start without known heading is made',
+        unit='rad',
+        low=0.01,
+        high=1.0,
+        live=True,
+    )
+    recovery_pictures: int = setting(
+        5, 'pictures that must agree to overrule the filter', low=2, high=100, live=True
+    )
+    recovery_distance: float = setting(
+        2.0,
+        'way over which they must agree when they tell no heading, or differ little',
+        unit='m',
+        low=0.0,
+        high=1e3,
+        live=True,
+    )
+    recovery_jump: float = setting(
+        1.5, 'difference that counts as little', unit='m', low=0.0, high=1e3, live=True
+    )
+    confirm_pictures: int = setting(
+        3, 'pictures that must agree after an outage', low=1, high=100, live=True
+    )
+    confirm_distance: float = setting(
+        1.0, 'way over which they must agree', unit='m', low=0.0, high=1e3, live=True
+    )
+    degraded_std: float = setting(
+        0.5, 'position deviation from which on DEGRADED', unit='m', low=1e-3, high=1e6, live=True
+    )
+    lost_std: float = setting(
+        2.0, 'position deviation from which on LOST', unit='m', low=1e-3, high=1e6, live=True
+    )
+    lost_yaw_std: float = setting(
+        0.8, 'heading deviation from which on LOST', unit='rad', low=0.01, high=10.0, live=True
+    )
+    picture_timeout: float = setting(
+        3.0,
+        'time without a usable picture that is worth a warning',
+        unit='s',
+        low=0.1,
+        high=3600.0,
+        live=True,
+    )
+    largest_std: float = setting(
+        100.0, 'position deviation that is never exceeded', unit='m', low=1.0, high=1e7
+    )
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if self.degraded_std > self.lost_std:
+            raise ConfigError('FilterConfig: degraded_std must not exceed lost_std')
+        if self.lost_std > self.largest_std:
+            raise ConfigError('FilterConfig: lost_std must not exceed largest_std')
+        if self.odometry_timeout > self.coast_time:
+            raise ConfigError('FilterConfig: odometry_timeout must not exceed coast_time')
+
+
+@dataclass(frozen=True, slots=True)
+class SfaNodeConfig(Settings):
+    """sfa_node: panorama in, slow features and pose out."""
+
+    model: str = setting('', 'file of the trained model', live=True)
+    map_frame: str = setting('map', 'frame of the positions')
+    feature_frame: str = setting('slow_feature_space', 'frame of the slow features')
+    compressed: bool = setting(False, 'listen to panorama/compressed')
+    dark_level: float = setting(
+        8.0, 'a picture of lower mean is dark', unit='grey levels', low=0.0, high=255.0, live=True
+    )
+    flat_level: float = setting(
+        3.0,
+        'a picture of lower deviation is covered',
+        unit='grey levels',
+        low=0.0,
+        high=255.0,
+        live=True,
+    )
+    frozen_pictures: int = setting(
+        5, 'equal pictures in a row that mean a frozen camera', low=2, high=10_000, live=True
+    )
+    novelty_warning: float = setting(
+        1.5, 'novelty from which on a warning is given', low=1.0, high=1e6, live=True
+    )
+    camera_timeout: float = setting(
+        2.0,
+        'silence of the panoramas that is worth a warning',
+        unit='s',
+        low=0.1,
+        high=3600.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class EkfNodeConfig(Settings):
+    """ekf_node: odometry and poses in, the robot's pose in the map out."""
+
+    map_frame: str = setting('map', 'frame of the estimate')
+    odom_frame: str = setting('odom', "the odometry's frame, where its messages tell none")
+    base_frame: str = setting('base_link', "the robot's frame, where odometry tells none")
+    publish_tf: bool = setting(True, 'broadcast map -> odom (needs tf2_msgs)')
+    transform_tolerance: float = setting(
+        0.1, 'the transform is dated so far ahead', unit='s', low=0.0, high=10.0, live=True
+    )
+    path_period: float = setting(
+        0.5, 'time between poses of ekf/path', unit='s', low=0.01, high=3600.0
+    )
+    path_length: int = setting(2000, 'poses that ekf/path keeps', low=1, high=100_000)
+    odometry_silence: float = setting(
+        1.0,
+        'silence of odometry on arrival that is worth a warning',
+        unit='s',
+        low=0.1,
+        high=3600.0,
+        live=True,
+    )
+    picture_silence: float = setting(
+        3.0,
+        'silence of pictures on arrival that is worth a warning',
+        unit='s',
+        low=0.1,
+        high=3600.0,
+        live=True,
     )

@@ -59,9 +59,7 @@ def choose(rng: np.random.Generator, tints: tuple[Tint, ...]) -> Tint:
     return float(b), float(g), float(r)
 
 
-def panel(
-    corner: Array, across: Array, up: Array, step: float, surface: str, tint: Tint
-) -> Shape:
+def panel(corner: Array, across: Array, up: Array, step: float, surface: str, tint: Tint) -> Shape:
     """A parallelogram whose normal is across x up, in a mesh of about `step` metres."""
     corner, across, up = (np.asarray(axis, float) for axis in (corner, across, up))
     n, m = (max(1, int(np.ceil(np.linalg.norm(axis) / step))) for axis in (across, up))
@@ -109,7 +107,9 @@ def bumpy(shape: Shape, rng: np.random.Generator, height: float, wavelength: flo
     vertices = shape.vertices + field_ * (shape.vertices[:, 2:] > 0.02)
     mesh = trimesh.Trimesh(vertices, shape.faces, process=False)
     shade = shape.shade * np.clip(1 + 0.5 * (field_ * shape.normals).sum(1) / height, 0.5, 1.4)
-    return Shape(vertices, np.array(mesh.vertex_normals), shape.faces, shape.surface, shape.tint, shade)
+    return Shape(
+        vertices, np.array(mesh.vertex_normals), shape.faces, shape.surface, shape.tint, shade
+    )
 
 
 def blob(
@@ -183,7 +183,12 @@ def _windows(centre: Array, size: Array, side: int, rng: np.random.Generator) ->
 
 
 def _pane(
-    middle: Array, along: int, wide: float, low: float, high: float, door: bool,
+    middle: Array,
+    along: int,
+    wide: float,
+    low: float,
+    high: float,
+    door: bool,
     rng: np.random.Generator,
 ) -> list[Shape]:
     depths = ((0.08, 0.06, WHITE), (-0.06, 0.10, choose(rng, WOODS) if door else GLASS))
@@ -237,7 +242,9 @@ class Plot:
         reach, width = self.half[side % 2], self.half[1 - side % 2]
         local = np.array([reach + out, along * (width + max(out, 0))])
         turn = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[side]
-        return np.array([turn[0] * local[0] - turn[1] * local[1], turn[1] * local[0] + turn[0] * local[1]])
+        return np.array(
+            [turn[0] * local[0] - turn[1] * local[1], turn[1] * local[0] + turn[0] * local[1]]
+        )
 
     def extent(self, side: int, deep: float, wide: float) -> Array:
         """Box size (x, y) of something `deep` across and `wide` along a side."""
@@ -273,7 +280,9 @@ def border(plot: Plot) -> None:
 
 def _section(plot: Plot, kind: str, side: int, edges: Array) -> None:
     width = np.diff(edges)[0] * (plot.half[1 - side % 2] + FENCE_M) + 0.3
-    deep, high = (0.9, plot.rng.uniform(1.2, 2.3)) if kind == 'hedge' else (0.15, plot.rng.uniform(0.8, 1.8))
+    deep, high = (
+        (0.9, plot.rng.uniform(1.2, 2.3)) if kind == 'hedge' else (0.15, plot.rng.uniform(0.8, 1.8))
+    )
     centre = plot.beside(side, float(edges.mean()), FENCE_M + deep / 2)
     size = [*plot.extent(side, deep, width), high]
     if kind == 'hedge':

@@ -243,7 +243,9 @@ class Scene:
     ) -> Floats:
         shape = rays.shape[:2]
         rows = self._table.take(np.maximum(hits['primID'], 0), 0)
-        values = rows[:, :4] + hits['u'][:, None] * rows[:, 4:8] + hits['v'][:, None] * rows[:, 8:12]
+        values = (
+            rows[:, :4] + hits['u'][:, None] * rows[:, 4:8] + hits['v'][:, None] * rows[:, 8:12]
+        )
         normal = hits['Ng']
         slant = np.abs(np.einsum('ij,ij->i', normal, rays.reshape(-1, 3)))
         slant /= np.sqrt(np.einsum('ij,ij->i', normal, normal)) + 1e-12
