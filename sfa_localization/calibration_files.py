@@ -79,12 +79,12 @@ def _from_ocam(text: str) -> dict[str, Any]:
     }
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """Plain YAML, and the matrices of OpenCV's FileStorage as mappings."""
 
 
 def _matrix_node(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
+    return dict(loader.construct_mapping(node, deep=True))
 
 
 _Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _matrix_node)

@@ -1,0 +1,249 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration files of other tools, each as that tool writes it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sfa_localization.calibration_files import read_calibration, with_calibration
+from sfa_localization.cameras import make_camera
+from sfa_localization.config import CameraConfig
+from sfa_localization.errors import CameraError
+
+OCAM = """#polynomial coefficients of the direct mapping
+
+4 -2.0e+02 0.0e+00 1.5e-03 -2.0e-06
+
+#polynomial coefficients of the inverse mapping
+
+3 300.0 150.0 -10.0
+
+#center: "row" and "column", starting from 0
+
+241.5 318.5
+
+#affine parameters "c", "d", "e"
+
+0.999 0.001 -0.002
+
+#image size: "height" and "width"
+
+480 640
+"""
+CAMERA_INFO = """image_width: 640
+image_height: 480
+camera_name: front
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [400.5, 0.0, 320.0, 0.0, 401.5, 240.0, 0.0, 0.0, 1.0]
+distortion_model: {model}
+distortion_coefficients:
+  rows: 1
+  cols: {n}
+  data: {coefficients}
+"""
+ECHOED = """header:
+  frame_id: camera
+height: 480
+width: 640
+distortion_model: equidistant
+d:
+- 0.1
+- 0.01
+- 0.001
+- 0.0001
+k:
+- 200.0
+- 0.0
+- 320.0
+- 0.0
+- 201.0
+- 240.0
+- 0.0
+- 0.0
+- 1.0
+---
+"""
+KALIBR = """cam0:
+  camera_model: {model}
+  intrinsics: {intrinsics}
+  distortion_model: {distortion}
+  distortion_coeffs: [0.1, 0.01, 0.001, -8.0e-05]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+"""
+MEI = """%YAML:1.0
+---
+model_type: MEI
+camera_name: camera
+image_width: 752
+image_height: 480
+mirror_parameters:
+   xi: 1.5
+distortion_parameters:
+   k1: 0.1
+   k2: 0.2
+   p1: 1e-3
+   p2: 0.004
+projection_parameters:
+   gamma1: 700.0
+   gamma2: 701.0
+   u0: 370.0
+   v0: 240.0
+"""
+BRANDT = """%YAML:1.0
+---
+model_type: KANNALA_BRANDT
+image_width: 640
+image_height: 480
+projection_parameters:
+   k2: 0.1
+   k3: 0.2
+   k4: 0.3
+   k5: 0.4
+   mu: 200.0
+   mv: 201.0
+   u0: 320.0
+   v0: 240.0
+"""
+
+
+def read(tmp_path, text, name='camera.yaml'):
+    path = tmp_path / name
+    path.write_text(text)
+    return read_calibration(path)
+
+
+def test_ocam(tmp_path):
+    values = read(tmp_path, OCAM, 'calib_results.txt')
+    assert values == {
+        'camera_model': 'ocam',
+        'polynomial': (-200.0, 0.0, 0.0015, -2e-06),
+        'affine': (0.999, 0.001, -0.002),
+        'cx': 318.5,
+        'cy': 241.5,
+        'image_width': 640,
+        'image_height': 480,
+    }
+
+
+def test_ocam_camera_by_hand(tmp_path):
+    """100 rows below the center: row = c x + cy, column = e x + cx; depth 200 - 15 + 2."""
+    (tmp_path / 'calib_results.txt').write_text(OCAM)
+    config = CameraConfig(calibration_file=str(tmp_path / 'calib_results.txt'))
+    camera = make_camera(config, (480, 640))
+    pixel = np.array([[318.5 - 0.2, 241.5 + 99.9]])
+    expected = np.array([[-100.0, 0.0, 187.0]]) / np.hypot(100, 187)
+    np.testing.assert_allclose(camera.unproject(pixel), expected, atol=1e-12)
+
+
+def test_camera_info_of_a_pinhole(tmp_path):
+    text = CAMERA_INFO.format(model='plumb_bob', n=5, coefficients=[0.1, 0.2, 0.3, 0.4, 0.0])
+    values = read(tmp_path, text)
+    assert values['camera_model'] == 'mirror'
+    assert values['xi'] == 0.0
+    assert values['mirrored'] == 'no'
+    assert [values[name] for name in ('fx', 'fy', 'cx', 'cy')] == [400.5, 401.5, 320.0, 240.0]
+    assert values['distortion'] == (0.1, 0.2, 0.3, 0.4)
+    assert (values['image_width'], values['image_height']) == (640, 480)
+
+
+@pytest.mark.parametrize('model', ['equidistant', 'fisheye'])
+def test_camera_info_of_a_fisheye(tmp_path, model):
+    text = CAMERA_INFO.format(model=model, n=4, coefficients=[0.1, 0.2, 0.3, 0.4])
+    values = read(tmp_path, text)
+    assert values['camera_model'] == 'fisheye'
+    assert values['distortion'] == (0.1, 0.2, 0.3, 0.4)
+
+
+def test_camera_info_as_echoed(tmp_path):
+    values = read(tmp_path, ECHOED)
+    assert values['camera_model'] == 'fisheye'
+    assert (values['fx'], values['cy'], values['image_height']) == (200.0, 240.0, 480)
+
+
+def test_kalibr(tmp_path):
+    omni = KALIBR.format(model='omni', intrinsics=[0.8, 833, 830, 373, 253], distortion='radtan')
+    values = read(tmp_path, omni)
+    assert values['camera_model'] == 'mirror'
+    assert [values[name] for name in ('xi', 'fx', 'fy', 'cx', 'cy')] == [0.8, 833, 830, 373, 253]
+    assert values['distortion'] == (0.1, 0.01, 0.001, -8e-05)
+    assert (values['image_width'], values['image_height']) == (752, 480)
+    equi = KALIBR.format(model='pinhole', intrinsics=[190, 191, 254, 256], distortion='equidistant')
+    values = read(tmp_path, equi)
+    assert values['camera_model'] == 'fisheye'
+    assert values['fy'] == 191
+
+
+def test_camodocal(tmp_path):
+    values = read(tmp_path, MEI)
+    assert values['camera_model'] == 'mirror'
+    assert values['xi'] == 1.5
+    assert values['distortion'] == (0.1, 0.2, 0.001, 0.004)
+    assert (values['fx'], values['cx'], values['image_width']) == (700.0, 370.0, 752)
+    values = read(tmp_path, BRANDT)
+    assert values['camera_model'] == 'fisheye'
+    assert values['distortion'] == (0.1, 0.2, 0.3, 0.4)
+    assert (values['fx'], values['fy']) == (200.0, 201.0)
+
+
+def test_opencv_file_storage(tmp_path):
+    path = tmp_path / 'opencv.yml'
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write('image_width', 640)
+    storage.write('image_height', 480)
+    storage.write('camera_matrix', np.array([[300.0, 0, 320], [0, 301.0, 240], [0, 0, 1]]))
+    storage.write('distortion_coefficients', np.array([[0.1, 1e-5, 0.0, 0.001]]))
+    storage.write('xi', np.array([[1.25]]))
+    storage.release()
+    values = read_calibration(path)
+    assert values['camera_model'] == 'mirror'
+    assert (values['xi'], values['fx'], values['fy']) == (1.25, 300.0, 301.0)
+    assert values['distortion'] == (0.1, 1e-5, 0.0, 0.001)
+
+
+def test_a_calibration_file_replaces_the_lens_and_keeps_the_mount(tmp_path):
+    path = tmp_path / 'calib_results.txt'
+    path.write_text(OCAM)
+    config = with_calibration(
+        CameraConfig(calibration_file=str(path), mount_yaw=12.0, radius_max=200.0)
+    )
+    assert config.camera_model == 'ocam'
+    assert config.calibration_file == ''
+    assert config.mount_yaw == 12.0
+    assert (config.radius_min, config.radius_max) == (0.0, 200.0)
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('', 'no camera calibration'),
+        ('just words', 'no camera calibration'),
+        ('a: [1, 2', 'not valid YAML'),
+        ('a: 1', 'camera_matrix'),
+        (CAMERA_INFO.format(model='plumb_bob', n=5, coefficients=[1, 2, 3, 4, 5]), 'only 4'),
+        (CAMERA_INFO.format(model='strange', n=4, coefficients=[0, 0, 0, 0]), 'strange'),
+        (CAMERA_INFO.replace('400.5', '0.0').format(model='', n=0, coefficients=[]), 'not calib'),
+        (KALIBR.format(model='ds', intrinsics=[1, 2, 3, 4, 5, 6], distortion='none'), "'ds'"),
+        (KALIBR.format(model='omni', intrinsics=[1, 2], distortion='none'), 'no camera calib'),
+        (KALIBR.replace('752', 'x').format(model='omni', intrinsics=[1] * 5, distortion=''), 'x'),
+        (MEI.replace('MEI', 'SCARAMUZZA'), 'SCARAMUZZA'),
+        (MEI.replace('gamma1', 'gamma'), 'gamma1'),
+    ],
+)
+def test_unusable_files_are_named_with_the_reason(tmp_path, text, words):
+    with pytest.raises(CameraError, match=words) as caught:
+        read(tmp_path, text)
+    assert 'camera.yaml' in str(caught.value)
+
+
+def test_unusable_text_files_are_named_with_the_reason(tmp_path):
+    for text in ('', 'hello', OCAM.replace('4 -2.0e+02', '9 -2.0e+02')):
+        with pytest.raises(CameraError, match=r'calib\.txt'):
+            read(tmp_path, text, 'calib.txt')
+    with pytest.raises(CameraError, match=r'missing\.yaml'):
+        read_calibration(tmp_path / 'missing.yaml')

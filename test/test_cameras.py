@@ -1,0 +1,273 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Camera models: ray -> pixel -> ray, agreement with other implementations, mounting."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sfa_localization.cameras import MirrorLens, make_camera
+from sfa_localization.config import CameraConfig, PanoramaConfig
+from sfa_localization.errors import CameraError
+
+FORWARD, LEFT, UP = np.eye(3)
+OPEN = {'radius_min': 0.0, 'radius_max': 0.0}
+OCAM = (-157.9, 0.0, 1.83e-3, -1.1e-6, 3.2e-9)
+CAMERAS = {
+    'hyperbolic mirror': CameraConfig(),
+    'parabolic mirror': CameraConfig(xi=1.0, fx=170.0, fy=168.0),
+    'distorted mirror': CameraConfig(distortion=(-0.03, 0.002, 0.001, -0.002), cx=310.0),
+    'beyond one': CameraConfig(xi=1.6, fx=350.0, fy=350.0),
+    'pinhole': CameraConfig(xi=0.0, fx=400.0, fy=400.0, axis='forward', mirrored='no', **OPEN),
+    'equidistant': CameraConfig(camera_model='fisheye', fx=190.0, fy=190.0),
+    'kannala-brandt': CameraConfig(
+        camera_model='fisheye', fx=190.0, fy=191.0, distortion=(-0.01, 0.005, -0.003, 0.0004)
+    ),
+    'ocam': CameraConfig(
+        camera_model='ocam', polynomial=OCAM, affine=(1.01, 0.002, -0.003), cx=322.0, cy=318.0
+    ),
+    'polar': CameraConfig(camera_model='polar', radius_min=60.0, radius_max=300.0),
+    'equirectangular': CameraConfig(camera_model='equirectangular'),
+    'dual fisheye': CameraConfig(
+        camera_model='dual_fisheye', fx=90.0, fy=90.0, cx=160.0, second_cx=480.0, second_cy=319.5
+    ),
+    'panorama': CameraConfig(camera_model='panorama'),
+}
+TILTED = {'mount_roll': 7.0, 'mount_pitch': -11.0, 'mount_yaw': 130.0}
+
+
+def tilted(config):
+    return CameraConfig(**{name: getattr(config, name) for name in config.__slots__} | TILTED)
+
+
+def rays(n=4000, seed=3):
+    vectors = np.random.default_rng(seed).normal(size=(n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def all_pixels(height, width):
+    rows, columns = np.mgrid[0:height:7, 0:width:7]
+    return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+
+
+@pytest.mark.parametrize('mount', [lambda config: config, tilted], ids=['level', 'tilted'])
+@pytest.mark.parametrize('name', CAMERAS)
+class TestRoundTrip:
+    def test_ray_to_pixel_to_ray(self, name, mount):
+        camera = make_camera(mount(CAMERAS[name]), (640, 640))
+        pixels = camera.project(rays())
+        seen = np.isfinite(pixels).all(axis=1)
+        assert seen.sum() > 100
+        np.testing.assert_allclose(camera.unproject(pixels[seen]), rays()[seen], atol=1e-9)
+
+    def test_pixel_to_ray_to_pixel(self, name, mount):
+        camera = make_camera(mount(CAMERAS[name]), (640, 640))
+        pixels = all_pixels(640, 640)
+        back = camera.unproject(pixels)
+        seen = np.isfinite(back).all(axis=1)
+        assert seen.sum() > 1000
+        np.testing.assert_allclose(np.linalg.norm(back[seen], axis=1), 1.0, atol=1e-12)
+        np.testing.assert_allclose(camera.project(back[seen]), pixels[seen], atol=1e-6)
+
+
+@pytest.mark.parametrize('name', CAMERAS)
+def test_a_seen_pixel_is_in_the_picture_and_within_the_radii(name):
+    config = CAMERAS[name]
+    camera = make_camera(config, (640, 640))
+    pixels = camera.project(rays())
+    seen = pixels[np.isfinite(pixels[:, 0])]
+    assert np.all(seen >= -0.5)
+    assert np.all(seen <= 639.5)
+    if camera.lens.center is not None:
+        radius = np.hypot(seen[:, 0] - config.cx, seen[:, 1] - config.cy)
+        assert radius.min() >= config.radius_min
+        assert radius.max() <= (config.radius_max or np.inf)
+
+
+def test_the_mirror_model_by_hand():
+    """xi = 0.9, horizontal ray: z = 0, so the radius is f / xi; straight down: the center."""
+    camera = make_camera(CameraConfig(radius_min=0.0), (640, 640))
+    expected = [[319.5, 319.5 - 150 / 0.9], [319.5 + 150 / 0.9, 319.5], [319.5, 319.5]]
+    np.testing.assert_allclose(camera.project(np.array([FORWARD, LEFT, -UP])), expected)
+    slanted = np.array([[np.cos(0.3), 0.0, np.sin(0.3)]])
+    radius = 150 * np.cos(0.3) / (0.9 - np.sin(0.3))
+    np.testing.assert_allclose(camera.project(slanted), [[319.5, 319.5 - radius]])
+
+
+def test_a_parabolic_mirror_obeys_its_reflection_law():
+    """A paraboloid (focal parameter p) maps the angle a from its axis to radius p tan(a / 2)."""
+    angle = np.array([0.2, 0.9, 1.5, 2.0])
+    lens = MirrorLens(np.array([100.0, 100.0]), np.zeros(2), 1.0)
+    pixels = lens.project(np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)]))
+    np.testing.assert_allclose(pixels[:, 0], 100 * np.tan(angle / 2))
+
+
+def test_a_hyperbolic_mirror_obeys_its_reflection_law():
+    """Reflect rays on a hyperboloid: towards one focus in, through the other focus out.
+
+    Mirror (z + c)^2 / a^2 - r^2 / b^2 = 1 with its focus at 0 and the camera at -2c below;
+    the unified model has xi = 2e / (1 + e^2), focal length (e^2 - 1) / (e^2 + 1), e = c / a.
+    """
+    a, c = 0.6, 0.8
+    b, e = np.sqrt(c**2 - a**2), c / a
+    polar = np.radians([100.0, 130.0, 160.0])  # of the mirror's point, from the upward axis
+    radial = np.sin(polar)
+    k = [(np.cos(t) ** 2 / a**2 - np.sin(t) ** 2 / b**2) for t in polar]
+    reach = [
+        min(root for root in np.roots([q, 2 * c * np.cos(t) / a**2, c**2 / a**2 - 1]) if root > 0)
+        for q, t in zip(k, polar, strict=True)
+    ]
+    height = np.array(reach) * np.cos(polar)
+    np.testing.assert_allclose((height + c) ** 2 / a**2 - (np.array(reach) * radial) ** 2 / b**2, 1)
+    seen_from_camera = np.array(reach) * radial / (height + 2 * c)
+    lens = MirrorLens(np.full(2, (e**2 - 1) / (e**2 + 1)), np.zeros(2), 2 * e / (1 + e**2))
+    rays_to_world = np.column_stack([radial, 0 * polar, -np.cos(polar)])  # the lens looks down
+    np.testing.assert_allclose(lens.project(rays_to_world)[:, 0], seen_from_camera)
+
+
+def test_pinhole_with_distortion_agrees_with_opencv():
+    coefficients = (-0.2, 0.05, 0.001, -0.002)
+    config = CameraConfig(
+        xi=0.0,
+        fx=400.0,
+        fy=410.0,
+        cx=300.0,
+        cy=330.0,
+        distortion=coefficients,
+        axis='forward',
+        mirrored='no',
+        **OPEN,
+    )
+    forward = rays()[rays()[:, 0] > 0.85]
+    optical = np.column_stack([-forward[:, 1], -forward[:, 2], forward[:, 0]])
+    matrix = np.array([[400.0, 0, 300.0], [0, 410.0, 330.0], [0, 0, 1]])
+    theirs = cv2.projectPoints(optical, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))
+    ours = make_camera(config, (640, 640)).project(forward)
+    np.testing.assert_allclose(ours, theirs[0].reshape(-1, 2), atol=1e-6)
+
+
+def test_fisheye_agrees_with_opencv():
+    config = CAMERAS['kannala-brandt']
+    above = rays()[rays()[:, 2] > 0.2]
+    above = above[np.isfinite(make_camera(config, (640, 640)).project(above)[:, 0])]
+    optical = np.column_stack([above[:, 1], -above[:, 0], above[:, 2]])
+    matrix = np.array([[190.0, 0, 319.5], [0, 191.0, 319.5], [0, 0, 1]])
+    theirs, _ = cv2.fisheye.projectPoints(
+        optical.reshape(-1, 1, 3),
+        np.zeros((3, 1)),
+        np.zeros((3, 1)),
+        matrix,
+        np.array(config.distortion),
+    )
+    ours = make_camera(config, (640, 640)).project(above)
+    np.testing.assert_allclose(ours, theirs.reshape(-1, 2), atol=1e-6)
+
+
+def test_ocam_by_hand():
+    """At radius 100 on the row axis the ray leans by atan(100 / -f(100))."""
+    config = CameraConfig(camera_model='ocam', polynomial=(-200.0, 0.0, 1e-3), **OPEN)
+    ray = make_camera(config, (640, 640)).unproject(np.array([[319.5, 319.5 - 100.0]]))
+    expected = np.array([[100.0, 0.0, 190.0]]) / np.hypot(100, 190)
+    np.testing.assert_allclose(ray, expected)
+
+
+def test_polar_angles_lie_at_the_radii():
+    camera = make_camera(CAMERAS['polar'], (640, 640))
+    forward = camera.unproject(np.array([[319.5, 319.5 - 60.0], [319.5, 319.5 - 300.0]]))
+    elevation = np.degrees(np.arcsin(forward[:, 2]))
+    np.testing.assert_allclose(elevation, [78 - 90, 114 - 90])
+
+
+@pytest.mark.parametrize(
+    ('axis', 'mirrored', 'right', 'top', 'center'),
+    [
+        ('down', 'no', -LEFT, FORWARD, -UP),
+        ('down', 'yes', LEFT, FORWARD, -UP),
+        ('up', 'no', LEFT, FORWARD, UP),
+        ('up', 'yes', -LEFT, FORWARD, UP),
+        ('forward', 'no', -LEFT, UP, FORWARD),
+    ],
+)
+def test_where_the_picture_looks(axis, mirrored, right, top, center):
+    config = CameraConfig(
+        camera_model='fisheye', fx=100.0, fy=100.0, axis=axis, mirrored=mirrored, **OPEN
+    )
+    quarter = 100 * np.pi / 2
+    pixels = np.array([[319.5 + quarter, 319.5], [319.5, 319.5 - quarter], [319.5, 319.5]])
+    looks = make_camera(config, (640, 640)).unproject(pixels)
+    np.testing.assert_allclose(looks, [right, top, center], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('mount', 'ray'),
+    [('mount_yaw', LEFT), ('mount_pitch', -UP), ('mount_roll', FORWARD)],
+)
+def test_mounting_angles_turn_the_forward_axis(mount, ray):
+    """A quarter turn: yaw to the left, pitch downwards, roll about the axis itself (REP-103)."""
+    config = CameraConfig(camera_model='equirectangular', **{mount: 90.0})
+    camera = make_camera(config, (200, 400))
+    np.testing.assert_allclose(camera.unproject(np.array([[199.5, 99.5]])), [ray], atol=1e-12)
+
+
+def test_intrinsics_follow_the_size_of_the_picture():
+    direction = rays()
+    large = make_camera(CameraConfig(), (640, 640)).project(direction)
+    small = make_camera(CameraConfig(), (320, 320)).project(direction)
+    both = np.isfinite(large[:, 0]) & np.isfinite(small[:, 0])
+    np.testing.assert_allclose((small[both] + 0.5) * 2 - 0.5, large[both], atol=1e-9)
+
+
+def test_rays_the_mirror_cannot_see_are_nan():
+    camera = make_camera(CameraConfig(), (640, 640))
+    assert np.isnan(camera.project(np.array([UP, -UP, [np.nan, 0, 0], [0, 0, 0]]))).all()
+
+
+def test_distortion_beyond_its_increasing_part_is_not_used():
+    """1 + 3 k r^2 = 0 at r = 1 for k = -1/3: a ray at 60 degrees (r = 1.7) must not fold back."""
+    config = CameraConfig(
+        xi=0.0,
+        fx=100.0,
+        fy=100.0,
+        distortion=(-1 / 3, 0.0, 0.0, 0.0),
+        axis='forward',
+        mirrored='no',
+        **OPEN,
+    )
+    angle = np.radians([30.0, 60.0])
+    looks = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    pixels = make_camera(config, (640, 640)).project(looks)
+    assert np.isfinite(pixels[0]).all()
+    assert np.isnan(pixels[1]).all()
+
+
+@pytest.mark.parametrize(
+    ('change', 'size', 'words'),
+    [
+        ({}, (480, 640), '640 x 480'),
+        ({}, (0, 640), 'empty'),
+        ({'distortion': (0.1,)}, (640, 640), 'coefficients'),
+        ({'camera_model': 'ocam'}, (640, 640), 'polynomial'),
+        ({'camera_model': 'ocam', 'polynomial': (100.0, 0.0)}, (640, 640), 'negative'),
+        ({'camera_model': 'polar', 'radius_max': 10.0}, (640, 640), 'radius_min'),
+        ({'camera_model': 'polar', 'angle_min': 120.0}, (640, 640), 'angle_min'),
+        (
+            {'camera_model': 'fisheye', 'distortion': (-1e6, 0.0, 0.0, 0.0)},
+            (640, 640),
+            'increase',
+        ),
+        ({'calibration_file': 'nowhere.yaml'}, (640, 640), 'nowhere.yaml'),
+    ],
+)
+def test_impossible_cameras_say_what_is_wrong(change, size, words):
+    with pytest.raises(CameraError, match=words):
+        camera = make_camera(CameraConfig(**change), size)
+        camera.project(rays(10))
+
+
+def test_the_panorama_model_uses_the_elevations_of_the_panorama():
+    panorama = PanoramaConfig(elevation_min=-10.0, elevation_max=30.0)
+    camera = make_camera(CameraConfig(camera_model='panorama'), (40, 360), panorama)
+    looks = camera.unproject(np.array([[179.5, -0.5], [179.5, 39.5]]))
+    np.testing.assert_allclose(np.degrees(np.arcsin(looks[:, 2])), [30.0, -10.0])
