@@ -25,3 +25,7 @@ class DataError(LocalizationError):
 
 class CameraError(LocalizationError):
     """A camera model or picture is unusable."""
+
+
+class NodeError(LocalizationError):
+    """A node process ended, or stays silent."""
