@@ -250,6 +250,63 @@ class CameraConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
+class OmnicamNodeConfig(Settings):
+    """Where the omnicam node takes pictures from, and how it watches over the camera."""
+
+    source: str = setting(
+        'topic',
+        'topic (image_raw, or image_raw/compressed), device (V4L2), video (a file) or folder (of '
+        'pictures, in the order of their names)',
+        choices=('topic', 'device', 'video', 'folder'),
+    )
+    source_path: str = setting('', 'device (a path or a number), video file or folder')
+    image_transport: str = setting(
+        'raw', 'which topic to take pictures from', choices=('raw', 'compressed')
+    )
+    frame_id: str = setting('', "frame of the panoramas; empty: the picture's own, or omnicam")
+    lazy: bool = setting(True, 'do nothing while nobody listens to the panorama', live=True)
+    jpeg_quality: int = setting(
+        90, 'quality of panorama/compressed', unit='%', low=1, high=100, live=True
+    )
+    silence_timeout: float = setting(
+        2.0,
+        'time without a picture after which the camera counts as silent',
+        unit='s',
+        low=0.05,
+        high=3600.0,
+        live=True,
+    )
+    frozen_timeout: float = setting(
+        5.0,
+        'time of equal pictures after which the camera counts as frozen; 0: never',
+        unit='s',
+        low=0.0,
+        high=3600.0,
+        live=True,
+    )
+    reopen_min: float = setting(
+        0.5, 'pause before the first attempt to reopen a device', unit='s', low=0.01, high=60.0
+    )
+    reopen_max: float = setting(
+        30.0, 'longest pause between attempts; they double', unit='s', low=0.01, high=3600.0
+    )
+    source_rate: float = setting(
+        0.0,
+        'pictures per second of a video or folder, or asked of a device; 0: its own, or 10',
+        unit='Hz',
+        low=0.0,
+        high=1000.0,
+    )
+    source_loop: bool = setting(False, 'start a video or folder again at its end')
+    source_width: int = setting(
+        0, 'columns asked of a device; 0: its own', unit='px', low=0, high=32767
+    )
+    source_height: int = setting(
+        0, 'rows asked of a device; 0: its own', unit='px', low=0, high=32767
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class TopicNames(Settings):
     """Topics of a bag; an empty name is found by its type. Of /tf, name '/tf:CHILD_FRAME'."""
 
@@ -766,4 +823,37 @@ class EkfNodeConfig(Settings):
         low=0.1,
         high=3600.0,
         live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DemoConfig(Settings):
+    """The demonstration: which garden and drives, and how long its nodes may stay silent."""
+
+    world: int = setting(1, 'garden', low=0, high=2**63 - 1)
+    seed: int = setting(1, 'drives and sensor errors', low=0, high=2**63 - 1)
+    rate: float = setting(1.0, 'speed of the replay', unit='x real time', low=0.1, high=20.0)
+    start_timeout: float = setting(
+        60.0, 'longest time that a node may take to start', unit='s', low=1.0, high=600.0
+    )
+    silence_timeout: float = setting(
+        15.0, 'longest silence of a node during the replay', unit='s', low=1.0, high=600.0
+    )
+    settle_time: float = setting(
+        2.0, 'silence that ends the recording after the replay', unit='s', low=0.1, high=60.0
+    )
+    stop_timeout: float = setting(
+        10.0, 'longest time that a process may take to stop', unit='s', low=0.1, high=60.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PlayConfig(Settings):
+    """How a bag is replayed."""
+
+    rate: float = setting(1.0, 'speed of the replay', unit='x', low=1e-3, high=1e6)
+    start_offset: float = setting(0.0, 'begin this far into the bag', unit='s', low=0.0, high=1e9)
+    clock_rate: float = setting(40.0, 'messages on /clock', unit='Hz', low=0.1, high=1e4)
+    wait: float = setting(
+        3.0, 'time given to subscribers to appear before it starts', unit='s', low=0.0, high=3600.0
     )
