@@ -54,8 +54,13 @@ class SqliteStorage:
         try:
             return read()
         except (sqlite3.Error, ValueError, TypeError) as error:
-            self.problems.append(f'{self._path.name}: damaged database ({error})')
+            self._damaged(error)
             return otherwise
+
+    def _damaged(self, error: Exception) -> None:
+        text = f'{self._path.name}: damaged database ({error}); what is reachable is read'
+        if text not in self.problems:
+            self.problems.append(text)
 
     def _columns(self, table: str) -> set[str]:
         return {row[1] for row in self._database.execute(f'PRAGMA table_info({table})')}
@@ -100,7 +105,7 @@ class SqliteStorage:
                     last = stamp, row
                     yield wanted[key], stamp, data
         except (sqlite3.Error, OverflowError) as error:
-            self.problems.append(f'{self._path.name}: damaged database ({error})')
+            self._damaged(error)
             yield from self._salvaged(wanted, start_ns, last)
 
     def _salvaged(
