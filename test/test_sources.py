@@ -1,0 +1,273 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Picture sources: files in order, and a camera that disconnects, hangs or freezes."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from sfa_localization.config import OmnicamNodeConfig
+from sfa_localization.errors import CameraError
+from sfa_localization.sources import Feed, FrozenWatch, Lost, opener
+
+PATIENCE_S = 10.0
+
+
+def picture(level):
+    return np.full((32, 48, 3), level % 256, np.uint8)
+
+
+def config(**values):
+    quick = {'silence_timeout': 0.1, 'frozen_timeout': 0.05, 'reopen_min': 0.01, 'reopen_max': 0.05}
+    return OmnicamNodeConfig(**{**quick, **values})
+
+
+class Script:
+    """Captures that play given steps: a level is a picture, an exception is raised, None ends.
+
+    `forever` repeats the last step of a capture; an Event blocks the read until it is set.
+    """
+
+    def __init__(self, *captures, live=True, forever=False):
+        self.captures, self.live, self.forever = list(captures), live, forever
+        self.opened = self.closed = 0
+
+    def __call__(self):
+        self.opened += 1
+        steps = self.captures.pop(0) if len(self.captures) > 1 else self.captures[0]
+        if isinstance(steps, Exception):
+            raise steps
+        return Player(self, list(steps))
+
+
+class Player:
+    def __init__(self, script, steps):
+        self.script, self.steps, self.live = script, steps, script.live
+
+    def read(self):
+        time.sleep(0.001)
+        step = self.steps[0] if self.script.forever and len(self.steps) == 1 else self.steps.pop(0)
+        if isinstance(step, Exception):
+            raise step
+        if isinstance(step, threading.Event):
+            step.wait(PATIENCE_S)
+            return picture(255)
+        return None if step is None else picture(step)
+
+    def close(self):
+        self.script.closed += 1
+
+
+@pytest.fixture
+def run_feed():
+    feeds = []
+
+    def start(script, refuse=lambda reason: None, **values):
+        received = queue.Queue()
+        feed = Feed(
+            script, lambda image: received.put(int(image[0, 0, 0])), config(**values), refuse
+        )
+        feeds.append(feed)
+        feed.start()
+        return feed, received
+
+    yield start
+    for feed in feeds:
+        feed.stop()
+
+
+def wait_for(condition, feed=None):
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, 'waited in vain'
+        if feed is not None:
+            feed.check()
+        time.sleep(0.002)
+
+
+def test_pictures_arrive_in_order_until_the_end(run_feed):
+    script = Script([1, 2, 3, None], live=False)
+    feed, received = run_feed(script)
+    assert [received.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 2, 3]
+    wait_for(lambda: feed.status().state == 'ended')
+    wait_for(lambda: script.closed == 1)
+    assert script.opened == 1
+    assert feed.check().state == 'ended'
+
+
+def test_a_disconnected_camera_is_opened_again(run_feed):
+    script = Script([1, 2, Lost('unplugged')], CameraError('not there'), [3, 4, 5, None])
+    feed, received = run_feed(script)
+    assert [received.get(timeout=PATIENCE_S) for _ in range(5)] == [1, 2, 3, 4, 5]
+    assert script.opened == 3
+    assert feed.status().lost == 2
+
+
+def test_the_reason_is_told_while_a_camera_is_away(run_feed):
+    feed, _ = run_feed(Script(CameraError('not there')), reopen_min=5.0, reopen_max=5.0)
+    wait_for(lambda: feed.status().state == 'lost')
+    assert feed.status().problem == 'not there'
+
+
+def test_pauses_double_up_to_the_longest(run_feed):
+    script = Script(CameraError('not there'))
+    feed, _ = run_feed(script, reopen_min=0.01, reopen_max=0.04)
+    wait_for(lambda: script.opened == 6)
+    waits = []
+    feed._stopped.wait = waits.append  # what is asked for, whatever the machine makes of it
+    wait_for(lambda: len(waits) >= 2)
+    assert set(waits) == {0.04}
+
+
+def test_a_silent_camera_is_abandoned_and_opened_again(run_feed):
+    released = threading.Event()
+    script = Script([1, released], [2, 3, None])
+    feed, received = run_feed(script)
+    assert received.get(timeout=PATIENCE_S) == 1
+    wait_for(lambda: script.opened == 2, feed)
+    assert [received.get(timeout=PATIENCE_S) for _ in range(2)] == [2, 3]
+    assert feed.status().lost == 1
+    released.set()  # the read that hung returns a picture, which nobody wants any more
+    wait_for(lambda: script.closed == 2)
+    assert received.empty()
+
+
+def test_a_frozen_camera_is_opened_again_until_it_moves(run_feed):
+    script = Script([1, 2], [2], [2], [3, 4, 5, None])
+    script.forever = True
+    feed, received = run_feed(script, frozen_timeout=0.05)
+    wait_for(lambda: script.opened == 2)
+    assert 'repeated' in feed.status().problem or feed.status().state == 'lost'
+    wait_for(lambda: script.opened == 4)
+    wait_for(lambda: feed.status().state == 'ended')
+    levels = list(received.queue)
+    assert levels[-3:] == [3, 4, 5]
+    assert feed.status().lost == 3
+
+
+def test_a_still_camera_is_left_alone_when_the_watch_is_off(run_feed):
+    script = Script([7], live=True, forever=True)
+    feed, received = run_feed(script, frozen_timeout=0.0)
+    for _ in range(100):
+        assert received.get(timeout=PATIENCE_S) == 7
+    assert feed.status().lost == 0
+    assert script.opened == 1
+
+
+def test_equal_pictures_of_a_file_are_no_fault(run_feed):
+    feed, received = run_feed(Script([7] * 60 + [None], live=False), frozen_timeout=0.01)
+    wait_for(lambda: feed.status().state == 'ended')
+    assert received.qsize() == 60
+    assert feed.status().lost == 0
+
+
+def test_files_wait_until_they_are_wanted():
+    wanted, received = threading.Event(), queue.Queue()
+    script = Script([1, 2, None], live=False)
+    feed = Feed(script, lambda image: received.put(1), config(), wanted=wanted.is_set)
+    feed.start()
+    try:
+        wait_for(lambda: script.opened == 1)
+        assert received.empty()
+        wanted.set()
+        wait_for(lambda: feed.status().state == 'ended')
+        assert received.qsize() == 2
+    finally:
+        feed.stop()
+
+
+def test_nothing_is_delivered_after_stop(run_feed):
+    script = Script(list(range(100000)))
+    feed, received = run_feed(script)
+    received.get(timeout=PATIENCE_S)
+    feed.stop()
+    assert script.closed == 1
+    count = received.qsize()
+    feed.check()
+    assert script.opened == 1
+    assert received.qsize() == count
+
+
+def test_frozen_watch_by_hand():
+    now = [0.0]
+    watch = FrozenWatch(lambda: now[0])
+    assert watch.see(picture(1))
+    assert watch.frozen_for_s() == 0.0
+    for now[0] in (1.0, 2.0, 3.0):
+        assert not watch.see(picture(1))
+    assert watch.frozen_for_s() == 3.0
+    assert watch.see(picture(2))
+    assert watch.frozen_for_s() == 0.0
+
+
+class TestFolder:
+    def test_in_order_of_names_with_the_unreadable_named(self, tmp_path, run_feed):
+        for name, level in (('b.png', 2), ('a.png', 1), ('d.bmp', 4)):
+            cv2.imwrite(str(tmp_path / name), picture(level))
+        (tmp_path / 'c.png').write_bytes(b'no picture')
+        (tmp_path / 'notes.txt').write_text('ignored')
+        refused = []
+        values = {'source': 'folder', 'source_path': str(tmp_path), 'source_rate': 1000.0}
+        feed, received = run_feed(opener(config(**values)), refused.append, **values)
+        wait_for(lambda: feed.status().state == 'ended')
+        assert list(received.queue) == [1, 2, 4]
+        assert len(refused) == 1
+        assert 'c.png' in refused[0]
+
+    def test_again_and_again(self, tmp_path, run_feed):
+        cv2.imwrite(str(tmp_path / 'a.png'), picture(1))
+        cv2.imwrite(str(tmp_path / 'b.png'), picture(2))
+        values = {
+            'source': 'folder',
+            'source_path': str(tmp_path),
+            'source_rate': 1000.0,
+            'source_loop': True,
+        }
+        _, received = run_feed(opener(config(**values)), **values)
+        assert [received.get(timeout=PATIENCE_S) for _ in range(5)] == [1, 2, 1, 2, 1]
+
+
+@pytest.mark.parametrize('loop', [False, True])
+def test_video(tmp_path, run_feed, loop):
+    path = str(tmp_path / 'drive.avi')
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*'MJPG'), 25.0, (48, 32))
+    if not writer.isOpened():
+        pytest.skip('this OpenCV writes no video')
+    for level in (10, 100, 200):
+        writer.write(picture(level))
+    writer.release()
+    values = {
+        'source': 'video',
+        'source_path': path,
+        'source_rate': 500.0,
+        'source_loop': loop,
+    }
+    feed, received = run_feed(opener(config(**values)), **values)
+    expected = [10, 100, 200] + ([10, 100] if loop else [])
+    levels = [received.get(timeout=PATIENCE_S) for _ in expected]
+    np.testing.assert_allclose(levels, expected, atol=3)
+    if not loop:
+        wait_for(lambda: feed.status().state == 'ended')
+
+
+@pytest.mark.parametrize(
+    ('values', 'words'),
+    [
+        ({'source': 'device'}, 'source_path is empty'),
+        ({'source': 'topic'}, 'topic'),
+        ({'source': 'device', 'source_path': '/dev/no_such_camera'}, 'no_such_camera'),
+        ({'source': 'video', 'source_path': 'no_such.mp4'}, r'no_such\.mp4'),
+        ({'source': 'folder', 'source_path': 'no_such_folder'}, 'no_such_folder'),
+        ({'source': 'folder', 'source_path': '.'}, 'no pictures'),
+    ],
+)
+def test_sources_that_are_not_there_are_named(values, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CameraError, match=words):
+        opener(config(**values))()
