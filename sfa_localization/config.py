@@ -436,7 +436,7 @@ class SimulationConfig(Settings):
     )
     images_every: float = setting(0.2, 'way between pictures', unit='m', low=0.02, high=10.0)
     images_every_turn: float = setting(
-        20.0, 'turn on the spot between pictures', unit='deg', low=1.0, high=360.0
+        30.0, 'turn on the spot between pictures', unit='deg', low=1.0, high=360.0
     )
     compression: str = setting(
         'none', 'of the pictures, published below /compressed', choices=('none', 'jpeg', 'png')
@@ -502,7 +502,7 @@ class MetricConfig(Settings):
         low=0.0,
         high=1.0,
     )
-    robust: bool = setting(True, 'give pictures and turns that fit badly less weight')
+    robust: bool = setting(False, 'give pictures and turns that fit badly less weight')
     left_out_folds: int = setting(8, 'parts of the drive left out in turn', low=2, high=100)
     left_out_length: float = setting(
         10.0, 'length of a drive that is left out as a whole', unit='m', low=0.1, high=1e4
@@ -857,3 +857,23 @@ class PlayConfig(Settings):
     wait: float = setting(
         3.0, 'time given to subscribers to appear before it starts', unit='s', low=0.0, high=3600.0
     )
+
+
+@dataclass(frozen=True, slots=True)
+class InspectionConfig(Settings):
+    """What a drive needs to be enough to train on."""
+
+    min_pictures: int = setting(300, 'pictures with odometry', low=1)
+    max_spacing: float = setting(
+        0.5, 'way between pictures (90th percentile)', unit='m', low=0.01, high=100.0
+    )
+    reach: float = setting(
+        1.0, 'ground this near to a picture is covered', unit='m', low=0.01, high=100.0
+    )
+    min_covered: float = setting(0.65, 'share of the area that is covered', low=0.0, high=1.0)
+    min_directions: int = setting(3, 'line directions, of six, driven along', low=1, high=6)
+    max_lost: float = setting(0.1, 'share of pictures that cannot be used', low=0.0, high=1.0)
+    max_gap: float = setting(
+        1.0, 'pause of a topic that is worth telling', unit='s', low=0.0, high=1e6
+    )
+    samples: int = setting(16, 'pictures on the contact sheet', low=1, high=400)

@@ -1,0 +1,101 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A bounded, sorted history of events, replayed from wherever a late one belongs.
+
+What is believed is a pure function of the sorted events: an event that comes late gives exactly
+what it would have given in time.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+E = TypeVar('E')
+B = TypeVar('B')
+Key = tuple[int, int]
+_SLACK = 64
+
+
+class History(Generic[E, B]):
+    """Events by (stamp_ns, rank), each with the belief after it; `step` makes the next belief.
+
+    `start` is believed at `start_ns`, before which nothing can be placed.
+    """
+
+    def __init__(
+        self, span_ns: int, start: B, step: Callable[[B, E], B], start_ns: int | None = None
+    ) -> None:
+        self._span_ns = span_ns
+        self._step = step
+        self._base = start
+        self._horizon_ns = start_ns
+        self._keys: list[Key] = []
+        self._events: list[E] = []
+        self._beliefs: list[B] = []
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @property
+    def newest(self) -> B:
+        return self._beliefs[-1] if self._beliefs else self._base
+
+    @property
+    def newest_ns(self) -> int | None:
+        return self._keys[-1][0] if self._keys else self._horizon_ns
+
+    def holds(self, key: Key) -> bool:
+        """Whether there is an event of this stamp and rank."""
+        at = bisect_left(self._keys, key)
+        return at < len(self._keys) and self._keys[at] == key
+
+    def reaches(self, stamp_ns: int) -> bool:
+        """Whether an event of this stamp can still be placed."""
+        if self._keys and stamp_ns < self._keys[-1][0] - self._span_ns:
+            return False
+        return self._horizon_ns is None or stamp_ns > self._horizon_ns
+
+    def add(self, key: Key, event: E) -> B:
+        """Place an event, in place of one of the same key, and redo what follows it.
+
+        Returns the belief right after it.
+        """
+        if not self._keys or key > self._keys[-1]:
+            belief = self._step(self.newest, event)
+            self._keys.append(key)
+            self._events.append(event)
+            self._beliefs.append(belief)
+            self._forget()
+            return belief
+        at = bisect_left(self._keys, key)
+        if self._keys[at] == key:
+            self._events[at] = event
+        else:
+            self._keys.insert(at, key)
+            self._events.insert(at, event)
+        belief = self._beliefs[at - 1] if at else self._base
+        redone = []
+        for later in self._events[at:]:
+            belief = self._step(belief, later)
+            redone.append(belief)
+        self._beliefs[at:] = redone
+        return redone[0]
+
+    def before(self, stamp_ns: int) -> B:
+        """The belief after the last event up to the stamp."""
+        at = bisect_right(self._keys, (stamp_ns, 1 << 30))
+        return self._beliefs[at - 1] if at else self._base
+
+    def _forget(self) -> None:
+        """Drop what lies beyond the span, some at a time; its last belief is the new base."""
+        oldest = self._keys[-1][0] - self._span_ns
+        if self._keys[0][0] >= oldest or len(self._keys) < _SLACK:
+            return
+        cut = bisect_left(self._keys, (oldest, 0))
+        if cut < _SLACK and self._keys[-1][0] - self._keys[0][0] < 2 * self._span_ns:
+            return
+        self._base = self._beliefs[cut - 1]
+        self._horizon_ns = self._keys[cut - 1][0]
+        del self._keys[:cut], self._events[:cut], self._beliefs[:cut]
