@@ -35,6 +35,12 @@ class Decoder:
         self._ros2 = get_typestore(Stores.ROS2_JAZZY)
         self._ros1 = get_typestore(Stores.ROS1_NOETIC)
 
+    def knows(self, kind: str, serialization: str) -> bool:
+        """Whether messages of this type can be decoded."""
+        if serialization == 'ros1':
+            return kind in self._ros1.fielddefs
+        return serialization == 'cdr' and kind in self._ros2.fielddefs
+
     def __call__(self, data: bytes, kind: str, serialization: str) -> Any:
         """Decode `data` of message type `kind`. Raises Unusable for damaged data."""
         ros1 = serialization == 'ros1'
@@ -68,10 +74,12 @@ class TransformChooser:
         return message.transforms[0] if message.transforms else None
 
 
-def header_stamp(message: Any) -> int:
-    """The stamp in nanoseconds that the sender gave."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+def header_stamp(message: Any) -> int | None:
+    """The stamp in nanoseconds that the sender gave; None of a type that has none."""
+    header = getattr(message, 'header', None)
+    if header is None:
+        return None
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
 def image_of(message: Any) -> Image:

@@ -212,11 +212,24 @@ class Bag:
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
         topic, _, child_frame = name.partition(':')
-        self._tallies[topic] = tally = Tally(f'{self.path}: {topic}', self.strict)
         chooser = messages.TransformChooser(topic, child_frame)
         is_tf = self.topics[topic].kind == messages.TF
+        return self._stream(topic, chooser if is_tf else _whole, convert)
+
+    def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
+        """A topic of any type, which may well be empty; `convert` gets None of unknown types."""
+        stream = self._stream(topic, _whole, convert)
+        channel = self.recording.channels[topic]
+        stream.opaque = not self._decode.knows(channel.kind, channel.serialization)
+        stream.required = False
+        return stream
+
+    def _stream(
+        self, topic: str, select: Callable[[Any], Any], convert: Callable[[Any], Any]
+    ) -> Stream:
+        self._tallies[topic] = tally = Tally(f'{self.path}: {topic}', self.strict)
         stamps = StampFilter(int(self.config.clock_jump * 1e9), tally)
-        return Stream(topic, chooser if is_tf else _whole, convert, stamps, tally)
+        return Stream(topic, select, convert, stamps, tally)
 
     def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
         """Read the streams' topics in one pass: stream, stamp in ns, value.
@@ -251,6 +264,8 @@ class Bag:
         """Stamps and values that a message gives its stream."""
         channel, receive_ns, data = record
         stream.received += 1
+        if stream.opaque:
+            return stream.push(Item(receive_ns, receive_ns, None))
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
         except messages.Unusable as error:
@@ -260,7 +275,7 @@ class Bag:
             stream.tally.leave('tells of other frames')
             return []
         stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
-        return stream.push(Item(stamp_ns, receive_ns, part))
+        return stream.push(Item(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part))
 
     def _check_complete(self, stream: Stream) -> None:
         """Compare what was read with what is said to be there; nothing usable is an error."""

@@ -112,7 +112,8 @@ class StampFilter:
 
 class Stream:
     """One topic being read: `select` picks the part of a message that matters, or None, and
-    `convert` turns that into a value."""
+    `convert` turns that into a value. Of an opaque one messages are not decoded: they are None.
+    """
 
     def __init__(
         self,
@@ -123,7 +124,7 @@ class Stream:
         tally: Tally,
     ) -> None:
         self.topic, self.select, self.tally = topic, select, tally
-        self.received, self.required = 0, True
+        self.received, self.required, self.opaque = 0, True, False
         self._convert, self._stamps = convert, stamps
 
     def push(self, item: Item) -> list[tuple[int, Any]]:

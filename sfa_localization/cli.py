@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from sfa_localization import __version__
-from sfa_localization.config import PanoramaConfig, Settings, SimulationConfig
+from sfa_localization.config import (
+    InspectionConfig,
+    PanoramaConfig,
+    PlayConfig,
+    Settings,
+    SimulationConfig,
+    TopicNames,
+)
 from sfa_localization.errors import LocalizationError
 
 S = TypeVar('S', bound=Settings)
@@ -105,7 +112,108 @@ SIMULATE = Command(
 )
 
 
-COMMANDS: list[Command] = [SIMULATE]
+def _configure_play(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bag', type=Path, metavar='BAG', help='bag: a folder or a single file')
+    parser.add_argument('--loop', action='store_true', help='start again at the end')
+    parser.add_argument(
+        '--clock', action='store_true', help='publish the time of the bag on /clock'
+    )
+    parser.add_argument('--topics', nargs='+', default=(), metavar='T', help='only these topics')
+    parser.add_argument(
+        '--wait-for', nargs='+', default=(), metavar='T', help='topics that need a subscriber first'
+    )
+    parser.add_argument('--strict', action='store_true', help='refuse a damaged bag')
+    _add_settings(parser, PlayConfig)
+
+
+def _play(arguments: argparse.Namespace) -> int:
+    try:
+        from sfa_localization.play import play
+    except ImportError as error:
+        raise LocalizationError(f'play needs ROS 2 ({error}); install ros-jazzy-rclpy') from None
+
+    played = play(
+        arguments.bag,
+        config=_settings(PlayConfig, arguments),
+        loop=arguments.loop,
+        clock=arguments.clock,
+        topics=arguments.topics,
+        wait_for=arguments.wait_for,
+        strict=arguments.strict,
+    )
+    for topic, number in sorted(played.messages.items()):
+        print(f'{topic}: {number} messages')
+    return 0
+
+
+PLAY = Command(
+    'play',
+    'Replay a bag through ROS, with the types, QoS and pace it was recorded with.',
+    '  play bags/sample\n'
+    '  play bags/sample --rate 2 --loop --clock\n'
+    '  play bags/sample --start-offset 10 --topics /panorama/compressed /odom\n\n'
+    'keys: space pauses, s or right arrow plays one message, up and down change the rate,\n'
+    'Ctrl-C ends it',
+    _configure_play,
+    _play,
+)
+
+
+def _configure_inspect(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='folders or single files')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write what was found as JSON')
+    parser.add_argument(
+        '--report', type=Path, metavar='DIR', help='write a contact sheet and the path as PNG'
+    )
+    parser.add_argument('--strict', action='store_true', help='refuse damaged bags')
+    _add_topics(parser)
+    _add_settings(parser, InspectionConfig)
+
+
+def _add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add the flags that choose topics (none named: for pictures and odometry)."""
+    flags = {
+        'image': '--image-topic',
+        'odometry': '--odom-topic',
+        'imu': '--imu-topic',
+        'ground_truth': '--ground-truth-topic',
+    }
+    docs = {item.name: item.metadata['doc'] for item in dataclasses.fields(TopicNames)}
+    for name in names or ('image', 'odometry'):
+        parser.add_argument(
+            flags[name], dest=name, metavar='T', default=argparse.SUPPRESS, help=docs[name]
+        )
+
+
+def _inspect(arguments: argparse.Namespace) -> int:
+    from sfa_localization.inspection_files import inspect_bags
+
+    reports = inspect_bags(
+        arguments.bags,
+        topics=_settings(TopicNames, arguments),
+        config=_settings(InspectionConfig, arguments),
+        strict=arguments.strict,
+        json_file=arguments.json,
+        folder=arguments.report,
+    )
+    for report in reports:
+        print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
+    return 1 if any(report.error for report in reports) else 0
+
+
+INSPECT = Command(
+    'inspect',
+    'Tell what is in bags, what is wrong with them, and whether they are enough to train on.',
+    '  inspect bags/coverage bags/test\n'
+    '  inspect recording_0.mcap --json bag.json --report report\n\n'
+    'JSON: {"bags": [{"path", "topics": {NAME: {"type", "count", "first_stamp_ns",\n'
+    '"last_stamp_ns", "rate_hz", "largest_gap_s", "problems"}}, "problems", "lacks", ...}]}',
+    _configure_inspect,
+    _inspect,
+)
+
+
+COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -117,7 +225,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--version', action='version', version=__version__)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for command in COMMANDS:
-        _prepare(commands.add_parser(command.name, help=command.summary, **_texts(command)), command)
+        _prepare(
+            commands.add_parser(command.name, help=command.summary, **_texts(command)), command
+        )
     arguments = parser.parse_args(argv)
     return _guarded(arguments.run_command, arguments)
 
