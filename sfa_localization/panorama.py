@@ -75,7 +75,7 @@ class Unwrapper:
         picture, or not one of this camera.
         """
         _check(image)
-        if self._is_panorama(image):
+        if self.is_panorama((image.shape[0], image.shape[1])):
             result = self._aligned(image)
         else:
             result = self._remapped(image)
@@ -88,11 +88,12 @@ class Unwrapper:
         scale = self.camera.supersampling
         return self._tables_of(size).seen[scale // 2 :: scale, scale // 2 :: scale]
 
-    def _is_panorama(self, image: Image) -> bool:
+    def is_panorama(self, size: tuple[int, int]) -> bool:
+        """Whether pictures of `size` (rows, columns) are panoramas already, so only resized."""
         if self.camera.camera_model == 'panorama':
             return self.camera.mount_roll == 0.0 and self.camera.mount_pitch == 0.0
         round_model = self.camera.camera_model != 'equirectangular'
-        return round_model and looks_like_panorama(*image.shape[:2])
+        return round_model and looks_like_panorama(*size)
 
     def _aligned(self, image: Image) -> Image:
         """A panorama, resized; if the camera makes them, also turned to the convention."""

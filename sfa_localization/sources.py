@@ -67,8 +67,9 @@ class Device:
     live = True
 
     def __init__(self, config: OmnicamNodeConfig) -> None:
-        path = config.source_path
-        self._path = path
+        self._path = path = config.source_path
+        if not path.isdigit() and not Path(path).exists():
+            raise CameraError(f'device {path} is not there')
         self._capture = cv2.VideoCapture(int(path) if path.isdigit() else path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
             raise CameraError(f'device {path} cannot be opened: is it there, and not in use?')
@@ -198,9 +199,12 @@ class FrozenWatch:
 
 @dataclass(frozen=True, slots=True)
 class FeedStatus:
-    """How a feed is: opening, running, lost (will be opened again) or ended; times it was lost."""
+    """How a feed is: new, opening, running, lost (will be opened again) or ended.
 
-    state: str = 'opening'
+    `lost` counts how often it was lost.
+    """
+
+    state: str = 'new'
     problem: str = ''
     lost: int = 0
 
@@ -299,6 +303,8 @@ class Feed:
     def _read_all(self, generation: int) -> None:
         """Open, and read to the end; raises CameraError when the source has to be opened again."""
         self._expect(_OPENING_S + self.config.silence_timeout)
+        if self.status().state == 'new':
+            self._tell('opening')
         capture = self._open()
         try:
             while self._is_current(generation) and self._read_one(capture, generation):

@@ -31,7 +31,10 @@ def declare(node: Node, kind: type[S]) -> S:
 
     Settings that are not `live` become read-only. Raises ConfigError for a value that is refused.
     """
-    values = {item.name: _declare_field(node, item) for item in dataclasses.fields(kind)}
+    values = {
+        item.name: _without_none(item, _declare_field(node, item))
+        for item in dataclasses.fields(kind)
+    }
     return kind.from_mapping(values, f'parameters of node {node.get_name()!r}')
 
 
@@ -61,8 +64,16 @@ def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) 
 def _changed(settings: S, changes: list[Parameter]) -> S:
     """The settings with those of `changes` that belong to them."""
     values = {item.name: getattr(settings, item.name) for item in dataclasses.fields(settings)}
-    values.update({change.name: change.value for change in changes if change.name in values})
+    given = {change.name: change.value for change in changes if change.name in values}
+    for item in dataclasses.fields(settings):
+        if item.name in given:
+            values[item.name] = _without_none(item, given[item.name])
     return type(settings).from_mapping(values, 'parameters')
+
+
+def _without_none(item: dataclasses.Field[Any], value: Any) -> Any:
+    """An empty list arrives from a parameter file as nothing at all."""
+    return () if value is None and item.default == () else value
 
 
 def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
@@ -98,6 +109,8 @@ def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
+    # An empty list has no type in ROS; its Settings check what is given instead.
+    made.dynamic_typing = item.default == ()
     if meta['choices']:
         made.additional_constraints = 'one of: ' + ', '.join(meta['choices'])
     if meta['low'] is not None or meta['high'] is not None:

@@ -1,0 +1,258 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 node: pictures of an omnidirectional camera in, panoramas out, with the pictures' stamps.
+
+Pictures come from a topic, or straight from a device, a video file or a folder. Nothing is done
+while nobody listens (`lazy`), and of pictures that come too fast only the newest is used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import Image as ImageMessage
+
+from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig, Settings
+from sfa_localization.errors import LocalizationError
+from sfa_localization.nodes.conversions import MessageError, read_image, to_compressed, to_image
+from sfa_localization.nodes.lifecycle import (
+    LocalizationNode,
+    reliable_qos,
+    run_node,
+    sensor_qos,
+)
+from sfa_localization.nodes.monitor import steady_s
+from sfa_localization.panorama import Unwrapper
+from sfa_localization.run import Image
+from sfa_localization.sources import Feed, FeedStatus, FrozenWatch, opener
+
+_DEMAND_PERIOD_S = 0.1
+_LITTLE_SEEN = 0.5
+_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+_TOPICS = {'raw': 'image_raw', 'compressed': 'image_raw/compressed'}
+
+
+class OmnicamNode(LocalizationNode):
+    """Unwraps each picture and publishes it as `panorama` and `panorama/compressed`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(
+            'omnicam_node', [OmnicamNodeConfig, CameraConfig, PanoramaConfig], **options
+        )
+        self._unwrapper = self._new_unwrapper()
+        self._size: tuple[int, int] | None = None
+        self._frozen = FrozenWatch()
+        self._subscription: Any = None
+        self._listening_since_s = 0.0
+        self._feed: Feed | None = None
+        self._arrival: Any = None
+        self._newest: tuple[int, Image] | None = None
+        self._newest_lock = threading.Lock()
+        self.add_on_set_parameters_callback(self._check_camera)
+
+    # Life cycle.
+
+    def setup(self) -> None:
+        self._config = self.settings(OmnicamNodeConfig)
+        self._unwrapper = self._new_unwrapper()
+        self._build_tables(self._unwrapper)
+        self._frozen = FrozenWatch()
+        self._panoramas = self.publisher(ImageMessage, 'panorama', reliable_qos(2))
+        self._compressed = self.publisher(CompressedImage, 'panorama/compressed', reliable_qos(2))
+        self._input = _TOPICS[self._config.image_transport]
+        if self._config.source != 'topic':
+            self._input = self._config.source_path
+            self._make_feed()
+        self.every(_DEMAND_PERIOD_S, self._follow_demand)
+
+    def started(self) -> None:
+        self._follow_demand()
+        if self._feed is not None and self._feed.status().state == 'new':
+            self._feed.start()
+
+    def teardown(self) -> None:
+        if self._feed is not None:
+            self._feed.stop()
+            self.destroy_guard_condition(self._arrival)
+        self._feed = self._arrival = self._newest = None
+        self._unsubscribe()
+
+    def _make_feed(self) -> None:
+        guarded = self._guarded(self._input, self._use_newest)
+        self._arrival = self.create_guard_condition(lambda: guarded(None))
+        self._feed = Feed(
+            opener(self._config), self._deliver, self._config, self._refuse_picture, self._wanted
+        )
+
+    # Demand: without listeners there is no subscription, and files wait.
+
+    def _wanted(self) -> bool:
+        if not self.active:
+            return False
+        return not self._config.lazy or self._listeners() > 0
+
+    def _listeners(self) -> int:
+        return int(
+            self._panoramas.get_subscription_count() + self._compressed.get_subscription_count()
+        )
+
+    def _follow_demand(self) -> None:
+        if self._feed is not None:
+            self._feed.check()
+        elif self._wanted() and self._subscription is None:
+            self._subscribe()
+        elif not self._wanted():
+            self._unsubscribe()
+
+    def _subscribe(self) -> None:
+        kind = CompressedImage if self._config.image_transport == 'compressed' else ImageMessage
+        self._listening_since_s = steady_s()
+        self._subscription = self.create_subscription(
+            kind,
+            self._input,
+            self._guarded(self._input, self._use_message),
+            sensor_qos(1),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def _unsubscribe(self) -> None:
+        if self._subscription is not None:
+            self.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    # Pictures.
+
+    def _use_message(self, message: ImageMessage | CompressedImage) -> None:
+        stamp_ns, picture = read_image(message)
+        self._publish(picture, stamp_ns, self._config.frame_id or message.header.frame_id)
+
+    def _deliver(self, picture: Image) -> None:
+        """Called in the feed's thread: keep the newest picture only, and wake the executor."""
+        with self._newest_lock:
+            self._newest = self.get_clock().now().nanoseconds, picture
+        self._arrival.trigger()
+
+    def _refuse_picture(self, reason: str) -> None:
+        self.refuse(self._input, reason)
+
+    def _use_newest(self, _: None) -> None:
+        with self._newest_lock:
+            newest, self._newest = self._newest, None
+        if newest is None:
+            return
+        stamp_ns, picture = newest
+        if stamp_ns <= 0:
+            raise MessageError('the clock has not started')
+        if self._wanted():
+            self._publish(picture, stamp_ns, self._config.frame_id)
+
+    def _publish(self, picture: Image, stamp_ns: int, frame: str) -> None:
+        panorama = self._unwrapper(picture)
+        self._size = (picture.shape[0], picture.shape[1])
+        frame = frame or 'omnicam'
+        if self._panoramas.get_subscription_count() or not self._config.lazy:
+            self._panoramas.publish(to_image(panorama, stamp_ns, frame))
+        if self._compressed.get_subscription_count():
+            quality = self._config.jpeg_quality
+            self._compressed.publish(to_compressed(panorama, stamp_ns, frame, quality))
+        self._frozen.see(picture)
+
+    # Parameters that change while running.
+
+    def settings_changed(self, settings: Settings) -> None:
+        if isinstance(settings, OmnicamNodeConfig):
+            self._config = settings
+            if self._feed is not None:
+                self._feed.config = settings
+        elif isinstance(settings, (CameraConfig, PanoramaConfig)):
+            self._unwrapper = self._new_unwrapper()
+
+    def _new_unwrapper(self) -> Unwrapper:
+        return Unwrapper(self.settings(CameraConfig), self.settings(PanoramaConfig))
+
+    def _check_camera(self, changes: Sequence[Parameter]) -> SetParametersResult:
+        """Refuse a mask, sector, mount or elevation from which no panorama can be made."""
+        try:
+            camera = self._with(self.settings(CameraConfig), changes)
+            panorama = self._with(self.settings(PanoramaConfig), changes)
+            if (camera, panorama) != (self._unwrapper.camera, self._unwrapper.panorama):
+                self._build_tables(Unwrapper(camera, panorama))
+        except LocalizationError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _with(self, settings: Any, changes: Sequence[Parameter]) -> Any:
+        names = {item.name for item in dataclasses.fields(settings)}
+        values = {change.name: change.value for change in changes if change.name in names}
+        return dataclasses.replace(settings, **values)
+
+    def _build_tables(self, unwrapper: Unwrapper) -> None:
+        """Build the tables for the size of picture that is, or will be, in use, if it is known."""
+        camera = unwrapper.camera
+        size = self._size or (camera.image_height, camera.image_width)
+        if 0 not in size:
+            unwrapper.seen(size)
+
+    # Health.
+
+    def health(self) -> tuple[int, str, dict[str, str]]:
+        values = {'camera model': self.settings(CameraConfig).camera_model}
+        if self._size is not None:
+            values['picture'] = f'{self._size[1]} x {self._size[0]}'
+        for judge in (self._judge_source, self._judge_pictures):
+            level, text = judge(values)
+            if level != _OK or text:
+                return level, text, values
+        return _OK, 'running', values
+
+    def _judge_source(self, values: dict[str, str]) -> tuple[int, str]:
+        if self._feed is not None:
+            return _judge_feed(self._feed.status(), values)
+        if self._subscription is None:
+            return _OK, 'idle: nobody listens to the panorama'
+        listening_s = steady_s() - self._listening_since_s
+        silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
+        if silent_s > self._config.silence_timeout:
+            return _ERROR, f'no picture on {self._input} for {silent_s:.0f} s'
+        return _OK, ''
+
+    def _judge_pictures(self, values: dict[str, str]) -> tuple[int, str]:
+        frozen_s = self._frozen.frozen_for_s()
+        if 0.0 < self._config.frozen_timeout < frozen_s:
+            return _WARN, f'the camera has repeated its last picture for {frozen_s:.0f} s'
+        monitor = self.monitor(self._input)
+        if monitor.received and not monitor.used:
+            return _ERROR, 'no picture could be used so far'
+        seen = self._seen_share()
+        values['panorama seen [%]'] = f'{100 * seen:.0f}'
+        if seen < _LITTLE_SEEN:
+            return _WARN, f'the camera sees only {100 * seen:.0f} % of the panorama'
+        return _OK, ''
+
+    def _seen_share(self) -> float:
+        if self._size is None or self._unwrapper.is_panorama(self._size):
+            return 1.0
+        return float(self._unwrapper.seen(self._size).mean())
+
+
+def _judge_feed(status: FeedStatus, values: dict[str, str]) -> tuple[int, str]:
+    values['source'] = status.state
+    values['source lost'] = str(status.lost)
+    if status.state == 'lost':
+        return _ERROR, f'camera lost, will be opened again: {status.problem}'
+    if status.state == 'opening':
+        return _WARN, 'opening the camera'
+    return _OK, 'at the end of the pictures' if status.state == 'ended' else ''
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM."""
+    return run_node(OmnicamNode, args)

@@ -1,0 +1,460 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The omnicam node on real messages: panoramas, demand, bad pictures, live parameters, sources."""
+
+import array
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from sfa_localization.config import CameraConfig, PanoramaConfig
+from sfa_localization.panorama import Unwrapper
+from sfa_localization.pictures import decode_compressed, encode_jpeg
+
+rclpy = pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
+
+from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
+
+PATIENCE_S = 20.0
+SMALL = {'width': 120, 'height': 12, 'diagnostics_period': 0.1}
+PANORAMA = PanoramaConfig(width=120, height=12)
+RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def raw_picture(seed=1):
+    noise = np.random.default_rng(seed).integers(0, 256, (40, 40, 3), np.uint8)
+    return cv2.resize(noise, (640, 640), interpolation=cv2.INTER_CUBIC)
+
+
+def image_message(picture, stamp=(12, 34), frame='camera', encoding='bgr8'):
+    message = Image(encoding=encoding)
+    message.header.stamp.sec, message.header.stamp.nanosec = stamp
+    message.header.frame_id = frame
+    message.height, message.width = picture.shape[:2]
+    message.step = message.width * (picture.size // (message.height * message.width))
+    message.data = array.array('B', picture.tobytes())
+    return message
+
+
+class Bench:
+    """A node under test, a node that feeds and hears it, and one thread that spins both."""
+
+    def __init__(self, context, **parameters):
+        self.context = context
+        overrides = [Parameter(name, value=value) for name, value in (SMALL | parameters).items()]
+        self.node = OmnicamNode(context=context, parameter_overrides=overrides)
+        self.peer = rclpy.create_node('peer', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        for node in (self.node, self.peer):
+            self.executor.add_node(node)
+        self.received = {}
+        self.spinning = True
+        self.thread = threading.Thread(target=self._spin, daemon=True)
+
+    def _spin(self):
+        while self.spinning:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def start(self):
+        self.started = self.node.start()
+        self.thread.start()
+        return self
+
+    def hear(self, topic, kind=Image):
+        self.received[topic] = []
+        return self.peer.create_subscription(kind, topic, self.received[topic].append, RELIABLE)
+
+    def speak(self, topic='image_raw', kind=Image):
+        publisher = self.peer.create_publisher(kind, topic, RELIABLE)
+        self.wait(lambda: publisher.get_subscription_count() > 0)
+        return publisher
+
+    def wait(self, condition):
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < deadline, 'waited in vain'
+            time.sleep(0.005)
+
+    def wait_for(self, topic, count=1):
+        self.wait(lambda: len(self.received[topic]) >= count)
+        return self.received[topic][-1]
+
+    def set(self, **values):
+        changes = [Parameter(name, value=value) for name, value in values.items()]
+        return self.node.set_parameters_atomically(changes)
+
+    def close(self):
+        self.spinning = False
+        if self.thread.is_alive():
+            self.thread.join(PATIENCE_S)
+        self.executor.shutdown()
+        for node in (self.node, self.peer):
+            node.destroy_node()
+
+
+@pytest.fixture
+def bench(monkeypatch, tmp_path):
+    monkeypatch.setenv('ROS_PYTHON_CHECK_FIELDS', '1')
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
+    context = rclpy.Context()
+    rclpy.init(
+        context=context, domain_id=63, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO
+    )
+    made = []
+
+    def build(**parameters):
+        made.append(Bench(context, **parameters))
+        return made[-1]
+
+    yield build
+    for each in made:
+        each.close()
+    rclpy.try_shutdown(context=context)
+
+
+def pixels(message):
+    return np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
+
+
+def send_until(bench, publisher, message, topic='panorama', more=1):
+    """Send again until something is heard: the input is best effort."""
+    goal = len(bench.received[topic]) + more
+    deadline = time.monotonic() + PATIENCE_S
+    while len(bench.received[topic]) < goal:
+        assert time.monotonic() < deadline, 'waited in vain'
+        publisher.publish(message)
+        time.sleep(0.02)
+    return bench.received[topic][-1]
+
+
+def test_the_panorama_has_the_stamp_and_frame_of_the_picture(bench):
+    run = bench().start()
+    run.hear('panorama')
+    message = send_until(run, run.speak(), image_message(raw_picture()))
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 34)
+    assert message.header.frame_id == 'camera'
+    assert (message.height, message.width, message.step) == (12, 120, 360)
+    assert message.encoding == 'bgr8'
+    expected = Unwrapper(CameraConfig(), PANORAMA)(raw_picture())
+    np.testing.assert_array_equal(pixels(message), expected)
+
+
+def test_frame_and_quality_of_service_by_parameter(bench):
+    run = bench(frame_id='mast').start()
+    run.hear('panorama')
+    assert send_until(run, run.speak(), image_message(raw_picture())).header.frame_id == 'mast'
+    assert run.node.get_parameter('qos_overrides./image_raw.subscription.depth').value == 1
+
+
+def test_a_picture_without_a_frame_gets_one(bench):
+    run = bench().start()
+    run.hear('panorama')
+    message = send_until(run, run.speak(), image_message(raw_picture(), frame=''))
+    assert message.header.frame_id == 'omnicam'
+
+
+def test_compressed_pictures_in_and_out(bench):
+    run = bench(image_transport='compressed').start()
+    run.hear('panorama/compressed', CompressedImage)
+    message = CompressedImage(format='jpeg')
+    message.header.stamp.sec = 5
+    data = encode_jpeg(raw_picture(), 95)
+    message.data = array.array('B', data)
+    publisher = run.speak('image_raw/compressed', CompressedImage)
+    heard = send_until(run, publisher, message, 'panorama/compressed')
+    assert heard.header.stamp.sec == 5
+    expected = Unwrapper(CameraConfig(), PANORAMA)(decode_compressed(data))
+    quality = run.node.get_parameter('jpeg_quality').value
+    assert heard.data.tobytes() == encode_jpeg(expected, quality)
+
+
+def test_nobody_listens_nothing_is_done(bench):
+    run = bench().start()
+    publisher = run.peer.create_publisher(Image, 'image_raw', RELIABLE)
+    run.hear('/diagnostics', DiagnosticArray)
+    status = run.wait_for('/diagnostics', 3).status[0]
+    assert 'idle' in status.message
+    assert status.level == DiagnosticStatus.OK
+    assert publisher.get_subscription_count() == 0
+    listener = run.hear('panorama')
+    run.wait(lambda: publisher.get_subscription_count() == 1)
+    send_until(run, publisher, image_message(raw_picture()))
+    run.peer.destroy_subscription(listener)
+    run.wait(lambda: publisher.get_subscription_count() == 0)
+    listener = run.hear('panorama')
+    run.wait(lambda: publisher.get_subscription_count() == 1)
+    send_until(run, publisher, image_message(raw_picture()))
+
+
+def test_told_not_to_be_lazy_it_works_unheard(bench):
+    run = bench(lazy=False).start()
+    publisher = run.speak()
+    deadline = time.monotonic() + PATIENCE_S
+    while not run.node.monitor('image_raw').used:
+        assert time.monotonic() < deadline
+        publisher.publish(image_message(raw_picture()))
+        time.sleep(0.02)
+
+
+def bad_pictures():
+    good = raw_picture()
+    cases = {}
+    for name, change in {
+        'encoding': {'encoding': 'hsv9'},
+        'no rows': {'height': 0},
+        'no columns': {'width': 0},
+        'step': {'step': 7},
+        'too wide': {'width': 641},
+        'too high': {'height': 641},
+    }.items():
+        message = image_message(good)
+        for field, value in change.items():
+            setattr(message, field, value)
+        cases[name] = message
+    cases['no data'] = image_message(good)
+    cases['no data'].data = array.array('B')
+    cases['other shape'] = image_message(good[:480])
+    cases['zero stamp'] = image_message(good, stamp=(0, 0))
+    cases['impossible stamp'] = image_message(good, stamp=(1, 4_000_000_000))
+    return cases
+
+
+def test_it_outlives_every_bad_picture_and_counts_each(bench):
+    run = bench().start()
+    run.hear('panorama')
+    run.hear('/diagnostics', DiagnosticArray)
+    publisher = run.speak()
+    send_until(run, publisher, image_message(raw_picture()))
+    count = len(run.received['panorama'])
+    monitor = run.node.monitor('image_raw')
+    for name, message in bad_pictures().items():
+        before = sum(monitor.refused.values())
+        deadline = time.monotonic() + PATIENCE_S
+        while sum(monitor.refused.values()) == before:
+            assert time.monotonic() < deadline, name
+            publisher.publish(message)
+            time.sleep(0.02)
+    assert not any('internal error' in reason for reason in monitor.refused)
+    assert len(monitor.refused) >= 6
+    assert len(run.received['panorama']) == count
+    send_until(run, publisher, image_message(raw_picture()))
+
+    def counted():
+        values = {
+            pair.key: pair.value for pair in run.received['/diagnostics'][-1].status[0].values
+        }
+        return 'image_raw: refused: empty picture' in values
+
+    run.wait(counted)
+
+
+def test_bad_compressed_pictures(bench):
+    run = bench(image_transport='compressed').start()
+    run.hear('panorama')
+    publisher = run.speak('image_raw/compressed', CompressedImage)
+    message = CompressedImage(format='jpeg', data=array.array('B', b'no picture'))
+    message.header.stamp.sec = 1
+    deadline = time.monotonic() + PATIENCE_S
+    monitor = run.node.monitor('image_raw/compressed')
+    while not monitor.refused:
+        assert time.monotonic() < deadline
+        publisher.publish(message)
+        time.sleep(0.02)
+    message.data = array.array('B', encode_jpeg(raw_picture(), 90))
+    send_until(run, publisher, message)
+
+
+def test_masks_elevation_and_mount_change_while_running(bench):
+    run = bench().start()
+    run.hear('panorama')
+    publisher = run.speak()
+    message = image_message(raw_picture())
+    send_until(run, publisher, message)
+    assert run.set(elevation_max=10.0, blind_sectors=[170.0, 190.0], mount_yaw=30.0).successful
+    camera = CameraConfig(blind_sectors=(170.0, 190.0), mount_yaw=30.0)
+    panorama = PanoramaConfig(width=120, height=12, elevation_max=10.0)
+    expected = Unwrapper(camera, panorama)(raw_picture())
+    deadline = time.monotonic() + PATIENCE_S
+    while not np.array_equal(pixels(send_until(run, publisher, message)), expected):
+        assert time.monotonic() < deadline
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'elevation_max': -40.0}, 'elevation_min'),
+        ({'mask_file': 'nowhere.png'}, 'nowhere.png'),
+        ({'blind_sectors': [10.0]}, 'a start and an end'),
+        ({'blind_sectors': [0.0, float('nan')]}, 'finite'),
+        ({'elevation_max': float('nan')}, ''),
+        ({'fx': 10.0}, ''),
+        ({'normalization': 'magic'}, 'magic'),
+    ],
+)
+def test_impossible_changes_are_refused_with_the_reason(bench, change, words):
+    run = bench()
+    assert run.node.start()
+    before = run.node.get_parameter('elevation_max').value
+    result = run.set(**change)
+    assert not result.successful
+    assert words in result.reason
+    assert run.node.get_parameter('elevation_max').value == before
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'words'),
+    [
+        ({'camera_model': 'polar', 'radius_max': 1.0}, 'radius_min'),
+        ({'source': 'video'}, 'source_path'),
+        ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
+        ({'elevation_min': 50.0}, 'elevation_min'),
+        ({'axis': 'up', 'elevation_min': -80.0, 'elevation_max': -60.0}, 'sees no part'),
+    ],
+)
+def test_an_impossible_camera_says_so_and_does_not_start(bench, parameters, words):
+    run = bench(**parameters)
+    assert not run.node.start()
+    assert words in run.node.failure
+
+
+@pytest.mark.parametrize(
+    ('given', 'expected'), [('[]', ()), ('[170, 190]', (170.0, 190.0)), ('[1.5, 2.5]', (1.5, 2.5))]
+)
+def test_lists_in_a_parameter_file(bench, tmp_path, given, expected):
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(f'omnicam_node:\n  ros__parameters:\n    blind_sectors: {given}\n')
+    arguments = ['--ros-args', '--params-file', str(path)]
+    node = OmnicamNode(context=bench().context, cli_args=arguments)
+    assert node.settings(CameraConfig).blind_sectors == expected
+    node.destroy_node()
+
+
+def test_every_parameter_is_described(bench):
+    run = bench()
+    for name in ('source', 'camera_model', 'blind_sectors', 'elevation_max', 'lazy'):
+        assert len(run.node.describe_parameter(name).description) > 10
+    assert run.node.describe_parameter('camera_model').read_only
+    assert not run.node.describe_parameter('blind_sectors').read_only
+
+
+def test_a_silent_camera_shows_in_diagnostics(bench):
+    run = bench(silence_timeout=0.2).start()
+    run.hear('panorama')
+    run.hear('/diagnostics', DiagnosticArray)
+    run.wait(
+        lambda: any(
+            'no picture' in message.status[0].message for message in run.received['/diagnostics']
+        )
+    )
+    publisher = run.speak()
+    send_until(run, publisher, image_message(raw_picture()))
+
+
+def test_a_frozen_camera_shows_in_diagnostics(bench):
+    run = bench(frozen_timeout=0.2).start()
+    run.hear('panorama')
+    run.hear('/diagnostics', DiagnosticArray)
+    publisher = run.speak()
+    message = image_message(raw_picture())
+
+    def told():
+        publisher.publish(message)
+        return any('repeated' in each.status[0].message for each in run.received['/diagnostics'])
+
+    run.wait(told)
+    assert run.received['panorama']
+
+
+def test_a_masked_camera_shows_in_diagnostics(bench):
+    run = bench(blind_sectors=[-100.0, 100.0]).start()
+    run.hear('panorama')
+    run.hear('/diagnostics', DiagnosticArray)
+    publisher = run.speak()
+    send_until(run, publisher, image_message(raw_picture()))
+    run.wait(
+        lambda: any(
+            'sees only 4' in each.status[0].message for each in run.received['/diagnostics']
+        )
+    )
+
+
+def test_a_folder_of_pictures(bench, tmp_path):
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f'{number}.png'), raw_picture(number))
+    (tmp_path / '3.png').write_bytes(b'no picture')
+    run = bench(source='folder', source_path=str(tmp_path), source_rate=20.0)
+    run.hear('panorama')
+    run.start()
+    run.wait_for('panorama', 3)
+    unwrap = Unwrapper(CameraConfig(), PANORAMA)
+    for number, message in enumerate(run.received['panorama'][:3]):
+        np.testing.assert_array_equal(pixels(message), unwrap(raw_picture(number)))
+        assert message.header.frame_id == 'omnicam'
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in run.received['panorama']]
+    assert stamps == sorted(stamps)
+    assert stamps[0] > 10**18
+    run.wait(lambda: sum(run.node.monitor(str(tmp_path)).refused.values()) == 1)
+
+
+def test_a_device_that_is_not_there_is_told_and_awaited(bench):
+    run = bench(source='device', source_path='/dev/no_such_camera', reopen_min=0.01)
+    run.hear('/diagnostics', DiagnosticArray)
+    run.start()
+    assert run.started
+    run.wait(
+        lambda: any(
+            each.status[0].level == DiagnosticStatus.ERROR
+            and 'no_such_camera' in each.status[0].message
+            for each in run.received['/diagnostics']
+        )
+    )
+
+
+def test_the_life_cycle_goes_round(bench):
+    run = bench()
+    run.hear('panorama')
+    run.start()
+    publisher = run.speak()
+    send_until(run, publisher, image_message(raw_picture()))
+    run.spinning = False
+    run.thread.join(PATIENCE_S)
+    run.node.trigger_deactivate()
+    run.node.trigger_cleanup()
+    run.node.trigger_configure()
+    run.node.trigger_activate()
+    run.spinning = True
+    run.thread = threading.Thread(target=run._spin, daemon=True)
+    run.thread.start()
+    run.wait(lambda: publisher.get_subscription_count() == 1)
+    send_until(run, publisher, image_message(raw_picture()))
+
+
+def test_of_pictures_that_come_too_fast_the_newest_is_used(bench):
+    """A burst while the node is busy: no more than the depth of one waits for it."""
+    run = bench()
+    run.hear('panorama')
+    run.start()
+    publisher = run.speak()
+    send_until(run, publisher, image_message(raw_picture()))
+    run.wait(lambda: publisher.get_subscription_count() == 1)
+    run.spinning = False
+    run.thread.join(PATIENCE_S)
+    run.received['panorama'].clear()
+    for second in range(100, 120):
+        publisher.publish(image_message(raw_picture(), stamp=(second, 0)))
+    time.sleep(0.2)  # nothing is waited for: the burst only has to be over
+    run.spinning = True
+    run.thread = threading.Thread(target=run._spin, daemon=True)
+    run.thread.start()
+    run.wait(lambda: any(m.header.stamp.sec == 119 for m in run.received['panorama']))
+    assert len([m for m in run.received['panorama'] if m.header.stamp.sec >= 100]) <= 2
