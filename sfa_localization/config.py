@@ -522,6 +522,12 @@ class MetricConfig(Settings):
     paper_start: str = setting(
         'odometry', 'where the descent starts', choices=('odometry', 'random')
     )
+    paper_area_x: float = setting(
+        16.0, 'span of a random start', unit='m', low=0.1, high=1e4
+    )
+    paper_area_y: float = setting(
+        18.0, 'span of a random start', unit='m', low=0.1, high=1e4
+    )
     paper_iterations: int = setting(1000, 'most iterations of the descent', low=1, high=10000000)
     paper_learning_rate: float = setting(1e-5, 'beta of equation 7', low=1e-12, high=1.0)
     paper_momentum: float = setting(0.95, 'gamma of equation 7', low=0.0, high=1.0)
@@ -877,3 +883,15 @@ class InspectionConfig(Settings):
         1.0, 'pause of a topic that is worth telling', unit='s', low=0.0, high=1e6
     )
     samples: int = setting(16, 'pictures on the contact sheet', low=1, high=400)
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingConfig(Settings):
+    """The visual compass, learnt with the map."""
+
+    learn_heading: bool = setting(True, 'learn the heading from the pictures too')
+    heading_layer: int = setting(2, 'layer whose map tells the heading', low=1, high=20)
+    heading_features: int = setting(8, 'slow features that tell it the place', low=0, high=1000)
+    heading_inducing_points: int = setting(
+        800, 'pictures that span the compass', low=20, high=20000
+    )

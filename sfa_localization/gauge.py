@@ -1,0 +1,65 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fix the map's frame: the odometry frame at the start of the first run, or an anchor."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.config import MetricConfig
+from sfa_localization.elimination import Stack
+from sfa_localization.fitting import Fit, targets
+from sfa_localization.geometry import Array, RigidTransform, compose, invert
+from sfa_localization.segments import Segments
+
+Complex = NDArray[np.complex128]
+
+
+def gauge(fit: Fit, segments: Segments, stack: Stack, config: MetricConfig) -> RigidTransform:
+    """The transform from the fit's arbitrary frame to the map frame.
+
+    The certified track is laid on the odometry of the first run, each picture weighted by how
+    little the odometry can have drifted until then: the map coincides with the odometry frame at
+    the start of the run. With an anchor, the run starts at the anchor's pose in the map.
+    """
+    poses, variances = _odometry(segments, fit)
+    rows = np.flatnonzero(stack.owner < len(poses))
+    owner = stack.owner[rows]
+    path = stack.corrected(fit.solution.bias)[rows]
+    driven = poses[owner, 0] + 1j * poses[owner, 1] + np.exp(1j * poses[owner, 2]) * path
+    weights = 1.0 / (variances[owner] + fit.variance)
+    frame = _align(targets(fit.solution, stack)[rows], driven, weights)
+    if not config.use_anchor:
+        return frame
+    start = np.array([config.anchor_x, config.anchor_y, config.anchor_yaw])
+    onto = compose(start, invert(segments[0].start))
+    moved = compose(onto, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
+    return RigidTransform(*(float(value) for value in moved))
+
+
+def _odometry(segments: Segments, fit: Fit) -> tuple[Array, Array]:
+    """Poses (n, 3) of the first segments' frames in the odometry frame, free of the bias, and
+    the variance (n,) of their places; up to the first break of the odometry."""
+    bias = float(fit.solution.bias[0])
+    poses, variances = [np.asarray(segments[0].start, float)], [0.0]
+    yaw_variance = place_variance = 0.0
+    for segment in segments.items[:-1]:
+        if not segment.linked:
+            break
+        moved = segment.displacement - bias * segment.displacement_drift
+        turned = segment.turn_rad - bias * segment.turn_time_s
+        poses.append(compose(poses[-1], np.array([moved.real, moved.imag, turned])))
+        place_variance += segment.displacement_variance + yaw_variance * abs(moved) ** 2
+        yaw_variance += segment.turn_variance
+        variances.append(place_variance)
+    return np.array(poses), np.array(variances)
+
+
+def _align(source: Complex, target: Complex, weights: Array) -> RigidTransform:
+    """Weighted least-squares rotation and translation of complex points (M,)."""
+    share = weights / weights.sum()
+    a, b = share @ source, share @ target
+    yaw = float(np.angle(np.sum(share * np.conj(source - a) * (target - b))))
+    shift = b - np.exp(1j * yaw) * a
+    return RigidTransform(float(shift.real), float(shift.imag), yaw)
