@@ -731,7 +731,7 @@ class FilterConfig(Settings):
         3, 'pictures that must agree after an outage', low=1, high=100, live=True
     )
     confirm_distance: float = setting(
-        1.0, 'way over which they must agree', unit='m', low=0.0, high=1e3, live=True
+        2.0, 'way over which they must agree', unit='m', low=0.0, high=1e3, live=True
     )
     degraded_std: float = setting(
         0.5, 'position deviation from which on DEGRADED', unit='m', low=1e-3, high=1e6, live=True

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
+from sfa_localization.cameras import make_camera
 from sfa_localization.config import CameraConfig, PanoramaConfig, SimulationConfig
-from sfa_localization.errors import ConfigError
+from sfa_localization.errors import CameraError, ConfigError
 from sfa_localization.geometry import Array
-from sfa_localization.panorama import make_camera
 from sfa_localization.rendering import Light, Scene, Shape, View, panorama_view, raw_view
 from sfa_localization.run import Image
 from sfa_localization.textures import Floats
@@ -29,7 +30,7 @@ FENCE_M = 2.3
 """From the driven area to the hedges and fences around it."""
 
 GRASS: Tint = (0.07, 0.24, 0.13)
-BARK: Tint = (0.08, 0.13, 0.19)
+BARK: Tint = (0.17, 0.25, 0.34)
 GLASS: Tint = (0.16, 0.13, 0.10)
 WHITE: Tint = (0.72, 0.76, 0.78)
 WOODS: tuple[Tint, ...] = ((0.10, 0.20, 0.34), (0.20, 0.33, 0.45), (0.13, 0.16, 0.20))
@@ -59,15 +60,17 @@ def choose(rng: np.random.Generator, tints: tuple[Tint, ...]) -> Tint:
     return float(b), float(g), float(r)
 
 
-def panel(corner: Array, across: Array, up: Array, step: float, surface: str, tint: Tint) -> Shape:
+def panel(
+    corner: ArrayLike, across: ArrayLike, up: ArrayLike, step: float, surface: str, tint: Tint
+) -> Shape:
     """A parallelogram whose normal is across x up, in a mesh of about `step` metres."""
-    corner, across, up = (np.asarray(axis, float) for axis in (corner, across, up))
-    n, m = (max(1, int(np.ceil(np.linalg.norm(axis) / step))) for axis in (across, up))
+    origin, right, rise = (np.asarray(axis, float) for axis in (corner, across, up))
+    n, m = (max(1, int(np.ceil(np.linalg.norm(axis) / step))) for axis in (right, rise))
     i, j = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, m + 1))
-    vertices = corner + i.ravel()[:, None] * across + j.ravel()[:, None] * up
+    vertices = origin + i.ravel()[:, None] * right + j.ravel()[:, None] * rise
     a = (np.arange(m)[:, None] * (n + 1) + np.arange(n)).ravel()
     faces = np.concatenate([[a, a + 1, a + n + 2], [a, a + n + 2, a + n + 1]], 1).T
-    normal = np.cross(across, up)
+    normal = np.cross(right, rise)
     normals = np.tile(normal / np.linalg.norm(normal), (len(vertices), 1))
     return Shape(vertices, normals, faces, surface, tint, np.ones(len(vertices)))
 
@@ -78,15 +81,15 @@ def box(
     """An upright box without a bottom: `centre` (x, y), `size` (x, y, height) in metres."""
     (x, y), (w, d, h) = centre, size
     west, east, south, north = x - w / 2, x + w / 2, y - d / 2, y + d / 2
-    up = np.array([0, 0, h])
-    walls = [
+    up = [0, 0, h]
+    walls: list[tuple[ArrayLike, ArrayLike, ArrayLike]] = [
         ([west, south, low], [w, 0, 0], up),
         ([east, south, low], [0, d, 0], up),
         ([east, north, low], [-w, 0, 0], up),
         ([west, north, low], [0, -d, 0], up),
         ([west, south, low + h], [w, 0, 0], [0, d, 0]),
     ]
-    return [panel(*map(np.array, wall), step, surface, tint) for wall in walls]  # type: ignore[arg-type]
+    return [panel(a, b, c, step, surface, tint) for a, b, c in walls]
 
 
 def solid(mesh: trimesh.Trimesh, surface: str, tint: Tint) -> Shape:
@@ -120,7 +123,7 @@ def blob(
     mesh.apply_scale(np.asarray(radii, float))
     mesh.apply_translation(centre)
     size = float(np.mean(radii))
-    return bumpy(solid(mesh, 'leaves', tint), rng, 0.16 * size, 0.8 * size)
+    return bumpy(solid(mesh, 'leaves', tint), rng, 0.13 * size, 1.1 * size)
 
 
 def pole(foot: Array, radius: float, height: float, surface: str, tint: Tint) -> Shape:
@@ -368,17 +371,13 @@ class Garden:
         self.scene = Scene(plot.shapes, _sun(plot.rng), np.random.default_rng([seed, 1]))
         self._views: dict[object, View] = {}
 
-    def render_panorama(
-        self, pose: Array, panorama: PanoramaConfig, light: Light | None = None
-    ) -> Image:
+    def render_panorama(self, pose: Array, panorama: PanoramaConfig) -> Image:
         """The noiseless panorama (H, W, 3) BGR seen from `pose` (x m, y m, yaw rad)."""
-        return rounded(self.picture(pose, self.panorama_view(panorama), light))
+        return rounded(self.picture(pose, self.panorama_view(panorama)))
 
-    def render_raw(
-        self, pose: Array, camera: CameraConfig, size: tuple[int, int] = (640, 640)
-    ) -> Image:
-        """The noiseless raw picture (height, width, 3) BGR of a camera of `size` pixels."""
-        return rounded(self.picture(pose, self.raw_view(camera, size)))
+    def render_raw(self, pose: Array, camera: CameraConfig) -> Image:
+        """The noiseless raw picture (H, W, 3) BGR of a camera of a given size in pixels."""
+        return rounded(self.picture(pose, self.raw_view(camera)))
 
     def picture(self, pose: Array, view: View, light: Light | None = None) -> Floats:
         """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose (3,)."""
@@ -388,14 +387,19 @@ class Garden:
 
     def panorama_view(self, panorama: PanoramaConfig) -> View:
         """The view of `render_panorama`, built once per configuration."""
-        return self._views.setdefault(panorama, panorama_view(panorama))
+        if panorama not in self._views:
+            self._views[panorama] = panorama_view(panorama)
+        return self._views[panorama]
 
-    def raw_view(self, camera: CameraConfig, size: tuple[int, int]) -> View:
-        """The view of `render_raw`, built once per camera and size (width, height)."""
-        if (camera, size) not in self._views:
-            model = make_camera(camera, size)
-            self._views[camera, size] = raw_view(model.unproject, size, PanoramaConfig())
-        return self._views[camera, size]
+    def raw_view(self, camera: CameraConfig) -> View:
+        """The view of `render_raw`, built once per camera. Raises CameraError without a size."""
+        if camera not in self._views:
+            size = (camera.image_width, camera.image_height)
+            if 0 in size:
+                raise CameraError('the simulated camera needs image_width and image_height')
+            model = make_camera(camera, size[::-1])
+            self._views[camera] = raw_view(model.unproject, size, PanoramaConfig())
+        return self._views[camera]
 
 
 def rounded(picture: Floats) -> Image:

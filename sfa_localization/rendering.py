@@ -31,8 +31,8 @@ from sfa_localization.textures import (
     sky,
 )
 
-SUN_BGR = np.array([0.80, 0.93, 1.0], np.float32)
-SKY_BGR = np.array([0.62, 0.52, 0.45], np.float32)
+SUN_BGR = np.array([1.04, 1.21, 1.30], np.float32)
+SKY_BGR = np.array([0.78, 0.65, 0.56], np.float32)
 BOUNCE = 0.22
 
 
@@ -130,14 +130,14 @@ def raw_view(
     x = (0.5 - azimuth / (2 * np.pi)) * dome.columns - 0.5 + 1
     falling = dome.elevations_rad[::-1]
     y = np.interp(elevation, falling, np.arange(len(falling))[::-1])
-    maps = [_as_map(axis, size) for axis in (x, y)]
+    map_x, map_y = (_as_map(axis, size) for axis in (x, y))
     below = elevation < falling[0] - np.radians(1)
     cover = np.where(np.isnan(elevation), 1.0, below).reshape(size[::-1]).astype(np.float32)
     hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(size[1], size[0], 3)
 
     def picture(dome_picture: Floats, gain: Floats) -> Floats:
         wrapped = np.concatenate([dome_picture[:, -1:], dome_picture, dome_picture[:, :1]], 1)
-        seen = cv2.remap(wrapped, *maps, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+        seen = cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray((seen * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
 
     return View(dome, picture)
@@ -153,7 +153,7 @@ def _rows_for(elevation: Array, config: PanoramaConfig) -> Array:
     top, bottom = np.radians(config.elevation_max), np.radians(config.elevation_min)
     fine = np.arange(top + 2.5 * step, bottom - 3 * step, -step)
     highest, lowest = np.nanmax(elevation), max(np.nanmin(elevation), HULL_RAD)
-    above = np.arange(fine[0] + 4 * step, highest + 4 * step, 4 * step)[::-1]
+    above = np.arange(fine[0] + 2 * step, highest + 2 * step, 2 * step)[::-1]
     below = np.arange(fine[-1] - 4 * step, lowest - 4 * step, -4 * step)
     return np.concatenate([above, fine, below])
 
@@ -212,7 +212,8 @@ class Scene:
     def _free(self, start: Floats, rays: Array) -> Array:
         """1 where nothing lies on the ray from start (V, 3) along rays (V, 3) or (3,), else 0."""
         rays = np.broadcast_to(rays, start.shape).astype(np.float32)
-        return np.asarray(self._embree.run(start, rays, query='OCCLUDED') < 0, float)
+        hits: Array = self._embree.run(start, rays, query='OCCLUDED')
+        return (hits < 0).astype(float)
 
     def _corners(self, light: Array) -> Floats:
         """Per face (F, 12): texture metres and light at corner 0, and their change to 1 and 2."""
@@ -262,7 +263,7 @@ class Scene:
         degrees = np.degrees(dome.elevations_rad)
         y = (SKY_HIGHEST_DEG - degrees) / (SKY_HIGHEST_DEG - SKY_LOWEST_DEG) * (SKY_ROWS - 1)
         grid = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
-        return np.asarray(cv2.remap(self._sky, *grid, cv2.INTER_LINEAR, None, cv2.BORDER_WRAP))
+        return np.asarray(cv2.remap(self._sky, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 def _about(direction: Array, spread: float, rng: np.random.Generator) -> Array:

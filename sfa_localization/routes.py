@@ -151,14 +151,16 @@ class Plan:
 def coverage(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 0.0) -> Route:
     """Straight legs criss-crossing the lawn until `length_m` is driven (0: by the lawn's size)."""
     plan, cells = Plan(lawn, start), Coverage(lawn)
+    driven = np.zeros(6)
     shortest = 0.8 * lawn.half.min()
-    while plan.length_m < (length_m or 1.2 * lawn.size_m2):
+    while plan.length_m < (length_m or 1.15 * lawn.size_m2):
         ends = lawn.random_points(rng, 250)
         ends = ends[lawn.clear(plan.position, ends)]
         far = np.linalg.norm(ends - plan.position, axis=1)
         ends = ends[far > min(shortest, far.max(initial=0.0) / 2)]
-        target = _most_new(cells, plan.position, ends)
+        target = _most_new(cells, driven, plan.position, ends)
         cells.add(_between(plan.position, target))
+        driven[_sector(target - plan.position)] += np.hypot(*(target - plan.position))
         plan.straight_to(target)
     return plan.route
 
@@ -168,11 +170,18 @@ def _between(start: Array, end: Array) -> Array:
     return np.asarray(start + np.linspace(0, 1, count)[:, None] * (end - start))
 
 
-def _most_new(cells: Coverage, start: Array, ends: Array) -> Array:
-    """The end (2,) of the leg that passes most new ground; for equal gain the shorter leg."""
+def _sector(ways: Array) -> NDArray[np.int64]:
+    """Which sixth of the directions ways (..., 2) point to; forth and back are the same."""
+    angle = np.arctan2(ways[..., 1], ways[..., 0]) % np.pi
+    return np.asarray(angle / np.pi * 6, int) % 6
+
+
+def _most_new(cells: Coverage, driven: Array, start: Array, ends: Array) -> Array:
+    """The end (2,) of the leg over most new ground, in directions not much `driven` (6,)."""
     lengths = np.linalg.norm(ends - start, axis=1)
-    gains = np.array([cells.gain(_between(start, end)) for end in ends]) - 0.5 * lengths
-    return np.asarray(ends[gains.argmax()])
+    share = driven[_sector(ends - start)] / (driven.sum() + 1.0)
+    gains = np.array([cells.gain(_between(start, end)) for end in ends])
+    return np.asarray(ends[(gains - (0.5 + 4 * share) * lengths).argmax()])
 
 
 def lines(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 0.0) -> Route:
@@ -214,7 +223,7 @@ def _line(
 
 
 def mower(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 0.0) -> Route:
-    """Nine lanes along each axis, boustrophedon, with turns of 90 degrees; `length_m` is not used."""
+    """Nine lanes along each axis, with turns of 90 degrees between; `length_m` is not used."""
     plan = Plan(lawn, start)
     for axis in rng.permutation(2):
         ahead = -1.0 if plan.position[axis] > 0 else 1.0
@@ -243,15 +252,15 @@ def closed_curve(
     lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 0.0
 ) -> Route:
     """A smooth closed curve through the start, of about `length_m` (0: by the lawn's size)."""
-    target = length_m or 1.8 * lawn.half.sum()
+    target = length_m or 3.8 * lawn.half.sum()
     best: Array | None = None
-    for attempt in range(3000):
+    for _ in range(4000):
         curve = _spline_around(lawn, start, rng)
-        if _drivable(lawn, curve) and (
-            best is None or _misses(curve, target) < _misses(best, target)
-        ):
+        if not _drivable(lawn, curve):
+            continue
+        if best is None or _misses(curve, target) < _misses(best, target):
             best = curve
-        if best is not None and (_misses(best, target) < 0.02 or attempt > 600):
+        if _misses(best, target) < 0.05:
             break
     if best is None:
         raise DataError('the simulated lawn is too crowded for a smooth curve; name a larger area')
@@ -269,13 +278,15 @@ def _length(curve: Array) -> float:
 
 
 def _spline_around(lawn: Lawn, start: Array, rng: np.random.Generator) -> Array:
-    """Points every STEP_M of a random closed spline that circles the lawn's center."""
-    count = int(rng.integers(6, 11))
+    """Points every STEP_M of a random closed spline, twice around the lawn's center."""
+    count = int(rng.integers(9, 14))
     first = np.arctan2(start[1] / lawn.half[1], start[0] / lawn.half[0])
-    turns = (np.arange(1, count) + rng.uniform(-0.3, 0.3, count - 1)) / count * 2 * np.pi
+    turns = (np.arange(1, count) + rng.uniform(-0.3, 0.3, count - 1)) / count * 4 * np.pi
     angles = first + rng.choice([-1, 1]) * turns
-    reach = rng.uniform(0.3, 1.1, (count - 1, 1))
+    reach = rng.uniform(0.25, 0.95, (count - 1, 1))
     corners = np.stack([np.cos(angles), np.sin(angles)], -1) * reach * lawn.half
+    if not lawn.free(corners).all():
+        return corners
     corners = np.concatenate([start[None, :2], corners, start[None, :2]])
     chords = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
     spline = CubicSpline(chords, corners, bc_type='periodic')
@@ -285,13 +296,14 @@ def _spline_around(lawn: Lawn, start: Array, rng: np.random.Generator) -> Array:
 def _drivable(lawn: Lawn, curve: Array) -> bool:
     ways = np.diff(curve, axis=0)
     bends = np.abs(wrap_angle(np.diff(np.arctan2(ways[:, 1], ways[:, 0]))))
-    return bool(lawn.free(curve).all() and (bends < np.hypot(*ways[1:].T) / TIGHTEST_M).all())
+    gentle = bends < np.hypot(*ways[1:].T) / TIGHTEST_M
+    return bool(lawn.free(curve).all() and gentle.all())
 
 
 def curves(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 0.0) -> Route:
     """Arcs of changing curvature, never straight, until `length_m` is driven (0: by the lawn)."""
     cells = Coverage(lawn)
-    pieces = int(np.ceil((length_m or 1.2 * lawn.size_m2) / ARC_M))
+    pieces = int(np.ceil((length_m or 1.15 * lawn.size_m2) / ARC_M))
     state = (np.asarray(start[:2], float), float(start[2]))
     trail = [_arcs_from(lawn, cells, state, rng)]
     chosen: list[Array] = []

@@ -10,13 +10,14 @@ from __future__ import annotations
 import heapq
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import lfilter
 from tqdm import tqdm
 
 from sfa_localization.bag_writer import BagWriter
@@ -33,6 +34,8 @@ ACCELERATION = 1.0
 TURN_ACCELERATION = 2.0
 SLIP_TIME_S = 2.0
 LIGHT_TIME_S = 30.0
+
+Entry = tuple[int, Callable[[], None]]
 
 ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM = range(4)
 
@@ -139,12 +142,8 @@ def wandering(count: int, dt: float, time_s: float, rng: np.random.Generator) ->
     """A stationary random process (count,) of unit variance, correlated over `time_s`."""
     keep = np.exp(-dt / time_s)
     pushes = rng.standard_normal(count) * np.sqrt(1 - keep**2)
-    value = float(rng.standard_normal())
-    values = np.empty(count)
-    for i, push in enumerate(pushes):
-        value = keep * value + push
-        values[i] = value
-    return values
+    values, _ = lfilter([1.0], [1.0, -keep], pushes, zi=keep * rng.standard_normal(1))
+    return np.asarray(values, float)
 
 
 def _image_stamps(
@@ -229,8 +228,7 @@ def simulate(
     if config.images == 'panorama':
         view = garden.panorama_view(panorama or PanoramaConfig())
     else:
-        camera = camera or CameraConfig()
-        view = garden.raw_view(camera, (camera.image_width or 640, camera.image_height or 640))
+        view = garden.raw_view(camera or CameraConfig())
     with BagWriter(out, config.storage) as bag:
         stills = pictures(garden, recorded, config, view)
         count = len(recorded.image_stamps_ns)
@@ -239,24 +237,29 @@ def simulate(
     return recorded
 
 
-def _write(bag: BagWriter, drive: Drive, stills: Iterator[Image], config: SimulationConfig) -> None:
+def _write(bag: BagWriter, drive: Drive, stills: Iterable[Image], config: SimulationConfig) -> None:
     """Write all messages in the order of their stamps."""
-    topic, compressed = f'/{"panorama" if config.images == "panorama" else "image_raw"}', None
-    if config.compression != 'none':
-        topic, compressed = f'{topic}/compressed', config.compression
-    frames = zip(map(int, drive.image_stamps_ns), stills, strict=True)
-    images = (
-        (stamp, 1, partial(bag.image, topic, stamp, image, 'camera', compressed))
-        for stamp, image in frames
+    entries = heapq.merge(
+        _readings(bag, drive), _stills(bag, drive, stills, config), key=lambda entry: entry[0]
     )
-    for _, _, write in heapq.merge(_readings(bag, drive), images, key=lambda entry: entry[:2]):
+    for _, write in entries:
         write()
 
 
-def _readings(bag: BagWriter, drive: Drive) -> Iterator[tuple[int, int, Callable[[], None]]]:
+def _stills(
+    bag: BagWriter, drive: Drive, stills: Iterable[Image], config: SimulationConfig
+) -> Iterator[Entry]:
+    compressed = None if config.compression == 'none' else config.compression
+    topic = '/panorama' if config.images == 'panorama' else '/image_raw'
+    topic += '/compressed' if compressed else ''
+    for stamp, image in zip(map(int, drive.image_stamps_ns), stills, strict=True):
+        yield stamp, partial(bag.image, topic, stamp, image, 'camera', compressed)
+
+
+def _readings(bag: BagWriter, drive: Drive) -> Iterator[Entry]:
     odometry, gyro = drive.odometry, drive.yaw_rate
     for i, stamp in enumerate(map(int, odometry.stamps_ns)):
         twist, variance = odometry.twists[i], odometry.variances[i]
-        yield stamp, 0, partial(bag.odometry, '/odom', stamp, odometry.poses[i], twist, variance)
-        yield stamp, 0, partial(bag.imu, '/imu', stamp, gyro.omega[i], gyro.variance[i])
-        yield stamp, 0, partial(bag.pose, '/ground_truth', stamp, drive.truth.poses[i])
+        yield stamp, partial(bag.odometry, '/odom', stamp, odometry.poses[i], twist, variance)
+        yield stamp, partial(bag.imu, '/imu', stamp, gyro.omega[i], gyro.variance[i])
+        yield stamp, partial(bag.pose, '/ground_truth', stamp, drive.truth.poses[i])

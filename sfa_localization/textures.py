@@ -27,15 +27,17 @@ SKY_ROWS, SKY_COLUMNS = 384, 2048
 SKY_LOWEST_DEG, SKY_HIGHEST_DEG = -6.0, 90.0
 
 
-def noise(rng: np.random.Generator, low: float, high: float, stretch: float = 1.0) -> Floats:
+def noise(
+    rng: np.random.Generator, low: float, high: float, stretch: float = 1.0, fall: float = 1.0
+) -> Floats:
     """Tileable noise (TILE, TILE) of unit deviation, between `low` and `high` cycles per tile.
 
-    `stretch` > 1 draws it out along the rows' direction (vertical streaks).
+    `stretch` > 1 draws it out into vertical streaks; amplitudes fall with frequency ** `fall`.
     """
     across = np.fft.fftfreq(TILE)[None] * TILE
     along = np.fft.fftfreq(TILE)[:, None] * TILE * stretch
     cycles = np.hypot(across, along)
-    spectrum = np.where((cycles >= low) & (cycles <= high), 1 / np.maximum(cycles, 1), 0)
+    spectrum = np.where((cycles >= low) & (cycles <= high), np.maximum(cycles, 1) ** -fall, 0)
     field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((TILE, TILE))) * spectrum).real
     return np.asarray(field / field.std(), np.float32)
 
@@ -170,12 +172,13 @@ def sky(rng: np.random.Generator) -> Image:
     azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False, dtype=np.float32)[None]
     height = np.clip(elevation / 60, 0, 1)
     blue = np.array([0.93, 0.74, 0.55], np.float32) - height[..., None] * [0.05, 0.18, 0.28]
-    colour = _mix(blue, np.array([0.97, 0.96, 0.95]), _clouds(rng, elevation, azimuth))
+    white = np.array([0.95, 0.94, 0.93], np.float32)
+    colour = _mix(blue.astype(np.float32), white, _clouds(rng, elevation, azimuth))
     for distance in (1.0, 0.5):
         hills = 0.6 + 2.2 * (1.2 - distance) + 1.1 * _outline(rng, azimuth)
         cover = np.clip((hills - elevation) / 0.3 + 0.5, 0, 1)
-        green = np.array([0.42, 0.44, 0.38]) * (0.55 + 0.55 * distance)
-        colour = _mix(colour, green, cover)
+        green = np.array([0.42, 0.44, 0.38], np.float32) * (0.55 + 0.55 * distance)
+        colour = _mix(colour, green.astype(np.float32), cover)
     return np.clip(np.rint(colour * 255), 0, 255).astype(np.uint8)
 
 
@@ -184,13 +187,17 @@ def _mix(below: Floats, above: Floats, cover: Floats) -> Floats:
 
 
 def _clouds(rng: np.random.Generator, elevation: Floats, azimuth: Floats) -> Floats:
-    field = noise(rng, 2, 60) + 0.25 * noise(rng, 8, 120)
+    field = noise(rng, 2, 50, fall=2.0)
     radius = 75 / (np.radians(np.maximum(elevation, 0)) + 0.35)
     x, y = (np.mod(256 + radius * f(azimuth), TILE) for f in (np.cos, np.sin))
     clouds = cv2.remap(
-        field, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, None, cv2.BORDER_WRAP
+        field,
+        x.astype(np.float32),
+        y.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_WRAP,
     )
-    return np.asarray(np.clip(0.35 + 0.55 * clouds, 0, 0.95), np.float32)
+    return np.asarray(np.clip(0.25 + 0.45 * clouds, 0, 0.9), np.float32)
 
 
 def _outline(rng: np.random.Generator, azimuth: Floats) -> Floats:

@@ -1,0 +1,356 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulator: geometry of its pictures, its routes, its sensors' errors, its bags."""
+
+import dataclasses
+import functools
+import hashlib
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from sfa_localization.config import CameraConfig, PanoramaConfig, SimulationConfig
+from sfa_localization.errors import BagError, CameraError, ConfigError
+from sfa_localization.garden import Garden, panel
+from sfa_localization.geometry import compose, wrap_angle
+from sfa_localization.panorama import Unwrapper
+from sfa_localization.rendering import Dome, Light, Scene
+from sfa_localization.routes import CLEARANCE_M, ROUTES, Lawn
+from sfa_localization.simulation import (
+    START_NS,
+    drive,
+    lights,
+    pictures,
+    simulate,
+    wandering,
+)
+
+TINY = SimulationConfig(area=(8.0, 8.0), length=20.0, images='panorama', images_every=0.4)
+SMALL = PanoramaConfig(width=300, height=30)
+TRAJECTORIES = list(ROUTES)
+
+
+@functools.cache
+def garden_of(world):
+    return Garden(world)
+
+
+@pytest.fixture(scope='module')
+def tiny():
+    return Garden(1, TINY)
+
+
+@pytest.fixture
+def garden():
+    return garden_of(1)
+
+
+EXACT = dict.fromkeys(('scale_error', 'slip', 'speed_noise', 'gyro_bias', 'gyro_noise'), 0.0)
+
+
+def psnr(one, other):
+    return 10 * np.log10(255**2 / np.mean((one.astype(float) - other) ** 2))
+
+
+def world_odometry(garden, recorded):
+    start = np.broadcast_to(garden.dock, recorded.odometry.poses.shape)
+    return compose(start, recorded.odometry.poses)
+
+
+# Pictures
+
+
+def test_a_box_appears_where_it_stands():
+    """A wall 2 m wide, 1 m high at 4 m to the left of a robot looking along +x."""
+    wall = panel([-1, 4, 0], [2, 0, 0], [0, 0, 1], 1.0, 'plain', (1.0, 1.0, 1.0))
+    scene = Scene([wall], np.array([0, -1, 0.0]), np.random.default_rng(0))
+    dome = Dome.build(np.radians(np.arange(19.5, -20, -1)), 360)
+    dark = scene.look(np.array([0, 0, 0.45]), 0.0, dome, Light(sun=0.0))
+    bright = scene.look(np.array([0, 0, 0.45]), 0.0, dome, Light(sun=1.0))
+    rows, columns = np.nonzero((bright != dark).any(-1))
+    azimuth = -(columns + 0.5 - 180)
+    elevation = 19.5 - rows
+    assert azimuth.min() == pytest.approx(90 - np.degrees(np.arctan2(1, 4)), abs=1)
+    assert azimuth.max() == pytest.approx(90 + np.degrees(np.arctan2(1, 4)), abs=1)
+    assert elevation.max() == pytest.approx(np.degrees(np.arctan2(0.55, 4)), abs=1)
+    assert elevation.min() == pytest.approx(-np.degrees(np.arctan2(0.45, 4)), abs=1)
+
+
+def test_turning_shifts_columns(tiny):
+    """A robot that turns counter-clockwise sees a thing ahead move clockwise: columns grow."""
+    pose = np.array([0.5, -1.0, 0.4])
+    ahead = tiny.render_panorama(pose, SMALL).astype(int)
+    turned = tiny.render_panorama(pose + np.array([0, 0, np.pi / 3]), SMALL).astype(int)
+    assert np.mean(np.abs(turned - np.roll(ahead, 50, axis=1)) <= 1) > 0.995
+    assert np.mean(np.abs(turned - np.roll(ahead, -50, axis=1)) <= 1) < 0.5
+
+
+def test_counter_clockwise_panorama_is_the_mirror_image(tiny):
+    pose = np.array([1.0, 1.0, 2.0])
+    mirrored = dataclasses.replace(SMALL, clockwise=False)
+    assert np.array_equal(
+        tiny.render_panorama(pose, SMALL)[:, ::-1], tiny.render_panorama(pose, mirrored)
+    )
+
+
+@pytest.mark.parametrize(
+    'camera',
+    [
+        CameraConfig(),
+        CameraConfig(camera_model='polar', mount_yaw=30.0),
+        CameraConfig(
+            camera_model='equirectangular',
+            image_width=1280,
+            image_height=640,
+            radius_min=0.0,
+            radius_max=0.0,
+        ),
+    ],
+    ids=lambda camera: camera.camera_model,
+)
+def test_unwrapped_raw_picture_equals_the_panorama(garden, camera):
+    pose = np.array([5.0, -6.0, 2.0])
+    raw = garden.render_raw(pose, camera)
+    assert raw.shape == (camera.image_height, camera.image_width, 3)
+    panorama = garden.render_panorama(pose, PanoramaConfig())
+    unwrapped = Unwrapper(camera, PanoramaConfig())(raw)
+    assert psnr(unwrapped, panorama) > 34
+    assert psnr(np.roll(unwrapped, 3, axis=1), panorama) < 30
+
+
+def test_pictures_differ_by_place_world_and_light(tiny):
+    pose = tiny.dock
+    here = tiny.render_panorama(pose, SMALL).astype(float)
+    there = tiny.render_panorama(pose + np.array([0, 3.0, 0]), SMALL)
+    elsewhere = Garden(2, TINY).render_panorama(pose, SMALL)
+    assert np.abs(here - there).mean() > 8
+    assert np.abs(here - elsewhere).mean() > 8
+    dimmed = tiny.picture(pose, tiny.panorama_view(SMALL), Light(exposure=0.49))
+    assert np.abs(dimmed / np.maximum(here, 20) - 0.7)[here > 60].max() < 0.02
+
+
+def test_camera_without_size_is_refused(tiny):
+    with pytest.raises(CameraError, match='image_width'):
+        tiny.render_raw(tiny.dock, CameraConfig(image_width=0))
+
+
+def test_area_that_is_no_rectangle_is_refused():
+    with pytest.raises(ConfigError, match='area'):
+        Garden(1, SimulationConfig(area=(8.0,)))
+
+
+def test_noise_and_illumination(tiny):
+    """Noise has the deviation asked for; without illumination all light is the same."""
+    config = dataclasses.replace(TINY, illumination=0.0, length=6.0)
+    recorded = drive(tiny, config)
+    assert set(lights(recorded.image_stamps_ns, config)) == {Light()}
+    noisy = list(pictures(tiny, recorded, config, tiny.panorama_view(SMALL)))
+    assert len(noisy) == len(recorded.image_stamps_ns)
+    for picture, pose in list(zip(noisy, recorded.image_poses, strict=True))[::5]:
+        clean = tiny.render_panorama(pose, SMALL).astype(float)
+        inside = (clean > 10) & (clean < 245)
+        assert (picture - clean)[inside].std() == pytest.approx(1.5, rel=0.06)
+    strong = lights(recorded.image_stamps_ns, dataclasses.replace(config, illumination=1.0))
+    assert np.ptp([light.sun for light in strong]) > 0.02
+
+
+# Routes
+
+
+@pytest.mark.parametrize('trajectory', TRAJECTORIES)
+@pytest.mark.parametrize('world', [1, 2])
+def test_robot_keeps_clear(trajectory, world):
+    """Nothing solid at hull height lies within the clearance, looking all around."""
+    config = SimulationConfig(trajectory=trajectory, world=world, seed=3)
+    garden = garden_of(world)
+    poses = drive(garden, config).truth.poses[::20]
+    assert (np.abs(poses[:, :2]) <= garden.half + 0.02).all()
+    solid = garden.scene.triangles[(garden.scene.triangles[..., 2] < 0.6).any(1)]
+    solid = solid[(solid[..., 2] > 0.05).any(1)].reshape(-1, 3)[:, :2]
+    gaps = [np.hypot(*(solid - pose[:2]).T).min() for pose in poses]
+    assert min(gaps) > CLEARANCE_M - 0.05
+
+
+@pytest.mark.parametrize('trajectory', TRAJECTORIES)
+def test_pictures_are_spaced_as_asked(garden, trajectory):
+    recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=5))
+    poses = recorded.image_poses
+    gaps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    turns = np.abs(wrap_angle(np.diff(poses[:, 2])))
+    assert np.all(np.diff(recorded.image_stamps_ns) > 0)
+    straight = (turns < 0.02) & (gaps < 0.5)
+    assert np.median(gaps[straight]) == pytest.approx(0.2, abs=1e-3)
+    assert np.percentile(gaps[straight], 99) < 0.201
+
+
+def test_coverage_reaches_everywhere_in_many_directions(garden):
+    poses = drive(garden, SimulationConfig(seed=2)).image_poses
+    grid = np.stack(np.meshgrid(np.arange(-7, 8), np.arange(-8, 9)), -1).reshape(-1, 2)
+    grid = grid[Lawn(garden.half, garden.obstacles).free(grid)]
+    nearest = [np.hypot(*(poses[:, :2] - point).T).min() for point in grid]
+    assert max(nearest) < 2.0 and np.mean(nearest) < 0.5
+    directions = np.histogram(poses[:, 2] % np.pi, bins=6, range=(0, np.pi))[0]
+    assert directions.min() > 0.04 * len(poses)
+    assert 1400 < len(poses) < 1900
+
+
+def test_lines_are_long_straight_and_spread(garden):
+    poses = drive(garden, SimulationConfig(trajectory='lines', seed=4)).image_poses
+    parts = np.split(poses, np.flatnonzero(np.hypot(*np.diff(poses[:, :2], axis=0).T) > 0.4) + 1)
+    headings = np.array([part[0, 2] for part in parts])
+    assert len(parts) == 10
+    for part in parts:
+        assert np.hypot(*(part[-1] - part[0])[:2]) > 8.0 - 0.4
+        assert np.ptp(np.unwrap(part[:, 2])) < 1e-6
+    spread = np.sort(headings % np.pi)
+    assert np.diff(np.append(spread, spread[0] + np.pi)).max() < 0.6
+
+
+def test_mower_drives_along_the_axes(garden):
+    recorded = drive(garden, SimulationConfig(trajectory='mower', seed=4))
+    v = recorded.odometry.twists[:, 0]
+    lane = recorded.truth.poses[v > 0.9]
+    off = np.abs(wrap_angle(lane[:, 2] * 4)) / 4
+    assert np.mean(off < 1e-6) > 0.9
+
+
+def test_test_curve_is_smooth_and_closed(garden):
+    poses = drive(garden, SimulationConfig(trajectory='test', seed=7)).truth.poses
+    assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.1
+    ways = np.diff(poses, axis=0)
+    length = np.hypot(ways[:, 0], ways[:, 1])
+    moving = length > 0.015
+    bends = np.abs(wrap_angle(ways[moving, 2])) / length[moving]
+    assert bends.max() < 1 / 0.75
+    assert 55 < length.sum() < 75
+
+
+def test_curves_have_no_straight_line(garden):
+    recorded = drive(garden, SimulationConfig(trajectory='curves', seed=7, length=100.0))
+    poses = recorded.image_poses
+    turned = np.abs(np.unwrap(poses[:, 2])[5:] - np.unwrap(poses[:, 2])[:-5])
+    # A bend may cross zero between two arcs; a straight metre may not occur often.
+    assert np.mean(turned > 0.03) > 0.9
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() == pytest.approx(100, abs=3)
+
+
+def test_every_drive_starts_at_the_dock(garden):
+    for trajectory in TRAJECTORIES:
+        recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=1))
+        assert np.allclose(recorded.truth.poses[0], garden.dock)
+        assert np.allclose(recorded.odometry.poses[0], 0)
+        assert recorded.truth.stamps_ns[0] == START_NS
+
+
+# Sensors
+
+
+def test_odometry_drifts_like_the_papers_robot(garden):
+    """About 0.3 m mean on the test curve, 1 to 3 m on coverage; over twenty seeds."""
+    errors = {'test': [], 'coverage': []}
+    for trajectory, means in errors.items():
+        for seed in range(20):
+            recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=seed))
+            off = world_odometry(garden, recorded) - recorded.truth.poses
+            means.append(np.hypot(*off[:, :2].T).mean())
+    assert 0.2 < np.mean(errors['test']) < 0.45
+    assert 1.0 < np.mean(errors['coverage']) < 3.0
+    assert len(set(np.round(errors['test'], 6))) == 20
+
+
+def test_perfect_sensors_measure_the_truth(garden):
+    for trajectory in ('coverage', 'test'):
+        recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=2, **EXACT))
+        off = world_odometry(garden, recorded) - recorded.truth.poses
+        assert np.abs(off[:, :2]).max() < 1e-6
+        assert np.abs(wrap_angle(off[:, 2])).max() < 1e-9
+
+
+def test_twist_variance_is_honest(garden):
+    """Squared errors over their variances average to one, over seeds."""
+    ratios = []
+    for seed in range(40):
+        recorded = drive(garden, SimulationConfig(trajectory='mower', seed=seed))
+        exact = SimulationConfig(trajectory='mower', seed=seed, **EXACT)
+        errors = recorded.odometry.twists - drive(garden, exact).odometry.twists
+        moving = recorded.odometry.twists[:, 0] > 0.5
+        ratios.append((errors**2 / recorded.odometry.variances)[moving].mean(0))
+    assert np.mean(ratios, 0) == pytest.approx([1, 1], abs=0.2)
+
+
+def test_wandering_has_unit_variance_and_its_time():
+    values = wandering(200_000, 0.1, 2.0, np.random.default_rng(0))
+    assert values.std() == pytest.approx(1, abs=0.05)
+    correlation = np.mean(values[20:] * values[:-20]) / values.var()
+    assert correlation == pytest.approx(np.exp(-1), abs=0.05)
+
+
+# Bags
+
+
+def digest(path):
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in path.iterdir()}
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_same_seeds_same_bytes(tmp_path, storage):
+    config = dataclasses.replace(TINY, length=4.0, storage=storage)
+    simulate(config, tmp_path / 'one' / 'bag', SMALL)
+    simulate(config, tmp_path / 'two' / 'bag', SMALL)
+    assert digest(tmp_path / 'one' / 'bag') == digest(tmp_path / 'two' / 'bag')
+    simulate(dataclasses.replace(config, seed=2), tmp_path / 'three' / 'bag', SMALL)
+    assert digest(tmp_path / 'one' / 'bag') != digest(tmp_path / 'three' / 'bag')
+
+
+@pytest.mark.parametrize(
+    ('options', 'topic'),
+    [
+        ({'images': 'panorama'}, '/panorama'),
+        ({'images': 'panorama', 'compression': 'jpeg'}, '/panorama/compressed'),
+        ({'images': 'raw'}, '/image_raw'),
+    ],
+)
+def test_bag_holds_every_message_in_order(tmp_path, options, topic):
+    config = dataclasses.replace(TINY, length=5.0, images_every=1.0, **options)
+    recorded = simulate(config, tmp_path / 'bag', SMALL)
+    with AnyReader([tmp_path / 'bag']) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+        stamps = [stamp for _, stamp, _ in reader.messages()]
+        images = [c for c in reader.connections if c.topic == topic]
+        image_stamps = [stamp for _, stamp, _ in reader.messages(images)]
+    readings = len(recorded.odometry.stamps_ns)
+    shared = {'/odom': readings, '/imu': readings, '/ground_truth': readings}
+    assert counts == {**shared, topic: len(recorded.image_stamps_ns)}
+    assert stamps == sorted(stamps)
+    assert image_stamps == list(recorded.image_stamps_ns)
+
+
+def test_existing_bag_is_left_alone(tmp_path):
+    (tmp_path / 'bag').mkdir()
+    with pytest.raises(BagError, match='exists'):
+        simulate(TINY, tmp_path / 'bag', SMALL)
+    assert list((tmp_path / 'bag').iterdir()) == []
+
+
+def test_ctrl_c_leaves_nothing(tmp_path):
+    out = tmp_path / 'bag'
+    command = [sys.executable, '-m', 'sfa_localization', 'simulate', str(out)]
+    process = subprocess.Popen(
+        [*command, '--trajectory', 'curves', '--area', '8x8', '--length', '2000'],
+        stderr=subprocess.PIPE,
+    )
+    deadline = time.monotonic() + 60
+    while not any(file.stat().st_size for file in tmp_path.glob('.*/*/*')):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, text = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b'Traceback' not in text
+    assert list(tmp_path.iterdir()) == []
