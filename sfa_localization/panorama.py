@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -177,7 +178,8 @@ def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
 
 def read_mask(path: str, size: tuple[int, int]) -> Mask:
     """Read a mask picture for pictures of `size` (rows, columns): True where it is not black."""
-    picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    known = Path(path).is_file()  # else OpenCV would warn on its own
+    picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if known else None
     if picture is None:
         raise CameraError(f'mask_file {path} is missing or is no picture')
     resized = cv2.resize(picture, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
