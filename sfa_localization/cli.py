@@ -21,7 +21,7 @@ from sfa_localization.config import (
     SimulationConfig,
     TopicNames,
 )
-from sfa_localization.errors import LocalizationError
+from sfa_localization.errors import ConfigError, LocalizationError
 
 S = TypeVar('S', bound=Settings)
 
@@ -91,14 +91,18 @@ def _simulate(arguments: argparse.Namespace) -> int:
     from sfa_localization.simulation import simulate
 
     config = _settings(SimulationConfig, arguments)
-    panorama = PanoramaConfig()
-    if arguments.size is not None:
-        size = dict(zip(('width', 'height'), map(int, arguments.size), strict=False))
-        panorama = PanoramaConfig.from_mapping(size, '--size')
-    drive = simulate(config, arguments.out, panorama, progress=True)
+    drive = simulate(config, arguments.out, _panorama_of(arguments.size), progress=True)
     seconds = (drive.truth.stamps_ns[-1] - drive.truth.stamps_ns[0]) * 1e-9
     print(f'{arguments.out}: {len(drive.image_stamps_ns)} pictures in {seconds:.0f} s')
     return 0
+
+
+def _panorama_of(size: tuple[float, ...] | None) -> PanoramaConfig:
+    if size is None:
+        return PanoramaConfig()
+    if len(size) != 2:
+        raise ConfigError('--size: name columns x rows, as in 300x30')
+    return PanoramaConfig.from_mapping({'width': int(size[0]), 'height': int(size[1])}, '--size')
 
 
 SIMULATE = Command(

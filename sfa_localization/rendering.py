@@ -207,7 +207,7 @@ class Scene:
         """Whether a random ray (cosine-weighted) from every vertex reaches the sky (V,)."""
         ray = rng.standard_normal(normals.shape)
         ray = normals + ray / np.linalg.norm(ray, axis=1, keepdims=True)
-        return self._free(start, ray) * (ray[:, 2] > 0)
+        return np.asarray(self._free(start, ray) * (ray[:, 2] > 0))
 
     def _free(self, start: Floats, rays: Array) -> Array:
         """1 where nothing lies on the ray from start (V, 3) along rays (V, 3) or (3,), else 0."""

@@ -286,7 +286,7 @@ def _spline_around(lawn: Lawn, start: Array, rng: np.random.Generator) -> Array:
     reach = rng.uniform(0.25, 0.95, (count - 1, 1))
     corners = np.stack([np.cos(angles), np.sin(angles)], -1) * reach * lawn.half
     if not lawn.free(corners).all():
-        return corners
+        return np.asarray(corners)
     corners = np.concatenate([start[None, :2], corners, start[None, :2]])
     chords = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
     spline = CubicSpline(chords, corners, bc_type='periodic')

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from sfa_localization.cli import main
 from sfa_localization.config import CameraConfig, PanoramaConfig, SimulationConfig
 from sfa_localization.errors import BagError, CameraError, ConfigError
 from sfa_localization.garden import Garden, panel
 from sfa_localization.geometry import compose, wrap_angle
 from sfa_localization.panorama import Unwrapper
+from sfa_localization.pictures import decode_compressed
 from sfa_localization.rendering import Dome, Light, Scene
 from sfa_localization.routes import CLEARANCE_M, ROUTES, Lawn
 from sfa_localization.simulation import (
@@ -335,6 +337,33 @@ def test_existing_bag_is_left_alone(tmp_path):
     with pytest.raises(BagError, match='exists'):
         simulate(TINY, tmp_path / 'bag', SMALL)
     assert list((tmp_path / 'bag').iterdir()) == []
+
+
+def test_every_route_is_a_choice():
+    field = next(f for f in dataclasses.fields(SimulationConfig) if f.name == 'trajectory')
+    assert field.metadata['choices'] == tuple(ROUTES)
+
+
+def test_command_records_what_it_is_told(tmp_path, capsys):
+    options = '--area 8x7 --length 4 --images panorama --size 120x12 --images-every 0.5 --seed 3'
+    assert main(['simulate', str(tmp_path / 'bag'), *options.split(), '--compressed']) == 0
+    assert 'pictures' in capsys.readouterr().out
+    with AnyReader([tmp_path / 'bag']) as reader:
+        connections = [c for c in reader.connections if c.topic == '/panorama/compressed']
+        _, _, raw = next(reader.messages(connections))
+        message = reader.deserialize(raw, connections[0].msgtype)
+    assert decode_compressed(message.data, message.format).shape == (12, 120, 3)
+
+
+@pytest.mark.parametrize(
+    ('options', 'named'),
+    [(['--area', '3x3'], 'area'), (['--size', '300'], '--size'), (['--size', '1x1'], 'width')],
+)
+def test_command_refuses_senseless_settings(tmp_path, capsys, options, named):
+    assert main(['simulate', str(tmp_path / 'bag'), *options]) == 1
+    text = capsys.readouterr().err
+    assert named in text and text.count('\n') == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_leaves_nothing(tmp_path):
