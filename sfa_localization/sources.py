@@ -27,7 +27,7 @@ _SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.ppm', '.pgm', '.tif', '.tiff', '
 _USUAL_RATE = 10.0
 _OPENING_S = 10.0  # devices may take so long
 _IDLE_PAUSE_S = 0.02
-_SAMPLE = 16  # every so many rows and columns are compared to find a repeated picture
+_SAMPLES = 32  # rows, and as densely columns, that are compared to find a repeated picture
 
 
 class Capture(Protocol):
@@ -185,7 +185,8 @@ class FrozenWatch:
 
     def see(self, picture: Image) -> bool:
         """Note a picture; True when it differs from the last one."""
-        sample = picture[::_SAMPLE, ::_SAMPLE]
+        step = max(min(picture.shape[:2]) // _SAMPLES, 1)
+        sample = picture[::step, ::step]
         if self._sample is not None and np.array_equal(sample, self._sample):
             self._repeats += 1
             return False
