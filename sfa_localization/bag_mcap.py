@@ -85,7 +85,7 @@ class McapStorage:
     """One .mcap file. Raises BagError when nothing in it can be read."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.problems = path, list[str]()
+        self._path, self.problems, self.notes = path, list[str](), list[str]()
         self._size = path.stat().st_size
         self._file = path.open('rb')
         self._forget()

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from sfa_localization.errors import BagError, LocalizationError
 from sfa_localization.pictures import decode_compressed, decode_image
@@ -28,12 +30,18 @@ class Unusable(LocalizationError):
     """A message that cannot be used; the text is the reason it is counted under."""
 
 
+@functools.cache
+def typestore(store: Stores) -> Typestore:
+    """The standard message types of a distribution, made once."""
+    return get_typestore(store)
+
+
 class Decoder:
     """Serialized messages to objects, by the standard definitions of ROS 2 or ROS 1."""
 
     def __init__(self) -> None:
-        self._ros2 = get_typestore(Stores.ROS2_JAZZY)
-        self._ros1 = get_typestore(Stores.ROS1_NOETIC)
+        self._ros2 = typestore(Stores.ROS2_JAZZY)
+        self._ros1 = typestore(Stores.ROS1_NOETIC)
 
     def knows(self, kind: str, serialization: str) -> bool:
         """Whether messages of this type can be decoded."""

@@ -40,6 +40,7 @@ class Metadata:
     """What metadata.yaml tells, of any version: files, channels, messages per topic."""
 
     files: list[str] = field(default_factory=list)
+    version: int = NEWEST_METADATA
     channels: list[Channel] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     file_counts: dict[str, int] = field(default_factory=dict)
@@ -104,12 +105,15 @@ class Recording:
             self.notes.append(f'no {METADATA}; rebuilt from the files')
             return self._rebuilt()
         try:
-            return parse_metadata(file.read_text(encoding='utf-8', errors='replace'))
+            metadata = parse_metadata(file.read_text(encoding='utf-8', errors='replace'))
         except OSError as error:
             raise BagError(f'{file}: cannot be read: {error.strerror}') from None
         except ValueError as error:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files')
             return self._rebuilt()
+        if metadata.version > NEWEST_METADATA:
+            self.notes.append(f'{METADATA} has version {metadata.version}, newer than known')
+        return metadata
 
     def _rebuilt(self) -> Metadata:
         try:
@@ -138,7 +142,8 @@ class Recording:
         """Open one file by what its first bytes say it is. Raises BagError."""
         try:
             plain = self._plain(path)
-            self.storages.append(open_storage(plain))
+            self.storages.append(_opened(plain, path))
+            self.notes += self.storages[-1].notes
         except FileNotFoundError:
             count = self.metadata.file_counts.get(path.name)
             lost = f' with {count} messages' if count else ''
@@ -184,6 +189,14 @@ def _natural(name: str) -> list[Any]:
     return [(int(part), '') if part.isdigit() else (-1, part) for part in parts]
 
 
+def _opened(plain: Path, path: Path) -> Storage:
+    """Open a file, whose errors name the file it was decompressed from."""
+    try:
+        return open_storage(plain)
+    except BagError as error:
+        raise BagError(str(error).replace(str(plain), str(path))) from None
+
+
 def open_storage(path: Path) -> Storage:
     """Open a bag file by its first bytes. Raises BagError, or OSError."""
     with path.open('rb') as file:
@@ -201,11 +214,10 @@ def parse_metadata(text: str) -> Metadata:
     try:
         tree = yaml.safe_load(text)
         information = tree['rosbag2_bagfile_information']
-        if int(information['version']) > NEWEST_METADATA:
-            raise BagError(f'{METADATA} has version {information["version"]}, newer than known')
         topics = information['topics_with_message_count']
         pairs = [(_channel(topic['topic_metadata']), topic['message_count']) for topic in topics]
         return Metadata(
+            version=int(information['version']),
             files=[PurePath(str(file)).name for file in information['relative_file_paths']],
             channels=[channel for channel, _ in pairs],
             counts=_summed([(channel.topic, int(count)) for channel, count in pairs]),

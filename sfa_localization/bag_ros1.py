@@ -20,7 +20,7 @@ class Ros1Storage:
     """One .bag file. Raises BagError when it has no index or is damaged."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.problems = path, list[str]()
+        self._path, self.problems, self.notes = path, list[str](), list[str]()
         self._reader = Reader(path)
         try:
             self._reader.open()

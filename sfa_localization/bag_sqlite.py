@@ -7,7 +7,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,17 @@ class SqliteStorage:
     """One .db3 file. Raises BagError when not even its list of topics can be read."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.problems = path, list[str]()
+        self._path, self.problems, self.notes = path, list[str](), list[str]()
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._database = self._connect()
         try:
-            self._by_id = self._read_topics()
+            self._by_id = self._read_topics_of_damaged()
         except (sqlite3.Error, ValueError, TypeError) as error:
             self.close()
             raise BagError(f'{path}: no readable bag database ({error})') from None
         self.channels = list(self._by_id.values())
-        self.counts = self._guarded(self._read_counts, {})
+        counts = self._guarded(self._read_counts, None)
+        self.counts: dict[str, int] = counts if counts is not None else self._count_reachable()
         self.start_ns = self._guarded(self._read_start, 0)
 
     def _connect(self) -> sqlite3.Connection:
@@ -42,7 +43,7 @@ class SqliteStorage:
             for file in (self._path, *logs):
                 target = path.with_name(file.name)
                 shutil.copyfile(file, target)
-            self.problems.append(f'{self._path.name}: was not closed; its -wal log is read as well')
+            self.notes.append(f'{self._path.name}: was not closed; its {logs[0].name} is read, too')
         access = 'mode=rw' if logs else 'mode=ro&immutable=1'
         return sqlite3.connect(f'{path.absolute().as_uri()}?{access}', uri=True)
 
@@ -65,6 +66,16 @@ class SqliteStorage:
     def _columns(self, table: str) -> set[str]:
         return {row[1] for row in self._database.execute(f'PRAGMA table_info({table})')}
 
+    def _read_topics_of_damaged(self) -> dict[int, Channel]:
+        """The topics, of a file too that is shorter than its header says."""
+        try:
+            return self._read_topics()
+        except sqlite3.DatabaseError as error:
+            self._damaged(error)
+            # It makes SQLite go by the file's real length; nothing can be written here.
+            self._database.execute('PRAGMA writable_schema=ON')
+            return self._read_topics()
+
     def _read_topics(self) -> dict[int, Channel]:
         columns = self._columns('topics')
         if not columns or not self._columns('messages'):
@@ -85,6 +96,28 @@ class SqliteStorage:
             if key in self._by_id:
                 counts[self._by_id[key].topic] += count
         return counts
+
+    def _count_reachable(self) -> dict[str, int]:
+        """Messages per topic by a walk over all rows."""
+        counts = {channel.topic: 0 for channel in self.channels}
+        last = self._last_row()
+        for row in self._rows(range(1, last + 1), 'topic_id'):
+            if row[0] in self._by_id:
+                counts[self._by_id[row[0]].topic] += 1
+        lost = last - sum(counts.values())
+        self.problems.append(f'{self._path.name}: {lost} of {last} rows are on damaged pages')
+        return counts
+
+    def _rows(self, ids: Iterable[int], columns: str) -> Iterator[tuple[Any, ...]]:
+        """Those rows of the messages that can be reached."""
+        query = f'SELECT {columns} FROM messages NOT INDEXED WHERE id = ?'
+        for row in ids:
+            try:
+                found = self._database.execute(query, (row,)).fetchone()
+            except (sqlite3.Error, OverflowError):
+                continue
+            if found is not None:
+                yield found
 
     def _read_start(self) -> int:
         (start,) = self._database.execute('SELECT min(timestamp) FROM messages').fetchone()
@@ -112,16 +145,11 @@ class SqliteStorage:
         self, wanted: dict[int, Channel], start_ns: int, last: tuple[int, int] | None
     ) -> Iterator[Record]:
         """Row by row what can still be reached, without those up to `last` (stamp, row)."""
-        query = 'SELECT topic_id, timestamp, data FROM messages NOT INDEXED WHERE id = ?'
-        for row in range(1, self._last_row() + 1):
-            try:
-                found = self._database.execute(query, (row,)).fetchone()
-            except (sqlite3.Error, OverflowError):
+        rows = self._rows(range(1, self._last_row() + 1), 'topic_id, timestamp, data, id')
+        for key, stamp, data, row in rows:
+            if key not in wanted or type(stamp) is not int or type(data) is not bytes:
                 continue
-            if found is None or found[0] not in wanted or type(found[2]) is not bytes:
-                continue
-            key, stamp, data = found
-            if type(stamp) is int and stamp >= start_ns and (last is None or (stamp, row) > last):
+            if stamp >= start_ns and (last is None or (stamp, row) > last):
                 yield wanted[key], stamp, data
 
     def _last_row(self) -> int:

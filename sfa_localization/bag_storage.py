@@ -45,6 +45,8 @@ class Storage(Protocol):
     start_ns: int
     problems: list[str]
     """What was found damaged so far; reading may add to it."""
+    notes: list[str]
+    """What is unusual, but no damage."""
 
     def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
         """Messages of the topics received at or after `start_ns`, in order of reception."""

@@ -22,8 +22,9 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 
+from sfa_localization.bag_messages import typestore
 from sfa_localization.errors import BagError
 from sfa_localization.geometry import Array
 from sfa_localization.pictures import encode_jpeg, encode_png
@@ -56,7 +57,7 @@ class BagWriter:
         if storage not in STORAGES:
             raise BagError(f'bag storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = storage
-        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._types = typestore(Stores.ROS2_JAZZY)
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:

@@ -33,9 +33,10 @@ from rclpy.qos import (
 from rclpy.signals import SignalHandlerOptions
 from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability, QosTime
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 from rosgraph_msgs.msg import Clock
 
+from sfa_localization.bag_messages import typestore
 from sfa_localization.bag_reader import Bag, Topic
 from sfa_localization.bag_storage import Record
 from sfa_localization.config import PlayConfig
@@ -273,7 +274,7 @@ class Ros1Converter:
     """Messages of ROS 1 as the bytes of their ROS 2 counterparts."""
 
     def __init__(self) -> None:
-        self._ros1, self._ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
+        self._ros1, self._ros2 = typestore(Stores.ROS1_NOETIC), typestore(Stores.ROS2_JAZZY)
         self._cache: dict[str, object] = {}
 
     def __call__(self, data: bytes, kind: str) -> bytes:
