@@ -24,6 +24,14 @@ from sfa_localization.config import (
 from sfa_localization.errors import ConfigError, LocalizationError
 
 S = TypeVar('S', bound=Settings)
+OPTIONAL = {
+    'trimesh': 'trimesh embreex',
+    'embreex': 'trimesh embreex',
+    'mdp': 'MDP==3.6',
+    'distributed': 'distributed',
+    'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
+}
+"""What some commands need beyond the rest, and how it is installed."""
 
 
 @dataclass(frozen=True)
@@ -268,6 +276,13 @@ def _guarded(run: Callable[[argparse.Namespace], int], arguments: argparse.Names
         return run(arguments)
     except LocalizationError as error:
         print(f'error: {error}', file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        package = (error.name or '').partition('.')[0]
+        if package not in OPTIONAL:
+            raise
+        remedy = f'pip install {OPTIONAL[package]}'
+        print(f'error: {package} is not installed; this needs it: {remedy}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as a whole: who may import what, one version, docstrings, executables."""
 
+import argparse
 import ast
 import re
 import runpy
@@ -16,6 +17,7 @@ import pytest
 import setuptools
 
 import sfa_localization
+from sfa_localization import cli
 from sfa_localization.cli import COMMANDS
 
 NAME = 'sfa_localization'
@@ -268,3 +270,22 @@ def test_module_runs_as_a_program():
         [sys.executable, '-m', NAME, '--version'], cwd=ROOT, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (0, f'{sfa_localization.__version__}\n')
+
+
+@pytest.mark.parametrize('package', ['trimesh', 'mdp', 'rclpy'])
+def test_a_missing_optional_package_is_named_with_its_remedy(package, capsys):
+    def run(_arguments):
+        raise ModuleNotFoundError(f'No module named {package!r}', name=f'{package}.inner')
+
+    assert cli._guarded(run, argparse.Namespace()) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f'error: {package} is not installed') and 'pip install' in error
+    assert error.count('\n') == 1
+
+
+def test_a_missing_part_of_the_package_is_no_users_error():
+    def run(_arguments):
+        raise ModuleNotFoundError('No module named numpy', name='numpy')
+
+    with pytest.raises(ModuleNotFoundError):
+        cli._guarded(run, argparse.Namespace())
