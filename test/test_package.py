@@ -243,7 +243,7 @@ SAYS_SHAPE = re.compile(
 )
 """A shape such as (N, 2), or a word that names an array the whole package shares."""
 SHAPES_BY_NAME = {'pose', 'start', 'dock', 'foot', 'mean', 'covariance', 'matrix', 'yaw_rad'}
-"""Arguments of one shape everywhere: poses (3,), places (2,), the filter's mean, square matrices."""
+"""Arguments of one shape everywhere: poses (3,), places (2,), the filter's state, matrices."""
 
 
 @pytest.mark.parametrize('module', sorted(MODULES))
