@@ -250,6 +250,18 @@ class CameraConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
+class CalibrationConfig(Settings):
+    """What the command `calibrate` cannot see in the pictures."""
+
+    model: str = setting(
+        'polar', 'camera model made from circles alone', choices=('polar', 'fisheye')
+    )
+    field_of_view: float = setting(
+        185.0, 'fisheye: field of view within the rim', unit='deg', low=10.0, high=360.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class OmnicamNodeConfig(Settings):
     """Where the omnicam node takes pictures from, and how it watches over the camera."""
 
@@ -522,12 +534,8 @@ class MetricConfig(Settings):
     paper_start: str = setting(
         'odometry', 'where the descent starts', choices=('odometry', 'random')
     )
-    paper_area_x: float = setting(
-        16.0, 'span of a random start', unit='m', low=0.1, high=1e4
-    )
-    paper_area_y: float = setting(
-        18.0, 'span of a random start', unit='m', low=0.1, high=1e4
-    )
+    paper_area_x: float = setting(16.0, 'span of a random start', unit='m', low=0.1, high=1e4)
+    paper_area_y: float = setting(18.0, 'span of a random start', unit='m', low=0.1, high=1e4)
     paper_iterations: int = setting(1000, 'most iterations of the descent', low=1, high=10000000)
     paper_learning_rate: float = setting(1e-5, 'beta of equation 7', low=1e-12, high=1.0)
     paper_momentum: float = setting(0.95, 'gamma of equation 7', low=0.0, high=1.0)
@@ -890,8 +898,60 @@ class HeadingConfig(Settings):
     """The visual compass, learnt with the map."""
 
     learn_heading: bool = setting(True, 'learn the heading from the pictures too')
-    heading_layer: int = setting(2, 'layer whose map tells the heading', low=1, high=20)
+    heading_layers: tuple[int, ...] = setting(
+        (1, 2), 'layers whose maps tell the heading', low=1, high=20
+    )
     heading_features: int = setting(8, 'slow features that tell it the place', low=0, high=1000)
     heading_inducing_points: int = setting(
         800, 'pictures that span the compass', low=20, high=20000
     )
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig(Settings):
+    """The hierarchical SFA network and its training."""
+
+    layers: str = setting(
+        'auto',
+        'sizes of the layers: by the size of the panorama, a standard set, or the arrays below',
+        choices=('auto', '600x60', '320x40', 'custom'),
+    )
+    normalization: str = setting(
+        'panorama',
+        'what is taken out of each picture: mean and scale of each channel, of all together, '
+        'gains (log), nothing, or color (grey)',
+        choices=('panorama', 'brightness', 'log', 'none', 'grey'),
+    )
+    relative_cut: float = setting(
+        1e-3,
+        'signals of less variance than this part of the largest are dropped',
+        low=0.0,
+        high=1.0,
+    )
+    difference: str = setting(
+        'picture',
+        'slowness per picture, per metre driven, or per second',
+        choices=('picture', 'distance', 'time'),
+    )
+    break_time: float = setting(
+        5.0, 'pictures farther apart are no neighbors', unit='s', low=0.01, high=1e4
+    )
+    break_distance: float = setting(
+        2.0, 'pictures farther apart are no neighbors', unit='m', low=0.01, high=1e4
+    )
+    photometric_std: float = setting(
+        0.0, 'random light of each training picture, logarithmic', low=0.0, high=2.0
+    )
+    photometric_seed: int = setting(0, 'seed of the random light', low=0)
+    binning: int = setting(2, 'custom: pixels averaged per side', low=1, high=64)
+    field_rows: tuple[int, ...] = setting((10, 3, 4), 'custom: rows of a field', low=1)
+    field_columns: tuple[int, ...] = setting((10, 5, 20), 'custom: columns of a field', low=1)
+    stride_rows: tuple[int, ...] = setting((4, 1, 1), 'custom: rows between fields', low=1)
+    stride_columns: tuple[int, ...] = setting((5, 1, 1), 'custom: columns between fields', low=1)
+    linear_dimensions: tuple[int, ...] = setting(
+        (32, 32, 48), 'custom: dimensions that are expanded', low=1
+    )
+    output_dimensions: tuple[int, ...] = setting(
+        (32, 32, 32), 'custom: slow features that leave a layer', low=1
+    )
+    clip: float = setting(4.0, 'custom: limit of a slow feature', low=0.1, high=1e6)

@@ -29,6 +29,8 @@ _DISTRUST = 1.3
 _ESTABLISHED = 100
 _DOMINATED = 4.0
 _CERTAIN = 1e-7
+_LASTING = 4
+_NO_DOUBT = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,8 @@ class Memory:
     excess: float = 0.0
     accepted_ns: int | None = None
     accepted_m: float = 0.0
+    outage: bool = False
+    doubt: tuple[float, float, float] = _NO_DOUBT
     evidence: tuple[Evidence, ...] = ()
     update: Update | None = None
 
@@ -105,8 +109,19 @@ class Belief(NamedTuple):
 
     @property
     def state(self) -> State | None:
-        """The estimate, if there is any."""
-        return State(self.stamp_ns, self.mean, self.covariance) if self.located else None
+        """The estimate, if there is any.
+
+        Doubt widens what is told, not what the gate goes by: wrong pictures must not open it.
+        """
+        if not self.located:
+            return None
+        doubt = self.memory.doubt
+        if doubt is _NO_DOUBT:
+            return State(self.stamp_ns, self.mean, self.covariance)
+        told = self.covariance.copy()
+        for i, variance in enumerate(doubt):
+            told[i, i] += variance
+        return State(self.stamp_ns, self.mean, told)
 
 
 class _Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -142,6 +157,7 @@ class Fusion:
     def __init__(self, config: FilterConfig) -> None:
         self.config = config
         self._kalman = _Kalman()
+        self._many = _LASTING * config.recovery_pictures
         self._thresholds = {n: float(chi2.ppf(config.gate_probability, n)) for n in (2, 3)}
 
     def blank(self, stamp_ns: int) -> Belief:
@@ -254,7 +270,8 @@ class Fusion:
             )
             return belief._replace(memory=memory)
         covariance = event.covariance * max(1.0, event.novelty) ** 2
-        if not belief.located:
+        blind = event.value.size == 2 and belief.covariance[YAW, YAW] > self.config.lost_yaw_std**2
+        if not belief.located or blind:
             return self._started(belief, event, covariance)
         return self._gated(belief, event, covariance)
 
@@ -342,6 +359,8 @@ class Fusion:
     def _surprising(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> bool:
         """The gate is wide because the estimate is poor, and the picture would move it far."""
         prior, own = belief.covariance, covariance
+        if belief.memory.support == 0:  # a pose set from outside says itself how poor it is
+            return False
         if max(prior[0, 0], prior[1, 1]) < _DOMINATED * max(own[0, 0], own[1, 1]):
             return False
         miss = event.value[:2] - belief.mean[:2]
@@ -355,7 +374,7 @@ class Fusion:
         if count < self.config.confirm_pictures:
             return False
         span = belief.travelled_m - evidence[-count].travelled_m
-        return span >= self.config.confirm_distance or count >= 2 * self.config.recovery_pictures
+        return span >= self.config.confirm_distance or count >= self._many
 
     def _doubted(
         self, belief: Belief, event: MeasurementEvent, covariance: Array, update: Update
@@ -371,6 +390,8 @@ class Fusion:
             belief.memory,
             refused=refused,
             excess=update.d2 / update.threshold,
+            outage=self._outage(belief, event),
+            doubt=self._doubt(belief, update, refused),
             evidence=evidence,
             update=update,
         )
@@ -378,6 +399,21 @@ class Fusion:
         if outside and refused >= DISTRUST_AFTER:
             widened = self._widened(belief, evidence)
         return belief._replace(covariance=widened, memory=memory)
+
+    def _doubt(self, belief: Belief, update: Update, refused: int) -> tuple[float, float, float]:
+        """Lost: the pose told may be wrong by as much as pictures say that it is."""
+        if refused < self.config.recovery_pictures or update.innovation is None:
+            return belief.memory.doubt
+        miss = update.innovation
+        spread = float(miss[0] ** 2 + miss[1] ** 2) / 4
+        return spread, spread, float(miss[2] ** 2) / 4 if len(miss) == 3 else 0.0
+
+    def _outage(self, belief: Belief, event: MeasurementEvent) -> bool:
+        """Whether the pictures that are refused now are the first for a long time."""
+        memory = belief.memory
+        if memory.accepted_ns is None or memory.refused or memory.outage:
+            return memory.outage
+        return event.stamp_ns - memory.accepted_ns > self.config.picture_timeout * 1e9
 
     def _overruled(self, belief: Belief, fit: Fit) -> bool:
         """Whether agreeing pictures outweigh the estimate that they contradict."""
@@ -387,9 +423,12 @@ class Fusion:
             return False
         jump = math.hypot(*(fit.pose[:2] - belief.mean[:2]))
         little = jump < config.recovery_jump and support >= config.recovery_pictures
-        if fit.has_yaw and not little:
-            return fit.pictures >= needed
         way = max(config.recovery_distance, 8 * fit.std_m)
+        if fit.has_yaw and not little:
+            seen = fit.pictures >= needed
+            # What follows an outage may be a burst of wrong pictures: let them last.
+            lasting = fit.span_m >= way or fit.pictures >= self._many
+            return seen and (lasting or not belief.memory.outage)
         enough = fit.pictures >= needed or (fit.pictures >= 3 and fit.span_m >= 1.25 * way)
         return enough and fit.span_m >= way
 

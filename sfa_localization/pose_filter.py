@@ -109,8 +109,8 @@ class PoseFilter:
     ) -> None:
         """Set the pose (3,) in the map at a stamp; covariance (3, 3), or the configured one.
 
-        Before the first message the pose waits for it, and a stamp that does not fit those of the
-        messages gives way to theirs. Raises DataError for a pose or covariance that is none.
+        A stamp that does not fit those of the messages, before or after, gives way to theirs.
+        Raises DataError for a pose or covariance that is none.
         """
         told = self._initial_covariance() if covariance is None else covariance
         value, spread = read_pose(pose, told)
@@ -225,7 +225,7 @@ class PoseFilter:
         assert self._pending is not None
         value, spread = self._pending
         given = self._history.newest_ns
-        if given is None or not 0 <= stamp_ns - given <= self.config.coast_time * 1e9:
+        if given is None or not 0 <= stamp_ns - given <= self.config.odometry_timeout * 1e9:
             self._history = self._fresh(self._fusion.blank(0))
             self._history.add((stamp_ns, _POSE), PoseEvent(stamp_ns, value, spread))
         self._pending = None

@@ -1,0 +1,125 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Drives for the filter's tests: a true path, odometry and pictures with known errors."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sfa_localization.geometry import compose, wrap_angle
+from sfa_localization.run import integrate
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def stamps(count, rate_hz, start_ns=START_NS):
+    return start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
+
+
+def winding(seconds, rate_hz=50.0, speed=1.0, turn=0.5):
+    """True twists (N, 2): constant speed, a turn rate that swings slowly."""
+    t = np.arange(round(seconds * rate_hz)) / rate_hz
+    return np.stack([np.full_like(t, speed), turn * np.sin(0.7 * t)], 1)
+
+
+def true_path(stamps_ns, twists, start=(0.0, 0.0, 0.0)):
+    """Poses (N, 3): each twist has been held since the stamp before."""
+    held = np.vstack([twists[1:], twists[-1:]])
+    return integrate(stamps_ns, held, np.array(start, float))
+
+
+@dataclass
+class Drive:
+    """A drive to be fed to a filter: odometry in order, pictures every `every` samples."""
+
+    seconds: float = 30.0
+    rate_hz: float = 50.0
+    every: int = 5
+    start: tuple = (0.0, 0.0, 0.0)
+    twists: np.ndarray | None = None
+    v_std: float = 0.0
+    omega_std: float = 0.0
+    position_std: float = 0.0
+    yaw_std: float = 0.0
+    bias: float = 0.0
+    scale: float = 1.0
+    share: float = 0.0
+    length: float = 0.6
+    seed: int = 0
+    stamps_ns: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        if self.twists is None:
+            self.twists = winding(self.seconds, self.rate_hz)
+        rng = np.random.default_rng(self.seed)
+        count = len(self.twists)
+        self.stamps_ns = stamps(count, self.rate_hz)
+        self.poses = true_path(self.stamps_ns, self.twists, self.start)
+        self.read = self.twists / [self.scale, 1.0] + [0.0, self.bias]
+        self.read = self.read + rng.standard_normal((count, 2)) * [self.v_std, self.omega_std]
+        self.pictures = np.arange(self.every, count, self.every)
+        self.seen = self._seen(rng)
+
+    def _seen(self, rng):
+        poses = self.poses[self.pictures]
+        way = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+        lasting = rng.standard_normal(3)
+        errors = []
+        for step in way:
+            fade = math.exp(-step / self.length)
+            lasting = fade * lasting + math.sqrt(1 - fade**2) * rng.standard_normal(3)
+            white = math.sqrt(1 - self.share) * rng.standard_normal(3)
+            errors.append(math.sqrt(self.share) * lasting + white)
+        stds = [self.position_std, self.position_std, self.yaw_std]
+        seen = poses + np.array(errors) * stds
+        seen[:, 2] = wrap_angle(seen[:, 2])
+        return seen
+
+    def kidnap(self, picture, shift):
+        """From this picture on, the robot drives the same way elsewhere: shift is (x, y, yaw)."""
+        sample = self.pictures[picture]
+        offset = self.seen[:, 2] - self.poses[self.pictures, 2]
+        error = self.seen[:, :2] - self.poses[self.pictures, :2]
+        self.poses[sample:] = compose(np.array(shift, float), self.poses[sample:])
+        moved = self.poses[self.pictures]
+        self.seen = np.column_stack([moved[:, :2] + error, wrap_angle(moved[:, 2] + offset)])
+
+    def covariance(self, heading):
+        position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
+        return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
+
+    def events(self, heading=False):
+        """(stamp, kind, index) in order; odometry before the picture of the same stamp."""
+        listed = [(int(s), 0, i) for i, s in enumerate(self.stamps_ns)]
+        listed += [(int(self.stamps_ns[i]), 1, k) for k, i in enumerate(self.pictures)]
+        return sorted(listed)
+
+    def give(self, fused, event, heading=False):
+        stamp_ns, kind, index = event
+        if kind == 0:
+            return fused.add_odometry(stamp_ns, *self.read[index], self.variances())
+        value = self.seen[index] if heading else self.seen[index, :2]
+        return fused.add_measurement(stamp_ns, value, self.covariance(heading))
+
+    def variances(self):
+        return max(self.v_std, 1e-6) ** 2, max(self.omega_std, 1e-6) ** 2
+
+    def feed(self, fused, heading=False, start=0, stop=None, pictures=True):
+        """Feed seconds [start, stop); per picture: (index, update, error, yaw error)."""
+        found = []
+        for event in self.events():
+            t = (event[0] - START_NS) * 1e-9
+            if t < start or (stop is not None and t >= stop) or (event[1] and not pictures):
+                continue
+            update = self.give(fused, event, heading)
+            if event[1]:
+                found.append((event[2], update, *self.error(fused, self.pictures[event[2]])))
+        return found
+
+    def error(self, fused, sample):
+        """Distance and heading error against the truth at a sample; NaN without a state."""
+        if fused.state is None:
+            return math.nan, math.nan
+        miss = fused.state.pose - self.poses[sample]
+        return math.hypot(miss[0], miss[1]), float(wrap_angle(miss[2]))

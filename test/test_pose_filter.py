@@ -1,0 +1,631 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The filter as a whole: exact on exact data, consistent on noisy data, and hard to fool."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from filter_drives import START_NS, Drive, winding
+from scipy.stats import chi2
+
+from sfa_localization.config import FilterConfig
+from sfa_localization.errors import ConfigError, DataError
+from sfa_localization.geometry import wrap_angle
+from sfa_localization.pose_filter import Level, PoseFilter
+
+SECOND = 1_000_000_000
+NOISY = {
+    'v_std': 0.02, 'omega_std': 0.01, 'position_std': 0.2, 'yaw_std': 0.05, 'share': 0.7,
+    'bias': 0.002, 'scale': 1.01,
+}  # fmt: skip
+
+
+def known(config=None, pose=(0.0, 0.0, 0.0), std=0.05):
+    fused = PoseFilter(config or FilterConfig())
+    fused.initialise(START_NS, pose, np.diag([std**2, std**2, std**2]))
+    return fused
+
+
+def snapshot(fused):
+    state = fused.state
+    return state.stamp_ns, state.mean.tolist(), state.covariance.tolist()
+
+
+# Exactness.
+
+
+@pytest.mark.parametrize('heading', [True, False])
+@pytest.mark.parametrize('start', [(0, 0, 0), (3.0, -2.0, math.pi), (0, 0, -math.pi + 1e-3)])
+def test_exact_data_gives_zero_error(heading, start):
+    drive = Drive(seconds=20, start=start)
+    fused = known(pose=start)
+    assert max(error for _, _, error, _ in drive.feed(fused, heading)) < 1e-6
+    assert all(update.accepted for _, update, _, _ in drive.feed(known(pose=start), heading))
+
+
+@pytest.mark.parametrize('speed', [1.0, -0.7])
+@pytest.mark.parametrize('turn', [0.0, 1e-7, 0.8])
+def test_exact_data_straight_turning_and_reversing(speed, turn):
+    drive = Drive(twists=np.tile([speed, turn], (500, 1)))
+    fused = known()
+    assert max(error for _, _, error, _ in drive.feed(fused)) < 1e-6
+
+
+def test_dead_reckoning_is_the_integral_of_the_odometry():
+    drive = Drive(seconds=10)
+    fused = known()
+    drive.feed(fused, pictures=False)
+    assert np.allclose(fused.state.pose, drive.poses[-1], atol=1e-9)
+
+
+# Delay and order.
+
+
+@pytest.mark.parametrize('heading', [True, False])
+@pytest.mark.parametrize('seed', range(3))
+def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, seed):
+    drive = Drive(seconds=20, **NOISY, seed=seed)
+    drive.seen[40:44, :2] += 3.0
+    rng = np.random.default_rng(seed)
+    ordered, late = known(), known()
+    for event in drive.events():
+        drive.give(ordered, event, heading)
+    # Pictures come 0-2 s late, odometry up to 0.1 s: then in the order of arrival.
+    delays = [rng.uniform(0, 2.0 if kind else 0.1) * 1e9 for _, kind, _ in drive.events()]
+    arrivals = sorted(zip(drive.events(), delays, strict=True), key=lambda e: e[0][0] + e[1])
+    for event, _ in arrivals:
+        drive.give(late, event, heading)
+    assert np.abs(ordered.state.mean - late.state.mean).max() < 1e-9
+    assert np.abs(ordered.state.covariance - late.state.covariance).max() < 1e-9
+    assert ordered.status == late.status
+
+
+def test_the_same_messages_give_the_same_bytes():
+    drive = Drive(seconds=10, **NOISY)
+    first, second = known(), known()
+    drive.feed(first)
+    drive.feed(second)
+    assert snapshot(first) == snapshot(second)
+
+
+def test_what_is_older_than_the_history_is_refused_and_counted():
+    drive = Drive(seconds=20)
+    fused = known(FilterConfig(history=2.0))
+    drive.feed(fused)
+    before = snapshot(fused)
+    update = fused.add_measurement(START_NS + SECOND, [0, 0], np.eye(2))
+    assert not update.accepted and update.reason == 'too old'
+    assert fused.add_odometry(START_NS + SECOND, 1.0, 0.0) == 'too old'
+    assert fused.counts['measurement: too old'] == fused.counts['odometry: too old'] == 1
+    assert snapshot(fused) == before
+
+
+def test_duplicate_stamps_are_refused_and_counted():
+    drive = Drive(seconds=2)
+    fused = known()
+    drive.feed(fused)
+    before = snapshot(fused)
+    newest = int(drive.stamps_ns[-1])
+    assert fused.add_odometry(newest, 5.0, 5.0) == 'duplicate stamp'
+    stamp = int(drive.stamps_ns[drive.pictures[-1]])
+    assert fused.add_measurement(stamp, [9, 9], np.eye(2)).reason == 'duplicate stamp'
+    assert snapshot(fused) == before
+
+
+@pytest.mark.parametrize('seconds', [60, 2])
+def test_a_bag_that_loops_starts_the_filter_anew(seconds):
+    config = FilterConfig(set_initial_pose=True)
+    drive = Drive(seconds=seconds)
+    once, looped = PoseFilter(config), PoseFilter(config)
+    drive.feed(once)
+    drive.feed(looped)
+    drive.feed(looped)
+    assert looped.counts['clock went back'] == 1
+    # A few messages were spent on noticing; the end is that of a drive begun after them.
+    assert np.allclose(looped.state.pose, once.state.pose, atol=0.2)
+    assert looped.state.stamp_ns == once.state.stamp_ns
+    assert looped.status.level is Level.LOCALISED
+
+
+def test_one_stamp_far_ahead_does_no_harm():
+    drive = Drive(seconds=4)
+    fused = known()
+    drive.feed(fused, stop=2)
+    before = snapshot(fused)
+    ahead = START_NS + 10**6 * SECOND
+    assert fused.add_odometry(ahead, 1.0, 0.0) == 'stamp far ahead'
+    assert fused.add_measurement(ahead + SECOND, [0, 0], np.eye(2)).reason == 'stamp far ahead'
+    assert snapshot(fused) == before
+    assert all(update.accepted for _, update, _, _ in drive.feed(fused, start=2))
+
+
+def test_a_long_pause_of_the_recording_is_survived_and_told():
+    drive = Drive(seconds=10)
+    fused = known()
+    drive.feed(fused, stop=5)
+    sure = fused.state.position_std
+    for step in range(20):
+        stamp = START_NS + 1000 * SECOND + step * SECOND // 50
+        fused.add_odometry(stamp, 0.0, 0.0)
+    assert fused.counts['gap in time'] == 1
+    assert fused.state.position_std > 10 * sure
+    assert fused.status.level is Level.LOST
+
+
+def test_prediction_to_a_stamp_recalls_and_extrapolates():
+    drive = Drive(twists=np.tile([1.0, 0.0], (200, 1)))
+    fused = known()
+    drive.feed(fused, pictures=False)
+    newest = int(drive.stamps_ns[-1])
+    assert fused.at(newest).pose[0] == pytest.approx(199 / 50, abs=1e-6)
+    assert fused.at(newest + SECOND // 10).pose[0] == pytest.approx(199 / 50 + 0.1, abs=1e-6)
+    assert fused.at(newest - SECOND).pose[0] == pytest.approx(149 / 50, abs=1e-6)
+    assert fused.at(newest + SECOND).position_std > fused.state.position_std
+    assert fused.at(newest - 100 * SECOND) is None
+
+
+# Consistency.
+
+
+def consistency(drive, fused, heading):
+    """Mean NEES of the pose, mean NIS over degrees of freedom, of one drive."""
+    nees, nis = [], []
+    for event in drive.events():
+        update = drive.give(fused, event, heading)
+        if not event[1]:
+            continue
+        if math.isfinite(update.d2):
+            nis.append(update.d2 / (3 if heading else 2))
+        miss = fused.state.pose - drive.poses[drive.pictures[event[2]]]
+        miss[2] = wrap_angle(miss[2])
+        nees.append(miss @ np.linalg.solve(fused.state.pose_covariance, miss))
+    return np.mean(nees[len(nees) // 2 :]), np.mean(nis)
+
+
+HONEST = FilterConfig(
+    odometry_correlation=0.0, slip_per_metre=0.0, yaw_per_metre=0.0, yaw_per_radian=0.0,
+    bias_walk=0.0, scale_walk=0.0, correlated_share=0.7, decorrelation=0.6, bias_std=0.005,
+    scale_std=0.02, gate_probability=0.999999, speed_std_floor=1e-4, rate_std_floor=1e-4,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize('heading', [True, False])
+def test_errors_and_innovations_are_as_large_as_told_over_100_seeds(heading):
+    nees, nis = [], []
+    for seed in range(100):
+        rng = np.random.default_rng(1000 + seed)
+        drive = Drive(
+            seconds=12, rate_hz=20, every=2, v_std=0.05, omega_std=0.05, position_std=0.2,
+            yaw_std=0.05, share=0.7, length=0.6, bias=0.005 * rng.standard_normal(),
+            scale=1 + 0.02 * rng.standard_normal(), seed=seed,
+        )  # fmt: skip
+        fused = PoseFilter(HONEST)
+        start = rng.standard_normal(3) * [0.1, 0.1, 0.05]
+        fused.initialise(START_NS, start, np.diag(np.square([0.1, 0.1, 0.05])))
+        one, other = consistency(drive, fused, heading)
+        nees.append(one)
+        nis.append(other)
+    # One drive's mean NEES is at worst one sample of chi2(3): their mean lies in chi2(300) / 100.
+    low, high = chi2.ppf([0.001, 0.999], 300) / 100
+    assert low < np.mean(nees) < high
+    assert 0.93 < np.mean(nis) < 1.07
+
+
+def test_standing_still_neither_drifts_nor_becomes_overconfident():
+    drive = Drive(seconds=5, **NOISY)
+    fused = known()
+    drive.feed(fused, heading=True)
+    before = fused.state
+    stamp, wrong = int(drive.stamps_ns[-1]), drive.seen[-1] + [0.15, -0.15, 0.02]
+    rng = np.random.default_rng(0)
+    for k in range(1, 3600):
+        fused.add_odometry(stamp + k * SECOND, 0.0, 0.0, (4e-4, 1e-4))
+        seen = wrong + 0.02 * rng.standard_normal(3)
+        fused.add_measurement(stamp + k * SECOND + 1, seen, np.diag([0.04, 0.04, 0.0025]))
+    after = fused.state
+    # The deviation of white errors alone would have shrunk by a factor of 100.
+    assert after.position_std > 0.5 * before.position_std
+    assert math.dist(after.pose[:2], before.pose[:2]) < 2 * before.position_std
+    assert fused.status.level is not Level.LOST
+
+
+def test_covariance_stays_symmetric_positive_over_a_long_run():
+    fused = known()
+    twists = winding(120, 50.0)
+    drive = Drive(twists=twists, **NOISY, every=10)
+    lap = int(drive.stamps_ns[-1] - drive.stamps_ns[0]) + SECOND // 50
+    seen = {int(i): k for k, i in enumerate(drive.pictures)}
+    for k in range(40_000):
+        i, stamp = (
+            k % len(twists),
+            START_NS + (k // len(twists)) * lap + int(drive.stamps_ns[k % len(twists)] - START_NS),
+        )
+        fused.add_odometry(stamp, *drive.read[i], (4e-4, 1e-4))
+        if i in seen:
+            fused.add_measurement(stamp, fused.state.pose, np.diag([0.04, 0.04, 0.0025]))
+        if k % 1000 == 0:
+            covariance = fused.state.covariance
+            assert np.array_equal(covariance, covariance.T)
+            assert np.linalg.eigvalsh(covariance)[0] > 0
+    assert fused.counts['odometry: used'] == 40_000
+
+
+def test_bias_and_scale_are_learnt_where_wanted():
+    drive = Drive(seconds=120, v_std=0.01, omega_std=0.005, position_std=0.1, yaw_std=0.03,
+                  share=0.7, bias=0.01, scale=1.03)  # fmt: skip
+    learning = known()
+    drive.feed(learning, heading=True)
+    assert learning.state.yaw_rate_bias == pytest.approx(0.01, abs=0.002)
+    assert learning.state.wheel_scale == pytest.approx(1.03, abs=0.01)
+    fixed = known(FilterConfig(estimate_bias=False, estimate_scale=False))
+    drive.feed(fixed, heading=True)
+    assert abs(fixed.state.yaw_rate_bias) < 1e-6 and abs(fixed.state.wheel_scale - 1) < 1e-6
+
+
+def test_it_beats_pictures_and_odometry():
+    drive = Drive(seconds=60, **NOISY)
+    fused, blind = known(), known()
+    errors = [error for _, _, error, _ in drive.feed(fused)]
+    drift = [error for _, _, error, _ in drive.feed(blind, pictures=False)] or [
+        drive.error(blind, -1)[0]
+    ]
+    alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T)
+    assert np.mean(errors) < 0.7 * alone.mean()
+    assert errors[-1] < drift[-1]
+
+
+# The gate.
+
+
+@pytest.mark.parametrize('heading', [True, False])
+def test_a_spike_is_refused_and_moves_nothing(heading):
+    drive = Drive(seconds=20, **NOISY)
+    drive.seen[100, :2] += [3.0, 3.0]
+    found = drive.feed(known(), heading)
+    assert not found[100][1].accepted and found[100][1].reason == 'outside the gate'
+    assert (
+        found[100][1].d2
+        > found[100][1].threshold
+        == pytest.approx(chi2.ppf(0.997, 3 if heading else 2))
+    )
+    assert max(error for _, _, error, _ in found) < 0.6
+
+
+def test_the_gate_covers_the_heading_too():
+    drive = Drive(seconds=20, **NOISY)
+    drive.seen[100, 2] = wrap_angle(drive.seen[100, 2] + 1.0)
+    found = drive.feed(known(), heading=True)
+    assert not found[100][1].accepted
+
+
+@pytest.mark.parametrize('heading', [True, False])
+def test_a_sustained_offset_is_believed_in_the_end(heading):
+    drive = Drive(seconds=40, **NOISY)
+    drive.seen[150:, :2] += [1.5, 0.0]
+    found = drive.feed(known(), heading)
+    lasting = drive.seen[:, :2] - drive.poses[drive.pictures, :2]
+    assert not found[152][1].accepted
+    assert abs(found[-1][2] - 1.5) < 0.5 and np.abs(lasting[-1, 0] - 1.5) < 1.0
+
+
+@pytest.mark.parametrize('heading', [True, False])
+def test_wrong_pictures_that_contradict_each_other_are_never_believed(heading):
+    drive = Drive(seconds=40, **NOISY)
+    wrong = np.random.default_rng(3).uniform(-8, 8, (30, 2))
+    drive.seen[150:180, :2] += wrong
+    found = drive.feed(known(), heading)
+    assert max(error for _, _, error, _ in found) < 1.0
+    assert found[-1][2] < 0.5
+
+
+@pytest.mark.parametrize('heading', [True, False])
+@pytest.mark.parametrize('outage', [5.0, 30.0])
+def test_a_cluster_of_wrong_pictures_after_an_outage_is_not_admitted(heading, outage):
+    drive = Drive(seconds=60, **NOISY)
+    fused = known()
+    drive.feed(fused, heading, stop=15)
+    drive.feed(fused, heading, start=15, stop=15 + outage, pictures=False)
+    drift = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))[0]
+    first = int(np.searchsorted(drive.pictures, (15 + outage) * 50))
+    drive.seen[first : first + 12, :2] += [3.0, 4.0]
+    found = drive.feed(fused, heading, start=15 + outage)
+    assert not any(update.accepted for _, update, _, _ in found[:12])
+    assert max(error for _, _, error, _ in found) < max(1.0, 2 * drift)
+    assert np.mean([error for _, _, error, _ in found[40:]]) < 0.4
+
+
+# Start and recovery.
+
+
+def test_one_picture_with_heading_starts_at_once():
+    drive = Drive(seconds=5, start=(4.0, -3.0, 2.0), **NOISY)
+    fused = PoseFilter()
+    assert fused.state is None and fused.status.level is Level.UNINITIALISED
+    found = drive.feed(fused, heading=True)
+    assert found[0][1].accepted and found[0][1].reason == 'started'
+    assert found[-1][2] < 0.6 and abs(found[-1][3]) < 0.2
+
+
+def test_five_pictures_with_heading_suffice_in_19_of_20_starts():
+    good = 0
+    for seed in range(200):
+        noise = {**NOISY, 'position_std': 0.15}
+        drive = Drive(seconds=0.6, start=(1.0, 2.0, seed), **noise, seed=seed)
+        found = drive.feed(PoseFilter(), heading=True)[4]
+        good += found[2] < 0.5 and abs(found[3]) < math.radians(5)
+    assert good >= 0.95 * 200
+
+
+def test_without_heading_the_first_metres_start_it():
+    for seed in range(20):
+        drive = Drive(seconds=8, start=(4.0, -3.0, 2.0 + seed), **NOISY, seed=seed)
+        fused = PoseFilter()
+        found = drive.feed(fused)
+        started = next(k for k, (_, update, _, _) in enumerate(found) if update.accepted)
+        assert drive.pictures[started] / 50 < 3.0
+        assert abs(found[-1][3]) < 0.3 and found[-1][2] < 0.8
+
+
+def test_a_first_picture_that_is_wrong_is_outvoted():
+    drive = Drive(seconds=5, **NOISY)
+    drive.seen[0] = [9.0, 9.0, 2.0]
+    found = drive.feed(PoseFilter(), heading=True)
+    assert found[0][1].accepted and found[1][1].reason == 'outside the gate'
+    assert found[3][2] < 0.8
+
+
+def test_pictures_without_motion_tell_no_heading():
+    fused = PoseFilter()
+    for k in range(100):
+        fused.add_odometry(START_NS + k * SECOND // 50, 0.0, 0.0)
+        update = fused.add_measurement(START_NS + k * SECOND // 50, [1.0, 2.0], 0.04 * np.eye(2))
+    assert not update.accepted and fused.state is None
+    assert fused.status.reasons == ('pictures tell no heading yet: drive on',)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_kidnapped_robot_recovers_after_five_pictures_with_heading(seed):
+    drive = Drive(seconds=30, **NOISY, seed=seed)
+    drive.kidnap(150, (5.0, -4.0, 2.0))
+    found = drive.feed(known(), heading=True)
+    assert found[154][1].reason == 're-initialised'
+    assert max(error for _, _, error, _ in found[156:]) < 0.9
+    assert found[-1][2] < 0.5
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_kidnapped_robot_recovers_within_three_metres_without_heading(seed):
+    drive = Drive(seconds=30, **NOISY, seed=seed)
+    drive.kidnap(150, (5.0, -4.0, 2.0))
+    found = drive.feed(known())
+    assert max(error for _, _, error, _ in found[180:]) < 1.2
+    assert found[-1][2] < 0.6
+
+
+@pytest.mark.parametrize('heading', [True, False])
+def test_while_lost_the_state_says_so_and_the_covariance_covers_the_error(heading):
+    config = FilterConfig(start_yaw_std=0.01)  # no way out
+    drive = Drive(seconds=30, **NOISY)
+    drive.kidnap(150, (5.0, -4.0, 2.0))
+    fused = known(config)
+    drive.feed(fused, heading, stop=16.5)
+    assert fused.status.level is Level.LOST
+    assert any('contradict' in reason for reason in fused.status.reasons)
+    error, _ = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))
+    assert error > 4 and error < 4 * fused.state.position_std
+
+
+def test_a_pose_from_outside_is_taken_at_any_time():
+    drive = Drive(seconds=10)
+    fused = known(pose=(50.0, 50.0, 1.0))
+    drive.feed(fused, stop=5, pictures=False)
+    fused.initialise(fused.state.stamp_ns, drive.poses[249], np.eye(3) * 1e-4)
+    drive.feed(fused, start=5, pictures=False)
+    assert np.allclose(fused.state.pose, drive.poses[-1], atol=1e-6)
+
+
+@pytest.mark.parametrize('stamp', [1, START_NS - SECOND, START_NS + 10**6 * SECOND])
+def test_a_pose_given_before_the_first_message_is_not_lost(stamp):
+    drive = Drive(seconds=5, start=(3.0, 1.0, math.pi))
+    fused = PoseFilter()
+    fused.initialise(stamp, (3.0, 1.0, math.pi), np.eye(3) * 1e-4)
+    assert np.allclose(fused.state.pose[:2], [3.0, 1.0])
+    drive.feed(fused, pictures=False)
+    assert drive.error(fused, -1)[0] < 1e-6
+
+
+@pytest.mark.parametrize('pose', [(math.nan, 0, 0), (0, 0), (1e12, 0, 0)])
+def test_a_pose_that_is_none_is_refused(pose):
+    with pytest.raises(DataError):
+        PoseFilter().initialise(1, pose)
+    with pytest.raises(DataError):
+        PoseFilter().initialise(1, (0, 0, 0), -np.eye(3))
+
+
+# Bad input and silence.
+
+
+BAD_MEASUREMENTS = [
+    ([math.nan, 0], np.eye(2), 'position is not finite'),
+    ([math.inf, 0], np.eye(2), 'position is not finite'),
+    ([1e300, 0], np.eye(2), 'position is not finite'),
+    ([0, 0], -np.eye(2), 'covariance is not symmetric positive'),
+    ([0, 0], [[1, 5], [5, 1]], 'covariance is not symmetric positive'),
+    ([0, 0], [[1, 0.5], [0, 1]], 'covariance is not symmetric positive'),
+    ([0, 0], np.full((2, 2), math.nan), 'covariance is not symmetric positive'),
+    ([0, 0], np.eye(2) * 1e308, 'covariance is not symmetric positive'),
+    ([0, 0], np.eye(2) * 1e9, 'covariance tells that nothing is known'),
+    ([0, 0, 0, 0], np.eye(4), 'shape is not that of a position or a pose'),
+    ([0, 0], np.eye(3), 'shape is not that of a position or a pose'),
+]
+
+
+@pytest.mark.parametrize(('value', 'covariance', 'reason'), BAD_MEASUREMENTS)
+def test_a_malformed_measurement_is_counted_and_changes_nothing(value, covariance, reason):
+    drive = Drive(seconds=2)
+    fused = known()
+    drive.feed(fused)
+    before = snapshot(fused)
+    update = fused.add_measurement(int(drive.stamps_ns[-1]) + 1, value, covariance)
+    assert not update.accepted and update.reason == reason
+    assert fused.counts[f'measurement: {reason}'] == 1 and snapshot(fused) == before
+
+
+@pytest.mark.parametrize(('v', 'omega', 'reason'), [
+    (math.nan, 0, 'not finite'), (0, math.inf, 'not finite'), (1e6, 0, 'absurdly fast'),
+])  # fmt: skip
+def test_malformed_odometry_is_counted_and_changes_nothing(v, omega, reason):
+    drive = Drive(seconds=2)
+    fused = known()
+    drive.feed(fused)
+    before = snapshot(fused)
+    assert fused.add_odometry(int(drive.stamps_ns[-1]) + 1, v, omega) == reason
+    assert fused.add_odometry(0, 1.0, 0.0) == 'zero or negative stamp'
+    assert fused.counts[f'odometry: {reason}'] == 1 and snapshot(fused) == before
+
+
+@pytest.mark.parametrize('variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e300)])
+def test_variances_that_are_none_give_way_to_the_configured_ones(variances):
+    fused, plain = known(), known()
+    drive = Drive(seconds=2)
+    for i, stamp in enumerate(drive.stamps_ns):
+        fused.add_odometry(int(stamp), *drive.read[i], variances)
+        plain.add_odometry(int(stamp), *drive.read[i])
+    assert snapshot(fused) == snapshot(plain)
+
+
+def test_a_heading_that_is_not_known_is_left_out():
+    drive = Drive(seconds=2)
+    with_unknown, without = known(), known()
+    drive.feed(with_unknown)
+    drive.feed(without)
+    stamp = int(drive.stamps_ns[-1]) + 1
+    at = drive.poses[-1]
+    flat = np.diag([0.04, 0.04, math.pi**2 / 3])
+    with_unknown.add_measurement(stamp, [at[0], at[1], math.nan], flat)
+    without.add_measurement(stamp, at[:2], flat[:2, :2])
+    assert snapshot(with_unknown) == snapshot(without)
+
+
+def test_zero_covariance_means_unknown_not_certain():
+    fused = known()
+    Drive(seconds=2).feed(fused)
+    update = fused.add_measurement(fused.state.stamp_ns + 1, [50.0, 0.0], np.zeros((2, 2)))
+    assert not update.accepted
+    assert fused.state.position_std > 0.01
+
+
+def test_silent_odometry_makes_the_estimate_less_and_less_sure():
+    drive = Drive(seconds=5)
+    fused = known()
+    drive.feed(fused)
+    newest = fused.state.stamp_ns
+    stds = [fused.at(newest + k * SECOND).position_std for k in (0, 1, 2, 5, 20)]
+    assert all(a < b for a, b in itertools.pairwise(stds))
+    far = fused.at(newest + 10**5 * SECOND)
+    assert far.position_std <= fused.config.largest_std * 1.5
+    # It does not run on for ever at the last speed.
+    assert math.dist(far.pose[:2], fused.state.pose[:2]) < 2.5
+
+
+def test_pictures_alone_carry_it_through_an_outage_of_the_odometry():
+    drive = Drive(seconds=30, **NOISY)
+    fused = known()
+    drive.feed(fused, heading=True, stop=10)
+    for event in drive.events():
+        if 10 <= (event[0] - START_NS) * 1e-9 < 20 and event[1]:
+            drive.give(fused, event, True)
+    assert fused.status.level is not Level.LOCALISED
+    assert any('no odometry' in reason for reason in fused.status.reasons)
+    assert drive.error(fused, 999)[0] < 1.0
+    found = drive.feed(fused, heading=True, start=20)
+    assert found[-1][2] < 0.5 and fused.status.level is Level.LOCALISED
+
+
+@pytest.mark.parametrize('gap', [0.3, 1.5])
+def test_dropouts_of_the_odometry_are_bridged(gap):
+    drive = Drive(seconds=30, **NOISY)
+    fused = known()
+    for event in drive.events():
+        t = (event[0] - START_NS) * 1e-9
+        if event[1] or t % 5.0 > gap:
+            drive.give(fused, event, True)
+    assert drive.error(fused, len(drive.stamps_ns) - 1)[0] < 0.6
+
+
+def test_the_state_machine_tells_why():
+    drive = Drive(seconds=30, **NOISY)
+    fused = PoseFilter()
+    assert fused.status.reasons == ('no odometry and no pictures yet',)
+    drive.feed(fused, stop=0.05)
+    assert fused.status.reasons == ('no usable picture yet',)
+    drive.feed(fused, heading=True, start=0.05, stop=10)
+    assert fused.status.level is Level.LOCALISED and fused.status.reasons == ()
+    drive.feed(fused, start=10, stop=14, pictures=False)
+    assert fused.status.level is Level.DEGRADED
+    assert 'no usable picture for 4 s' in fused.status.reasons
+    drive.feed(fused, heading=True, start=14)
+    assert fused.status.level is Level.LOCALISED
+
+
+def test_novel_pictures_weigh_less_and_then_nothing():
+    drive = Drive(seconds=5, **NOISY)
+    states = []
+    for novelty in (0.0, 2.0, 9.0):
+        fused = known(FilterConfig(correlated_share=0.0))
+        drive.feed(fused, heading=True)
+        stamp, before = fused.state.stamp_ns + 1, fused.state.pose
+        seen = before + np.array([0.2, 0.0, 0.0])
+        update = fused.add_measurement(stamp, seen, np.diag([0.04, 0.04, 0.0025]), novelty)
+        states.append(fused.state.pose[0] - before[0])
+        assert update.accepted == (novelty < 3)
+    assert states[0] > states[1] > 0.001 and abs(states[2]) < 1e-9
+    for k in range(2, 6):
+        fused.add_measurement(stamp + k, seen, np.diag([0.04, 0.04, 0.0025]), 9.0)
+    assert fused.status.level is Level.DEGRADED
+    assert any('unlike any of training' in reason for reason in fused.status.reasons)
+
+
+def test_a_novel_picture_does_not_start_the_filter():
+    fused = PoseFilter()
+    update = fused.add_measurement(START_NS, [1, 2, 0], np.diag([0.04, 0.04, 0.0025]), 2.0)
+    assert not update.accepted and fused.state is None
+
+
+def test_parameters_change_without_losing_the_estimate():
+    drive = Drive(seconds=10)
+    fused = known()
+    drive.feed(fused, stop=5)
+    before = snapshot(fused)
+    fused.reconfigure(dataclasses.replace(fused.config, measurement_factor=4.0))
+    assert snapshot(fused) == before
+    assert all(update.accepted for _, update, _, _ in drive.feed(fused, start=5))
+
+
+def test_reset_forgets_the_pose_but_not_the_counts():
+    drive = Drive(seconds=2)
+    fused = known()
+    drive.feed(fused)
+    fused.reset()
+    assert fused.state is None and fused.counts['reset'] == 1
+    assert fused.counts['odometry: used'] == 100
+
+
+def test_the_history_stays_bounded():
+    fused = known()
+    drive = Drive(seconds=120, rate_hz=20)
+    drive.feed(fused)
+    assert len(fused._history) < 2 * 20 * 1.3 * fused.config.history
+
+
+@pytest.mark.parametrize(('values', 'why'), [
+    ({'degraded_std': 3.0}, 'degraded_std'), ({'lost_std': 200.0}, 'lost_std'),
+    ({'odometry_timeout': 3.0}, 'odometry_timeout'), ({'gate_probability': 2.0}, 'outside'),
+    ({'history': math.nan}, 'finite'), ({'recovery_pictures': 1}, 'outside'),
+])  # fmt: skip
+def test_parameters_are_checked_together(values, why):
+    with pytest.raises(ConfigError, match=why):
+        FilterConfig(**values)
