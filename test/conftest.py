@@ -1,0 +1,12 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""For all tests: ROS stays on this machine, checks its messages, and logs to a temporary folder."""
+
+import os
+import tempfile
+
+# Before rclpy is imported by any test; a user's own choice stands.
+_LOGS = tempfile.TemporaryDirectory(prefix='sfa_localization_ros_log_')
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
+os.environ.setdefault('ROS_LOG_DIR', _LOGS.name)

@@ -1,0 +1,190 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the documents say exists: commands, options, executables, topics, parameters, files, links.
+
+Commands marked `run:` in the README are run, in test_readme_commands.py; the others are checked
+here as far as that goes without the ROS 2 command line.
+"""
+
+import argparse
+import ast
+import dataclasses
+import json
+import re
+import shlex
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sfa_localization import cli, config
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md')])
+NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+COMMANDS = {command.name: command for command in cli.COMMANDS}
+BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
+LINK = re.compile(r'\]\(([^)#\s]+)\)')
+TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
+# Programs of others, whose arguments are theirs to check.
+FOREIGN = {'source', 'colcon', 'rviz2', 'rosdep', 'git', 'cd', 'mkdir', 'pip', 'sudo'}
+OTHER_ROS = {('run', 'robot_localization'), ('launch', 'nav2_bringup'), ('bag', 'record')}
+
+
+def commands() -> list:
+    """Return every command line in the documents as words."""
+    found = []
+    for path in DOCUMENTS:
+        for block in BLOCK.findall(path.read_text('utf-8')):
+            for line in block.replace('\\\n', ' ').splitlines():
+                words = shlex.split(line, comments=True)
+                if words:
+                    found.append(pytest.param(words, id=f'{path.name}: {line}'))
+    return found
+
+
+@pytest.mark.parametrize('words', commands())
+def test_command_exists(words):
+    check(words)
+
+
+def check(words: list[str]) -> None:
+    program, *rest = words
+    if program == 'ros2':
+        check_ros2(rest)
+    elif program == 'make':
+        targets = [word for word in rest if '=' not in word]
+        subprocess.run(['make', '--dry-run', *targets], cwd=ROOT, check=True, capture_output=True)
+    elif program == 'python' and rest[:2] == ['-m', 'sfa_localization']:
+        check(rest[2:])
+    elif program in NODES:
+        check_node(program, rest)
+    elif program in COMMANDS:
+        check_arguments(COMMANDS[program], rest)
+    else:
+        assert program in FOREIGN, f'unknown program {program}'
+
+
+def check_ros2(words: list[str]) -> None:
+    if tuple(words[:2]) in OTHER_ROS:
+        return
+    verb, package, name, *rest = words
+    assert package == 'sfa_localization'
+    if verb == 'launch':
+        assert (ROOT / 'config' / name).is_file()
+        known = launch_arguments(ROOT / 'config' / name)
+        assert {word.partition(':=')[0] for word in rest} <= known
+        return
+    assert verb == 'run'
+    check([name, *rest])
+
+
+def launch_arguments(path: Path) -> set[str]:
+    """Return the names that a launch file declares as arguments."""
+    calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+    return {
+        call.args[0].value
+        for call in calls
+        if isinstance(call.func, ast.Name) and call.func.id == 'DeclareLaunchArgument'
+    }
+
+
+def check_arguments(command: cli.Command, words: list[str]) -> None:
+    if words == ['...']:
+        return
+    parser = argparse.ArgumentParser(prog=command.name)
+    command.configure(parser)
+    parser.parse_args(words)
+
+
+def check_node(name: str, words: list[str]) -> None:
+    """Parameters of a node are settings, and remapped topics are its own."""
+    assert words[:1] in ([], ['--ros-args'], ['...'])
+    for option, value in zip(words[1::2], words[2::2], strict=True):
+        assert option in ('-p', '-r', '--params-file')
+        if option == '-p':
+            assert value.partition(':=')[0] in parameters()
+        if option == '-r':
+            assert value.partition(':=')[0].lstrip('/') in topics()
+
+
+def parameters() -> set[str]:
+    """Return the names of all settings, which the nodes' parameters are."""
+    groups = config.Settings.__subclasses__()
+    return {item.name for group in groups for item in dataclasses.fields(group)} | {'use_sim_time'}
+
+
+def topics() -> set[str]:
+    """Return the topics that the nodes name in their source, without leading slashes."""
+    sources = [ROOT / 'sfa_localization' / 'nodes' / f'{name}.py' for name in NODES]
+    strings = (
+        node.value
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text('utf-8')))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )
+    return {text.lstrip('/') for text in strings if re.fullmatch(r'/?[a-z_]+(/[a-z_]+)*', text)}
+
+
+@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    for target in LINK.findall(path.read_text('utf-8')):
+        assert target.startswith('https://') or (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize(
+    'path', [*DOCUMENTS, *ROOT.glob('config/*.rviz')], ids=lambda path: path.name
+)
+def test_topics_exist(path):
+    assert set(TOPIC.findall(path.read_text('utf-8'))) <= topics()
+
+
+def test_foxglove_layout_is_whole_and_its_topics_exist():
+    layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text('utf-8'))
+    panels = set(re.findall(r'"([A-Za-z0-9]+![a-z]+)"', json.dumps(layout['layout'])))
+    assert panels == set(layout['configById'])
+    named = set(layout['configById']['3D!map']['topics'])
+    named.add(layout['configById']['Image!panorama']['imageMode']['imageTopic'])
+    for panel in layout['configById'].values():
+        named.update(path['value'].partition('.')[0] for path in panel.get('paths', ()))
+    assert {name.lstrip('/') for name in named} <= topics()
+
+
+def test_robot_localization_takes_position_and_heading_of_our_pose():
+    text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
+    settings = yaml.safe_load(text)['ekf_filter_node_map']['ros__parameters']
+    assert settings['pose0'].lstrip('/') in topics()
+    assert len(settings['pose0_config']) == len(settings['odom0_config']) == 15
+    used = [index for index, wanted in enumerate(settings['pose0_config']) if wanted]
+    assert used == [0, 1, 5], 'x, y and yaw'
+
+
+def test_nav2_uses_our_frames():
+    settings = yaml.safe_load((ROOT / 'config/nav2.yaml').read_text('utf-8'))
+    navigator = settings['bt_navigator']['ros__parameters']
+    frames = config.EkfNodeConfig()
+    assert navigator['global_frame'] == frames.map_frame
+    assert navigator['robot_base_frame'] == frames.base_frame
+
+
+def test_launch_file_starts_all_nodes_and_passes_known_parameters():
+    text = (ROOT / 'config/localization.launch.py').read_text('utf-8')
+    assert set(re.findall(r"_node\('(\w+)'", text)) == set(NODES)
+    assert 'model' in parameters()
+
+
+def test_package_manifest_is_of_format_3():
+    manifest = ET.parse(ROOT / 'package.xml').getroot()
+    assert manifest.get('format') == '3'
+    assert manifest.findtext('export/build_type') == 'ament_python'
+
+
+def test_make_help_lists_every_target():
+    text = (ROOT / 'Makefile').read_text('utf-8')
+    targets = set(re.search(r'\.PHONY: (.*)', text).group(1).split())
+    shown = subprocess.run(
+        ['make', 'help'], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
+    assert set(re.findall(r'make (\w+)', shown)) == targets
