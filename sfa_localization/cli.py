@@ -14,6 +14,8 @@ from typing import TypeVar
 
 from sfa_localization import __version__
 from sfa_localization.config import (
+    CalibrationConfig,
+    CameraConfig,
     InspectionConfig,
     PanoramaConfig,
     PlayConfig,
@@ -225,7 +227,70 @@ INSPECT = Command(
 )
 
 
-COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT]
+_MOUNT = (
+    'angle_min',
+    'angle_max',
+    'axis',
+    'mirrored',
+    'mount_roll',
+    'mount_pitch',
+    'mount_yaw',
+)
+
+
+def _configure_calibrate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('images', nargs='*', type=Path, metavar='IMAGE', help='raw pictures')
+    parser.add_argument(
+        '--calibration',
+        type=Path,
+        help='camera_info, OpenCV, Kalibr or camodocal YAML, or OCamCalib calib_results.txt',
+    )
+    parser.add_argument('--center', type=_by_x, help='COLUMNxROW of the mirror (px); else found')
+    parser.add_argument('--radii', type=_by_x, help='INNERxOUTER radius (px); else found')
+    parser.add_argument('--output', type=Path, help='parameter file to write (YAML)')
+    parser.add_argument('--check', type=Path, help='picture to write, to see if all is right (PNG)')
+    _add_settings(parser, CalibrationConfig)
+    _add_settings(parser, CameraConfig, _MOUNT)
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from sfa_localization import calibration
+
+    pictures = calibration.read_pictures(arguments.images)
+    circles = None
+    if arguments.center or arguments.radii:
+        circles = calibration.given_circles(arguments.center or (), arguments.radii or ())
+    known = {name: value for name, value in vars(arguments).items() if name in _MOUNT}
+    config = _settings(CalibrationConfig, arguments)
+    camera = calibration.calibrate(pictures, arguments.calibration, circles, config, known)
+    print(calibration.parameters_text(camera), end='')
+    if arguments.check:
+        if not pictures:
+            raise LocalizationError('--check needs a picture of the camera to draw in')
+        drawn = calibration.check_picture(pictures[0], camera, PanoramaConfig())
+        calibration.write_check(arguments.check, drawn)
+    if arguments.output:
+        text = calibration.parameters_text(camera)
+        calibration.write_whole(arguments.output, text.encode())
+    return 0
+
+
+CALIBRATE = Command(
+    'calibrate',
+    'Find the mirror in pictures, or read a calibration file; write camera parameters.',
+    '  calibrate drive/*.png --check check.png --output camera.yaml\n'
+    '  calibrate picture.png --model fisheye --field-of-view 190 --check check.png\n'
+    '  calibrate picture.png --calibration calib_results.txt --mirrored yes --axis down \\\n'
+    '      --check check.png --output camera.yaml\n'
+    '  calibrate --calibration camchain.yaml --output camera.yaml\n\n'
+    'The check picture shows where FRONT, LEFT, BACK and RIGHT of the robot are taken to be, and\n'
+    'the elevations of the panorama. Turn it right with --mount-yaw, --axis and --mirrored.',
+    _configure_calibrate,
+    _calibrate,
+)
+
+
+COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT, CALIBRATE]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,183 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Finding the mirror, and the command `calibrate` from pictures to a parameter file."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from sfa_localization import cli
+from sfa_localization.calibration import check_picture, find_circles, given_circles
+from sfa_localization.config import CameraConfig, PanoramaConfig
+from sfa_localization.errors import CameraError
+from sfa_localization.panorama import Unwrapper
+
+CENTER, RADII = (330.3, 241.7), (42.0, 205.0)
+
+
+def scene(seed, background=10.0, center=CENTER, radii=RADII, size=(480, 640)):
+    """A textured ring, as a mirror shows the world, before a background; sub-pixel edges."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(70, 256, (24, 32, 3), np.uint8)
+    texture = cv2.resize(coarse, size[::-1], interpolation=cv2.INTER_CUBIC).astype(float)
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    radius = np.hypot(columns - center[0], rows - center[1])
+    ring = np.clip(radius - radii[0] + 0.5, 0, 1) * np.clip(radii[1] - radius + 0.5, 0, 1)
+    picture = texture * ring[..., None] + background * (1 - ring[..., None])
+    return np.clip(picture + rng.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
+
+
+def assert_found(circles, center=CENTER, radii=RADII, atol=1.0):
+    rim, hole = circles.rim, circles.hole
+    np.testing.assert_allclose((rim.column, rim.row, rim.radius), (*center, radii[1]), atol=atol)
+    np.testing.assert_allclose((hole.column, hole.row, hole.radius), (*center, radii[0]), atol=2.0)
+
+
+def test_one_picture_on_a_dark_background():
+    assert_found(find_circles([scene(1)]))
+
+
+def test_a_drive_before_a_bright_still_background():
+    """The surroundings are brighter than the mirror; only change tells them apart."""
+    still = np.full((480, 640, 1), 200.0)
+    still[::8] = 60
+    assert_found(find_circles([scene(n, still) for n in range(8)]), atol=3.0)
+
+
+def test_a_rim_that_the_picture_cuts_off():
+    circles = find_circles([scene(1, center=(330.0, 200.0), radii=(42.0, 260.0))])
+    np.testing.assert_allclose(
+        (circles.rim.column, circles.rim.row, circles.rim.radius), (330, 200, 260), atol=2.0
+    )
+
+
+def test_a_mirror_without_a_hole():
+    assert find_circles([scene(1, radii=(0.0, 200.0))]).hole is None
+
+
+def test_the_same_pictures_give_the_same_circles():
+    assert find_circles([scene(1)]) == find_circles([scene(1)])
+
+
+@pytest.mark.parametrize('level', [0, 255])
+def test_pictures_without_a_mirror_are_refused(level):
+    with pytest.raises(CameraError, match='stands out'):
+        find_circles([np.full((480, 640, 3), level, np.uint8)])
+
+
+def test_noise_without_a_mirror_is_refused():
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    with pytest.raises(CameraError, match='stands out'):
+        find_circles([noise])
+
+
+@pytest.fixture
+def picture(tmp_path):
+    path = tmp_path / 'raw.png'
+    cv2.imwrite(str(path), scene(1))
+    return path
+
+
+def parameters(path):
+    return yaml.safe_load(path.read_text())['omnicam_node']['ros__parameters']
+
+
+def test_from_pictures_to_a_parameter_file(tmp_path, picture, capsys):
+    output, check = tmp_path / 'made' / 'camera.yaml', tmp_path / 'check.png'
+    arguments = ['calibrate', str(picture), '--output', str(output), '--check', str(check)]
+    assert cli.main([*arguments, '--angle-min', '70', '--angle-max', '120']) == 0
+    values = parameters(output)
+    assert values['camera_model'] == 'polar'
+    assert (values['image_width'], values['image_height']) == (640, 480)
+    assert values['cx'] == pytest.approx(CENTER[0], abs=1.0)
+    assert values['radius_max'] == pytest.approx(RADII[1], abs=1.0)
+    config = CameraConfig.from_mapping(values, 'test')
+    assert (config.angle_min, config.angle_max) == (70.0, 120.0)
+    result = Unwrapper(config, PanoramaConfig())(scene(1))
+    assert result.min() > 30  # no background inside the panorama
+    assert 'camera_model: polar' in capsys.readouterr().out
+    assert cv2.imread(str(check)).shape[1] == 1200
+    assert sorted(entry.name for entry in output.parent.iterdir()) == ['camera.yaml']
+
+
+def test_a_fisheye_from_its_rim(tmp_path, picture):
+    output = tmp_path / 'camera.yaml'
+    arguments = ['--model', 'fisheye', '--field-of-view', '200', '--output', str(output)]
+    assert cli.main(['calibrate', str(picture), *arguments]) == 0
+    values = parameters(output)
+    assert values['camera_model'] == 'fisheye'
+    assert values['fx'] == pytest.approx(RADII[1] / np.radians(100), rel=0.01)
+
+
+def test_circles_told_by_hand(tmp_path, picture):
+    output = tmp_path / 'camera.yaml'
+    arguments = ['--center', '300x200', '--radii', '20x150', '--output', str(output)]
+    assert cli.main(['calibrate', str(picture), *arguments]) == 0
+    values = parameters(output)
+    assert [values[name] for name in ('cx', 'cy', 'radius_min', 'radius_max')] == [
+        300.0,
+        200.0,
+        20.0,
+        150.0,
+    ]
+
+
+def test_from_a_calibration_file(tmp_path):
+    known, output = tmp_path / 'camchain.yaml', tmp_path / 'camera.yaml'
+    known.write_text(
+        'cam0:\n  camera_model: omni\n  intrinsics: [0.8, 233, 230, 373, 253]\n'
+        '  distortion_model: radtan\n  distortion_coeffs: [0.1, 0.01, 0.001, -8.0e-05]\n'
+        '  resolution: [752, 480]\n'
+    )
+    arguments = ['--calibration', str(known), '--mount-yaw', '90', '--output', str(output)]
+    assert cli.main(['calibrate', *arguments]) == 0
+    config = CameraConfig.from_mapping(parameters(output), 'test')
+    assert (config.camera_model, config.xi, config.mount_yaw) == ('mirror', 0.8, 90.0)
+    assert config.distortion == (0.1, 0.01, 0.001, -8e-05)
+    assert (config.radius_min, config.radius_max) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ([], 'give pictures'),
+        (['missing.png'], 'missing.png'),
+        (['notes.txt'], 'notes.txt'),
+        (['raw.png', 'small.png'], 'differ in size'),
+        (['raw.png', '--center', '3x4'], '--radii'),
+        (['--calibration', 'missing.yaml'], 'missing.yaml'),
+        (['filled.png'], 'inner circle'),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite('raw.png', scene(1))
+    cv2.imwrite('small.png', scene(1)[:100])
+    cv2.imwrite('filled.png', scene(1, radii=(0.0, 200.0)))
+    (tmp_path / 'notes.txt').write_text('no picture')
+    output = tmp_path / 'camera.yaml'
+    assert cli.main(['calibrate', *arguments, '--output', str(output)]) == 1
+    told = capsys.readouterr().err.strip()
+    assert words in told
+    assert '\n' not in told
+    assert not output.exists()
+
+
+def test_the_check_picture_marks_the_directions():
+    """Red spokes leave the center upwards (front) and to the right (left, in a mirror)."""
+    config = CameraConfig()
+    drawn = check_picture(np.zeros((640, 640, 3), np.uint8), config, PanoramaConfig())
+    assert drawn.shape[1] == 1200
+    raw = drawn[:640, 280:920].astype(int)
+    red = (raw[..., 2] > 150) & (raw[..., 1] < 100)
+    assert red[60:180, 319:321].any(axis=1).all()
+    assert red[319:321, 460:590].any(axis=0).all()
+
+
+def test_given_circles_are_checked():
+    with pytest.raises(CameraError, match='--radii'):
+        given_circles((1.0, 2.0), (5.0, 4.0))
+    assert given_circles((1.0, 2.0), (0.0, 4.0)).hole is None
