@@ -19,7 +19,7 @@ from rosbags.interfaces import Qos
 from sfa_localization import bag_messages as messages
 from sfa_localization.bag_recording import Recording
 from sfa_localization.bag_storage import Channel, Record, inflate_message
-from sfa_localization.bag_stream import Item, StampFilter, Stream, Tally
+from sfa_localization.bag_stream import StampFilter, Stream, Tally
 from sfa_localization.bag_values import Values, to_odometry, to_trajectory, to_yaw_rate
 from sfa_localization.config import BagConfig
 from sfa_localization.errors import BagError
@@ -265,7 +265,7 @@ class Bag:
         channel, receive_ns, data = record
         stream.received += 1
         if stream.opaque:
-            return stream.push(Item(receive_ns, receive_ns, None))
+            return stream.push(receive_ns, receive_ns, None)
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
         except messages.Unusable as error:
@@ -275,7 +275,7 @@ class Bag:
             stream.tally.leave('tells of other frames')
             return []
         stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
-        return stream.push(Item(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part))
+        return stream.push(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part)
 
     def _check_complete(self, stream: Stream) -> None:
         """Compare what was read with what is said to be there; nothing usable is an error."""

@@ -45,11 +45,11 @@ class Tally:
 
 
 class Item(NamedTuple):
-    """A message on its way: the stamp it is filed under, its reception, itself."""
+    """A message on its way: the stamp it is filed under, its reception, what it tells."""
 
     stamp_ns: int
     receive_ns: int
-    message: Any
+    value: Any
 
 
 class StampFilter:
@@ -57,13 +57,15 @@ class StampFilter:
 
     A stamp that moved by `jump_ns` more or less than the time of reception is a jump. It is
     believed only when the next message goes on from it: a lone one is skipped, a lasting one
-    was a clock being set. One message may be held back, so ask `flush` for it at the end.
+    was a clock being set; what comes after a clock was set back is skipped until it has caught
+    up. One message may be held back, so ask `flush` for it at the end.
     """
 
     def __init__(self, jump_ns: int, tally: Tally) -> None:
         self._jump_ns, self._tally = jump_ns, tally
         self._last: Item | None = None
         self._suspect: Item | None = None
+        self._behind: Item | None = None
 
     def push(self, item: Item) -> list[Item]:
         """Messages that can be used now."""
@@ -71,43 +73,56 @@ class StampFilter:
             self._tally.skip('zero stamp')
             return []
         suspect, self._suspect = self._suspect, None
-        if self._last is not None and self._follows(self._last, item):
-            if suspect is not None:
-                self._tally.skip('stamp jumps')
-            return self._in_order([item])
-        if suspect is not None and self._follows(suspect, item):
-            return self._in_order([suspect, item])
-        if suspect is not None:
-            self._tally.skip('stamp jumps')
+        if self._follows(self._last, item):
+            self._drop(suspect)
+            return self._in_order(item)
+        if self._follows(self._behind, item) and not self._ahead(item):
+            self._behind = item
+            self._tally.skip('clock was set back')
+            return []
+        if self._follows(suspect, item):
+            return self._after_clock_was_set(suspect, item)
+        self._drop(suspect)
         self._suspect = item
         return []
 
     def flush(self) -> list[Item]:
         """What was held back; of use only when nothing came before it."""
         suspect, self._suspect = self._suspect, None
-        if suspect is None:
-            return []
-        if self._last is None:
-            return self._in_order([suspect])
-        self._tally.skip('stamp jumps')
+        if suspect is not None and self._last is None:
+            return self._in_order(suspect)
+        self._drop(suspect)
         return []
 
-    def _follows(self, before: Item, after: Item) -> bool:
-        moved = after.stamp_ns - before.stamp_ns
-        return abs(moved - (after.receive_ns - before.receive_ns)) <= self._jump_ns
+    def _follows(self, before: Item | None, after: Item) -> bool:
+        """Whether both clocks tell about the same time between two messages."""
+        if before is None:
+            return False
+        moved, received = after.stamp_ns - before.stamp_ns, after.receive_ns - before.receive_ns
+        return abs(moved - received) <= self._jump_ns
 
-    def _in_order(self, items: list[Item]) -> list[Item]:
-        passed = []
-        for item in items:
-            last = self._last
-            if last is not None and item.stamp_ns == last.stamp_ns:
-                self._tally.skip('duplicate stamp')
-            elif last is not None and item.stamp_ns < last.stamp_ns:
-                self._tally.skip('stamp out of order')
-            else:
-                self._last = item
-                passed.append(item)
-        return passed
+    def _ahead(self, item: Item) -> bool:
+        return self._last is None or item.stamp_ns > self._last.stamp_ns
+
+    def _drop(self, suspect: Item | None) -> None:
+        if suspect is not None:
+            self._tally.skip('stamp jumps')
+
+    def _after_clock_was_set(self, suspect: Item | None, item: Item) -> list[Item]:
+        first = [] if suspect is None else [suspect]
+        if all(self._ahead(entry) for entry in first):
+            return [passed for entry in (*first, item) for passed in self._in_order(entry)]
+        self._behind = item
+        self._tally.skip('clock was set back', len(first) + 1)
+        return []
+
+    def _in_order(self, item: Item) -> list[Item]:
+        if self._ahead(item):
+            self._last = item
+            return [item]
+        same = self._last is not None and item.stamp_ns == self._last.stamp_ns
+        self._tally.skip('duplicate stamp' if same else 'stamp out of order')
+        return []
 
 
 class Stream:
@@ -127,20 +142,19 @@ class Stream:
         self.received, self.required, self.opaque = 0, True, False
         self._convert, self._stamps = convert, stamps
 
-    def push(self, item: Item) -> list[tuple[int, Any]]:
+    def push(self, stamp_ns: int, receive_ns: int, part: Any) -> list[tuple[int, Any]]:
         """Stamps and values that the message, with one held back, gives."""
-        return self._converted(self._stamps.push(item))
+        try:
+            item = Item(stamp_ns, receive_ns, self._convert(part))
+        except LocalizationError as error:
+            self.tally.skip(str(error))
+            return []
+        return self._used(self._stamps.push(item))
 
     def flush(self) -> list[tuple[int, Any]]:
         """The rest, when the topic has ended."""
-        return self._converted(self._stamps.flush())
+        return self._used(self._stamps.flush())
 
-    def _converted(self, items: list[Item]) -> list[tuple[int, Any]]:
-        values = []
-        for item in items:
-            try:
-                values.append((item.stamp_ns, self._convert(item.message)))
-                self.tally.use()
-            except LocalizationError as error:
-                self.tally.skip(str(error))
-        return values
+    def _used(self, items: list[Item]) -> list[tuple[int, Any]]:
+        self.tally.use(len(items))
+        return [(item.stamp_ns, item.value) for item in items]

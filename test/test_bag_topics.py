@@ -1,0 +1,432 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a bag are taken, what their messages mean, and whose stamps are believed."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_formats import PERIOD, pose, stamp
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from sfa_localization.bag import Bag, BagWriter, load_run
+from sfa_localization.config import TopicNames
+from sfa_localization.errors import BagError
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+COUNT = 6
+
+
+def make(kind: str, **fields: Any) -> Any:
+    """Return a message; `kind` is package/Name."""
+    return STORE.types[kind.replace('/', '/msg/')](**fields)
+
+
+def header(stamp_ns: int, frame: str = 'world') -> Any:
+    time = make('builtin_interfaces/Time', sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return make('std_msgs/Header', stamp=time, frame_id=frame)
+
+
+def quaternion(yaw: float, scale: float = 1.0) -> Any:
+    z, w = scale * math.sin(yaw / 2), scale * math.cos(yaw / 2)
+    return make('geometry_msgs/Quaternion', x=0.0, y=0.0, z=z, w=w)
+
+
+def plain_pose(x: float, y: float, yaw: float) -> Any:
+    position = make('geometry_msgs/Point', x=x, y=y, z=0.3)
+    return make('geometry_msgs/Pose', position=position, orientation=quaternion(yaw))
+
+
+def pose_stamped(stamp_ns: int, x: float, y: float, yaw: float) -> Any:
+    return make('geometry_msgs/PoseStamped', header=header(stamp_ns), pose=plain_pose(x, y, yaw))
+
+
+def with_covariance(stamp_ns: int, x: float, y: float, yaw: float) -> Any:
+    inner = make(
+        'geometry_msgs/PoseWithCovariance', pose=plain_pose(x, y, yaw), covariance=np.zeros(36)
+    )
+    return make('geometry_msgs/PoseWithCovarianceStamped', header=header(stamp_ns), pose=inner)
+
+
+def transform_stamped(
+    stamp_ns: int, x: float, y: float, yaw: float, child: str = 'base_link'
+) -> Any:
+    shift = make('geometry_msgs/Vector3', x=x, y=y, z=0.3)
+    transform = make('geometry_msgs/Transform', translation=shift, rotation=quaternion(yaw))
+    return make(
+        'geometry_msgs/TransformStamped',
+        header=header(stamp_ns),
+        child_frame_id=child,
+        transform=transform,
+    )
+
+
+def tf(stamp_ns: int, x: float, y: float, yaw: float, *others: Any) -> Any:
+    transforms = [*others, transform_stamped(stamp_ns, x, y, yaw)]
+    return make('tf2_msgs/TFMessage', transforms=transforms)
+
+
+def odometry(stamp_ns: int, x: float, y: float, yaw: float, v: float = 1.0) -> Any:
+    zero = make('geometry_msgs/Vector3', x=0.0, y=0.0, z=0.0)
+    twist = make(
+        'geometry_msgs/Twist', linear=make('geometry_msgs/Vector3', x=v, y=0.0, z=0.0), angular=zero
+    )
+    return make(
+        'nav_msgs/Odometry',
+        header=header(stamp_ns, 'odom'),
+        child_frame_id='base_link',
+        pose=with_covariance(stamp_ns, x, y, yaw).pose,
+        twist=make('geometry_msgs/TwistWithCovariance', twist=twist, covariance=np.zeros(36)),
+    )
+
+
+def picture(stamp_ns: int, **changes: Any) -> Any:
+    fields = {
+        'height': 4,
+        'width': 20,
+        'encoding': 'bgr8',
+        'is_bigendian': 0,
+        'step': 60,
+        'data': np.full(240, 7, np.uint8),
+    }
+    return make('sensor_msgs/Image', header=header(stamp_ns, 'camera'), **{**fields, **changes})
+
+
+Entry = tuple[str, int, Any]
+
+
+def record(path: Path, entries: list[Entry], serialization: str = 'cdr') -> Path:
+    """Write (topic, reception, message or bytes of a std_msgs/String) to a bag."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for topic, receive_ns, message in entries:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic,
+                    message.__msgtype__,
+                    typestore=STORE,
+                    serialization_format=serialization,
+                )
+            data = STORE.serialize_cdr(message, message.__msgtype__)
+            writer.write(connections[topic], receive_ns, data)
+    return path
+
+
+def poses_of(make_message: Callable[..., Any], topic: str) -> list[Entry]:
+    return [(topic, stamp(i) + 1000, make_message(stamp(i), *pose(i))) for i in range(COUNT)]
+
+
+EXPECTED = np.array([pose(i) for i in range(COUNT)])
+
+
+# What the messages mean.
+
+
+@pytest.mark.parametrize(
+    'make_message', [pose_stamped, with_covariance, transform_stamped, tf, odometry]
+)
+def test_true_poses_come_in_any_type(make_message: Callable[..., Any], tmp_path: Path) -> None:
+    path = record(tmp_path / 'bag', poses_of(make_message, '/truth'))
+    with Bag(path, strict=True) as bag:
+        truth = bag.trajectory('/truth')
+    assert truth.stamps_ns.tolist() == [stamp(i) for i in range(COUNT)]
+    np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
+
+
+@pytest.mark.parametrize('make_message', [pose_stamped, with_covariance, transform_stamped, tf])
+def test_poses_serve_as_odometry_when_named(
+    make_message: Callable[..., Any], tmp_path: Path
+) -> None:
+    path = record(tmp_path / 'bag', poses_of(make_message, '/tf'))
+    with Bag(path, strict=True) as bag:
+        with pytest.raises(BagError, match='has no odometry'):
+            bag.find('odometry')
+        read = bag.odometry('/tf')
+    np.testing.assert_allclose(read.poses, EXPECTED, atol=1e-12)
+    np.testing.assert_allclose(read.twists[:, 1], 0.02 * 1e9 / PERIOD, atol=1e-6)
+    speed = math.hypot(0.5, 0.25) * 1e9 / PERIOD
+    np.testing.assert_allclose(read.twists[:, 0], speed, rtol=1e-4)
+    assert not read.variances.any()
+
+
+def test_driving_backwards_has_a_negative_speed(tmp_path: Path) -> None:
+    entries = [('/p', stamp(i), pose_stamped(stamp(i), -0.1 * i, 0.0, 0.0)) for i in range(4)]
+    with Bag(record(tmp_path / 'bag', entries)) as bag:
+        np.testing.assert_allclose(bag.odometry('/p').twists, [[-1.0, 0.0]] * 4, atol=1e-9)
+
+
+def test_one_transform_of_several_is_named_by_its_frame(tmp_path: Path) -> None:
+    wheel = transform_stamped(stamp(99), 9.0, 9.0, 0.0, child='wheel')
+    entries = [('/tf', stamp(i), tf(stamp(i), *pose(i), wheel)) for i in range(COUNT)]
+    entries.append(('/tf', stamp(COUNT), make('tf2_msgs/TFMessage', transforms=[wheel])))
+    with Bag(record(tmp_path / 'bag', entries), strict=True) as bag:
+        with pytest.raises(BagError, match='base_link, wheel; choose one as /tf:FRAME'):
+            bag.trajectory('/tf')
+        truth = bag.trajectory('/tf:base_link')
+        assert bag.counts['/tf'].skipped == {'tells of other frames': 1}
+    np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
+
+
+def test_yaw_survives_tilt_and_scale(tmp_path: Path) -> None:
+    entries = []
+    for index, yaw in enumerate([-3.0, -1.0, 0.0, 2.0, math.pi]):
+        message = pose_stamped(stamp(index), 0.0, 0.0, 0.0)
+        roll = math.sin(0.1), math.cos(0.1)  # half of 0.2 rad about x, after the yaw about z
+        z, w = math.sin(yaw / 2), math.cos(yaw / 2)
+        q = (w * roll[0], z * roll[0], z * roll[1], w * roll[1])
+        x, y, z, w = (3.0 * value for value in q)
+        message.pose = make(
+            'geometry_msgs/Pose',
+            position=message.pose.position,
+            orientation=make('geometry_msgs/Quaternion', x=x, y=y, z=z, w=w),
+        )
+        entries.append(('/p', stamp(index), message))
+    with Bag(record(tmp_path / 'bag', entries)) as bag:
+        read = bag.trajectory().poses[:, 2]
+    np.testing.assert_allclose(np.exp(1j * read), np.exp(1j * np.array([-3, -1, 0, 2, np.pi])))
+
+
+def test_odometry_that_was_reset_is_joined(tmp_path: Path) -> None:
+    entries = []
+    for index in range(20):
+        x = 0.1 * index if index < 10 else 0.1 * (index - 10)
+        y = 50.0 if index < 10 else 0.0
+        entries.append(('/odom', stamp(index), odometry(stamp(index), x, y, 0.0)))
+    path = record(tmp_path / 'bag', entries)
+    with Bag(path) as bag:
+        read = bag.odometry()
+        assert bag.problems == ['/odom: odometry was reset 1 times; joined by its twist']
+    np.testing.assert_allclose(read.poses[:, 0], 0.1 * np.arange(20), atol=1e-9)
+    np.testing.assert_allclose(read.poses[:, 1], 50.0, atol=1e-9)
+    with pytest.raises(BagError, match='was reset'), Bag(path, strict=True) as bag:
+        bag.odometry()
+
+
+# Which topic is taken.
+
+
+def full(path: Path, *more: Entry) -> Path:
+    entries = [('/camera', stamp(i), picture(stamp(i))) for i in range(COUNT)]
+    return record(path, [*entries, *poses_of(odometry, '/odom'), *more])
+
+
+@pytest.mark.parametrize(
+    ('kind', 'entry', 'names', 'flag'),
+    [
+        ('image', ('/second', stamp(1), picture(stamp(1))), '/camera, /second', '--image-topic'),
+        (
+            'odometry',
+            ('/ekf', stamp(1), odometry(stamp(1), 0, 0, 0)),
+            '/ekf, /odom',
+            '--odom-topic',
+        ),
+    ],
+)
+def test_ambiguity_is_an_error_that_lists_the_candidates(
+    kind: str, entry: Entry, names: str, flag: str, tmp_path: Path
+) -> None:
+    with Bag(full(tmp_path / 'bag', entry)) as bag:
+        with pytest.raises(BagError, match=f'several topics have .*: {names}; .* {flag}'):
+            bag.find(kind)
+        assert bag.find(kind, names.split(', ')[1]) == names.split(', ')[1]
+
+
+def test_ambiguous_truth_lists_the_candidates(tmp_path: Path) -> None:
+    more = [*poses_of(pose_stamped, '/a'), *poses_of(with_covariance, '/b')]
+    path = full(tmp_path / 'bag', *more)
+    with pytest.raises(BagError, match=r'/a, /b; choose one with --ground-truth-topic'):
+        load_run(path, cache=tmp_path, want_truth=True)
+    named = TopicNames(ground_truth='/b')
+    assert load_run(path, cache=tmp_path, want_truth=True, topics=named).ground_truth is not None
+
+
+@pytest.mark.parametrize(
+    ('kind', 'name', 'complaint'),
+    [
+        ('image', '/nothing', r'has no topic /nothing; it has /camera \(Image, 6\)'),
+        ('image', '/odom', r'/odom is nav_msgs/msg/Odometry, not one of Image, CompressedImage'),
+        ('odometry', '/camera', r'/camera is sensor_msgs/msg/Image, not one of Odometry'),
+        ('imu', '', r'has no yaw rates \(Imu\); .* --imu-topic'),
+        ('ground_truth', '', r'has no true poses .* --ground-truth-topic'),
+    ],
+)
+def test_a_missing_or_wrong_topic_names_the_remedy(
+    kind: str, name: str, complaint: str, tmp_path: Path
+) -> None:
+    with Bag(full(tmp_path / 'bag')) as bag, pytest.raises(BagError, match=complaint):
+        bag.find(kind, name)
+
+
+def test_a_leading_slash_may_be_left_out(tmp_path: Path) -> None:
+    with Bag(full(tmp_path / 'bag')) as bag:
+        assert bag.find('odometry', 'odom') == '/odom'
+
+
+def test_an_unknown_serialization_is_refused_by_name(tmp_path: Path) -> None:
+    path = record(tmp_path / 'bag', poses_of(odometry, '/odom'), serialization='protobuf')
+    with Bag(path) as bag, pytest.raises(BagError, match="/odom is serialized as 'protobuf'"):
+        bag.odometry()
+
+
+def test_a_run_needs_no_gyro(tmp_path: Path) -> None:
+    assert load_run(full(tmp_path / 'bag'), cache=tmp_path).yaw_rate is None
+
+
+# Faulty messages.
+
+
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'step': 59}, 'data size is not rows times step'),
+        ({'step': 30, 'data': np.zeros(120, np.uint8)}, 'step is shorter than a row'),
+        ({'data': np.zeros(239, np.uint8)}, 'data size is not rows times step'),
+        ({'data': np.zeros(0, np.uint8)}, 'data size is not rows times step'),
+        ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty picture'),
+        ({'encoding': 'rgb9'}, "unsupported encoding 'rgb9'"),
+        ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first picture'),
+    ],
+)
+def test_a_faulty_picture_is_skipped_and_counted(
+    changes: dict[str, Any], reason: str, tmp_path: Path
+) -> None:
+    entry = ('/camera', stamp(2) + 7, picture(stamp(2) + 7, **changes))
+    path = full(tmp_path / 'bag', entry)
+    run = load_run(path, cache=tmp_path)
+    assert run.counts['images'].as_dict() == {'used': COUNT, 'skipped': {reason: 1}}
+    with pytest.raises(BagError, match=f'/camera: {reason}; read without --strict'):
+        load_run(path, cache=tmp_path, strict=True)
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf])
+def test_odometry_that_is_not_finite_is_skipped(value: float, tmp_path: Path) -> None:
+    bad = [
+        ('/odom', stamp(1) + 1, odometry(stamp(1) + 1, value, 0.0, 0.0)),
+        ('/odom', stamp(2) + 1, odometry(stamp(2) + 1, 0.0, 0.0, 0.0, v=value)),
+    ]
+    with Bag(full(tmp_path / 'bag', *bad)) as bag:
+        read = bag.odometry()
+        assert bag.counts['/odom'].skipped == {'not a finite pose': 1, 'not a finite twist': 1}
+    assert np.isfinite(read.poses).all() and len(read.stamps_ns) == COUNT
+
+
+def test_a_pose_without_orientation_is_skipped(tmp_path: Path) -> None:
+    entries = poses_of(pose_stamped, '/p')
+    entries[2][2].pose.orientation.z = entries[2][2].pose.orientation.w = 0.0
+    with Bag(record(tmp_path / 'bag', entries)) as bag:
+        assert len(bag.trajectory()) == COUNT - 1
+        assert bag.counts['/p'].skipped == {'orientation is no quaternion': 1}
+
+
+# Stamps.
+
+
+def stamped(path: Path, stamps: list[int]) -> tuple[list[int], dict[str, int]]:
+    """Return the stamps that are used, and the reasons of others, received every 0.1 s."""
+    entries = [('/p', stamp(i), pose_stamped(s, 0.0, 0.0, 0.0)) for i, s in enumerate(stamps)]
+    with Bag(record(path, entries)) as bag:
+        return bag.trajectory().stamps_ns.tolist(), bag.counts['/p'].skipped
+
+
+TIMES = [stamp(i) for i in range(10)]
+HOUR = 3600 * 10**9
+
+
+@pytest.mark.parametrize(
+    ('stamps', 'used', 'skipped'),
+    [
+        (TIMES, TIMES, {}),
+        (TIMES[:1], TIMES[:1], {}),
+        ([0, *TIMES[1:]], TIMES[1:], {'zero stamp': 1}),
+        ([*TIMES[:4], TIMES[3], *TIMES[4:9]], TIMES[:9], {'duplicate stamp': 1}),
+        (
+            [*TIMES[:3], TIMES[4], TIMES[3], *TIMES[5:]],
+            [*TIMES[:3], *TIMES[4:]],
+            {'stamp out of order': 1},
+        ),
+        ([*TIMES[:4], TIMES[4] + HOUR, *TIMES[5:]], TIMES[:4] + TIMES[5:], {'stamp jumps': 1}),
+        ([*TIMES[:4], TIMES[4] - HOUR, *TIMES[5:]], TIMES[:4] + TIMES[5:], {'stamp jumps': 1}),
+        ([TIMES[0] + HOUR, *TIMES[1:]], TIMES[1:], {'stamp jumps': 1}),
+        ([*TIMES[:9], TIMES[9] + HOUR], TIMES[:9], {'stamp jumps': 1}),
+        # A clock that was set forward stays so: what follows is as good as what came before.
+        (
+            [*TIMES[:5], *(t + HOUR for t in TIMES[5:])],
+            [*TIMES[:5], *(t + HOUR for t in TIMES[5:])],
+            {},
+        ),
+        # Set back, later pictures would have to be put among the earlier ones.
+        ([*TIMES[:5], *(t - HOUR for t in TIMES[5:])], TIMES[:5], {'clock was set back': 5}),
+    ],
+)
+def test_stamps_that_cannot_be(
+    stamps: list[int], used: list[int], skipped: dict[str, int], tmp_path: Path
+) -> None:
+    assert stamped(tmp_path / 'bag', stamps) == (used, skipped)
+
+
+def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
+    entries = [('/p', stamp(i), pose_stamped(0, *pose(i))) for i in range(COUNT)]
+    path = record(tmp_path / 'bag', entries)
+    with (
+        Bag(path) as bag,
+        pytest.raises(BagError, match=r'6 zero stamp.*stamp_source: receive'),
+    ):
+        bag.trajectory()
+    with Bag(path, stamp_source='receive') as bag:
+        np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
+
+
+# The writer.
+
+
+def test_a_bag_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), BagWriter(tmp_path / 'new' / 'bag') as bag:
+        bag.imu('/imu', stamp(0), 0.1, 0.0)
+        assert not (tmp_path / 'new' / 'bag').exists()
+        raise KeyError
+    assert list((tmp_path / 'new').iterdir()) == []
+
+
+def test_an_existing_bag_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / 'bag').mkdir()
+    with pytest.raises(BagError, match='bag: exists already'), BagWriter(tmp_path / 'bag'):
+        pass
+    with pytest.raises(BagError, match="storage 'tape' is not one of mcap, sqlite3"):
+        BagWriter(tmp_path / 'bag', 'tape')
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_same_calls_write_same_bytes(storage: str, tmp_path: Path) -> None:
+    content = []
+    for folder in ('one', 'two'):
+        with BagWriter(tmp_path / folder / 'bag', storage) as bag:
+            for index in range(50):
+                bag.imu('/imu', stamp(index), 0.1 * index, 0.0)
+                bag.image('/image', stamp(index), np.full((9, 9, 3), index, np.uint8), '', 'png')
+        files = sorted((tmp_path / folder / 'bag').iterdir())
+        content.append([(file.name, file.read_bytes()) for file in files])
+    assert content[0] == content[1] and len(content[0]) == 2
+
+
+@pytest.mark.parametrize(('compressed', 'error'), [(None, 0), ('png', 0), ('jpeg', 12)])
+def test_pictures_are_written_raw_or_compressed(
+    compressed: str | None, error: int, tmp_path: Path
+) -> None:
+    smooth = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.image('/image', stamp(0), smooth, 'camera', compressed)
+    with Bag(tmp_path / 'bag', strict=True) as bag:
+        ((at, read),) = bag.images()
+    assert at == stamp(0)
+    assert np.abs(read.astype(int) - smooth).max() <= error
+
+
+def test_a_topic_has_one_type(tmp_path: Path) -> None:
+    refusal = pytest.raises(BagError, match=r'/x is sensor_msgs/msg/Imu, not')
+    with refusal, BagWriter(tmp_path / 'bag') as bag:
+        bag.imu('/x', stamp(0), 0.0, 0.0)
+        bag.pose('/x', stamp(0), np.zeros(3))
