@@ -504,7 +504,9 @@ class MetricConfig(Settings):
     gp_noise: float = setting(
         0.0, 'variance of a picture over the variance of the process; 0: chosen', low=0.0, high=1e3
     )
-    inducing_points: int = setting(1000, 'pictures that span the process', low=10, high=20000)
+    inducing_points: int = setting(
+        1500, 'most pictures that span the process; more are exact, but slow', low=10, high=20000
+    )
     use_turns: bool = setting(True, 'use signed turns between segments')
     use_displacements: bool = setting(True, 'use displacements between segments')
     yaw_bias_std: float = setting(
@@ -902,6 +904,9 @@ class HeadingConfig(Settings):
         (1, 2), 'layers whose maps tell the heading', low=1, high=20
     )
     heading_features: int = setting(8, 'slow features that tell it the place', low=0, high=1000)
+    heading_folds: int = setting(
+        6, 'parts of the segments left out in turn for its accuracy', low=2, high=100
+    )
     heading_inducing_points: int = setting(
         800, 'pictures that span the compass', low=20, high=20000
     )

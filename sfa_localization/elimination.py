@@ -10,6 +10,7 @@ with signed turns and odometry's displacements between segments as further squar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -63,9 +64,9 @@ class Stack:
         """Paths (M,) without the yaw-rate bias of each run (R,)."""
         return np.asarray(self.path - bias[self.run[self.owner]] * self.drift)
 
-    def sums(self, rows: NDArray[np.generic]) -> NDArray[np.generic]:
+    def sums(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Sum (N, ...) of the rows (M, ...) of each segment."""
-        return np.add.reduceat(rows, self.first, axis=0)
+        return np.asarray(np.add.reduceat(rows, self.first, axis=0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +88,11 @@ class Links:
     def of(cls, segments: Segments, turns: bool, displacements: bool) -> Links:
         """All that are known; trust 0 where not to be used."""
         items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
-        column = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
+        column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
         at = np.array([n for n, _ in items], np.int64)
         run = np.array([s.run for _, s in items], np.int64)
         trust = [np.full(len(at), float(used)) for used in (turns, displacements)]
-        return cls(at, run, *column, *trust)  # type: ignore[arg-type]
+        return cls(at, run, *column, *trust)
 
     def trusted(self, turn: Array, displacement: Array) -> Links:
         """The same links with other weights (L,)."""

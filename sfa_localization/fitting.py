@@ -70,7 +70,7 @@ def fit(
     correlation = 1.0 if start is None else start.correlation
     links = links if start is None else start.links
     solution = None if start is None else start.solution
-    for _ in range(rounds):
+    for _ in range(max(rounds, 1)):
         elimination = eliminate(expanded, basis.ridge, trust / missing, stack)
         solution = _solve(elimination, links, stack, variance * correlation, config, solution)
         weights = elimination.weights(solution.coefficients(stack.run))
@@ -82,6 +82,7 @@ def fit(
             links = _link_trust(links, solution, config)
         if abs(variance - before) < 0.01 * variance:
             break
+    assert solution is not None
     return Fit(
         basis,
         expanded,
@@ -106,7 +107,17 @@ def _solve(
 ) -> Solution:
     problem = Problem(elimination.gram, links, stack.run, variance, config.yaw_bias_std)
     bias = np.zeros(stack.run[-1] + 1) if before is None else before.bias
-    return problem.solve(None if before is None else before.z, bias)
+    return _unmirrored(problem.solve(None if before is None else before.z, bias), links)
+
+
+def _unmirrored(solution: Solution, links: Links) -> Solution:
+    """Where the cost cannot tell the map from its mirror image, let the turns' signs decide."""
+    if np.abs(solution.h.imag).max() > 1e-9 * np.abs(solution.h).max():
+        return solution
+    turned = solution.z[links.at + 1] * np.conj(solution.z[links.at])
+    if np.cos(np.angle(turned) - links.turn).sum() >= np.cos(np.angle(turned) + links.turn).sum():
+        return solution
+    return replace(solution, z=np.conj(solution.z), o=np.conj(solution.o))
 
 
 def problem_of(fit: Fit, stack: Stack) -> Problem:

@@ -22,7 +22,7 @@ from sfa_localization.fitting import Fit, problem_of, targets
 from sfa_localization.gauge import gauge
 from sfa_localization.geometry import Array, RigidTransform, wrap_angle
 from sfa_localization.hyperparameters import LeftOut, choose, leave_out
-from sfa_localization.phases import Certificate
+from sfa_localization.phases import Certificate, certify, refine
 from sfa_localization.regression import MetricMap
 from sfa_localization.segments import Segments
 from sfa_localization.sufficiency import (
@@ -66,6 +66,7 @@ class MetricResult:
     yaw_bias: Array
     """(R,) rad/s: what each run's odometry turned too fast."""
     certificate: Certificate
+    """Of the directions; the paper's descent seldom arrives close enough to have one."""
     images: Indices
     """(M,) pictures of the segments, in order."""
     residuals: Array
@@ -103,8 +104,8 @@ def learn(features: Array, segments: Segments, config: MetricConfig) -> MetricRe
     else:
         whole = choose(rows, stack, links, config)
     diagnostics = diagnose(whole, stack)
-    check(diagnostics, config)
     _check_certificate(whole, config)
+    check(diagnostics, config)
     left = leave_out(whole, stack, config)
     return _result(whole, left, segments, stack, diagnostics, history, config)
 
@@ -131,13 +132,19 @@ def _rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
 
 
 def _check_certificate(whole: Fit, config: MetricConfig) -> None:
-    certificate = whole.solution.certificate
-    if config.solver == 'certified' and config.require_certificate and not certificate.certified:
-        raise DataError(
-            'the best directions found are not proven best '
-            f'(certificate {certificate.eigenvalue:.1e}): the odometry contradicts the pictures; '
-            'drive more, or accept the risk with require_certificate: false'
-        )
+    """Refuse unproven directions; of the paper's descent, those that end by a wrong minimum."""
+    solution, certificate = whole.solution, whole.solution.certificate
+    if config.solver == 'paper':
+        certificate = certify(solution.h, refine(solution.h, solution.z))
+    if certificate.certified or not config.require_certificate:
+        return
+    found = f'(certificate {certificate.eigenvalue:.1e})'
+    if config.solver == 'paper':
+        raise DataError(f'the descent ended by a wrong minimum {found}: set solver: certified')
+    raise DataError(
+        f'the best directions found are not proven best {found}: the odometry contradicts the '
+        'pictures; drive more, or accept the risk with require_certificate: false'
+    )
 
 
 def _result(

@@ -68,10 +68,11 @@ class Lines:
         predicted = self.regressors @ theta.weights - theta.origins[self.line]
         sine, cosine = np.sin(theta.alpha)[self.line], np.cos(theta.alpha)[self.line]
         lever = self.distances * (sine * predicted[:, 0] - cosine * predicted[:, 1])
-        alpha = np.bincount(self.line, lever, lines)
+        alpha: Array = np.bincount(self.line, lever, lines).astype(float)
         if len(self.turns):
-            alpha += self._turn_gradient(theta)
-        origins = np.column_stack([np.bincount(self.line, axis, lines) for axis in misfit.T])
+            alpha = alpha + self._turn_gradient(theta)
+        origins: Array = np.zeros((lines, 2))
+        np.add.at(origins, self.line, misfit)
         return Parameters(alpha, origins, -self.regressors.T @ misfit)
 
     def _misfit(self, theta: Parameters) -> Array:
@@ -149,11 +150,19 @@ def learn(features: Array, stack: Stack, links: Links, config: MetricConfig) -> 
     random = config.paper_start == 'random'
     start = random_start(lines, config) if random else odometry_start(lines, stack.starts)
     theta, history = descend(lines, start, config)
+    if _mirrored(theta.alpha, turns):
+        theta = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
     return _fit(theta, regressors, count, stack, links), history
 
 
+def _mirrored(alpha: Array, turns: Array) -> bool:
+    """Whether the signed turns (N - 1,) fit the mirror image better: no cosine can tell."""
+    step = np.diff(alpha)
+    return bool(np.nansum(np.cos(step - turns)) < np.nansum(np.cos(-step - turns)))
+
+
 def _fit(theta: Parameters, regressors: Array, count: int, stack: Stack, links: Links) -> Fit:
-    """The descent's end in the certified solver's terms, with its certificate."""
+    """The descent's end in the certified solver's terms, certificate included."""
     terms = regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
     expanded = np.column_stack([regressors[:, 1:], np.ones(len(regressors))])

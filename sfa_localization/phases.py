@@ -22,6 +22,8 @@ Complex = NDArray[np.complex128]
 # Relative to the largest eigenvalue of H; what rounding leaves of an exact zero.
 CERTIFICATE_TOLERANCE = 1e-9
 _NEWTON_STEPS = 100
+# Newton's steps shrink quadratically: the one after this would be rounding.
+_CONVERGED = 1e-9
 _SWEEPS = 500
 
 
@@ -136,7 +138,7 @@ def refine(h: Complex, z: Complex) -> Complex:
             damping = max(4 * damping, 1e-6 * scale)
             continue
         z, cost, damping = proposal, min(new, cost), damping / 8 if damping > 1e-9 * scale else 0.0
-        if np.abs(step).max() < 1e-13:
+        if np.abs(step).max() < _CONVERGED:
             break
     return z
 
@@ -155,7 +157,9 @@ def angle_hessian(h: Complex, z: Complex) -> Array:
 
 def _step(hessian: Array, gradient: Array, damping: float) -> Array:
     """Newton step; where the Hessian is not positive, along its absolute value."""
-    damped = hessian + damping * np.eye(len(hessian))
+    # Turning all together changes nothing: hold the mean.
+    damped = hessian + np.mean(np.abs(np.diag(hessian))) / len(hessian)
+    damped[np.diag_indices_from(damped)] += damping
     try:
         return np.asarray(-scipy.linalg.solve(damped, gradient, assume_a='pos'))
     except np.linalg.LinAlgError:

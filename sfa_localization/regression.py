@@ -254,10 +254,11 @@ class MetricMap:
         try:
             parts = {k[6:]: v for k, v in arrays.items() if k.startswith('basis_')}
             basis: Basis = _BASES[str(parts['kind'])].from_arrays(parts)
-            plain = {
-                name: np.asarray(arrays[name], float) for name in ('weights', 'spread', 'sway')
-            }
-            numbers = {name: float(arrays[name]) for name in ('noise_m', 'inflation')}
+            weights, spread, sway = (np.asarray(arrays[n], float) for n in _ARRAYS)
+            noise_m, inflation = float(arrays['noise_m']), float(arrays['inflation'])
         except KeyError as error:
             raise ModelError(f'the metric map lacks {error}: train the model again') from None
-        return cls(basis=basis, **plain, **numbers)
+        return cls(basis, weights, spread, sway, noise_m, inflation)
+
+
+_ARRAYS = ('weights', 'spread', 'sway')

@@ -15,7 +15,7 @@ from sfa_localization.elimination import Stack
 from sfa_localization.errors import DataError
 from sfa_localization.fitting import Fit, targets
 from sfa_localization.geometry import Array
-from sfa_localization.phases import angle_hessian, metric_upgrade
+from sfa_localization.phases import angle_hessian, metric_upgrade, refine
 
 Complex = NDArray[np.complex128]
 
@@ -64,7 +64,9 @@ def diagnose(fit: Fit, stack: Stack) -> Diagnostics:
     steps = stack.path[1:] - stack.path[:-1]
     same = stack.owner[1:] == stack.owner[:-1]
     heading = steps[same] * fit.solution.z[stack.owner[1:][same]]
-    signed = bool(np.any(fit.links.turn_trust > 0)) or not _straight(stack)
+    links = fit.links
+    signed = bool(np.any(links.turn_trust > 0) or np.any(links.displacement_trust > 0))
+    signed = signed or not _straight(stack)
     condition = np.nan if signed else metric_upgrade(np.real(fit.solution.h))[1]
     return Diagnostics(
         segments=stack.segments,
@@ -74,14 +76,14 @@ def diagnose(fit: Fit, stack: Stack) -> Diagnostics:
         directions=_directions(heading),
         crossings=_crossings(places, stack),
         upgrade_condition=float(condition),
-        mirror_ambiguous=not signed,
+        mirror_ambiguous=not signed and len(links.at) == 0,
         angle_std_rad=float(np.sqrt(np.diag(angle_covariance(fit))).max()),
     )
 
 
 def angle_covariance(fit: Fit) -> Array:
     """Covariance (N, N) of the directions, rad^2, relative to the whole map's rotation."""
-    hessian = angle_hessian(fit.solution.h, fit.solution.z)
+    hessian = angle_hessian(fit.solution.h, refine(fit.solution.h, fit.solution.z))
     values, vectors = np.linalg.eigh(hessian)
     n = len(values)
     common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
