@@ -284,7 +284,14 @@ CALIBRATE = Command(
     '      --check check.png --output camera.yaml\n'
     '  calibrate --calibration camchain.yaml --output camera.yaml\n\n'
     'The check picture shows where FRONT, LEFT, BACK and RIGHT of the robot are taken to be, and\n'
-    'the elevations of the panorama. Turn it right with --mount-yaw, --axis and --mirrored.',
+    'the elevations of the panorama. Turn it right with --mount-yaw, --axis and --mirrored.\n\n'
+    'how to get each model:\n'
+    '  mirror    (most exact) Kalibr, omni-radtan; OpenCV omnidir; camodocal, MEI; a fisheye\n'
+    '            calibrated so needs --mirrored no --axis up\n'
+    '  fisheye   Kalibr, pinhole-equi; OpenCV fisheye; ROS camera_calibration with its\n'
+    '            fisheye model; or from the rim alone with --model fisheye\n'
+    '  ocam      OCamCalib: export calib_results.txt; a mirror needs --mirrored yes --axis down\n'
+    '  polar     (no calibration) from pictures, --angle-min and --angle-max',
     _configure_calibrate,
     _calibrate,
 )

@@ -208,6 +208,13 @@ def test_masks_elevation_and_mount_change_while_running(bench):
         assert time.monotonic() < deadline
 
 
+def test_masks_are_taken_away_again(bench):
+    run = bench(blind_sectors=[10.0, 20.0])
+    assert run.node.start()
+    assert run.set(blind_sectors=[]).successful
+    assert run.node.settings(CameraConfig).blind_sectors == ()
+
+
 @pytest.mark.parametrize(
     ('change', 'words'),
     [
