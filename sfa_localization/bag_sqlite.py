@@ -45,7 +45,8 @@ class SqliteStorage:
                 shutil.copyfile(file, target)
             self.notes.append(f'{self._path.name}: was not closed; its {logs[0].name} is read, too')
         access = 'mode=rw' if logs else 'mode=ro&immutable=1'
-        return sqlite3.connect(f'{path.absolute().as_uri()}?{access}', uri=True)
+        uri = f'{path.absolute().as_uri()}?{access}'
+        return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
     def _pending_logs(self) -> list[Path]:
         logs = [self._path.with_name(self._path.name + end) for end in ('-wal', '-journal')]

@@ -299,9 +299,11 @@ class Ros1Converter:
 def message_class(kind: str) -> Callable[..., Any] | None:
     """The Python class of a message type, or None where it is not installed."""
     package, _, name = kind.partition('/msg/')
+    if not (package.isidentifier() and name.isidentifier()):
+        return None
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name, None)
-    except (ImportError, ValueError):
+    except ImportError:
         return None
 
 

@@ -1,0 +1,397 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Replay: the pace and the keys by themselves, then whole bags through real subscribers."""
+
+import math
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bag_formats import (
+    COUNTS,
+    IMAGES,
+    Message,
+    drive,
+    image,
+    stamp,
+    write_database,
+    write_ros1,
+    write_rosbags,
+    write_version,
+)
+
+from sfa_localization.config import PlayConfig
+from sfa_localization.errors import BagError
+from sfa_localization.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace
+
+DEADLINE_S = 30.0
+DOMAIN = 67
+FAST = PlayConfig(rate=20.0, wait=20.0)
+
+
+@pytest.fixture(scope='session')
+def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
+    """Return the drive that is replayed."""
+    return drive(tmp_path_factory.mktemp('drive'))
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition, with a deadline."""
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, 'deadline'
+        time.sleep(0.005)
+
+
+# The pace.
+
+
+class Seconds:
+    """A clock that is set by hand."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_the_pace_follows_the_clock_at_its_rate() -> None:
+    clock = Seconds()
+    pace = Pace(5_000_000_000, 2.0, clock)
+    assert pace.delay(7_000_000_000) == 1.0
+    clock.now += 0.25
+    assert pace.time_ns == 5_500_000_000
+    assert pace.delay(7_000_000_000) == 0.75
+    pace.scale(0.5)
+    assert pace.delay(7_000_000_000) == 1.5
+
+
+def test_a_paused_pace_stands_still_and_goes_on_from_there() -> None:
+    clock = Seconds()
+    pace = Pace(0, 1.0, clock)
+    clock.now += 1.0
+    pace.toggle_pause()
+    clock.now += 50.0
+    assert pace.time_ns == 1_000_000_000 and pace.delay(0) == math.inf
+    pace.jump(3_000_000_000)
+    assert pace.time_ns == 3_000_000_000
+    pace.toggle_pause()
+    clock.now += 1.0
+    assert pace.time_ns == 4_000_000_000
+
+
+# The keys.
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """Return the user's side of a terminal, and the program's."""
+    user, program = pty.openpty()
+    yield user, program
+    os.close(user)
+    os.close(program)
+
+
+@pytest.mark.parametrize(
+    ('keys', 'action'),
+    [
+        (b' ', PAUSE),
+        (b's', STEP),
+        (b'\x1b[C', STEP),
+        (b'\x1b[A', FASTER),
+        (b'\x1b[B', SLOWER),
+        (b'x', ''),
+        (b'', ''),
+    ],
+)
+def test_keys_are_read_one_by_one(keys: bytes, action: str, terminal: tuple[int, int]) -> None:
+    user, program = terminal
+    with Keyboard(program) as keyboard:
+        os.write(user, keys)
+        assert keyboard.read(5.0 if action else 0.0) == action
+
+
+def test_the_terminal_is_left_as_it_was(terminal: tuple[int, int]) -> None:
+    _, program = terminal
+    before = termios.tcgetattr(program)
+    with pytest.raises(KeyboardInterrupt), Keyboard(program):
+        assert termios.tcgetattr(program) != before
+        raise KeyboardInterrupt
+    assert termios.tcgetattr(program) == before
+
+
+def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, 'stdin', None)
+    with Keyboard() as keyboard:
+        assert not keyboard.attached and keyboard.read(0.0) == ''
+
+
+# Through ROS.
+
+rclpy = pytest.importorskip('rclpy')
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rosbags.interfaces import (  # noqa: E402
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import Image, Imu  # noqa: E402
+
+from sfa_localization.bag import Bag  # noqa: E402
+from sfa_localization.play import Player, message_class, play, qos_profile  # noqa: E402
+
+NO_TIME = QosTime(9223372036, 854775807)
+ROS = pytest.mark.ros
+
+
+def offered(**changes: Any) -> Qos:
+    fields = {
+        'history': QosHistory.KEEP_LAST,
+        'depth': 5,
+        'reliability': QosReliability.BEST_EFFORT,
+        'durability': QosDurability.VOLATILE,
+        'deadline': NO_TIME,
+        'lifespan': NO_TIME,
+        'liveliness': QosLiveliness.AUTOMATIC,
+        'liveliness_lease_duration': NO_TIME,
+        'avoid_ros_namespace_conventions': False,
+    }
+    return Qos(**{**fields, **changes})
+
+
+STRONG = offered(reliability=QosReliability.RELIABLE, depth=50)
+LATCHED = offered(reliability=QosReliability.RELIABLE, durability=QosDurability.TRANSIENT_LOCAL)
+
+
+@ROS
+@pytest.mark.parametrize(
+    ('recorded', 'reliability', 'durability', 'depth'),
+    [
+        ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 10),
+        ((offered(),), ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE, 10),
+        ((STRONG,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
+        ((LATCHED,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL, 100),
+        ((offered(), STRONG), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
+        ((STRONG, LATCHED), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
+    ],
+)
+def test_quality_of_service_suits_the_recorded(
+    recorded: tuple[Qos, ...],
+    reliability: ReliabilityPolicy,
+    durability: DurabilityPolicy,
+    depth: int,
+) -> None:
+    profile = qos_profile(recorded)
+    assert (profile.reliability, profile.durability) == (reliability, durability)
+    assert profile.depth == depth
+
+
+@ROS
+def test_finite_times_of_the_recorded_qos_are_kept() -> None:
+    profile = qos_profile([offered(deadline=QosTime(2, 500_000_000))])
+    assert profile.deadline.nanoseconds == 2_500_000_000
+    assert qos_profile([offered()]).deadline == QoSProfile(depth=1).deadline
+
+
+@ROS
+def test_types_are_found_where_installed() -> None:
+    assert message_class('sensor_msgs/msg/Imu') is Imu
+    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', '/msg/'):
+        assert message_class(kind) is None
+
+
+@pytest.fixture
+def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Return an initialized context of its own."""
+    monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
+    context = rclpy.Context()
+    options = rclpy.signals.SignalHandlerOptions.NO
+    rclpy.init(context=context, domain_id=DOMAIN, signal_handler_options=options)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+class Listener:
+    """Subscribes and keeps what it hears, spinning in a thread."""
+
+    def __init__(self, context: Any, topics: dict[str, Any]) -> None:
+        self.node = rclpy.create_node('listener', context=context)
+        self.heard: dict[str, list[Any]] = {topic: [] for topic in topics}
+        for topic, kind in topics.items():
+            self.node.create_subscription(kind, topic, self.heard[topic].append, 500)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._executor.spin)
+
+    def __enter__(self) -> 'Listener':
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._executor.shutdown()
+        self._thread.join()
+        self.node.destroy_node()
+
+    def stamps(self, topic: str) -> list[int]:
+        times = [message.header.stamp for message in self.heard[topic]]
+        return [time.sec * 10**9 + time.nanosec for time in times]
+
+
+def reliable(messages: list[Message], path: Path) -> Path:
+    return write_rosbags(path, messages, storage='mcap')
+
+
+TOPICS = {'/image_raw': Image, '/imu': Imu}
+
+
+@ROS
+@pytest.mark.parametrize('ros1', [False, True])
+def test_every_message_arrives_as_recorded(
+    ros1: bool, context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    path = tmp_path / 'bag'
+    path = write_ros1(path / 'a.bag', messages) if ros1 else reliable(messages, path)
+    with Listener(context, TOPICS) as listener:
+        played = play(path, config=FAST, context=context, wait_for=list(TOPICS))
+        until(lambda: len(listener.heard['/image_raw']) == IMAGES)
+        until(lambda: len(listener.heard['/imu']) == COUNTS['/imu'])
+    assert played.messages == COUNTS and played.skipped == {}
+    assert listener.stamps('/image_raw') == [stamp(i) for i in range(IMAGES)]
+    for index, message in enumerate(listener.heard['/image_raw']):
+        pixels = np.frombuffer(message.data, np.uint8).reshape(image(0).shape)
+        assert np.array_equal(pixels, image(index))
+        assert (message.encoding, message.header.frame_id) == ('bgr8', 'camera')
+    np.testing.assert_allclose(listener.heard['/imu'][7].angular_velocity.z, 0.014)
+
+
+@ROS
+def test_the_clock_runs_through_the_bag(
+    context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    config = PlayConfig(rate=2.0, clock_rate=200.0, wait=20.0)
+    with Listener(context, {**TOPICS, '/clock': Clock}) as listener:
+        path = reliable(messages, tmp_path / 'bag')
+        play(path, config=config, context=context, clock=True, wait_for=['/imu'])
+        until(lambda: len(listener.heard['/clock']) > 2)
+    times = [m.clock.sec * 10**9 + m.clock.nanosec for m in listener.heard['/clock']]
+    assert times == sorted(times)
+    assert messages[0].receive_ns <= times[0] and times[-1] <= messages[-1].receive_ns + 10**9
+
+
+@ROS
+def test_it_starts_where_told(context: Any, tmp_path: Path, messages: list[Message]) -> None:
+    config = PlayConfig(rate=20.0, start_offset=0.55, wait=0.0)
+    path = reliable(messages, tmp_path / 'bag')
+    played = play(path, config=config, context=context)
+    assert played.messages['/image_raw'] == IMAGES - 6
+    beyond = PlayConfig(start_offset=1e6, wait=0.0)
+    with pytest.raises(BagError, match='nothing to play after'):
+        play(path, config=beyond, context=context)
+
+
+@ROS
+def test_only_named_topics_are_played(
+    context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    path = reliable(messages, tmp_path / 'bag')
+    config = PlayConfig(rate=50.0, wait=0.0)
+    played = play(path, config=config, context=context, topics=['/imu'])
+    assert played.messages == {'/imu': COUNTS['/imu']}
+    with pytest.raises(BagError, match=r'has no topic /x; --topics can be: /ground_truth, /image'):
+        play(path, config=config, context=context, topics=['/x'])
+
+
+@ROS
+def test_types_that_are_not_installed_are_named_and_skipped(
+    context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    kind = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
+    write_database(tmp_path / 'a.db3', messages, kind=lambda name: kind.get(name, name))
+    config = PlayConfig(rate=50.0, wait=0.0)
+    played = play(tmp_path / 'a.db3', config=config, context=context)
+    assert played.skipped == {'/imu': 'type nowhere_msgs/msg/Imu is not installed'}
+    assert played.messages['/odom'] == COUNTS['/odom']
+    write_database(tmp_path / 'b.db3', messages, kind=lambda name: 'nowhere_msgs/msg/Any')
+    with pytest.raises(BagError, match='no topic can be played'):
+        play(tmp_path / 'b.db3', config=config, context=context)
+
+
+@ROS
+def test_a_loop_ends_when_ros_does(context: Any, tmp_path: Path, messages: list[Message]) -> None:
+    path, played = reliable(messages, tmp_path / 'bag'), []
+    config = PlayConfig(rate=100.0, wait=20.0)
+    with Listener(context, TOPICS) as listener:
+        thread = threading.Thread(
+            target=lambda: played.append(play(path, config=config, loop=True, context=context))
+        )
+        thread.start()
+        until(lambda: len(listener.heard['/imu']) > 2.5 * COUNTS['/imu'])
+    rclpy.try_shutdown(context=context)
+    thread.join(DEADLINE_S)
+    assert not thread.is_alive()
+    assert played[0].messages['/imu'] > 2.5 * COUNTS['/imu']
+
+
+@ROS
+def test_pause_and_step_from_the_keyboard(
+    context: Any, tmp_path: Path, messages: list[Message], terminal: tuple[int, int]
+) -> None:
+    user, program = terminal
+    node = rclpy.create_node('player', context=context)
+    path = write_version(tmp_path / 'bag', messages, 5)
+    with Bag(path) as bag, Keyboard(program) as keyboard:
+        player = Player(node, bag, PlayConfig(rate=1.0), keyboard)
+        player.pace.toggle_pause()
+        thread = threading.Thread(target=player.play)
+        thread.start()
+        for count in range(1, 4):
+            os.write(user, b's' if count % 2 else b'\x1b[C')
+            until(lambda count=count: player.played.messages.total() == count)
+        assert player.pace.time_ns == messages[2].receive_ns
+        os.write(user, b'\x1b[A')
+        until(lambda: player.pace.rate > 1.05)
+        assert player.played.messages.total() == 3
+        os.write(user, b' ')
+        until(lambda: player.played.messages.total() == len(messages))
+        thread.join(DEADLINE_S)
+    assert not thread.is_alive()
+    node.destroy_node()
+
+
+@ROS
+@pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_signals_end_it_cleanly(
+    number: int, code: int, context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    path = reliable(messages, tmp_path / 'bag')
+    command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--loop', '--rate=9']
+    environment = {**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN)}
+    with Listener(context, TOPICS) as listener:
+        process = subprocess.Popen(
+            command, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            until(lambda: len(listener.heard['/imu']) > 1)
+            process.send_signal(number)
+            _, errors = process.communicate(timeout=DEADLINE_S)
+        finally:
+            process.kill()
+            process.wait()
+    assert 'Traceback' not in errors
+    assert process.returncode == code, errors
