@@ -23,32 +23,35 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument('config', default_value=parameters, description='parameter file'),
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
         DeclareLaunchArgument('image', default_value='image_raw', description="camera's topic"),
-        DeclareLaunchArgument('odom', default_value='/odom', description="odometry's topic"),
+        DeclareLaunchArgument(
+            'image_transport', default_value='raw', description='raw, or compressed pictures'
+        ),
+        DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
         DeclareLaunchArgument(
             'use_sim_time', default_value='false', description='time from /clock (bags, simulators)'
         ),
-        PushROSNamespace(LaunchConfiguration('namespace')),
     ]
+    image = LaunchConfiguration('image')
+    transport = {'image_transport': LaunchConfiguration('image_transport')}
+    pictures = [('image_raw', image), ('image_raw/compressed', [image, '/compressed'])]
     return LaunchDescription(
         [
             *arguments,
-            _node('omnicam_node', [('image_raw', LaunchConfiguration('image'))]),
+            PushROSNamespace(LaunchConfiguration('namespace')),
+            _node('omnicam_node', pictures, transport),
             _node('sfa_node', [], {'model': LaunchConfiguration('model')}),
-            _node('ekf_node', [('/odom', LaunchConfiguration('odom'))]),
+            _node('ekf_node', [('odom', LaunchConfiguration('odom'))], {}),
         ]
     )
 
 
-def _node(name: str, remappings: list, parameters: dict | None = None) -> Node:
+def _node(name: str, remappings: list, parameters: dict) -> Node:
     sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     return Node(
         package=PACKAGE,
         executable=name,
         name=name,
         output='screen',
-        parameters=[
-            LaunchConfiguration('config'),
-            {'use_sim_time': sim_time, **(parameters or {})},
-        ],
+        parameters=[LaunchConfiguration('config'), {'use_sim_time': sim_time, **parameters}],
         remappings=remappings,
     )

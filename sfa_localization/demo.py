@@ -136,6 +136,7 @@ def commands(model: Path, bag: Path, rate: float) -> dict[str, list[str]]:
         name: [sys.executable, '-m', f'sfa_localization.nodes.{name}', '--ros-args']
         for name in NODES
     }
+    nodes['omnicam_node'] += ['-p', 'image_transport:=compressed']
     nodes['sfa_node'] += ['-p', f'model:={model}']
     player = [sys.executable, '-m', 'sfa_localization', PLAYER, str(bag), '--rate', str(rate)]
     return {**nodes, PLAYER: player}
