@@ -11,8 +11,11 @@ import ast
 import dataclasses
 import json
 import re
+import runpy
 import shlex
 import subprocess
+import sys
+import types
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -169,10 +172,40 @@ def test_nav2_uses_our_frames():
     assert navigator['robot_base_frame'] == frames.base_frame
 
 
-def test_launch_file_starts_all_nodes_and_passes_known_parameters():
-    text = (ROOT / 'config/localization.launch.py').read_text('utf-8')
-    assert set(re.findall(r"_node\('(\w+)'", text)) == set(NODES)
-    assert 'model' in parameters()
+class Said:
+    """Stands in for every class of launch: remembers what it was told."""
+
+    def __init__(self, *told, **named):
+        self.told, self.named = told, named
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Return the node actions that the launch file makes, with launch replaced by stand-ins."""
+    names = {
+        'launch': ['LaunchDescription'],
+        'launch.actions': ['DeclareLaunchArgument'],
+        'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
+        'launch_ros.actions': ['Node', 'PushROSNamespace'],
+        'launch_ros.parameter_descriptions': ['ParameterValue'],
+        'launch_ros.substitutions': ['FindPackageShare'],
+    }
+    for name, classes in {'launch_ros': [], **names}.items():
+        module = types.ModuleType(name)
+        for each in classes:
+            setattr(module, each, type(each, (Said,), {}))
+        monkeypatch.setitem(sys.modules, name, module)
+    made = runpy.run_path(str(ROOT / 'config/localization.launch.py'))
+    (actions,) = made['generate_launch_description']().told
+    return [action.named for action in actions if type(action).__name__ == 'Node']
+
+
+def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launched):
+    assert [node['executable'] for node in launched] == list(NODES)
+    for node in launched:
+        _file, given = node['parameters']
+        assert set(given) <= parameters()
+        assert {source for source, _ in node['remappings']} <= topics() | {'image_raw', 'odom'}
 
 
 def test_package_manifest_is_of_format_3():
