@@ -1,0 +1,122 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Reading bags against bare rosbags, both raw and decoded: `python bench_bag.py`.
+
+Each ratio compares two ways through the same bag, measured in turns, in one run.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from sfa_localization.bag import Bag, BagWriter
+
+START = 1_700_000_000_000_000_000
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STORAGES = ('mcap', 'sqlite3')
+Counter = Callable[[Path], tuple[int, int]]
+
+
+def write_drive(path: Path, storage: str, pictures: int = 300) -> Path:
+    """A drive with 10 JPEG panoramas, 50 odometry and 50 gyro messages per second."""
+    rng = np.random.default_rng(1)
+    panorama = rng.integers(0, 256, (60, 600, 3), np.uint8)
+    with BagWriter(path, storage) as bag:
+        for index in range(pictures * 5):
+            at = START + index * 20_000_000
+            if index % 5 == 0:
+                bag.image('/panorama/compressed', at, panorama, 'camera', 'jpeg')
+            bag.odometry('/odom', at, (0.01 * index, 0.0, 0.0), (0.5, 0.0), (0.01, 0.01))
+            bag.imu('/imu', at, 0.0, 0.01)
+    return path
+
+
+def bare_raw(path: Path) -> tuple[int, int]:
+    """Messages and bytes, by rosbags alone."""
+    count = size = 0
+    with Reader(path) as reader:
+        for _, _, data in reader.messages():
+            count, size = count + 1, size + len(data)
+    return count, size
+
+
+def our_raw(path: Path) -> tuple[int, int]:
+    """Messages and bytes, by ours."""
+    count = size = 0
+    with Bag(path) as bag:
+        for _, _, data in bag.messages(bag.topics):
+            count, size = count + 1, size + len(data)
+    return count, size
+
+
+def bare_decoded(path: Path) -> tuple[int, int]:
+    """Messages and bytes, each deserialized by rosbags."""
+    count = size = 0
+    with Reader(path) as reader:
+        for connection, _, data in reader.messages():
+            STORE.deserialize_cdr(data, connection.msgtype)
+            count, size = count + 1, size + len(data)
+    return count, size
+
+
+def our_decoded(path: Path) -> tuple[int, int]:
+    """Messages, each deserialized, its stamp judged and counted, by ours."""
+    count = 0
+    with Bag(path) as bag:
+        for _ in bag.read([bag.any_stream(topic, lambda message: None) for topic in bag.topics]):
+            count += 1
+    return count, 0
+
+
+CASES = {'raw': (our_raw, bare_raw), 'decoded': (our_decoded, bare_decoded)}
+
+
+def seconds(read: Counter, path: Path) -> float:
+    start = time.perf_counter()
+    read(path)
+    return time.perf_counter() - start
+
+
+def in_turns(ours: Counter, bare: Counter, path: Path, rounds: int) -> tuple[float, float]:
+    """Median of the ratios of speed, and our median seconds."""
+    ratios, times = [], []
+    for turn in range(rounds):
+        order = (ours, bare) if turn % 2 else (bare, ours)
+        taken = {read: seconds(read, path) for read in order}
+        ratios.append(taken[bare] / taken[ours])
+        times.append(taken[ours])
+    return statistics.median(ratios), statistics.median(times)
+
+
+def bench_bag(folder: Path, rounds: int = 15) -> dict[str, float]:
+    """Speed of our iteration over that of bare rosbags, the lesser storage's, and each case."""
+    result: dict[str, float] = {}
+    for storage in STORAGES:
+        path = write_drive(folder / storage, storage)
+        count, size = bare_raw(path)
+        assert our_raw(path) == (count, size) and our_decoded(path)[0] == count
+        for name, ours, bare in (
+            ('raw', our_raw, bare_raw),
+            ('decoded', our_decoded, bare_decoded),
+        ):
+            ratio, taken = in_turns(ours, bare, path, rounds)
+            result[f'bag_over_rosbags_{storage}_{name}'] = ratio
+            result[f'bag_{storage}_{name}_messages_per_s'] = count / taken
+            result[f'bag_{storage}_{name}_mb_per_s'] = size / taken / 1e6
+    ratios = [value for key, value in result.items() if key.startswith('bag_over_rosbags')]
+    return {'bag_over_rosbags': min(ratios), **result}
+
+
+if __name__ == '__main__':
+    with tempfile.TemporaryDirectory() as temporary:
+        sys.stdout.write(json.dumps(bench_bag(Path(temporary)), indent=2) + '\n')

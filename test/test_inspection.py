@@ -1,0 +1,249 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What `inspect` tells of bags: contents, problems, the camera, and whether they suffice."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sfa_localization.bag import BagWriter
+from sfa_localization.cli import main
+from sfa_localization.config import InspectionConfig
+from sfa_localization.inspection import (
+    DUAL_FISHEYE,
+    FISHEYE,
+    OMNIDIRECTIONAL,
+    ORDINARY,
+    PANORAMA,
+    area,
+    covered,
+    directions,
+    guess_geometry,
+    inspect,
+    spacing,
+    way,
+)
+
+START = 1_700_000_000_000_000_000
+STEP = 200_000_000
+ENOUGH = InspectionConfig(min_pictures=150)
+Route = Callable[[float], tuple[float, float]]
+
+
+def star(share: float) -> tuple[float, float]:
+    """Cross a disc of 4 m eleven times, each time in another direction."""
+    angle = np.pi * (1 - 2 / 23) * np.floor(share * 23)
+    following = np.pi * (1 - 2 / 23) * (np.floor(share * 23) + 1)
+    part = share * 23 % 1
+    a, b = (4 * np.array([np.cos(t), np.sin(t)]) for t in (angle, following))
+    x, y = a + part * (b - a)
+    return float(x), float(y)
+
+
+def circle(share: float) -> tuple[float, float]:
+    return float(8 * np.cos(6.28 * share)), float(8 * np.sin(6.28 * share))
+
+
+def line(share: float) -> tuple[float, float]:
+    return 30 * share, 0.0
+
+
+def write(
+    path: Path,
+    route: Route = star,
+    pictures: int = 600,
+    shape: tuple[int, int] = (8, 60),
+    brightness: int = 120,
+    odometry_until: float = 1.0,
+) -> Path:
+    """Record a drive along a route with a picture every 0.2 s."""
+    rng = np.random.default_rng(0)
+    with BagWriter(path) as bag:
+        for index in range(pictures):
+            at, share = START + index * STEP, index / pictures
+            picture = rng.integers(0, 2 * brightness + 1, (*shape, 3), np.uint8)
+            bag.image('/panorama', at, picture, 'camera')
+            if share <= odometry_until:
+                bag.odometry('/odom', at, (*route(share), 0.0), (1.0, 0.0), (0.0, 0.0))
+    return path
+
+
+def test_a_good_drive_is_enough(tmp_path: Path) -> None:
+    report = inspect(write(tmp_path / 'bag'), config=ENOUGH)
+    assert report.lacks == [] and report.problems == []
+    told = report.as_dict()
+    assert told['enough_to_train_on'] is True
+    assert told['topics']['/panorama'] == {
+        'type': 'sensor_msgs/msg/Image',
+        'count': 600,
+        'first_stamp_ns': START,
+        'last_stamp_ns': START + 599 * STEP,
+        'rate_hz': 5.0,
+        'largest_gap_s': 0.2,
+        'problems': [],
+    }
+    assert told['pictures'] == {
+        'topic': '/panorama',
+        'width': 60,
+        'height': 8,
+        'geometry': PANORAMA,
+    }
+    assert 'enough to train on' in report.as_text()
+    assert 'not enough' not in report.as_text()
+
+
+@pytest.mark.parametrize(
+    ('options', 'reason'),
+    [
+        ({'pictures': 149}, '149 pictures with odometry are few'),
+        ({'route': line}, 'driven along 1 of 6 directions'),
+        ({'route': circle}, 'of the area lie within 1 m of a picture'),
+        ({'route': lambda share: (0.0, 0.0)}, 'the robot did not move'),
+        ({'shape': (48, 64)}, 'the pictures do not look around'),
+        ({'brightness': 4}, 'the pictures are dark'),
+        ({'odometry_until': 0.5}, '299 of 600 pictures have no odometry nearby'),
+        ({'pictures': 160}, 'm apart: drive slower'),
+    ],
+)
+def test_it_tells_why_a_drive_is_not_enough(
+    options: dict[str, object], reason: str, tmp_path: Path
+) -> None:
+    report = inspect(write(tmp_path / 'bag', **options), config=ENOUGH)
+    assert any(reason in lack for lack in report.lacks), report.lacks
+    assert f'not enough to train on: {report.lacks[0]}' in report.as_text()
+
+
+@pytest.mark.parametrize('missing', ['/panorama', '/odom'])
+def test_a_missing_topic_is_told_not_raised(missing: str, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(3):
+            if missing != '/odom':
+                bag.odometry('/odom', START + index, (0, 0, 0), (0, 0), (0, 0))
+            if missing != '/panorama':
+                picture = np.zeros((8, 60, 3), np.uint8)
+                bag.image('/panorama', START + index, picture, 'camera')
+            bag.imu('/imu', START + index, 0.0, 0.0)
+    report = inspect(tmp_path / 'bag')
+    assert any('has no' in lack for lack in report.lacks)
+    assert {topic.name for topic in report.topics} == {'/panorama', '/odom', '/imu'} - {missing}
+
+
+def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(20):
+            at = START + index * STEP + (10**10 if index > 9 else 0)
+            width = 60 if index % 5 else 80
+            bag.image('/panorama', at, np.zeros((8, width, 3), np.uint8), 'camera')
+            bag.odometry('/odom', 0 if index == 3 else at, (0, 0, 0), (0, 0), (0, 0))
+    problems = {topic.name: topic.problems for topic in inspect(tmp_path / 'bag').topics}
+    assert problems['/panorama'] == ['pause of 10.2 s', 'pictures of several sizes: 80x8, 60x8']
+    assert problems['/odom'] == ['1 of 20 messages: zero stamp', 'pause of 10.2 s']
+
+
+# The numbers.
+
+SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]])
+
+
+def test_way_area_and_directions_of_a_square() -> None:
+    assert way(SQUARE) == 16.0
+    assert area(SQUARE) == pytest.approx(16.0)
+    assert directions(SQUARE) == 2
+    assert directions(np.array([[0, 0], [5, 0], [0, 0]])) == 1
+    assert area(SQUARE[:2]) == 0.0 and covered(SQUARE[:2], 1.0) == 0.0
+
+
+def test_ground_within_reach_of_a_square_path() -> None:
+    side = np.linspace(0, 4, 200)
+    zero, four = np.zeros(200), np.full(200, 4.0)
+    ring = np.concatenate(
+        [np.stack(edge, -1) for edge in [(side, zero), (side, four), (zero, side), (four, side)]]
+    )
+    # All but the inner 2 m x 2 m.
+    assert covered(ring, 1.0) == pytest.approx(1 - 4 / 16, abs=0.03)
+
+
+def test_spacing_ignores_pictures_taken_standing() -> None:
+    places = np.zeros((300, 2))
+    places[:100, 0] = 0.3 * np.arange(100)
+    places[100:, 0] = places[99, 0]
+    assert spacing(places) == pytest.approx(0.3)
+
+
+# The camera.
+
+
+def views(shape: tuple[int, int], count: int = 6) -> list[np.ndarray]:
+    """Pictures whose contents all change."""
+    rng = np.random.default_rng(1)
+    small = rng.integers(40, 255, (count, 12, 12, 3), np.uint8)
+    return [cv2.resize(s, shape[::-1], interpolation=cv2.INTER_CUBIC) for s in small]
+
+
+def disc(shape: tuple[int, int], center: tuple[float, float], radius: float) -> np.ndarray:
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return np.hypot(rows - center[0], columns - center[1]) < radius
+
+
+def test_a_wide_strip_is_a_panorama() -> None:
+    assert guess_geometry(views((60, 600))) == PANORAMA
+    assert guess_geometry(views((200, 400))) == PANORAMA
+
+
+def test_an_ordinary_picture_is_told_as_such() -> None:
+    assert guess_geometry(views((240, 320))) == ORDINARY
+
+
+@pytest.mark.parametrize('shape', [(240, 240), (240, 320)])
+def test_a_bright_circle_is_a_fisheye(shape: tuple[int, int]) -> None:
+    circle_mask = disc(shape, (120, shape[1] / 2), 115)[..., None]
+    assert guess_geometry([view * circle_mask for view in views(shape)]) == FISHEYE
+
+
+def test_a_circle_whose_middle_never_changes_is_a_mirror() -> None:
+    shape = (240, 240)
+    ring, camera = disc(shape, (120, 120), 115)[..., None], disc(shape, (120, 120), 25)[..., None]
+    pictures = [np.where(camera, 90, view * ring).astype(np.uint8) for view in views(shape)]
+    assert guess_geometry(pictures) == OMNIDIRECTIONAL
+
+
+def test_two_circles_are_a_dual_fisheye() -> None:
+    shape = (200, 400)
+    mask = disc(shape, (100, 100), 95) | disc(shape, (100, 300), 95)
+    assert guess_geometry([view * mask[..., None] for view in views(shape)]) == DUAL_FISHEYE
+
+
+# The command.
+
+
+def test_the_command_writes_json_and_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, report = write(tmp_path / 'good'), tmp_path / 'report'
+    json_file = tmp_path / 'new' / 'bags.json'
+    arguments = ['inspect', str(good), str(tmp_path / 'missing'), '--json', str(json_file)]
+    assert main([*arguments, '--report', str(report)]) == 1
+    told = json.loads(json_file.read_text())['bags']
+    assert [bag['path'] for bag in told] == [str(good), str(tmp_path / 'missing')]
+    assert told[0]['topics']['/odom']['count'] == 600 and told[0]['error'] == ''
+    assert 'no such bag' in told[1]['error'] and told[1]['enough_to_train_on'] is False
+    out, errors = capsys.readouterr()
+    assert '/odom (Odometry): 600 messages, 5.0 Hz' in out
+    assert errors.strip() == f'error: {tmp_path / "missing"}: no such bag; check the path'
+    for name in ('0_good_pictures.png', '0_good_path.png'):
+        picture = cv2.imread(str(report / name))
+        assert picture is not None and picture.std() > 5
+    assert {file.name for file in report.iterdir()} == {'0_good_pictures.png', '0_good_path.png'}
+
+
+def test_the_command_takes_topics_and_limits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / 'bag')
+    options = ['--image-topic', '/nothing', '--min-pictures', '5']
+    assert main(['inspect', str(path), *options]) == 0
+    assert 'has no topic /nothing' in capsys.readouterr().out
