@@ -799,6 +799,9 @@ class SfaNodeConfig(Settings):
     novelty_warning: float = setting(
         1.5, 'novelty from which on a warning is given', low=1.0, high=1e6, live=True
     )
+    novelty_unusable: float = setting(
+        3.0, 'novelty from which on a picture is told to know nothing', low=1.0, high=1e6, live=True
+    )
     camera_timeout: float = setting(
         2.0,
         'silence of the panoramas that is worth a warning',

@@ -269,7 +269,7 @@ class Fusion:
                 update=_refused(event, 'unlike any picture of training'),
             )
             return belief._replace(memory=memory)
-        covariance = event.covariance * max(1.0, event.novelty) ** 2
+        covariance = event.covariance
         blind = event.value.size == 2 and belief.covariance[YAW, YAW] > self.config.lost_yaw_std**2
         if not belief.located or blind:
             return self._started(belief, event, covariance)

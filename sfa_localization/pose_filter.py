@@ -149,7 +149,8 @@ class PoseFilter:
         """Fuse a position (2,) or pose (3,) seen at a stamp, with its covariance.
 
         A heading that is NaN or less sure than `yaw_std_limit` is left out. Zero covariance means
-        unknown. `novelty` above 1 says how unlike training the picture is.
+        unknown. `novelty` above 1 says how unlike training the picture is: the covariance should
+        have grown with it already, and the filter does not start from such a picture.
         """
         stamp_ns = int(stamp_ns)
         try:

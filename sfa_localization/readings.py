@@ -60,7 +60,7 @@ def read_measurement(
         covariance = np.diag(np.square(stds[:size]))
     if not is_covariance(covariance):
         raise DataError('covariance is not symmetric positive')
-    if np.diag(covariance).max() > _LARGEST_VARIANCE:
+    if np.diag(covariance).max() >= _LARGEST_VARIANCE:
         raise DataError('covariance tells that nothing is known')
     return value, _conditioned(covariance, config)
 

@@ -15,7 +15,12 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+)
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import CompressedImage
@@ -187,6 +192,18 @@ def to_odometry(
     spread = np.diag([_FIXED_VARIANCE] * 6)
     spread[np.ix_([0, 5], [0, 5])] = twist_covariance
     message.twist.covariance = spread.ravel()
+    return message
+
+
+def to_transform(pose: ArrayLike, stamp_ns: int, frames: tuple[str, str]) -> TransformStamped:
+    """Pose (3,) of frames[1] in frames[0] as a transform from the one to the other."""
+    value = np.asarray(pose, float)
+    _require_finite('output', value)
+    message = TransformStamped(child_frame_id=frames[1])
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frames[0]
+    message.transform.translation.x = float(value[0])
+    message.transform.translation.y = float(value[1])
+    message.transform.rotation = to_quaternion(float(value[2]))
     return message
 
 

@@ -1,0 +1,191 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameter file: nodes and trainer read the same YAML, which is written from the settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import os
+import tempfile
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from sfa_localization import config
+from sfa_localization.config import Settings
+from sfa_localization.errors import ConfigError
+
+S = TypeVar('S', bound=Settings)
+SECTIONS: dict[str, tuple[type[Settings], ...]] = {
+    'omnicam_node': (
+        config.NodeConfig,
+        config.OmnicamNodeConfig,
+        config.CameraConfig,
+        config.PanoramaConfig,
+    ),
+    'sfa_node': (config.NodeConfig, config.SfaNodeConfig),
+    'ekf_node': (config.NodeConfig, config.EkfNodeConfig, config.FilterConfig),
+    'training': (
+        config.TopicNames,
+        config.BagConfig,
+        config.NetworkConfig,
+        config.SegmentConfig,
+        config.MetricConfig,
+        config.HeadingConfig,
+    ),
+}
+"""Which settings each section holds; the trainer takes camera and panorama from omnicam_node."""
+_EVERY_NODE = '/**'
+_KEY = 'ros__parameters'
+_OF_ROS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+_WIDTH = 100
+_HEAD = """\
+# Every parameter of sfa_localization, with its default; all may be left out.
+# The nodes take this file with --ros-args --params-file FILE, the commands with --config FILE.
+# Written from sfa_localization/config.py by: python -m sfa_localization config --output FILE
+"""
+
+
+def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
+    """The settings `kind` from a section of a parameter file; what it does not name is default.
+
+    Raises ConfigError naming file, section and parameter for whatever cannot be used.
+    """
+    values = load_section(Path(path), section)
+    names = {item.name: item for item in dataclasses.fields(kind)}
+    given = {name: _number(names[name], value) for name, value in values.items() if name in names}
+    return kind.from_mapping(given, f'{path}: {section}')
+
+
+def load_section(path: Path, section: str) -> dict[str, Any]:
+    """Names and values of one section, those of `/**` below them. Raises ConfigError."""
+    document = _read(path)
+    known = {item.name for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
+    anywhere = {item.name for kinds in SECTIONS.values() for kind in kinds
+                for item in dataclasses.fields(kind)}  # fmt: skip
+    shared = _parameters(document, _EVERY_NODE, path)
+    own = {name: value for given in (section, f'/{section}')
+           for name, value in _parameters(document, given, path).items()}  # fmt: skip
+    _require_known(shared, anywhere, f'{path}: {_EVERY_NODE}')
+    _require_known(own, known, f'{path}: {section}')
+    return {**shared, **own}
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f'{path}: cannot be read: {error}') from None
+    except yaml.YAMLError as error:
+        raise ConfigError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        raise ConfigError(f'{path}: must hold sections such as {", ".join(SECTIONS)}')
+    for name in document:
+        if str(name).lstrip('/') not in SECTIONS and name != _EVERY_NODE:
+            raise ConfigError(f'{path}: unknown section {name!r}; known are {", ".join(SECTIONS)}')
+    return document
+
+
+def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[str, Any]:
+    part = document.get(section) or {}
+    if not isinstance(part, dict) or (part and set(part) != {_KEY}):
+        raise ConfigError(f'{path}: section {section!r} must hold {_KEY!r}, and all below it')
+    values = part.get(_KEY) or {}
+    if not isinstance(values, dict):
+        raise ConfigError(f'{path}: {section}.{_KEY} must hold names and values')
+    return {str(name): value for name, value in values.items() if name not in _OF_ROS}
+
+
+def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
+    for name in values:
+        if name not in known:
+            close = difflib.get_close_matches(name, sorted(known), n=1)
+            hint = f'; did you mean {close[0]!r}?' if close else ''
+            raise ConfigError(f'{where}: unknown parameter {name!r}{hint}')
+
+
+def _number(item: dataclasses.Field[Any], value: Any) -> Any:
+    """YAML 1.1 takes 1e-3 for a text; ROS does not, and neither do people."""
+    if isinstance(item.default, float) and isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return value
+
+
+def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
+    """The parameter file with every default, or with `changes` {section: {name: value}}."""
+    parts = [_HEAD]
+    for section, kinds in SECTIONS.items():
+        parts.append(f'{section}:\n  {_KEY}:\n')
+        changed = (changes or {}).get(section, {})
+        parts += [_group(kind, changed) for kind in kinds]
+    return ''.join(parts)
+
+
+def write_config(path: Path | str, changes: Mapping[str, Mapping[str, Any]] | None = None) -> None:
+    """Write `render(changes)` to a file, at once or not at all. Raises ConfigError."""
+    path = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix='.part')
+        with os.fdopen(handle, 'w', encoding='utf-8') as file:
+            file.write(render(changes))
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be written: {error}') from None
+
+
+def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:
+    title = (kind.__doc__ or '').strip().splitlines()[0]
+    lines = [f'    # --- {title}']
+    for item in dataclasses.fields(kind):
+        lines += textwrap.wrap(
+            _described(item), _WIDTH, initial_indent='    # ', subsequent_indent='    # '
+        )
+        lines.append(f'    {item.name}: {_text(changes.get(item.name, item.default))}')
+    return '\n'.join(lines) + '\n'
+
+
+def _described(item: dataclasses.Field[Any]) -> str:
+    """What a parameter means, its unit, its range, and whether it may change at run time."""
+    meta = item.metadata
+    unit = f' [{meta["unit"]}]' if meta['unit'] else ''
+    told = [f'{meta["doc"]}{unit}']
+    if meta['choices']:
+        told.append('one of ' + ', '.join(meta['choices']))
+    if meta['low'] is not None or meta['high'] is not None:
+        low = '' if meta['low'] is None else f'{meta["low"]:g}'
+        high = '' if meta['high'] is None else f'{meta["high"]:g}'
+        told.append(f'{low}..{high}')
+    if meta['live']:
+        told.append('may change while running')
+    return '; '.join(told)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, (tuple, list)):
+        return '[' + ', '.join(_text(entry) for entry in value) + ']'
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return _float(value)
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    return str(value)
+
+
+def _float(value: float) -> str:
+    """With a point, which YAML 1.1 needs to know a number by."""
+    text = repr(value)
+    if 'e' in text:
+        digits, exponent = text.split('e')
+        return f'{digits if "." in digits else digits + ".0"}e{exponent}'
+    return text

@@ -1,0 +1,300 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 node: odometry and poses seen in pictures in, the robot's pose in the map out."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from sfa_localization.config import EkfNodeConfig, FilterConfig, Settings
+from sfa_localization.geometry import compose, invert
+from sfa_localization.nodes.conversions import (
+    MessageError,
+    Motion,
+    read_odometry,
+    read_pose,
+    to_odometry,
+    to_pose,
+    to_pose_with_covariance,
+    to_stamp,
+    to_transform,
+)
+from sfa_localization.nodes.lifecycle import (
+    LocalizationNode,
+    latched_qos,
+    reliable_qos,
+    run_node,
+    sensor_qos,
+)
+from sfa_localization.pose_filter import Level, PoseFilter, State, Status, Update
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # the pip wheels of ROS have none
+    TFMessage = None
+
+_LEVELS = {
+    Level.UNINITIALISED: DiagnosticStatus.WARN,
+    Level.LOCALISED: DiagnosticStatus.OK,
+    Level.DEGRADED: DiagnosticStatus.WARN,
+    Level.LOST: DiagnosticStatus.ERROR,
+}
+_WATCH_PERIOD_S = 0.2
+_REPEAT_STATE_S = 1.0
+_BACKWARD_JUMP_NS = -500_000_000
+_ODOM, _SEEN = 'odom', 'sfa/pose_with_covariance'
+
+
+class EkfNode(LocalizationNode):
+    """Feeds the pose filter, and tells what it believes and how far that can be trusted."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('ekf_node', [EkfNodeConfig, FilterConfig], **options)
+        self._config = self.settings(EkfNodeConfig)
+        self._filter = PoseFilter(self.settings(FilterConfig))
+        self._paused = False
+        self._path: deque[PoseStamped] = deque(maxlen=self._config.path_length)
+        self._path_ns = 0
+        self._frames = self._config.odom_frame, self._config.base_frame
+        self._told = ''
+        self._told_level: Level | None = None
+        self._since_told = 0
+
+    def setup(self) -> None:
+        self._config = self.settings(EkfNodeConfig)
+        self._filter = PoseFilter(self.settings(FilterConfig))
+        self._path.clear()
+        self._told_level = None
+        self._make_publishers()
+        self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
+        self.subscribe(PoseWithCovarianceStamped, _SEEN, self._receive_pose, sensor_qos(20))
+        for topic in ('initialpose', '~/set_pose'):
+            self.subscribe(PoseWithCovarianceStamped, topic, self._set_pose, reliable_qos(1))
+        self.service(Trigger, '~/reset', self._reset)
+        self.service(SetBool, '~/pause', self._pause)
+        self.every(_WATCH_PERIOD_S, self._tell_state)
+        # Looped playback steps simulated time back; stamps alone would show it only later.
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=None,
+                min_backward=Duration(nanoseconds=_BACKWARD_JUMP_NS),
+                on_clock_change=False,
+            ),
+            post_callback=self._clock_jumped,
+        )
+
+    def _make_publishers(self) -> None:
+        self._odometry = self.publisher(Odometry, 'ekf/odometry')
+        self._pose = self.publisher(PoseWithCovarianceStamped, 'ekf/pose')
+        self._trail = self.publisher(Path, 'ekf/path')
+        self._state = self.publisher(String, 'ekf/state', latched_qos())
+        self._verdict = self.publisher(DiagnosticArray, 'ekf/measurement_status')
+        self._transform = self.publisher(TransformStamped, 'ekf/map_to_odom')
+        self._tf = None
+        if self._config.publish_tf and TFMessage is not None:
+            self._tf = self.publisher(TFMessage, '/tf', QoSProfile(depth=100))
+        elif self._config.publish_tf:
+            self.get_logger().warning(
+                'tf2_msgs is not installed: map -> odom goes to ekf/map_to_odom only, not to /tf'
+            )
+
+    def started(self) -> None:
+        self._tell_state()
+
+    def teardown(self) -> None:
+        jumps = getattr(self, '_jumps', None)
+        if jumps is not None:
+            jumps.unregister()
+            self._jumps = None
+
+    def settings_changed(self, settings: Settings) -> None:
+        if isinstance(settings, EkfNodeConfig):
+            self._config = settings
+        if isinstance(settings, FilterConfig):
+            self._filter.reconfigure(settings)
+
+    # What comes in.
+
+    def _receive_odometry(self, message: Odometry) -> None:
+        motion = read_odometry(message)
+        self._frames = (
+            motion.frame or self._config.odom_frame,
+            motion.child_frame or self._config.base_frame,
+        )
+        reason = self._filter.add_odometry(motion.stamp_ns, *motion.twist, motion.variances)
+        if reason:
+            raise MessageError(reason)
+        state = self._filter.at(motion.stamp_ns)
+        if state is not None:
+            self._publish_odometry(state, motion)
+            self._extend_path(state)
+
+    def _receive_pose(self, message: PoseWithCovarianceStamped) -> None:
+        stamp_ns, pose, covariance = self._read_in_map(message)
+        if self._paused:
+            raise MessageError('paused')
+        if covariance.any() and not covariance[2].any():
+            covariance[2, 2] = math.inf  # a source that tells no heading leaves its variance 0
+        update = self._filter.add_measurement(stamp_ns, pose, covariance)
+        self._verdict.publish(_verdict(update))
+        state = self._filter.at(stamp_ns)
+        if state is not None:
+            self._pose.publish(
+                to_pose_with_covariance(
+                    state.pose, state.pose_covariance, stamp_ns, self._config.map_frame
+                )
+            )
+        if not update.accepted:
+            self.monitor(_SEEN).refuse(update.reason)
+
+    def _set_pose(self, message: PoseWithCovarianceStamped) -> None:
+        if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
+            message.header.stamp = to_stamp(max(self._newest_ns(), 1))
+        stamp_ns, pose, covariance = self._read_in_map(message)
+        self._filter.initialise(stamp_ns, pose, covariance if covariance.any() else None)
+        self.get_logger().info(f'pose set to {pose[0]:.2f}, {pose[1]:.2f}, {pose[2]:.2f} rad')
+        self._tell_state()
+
+    def _read_in_map(self, message: PoseWithCovarianceStamped) -> tuple[int, Any, Any]:
+        frame = message.header.frame_id.lstrip('/')
+        if frame not in ('', self._config.map_frame):
+            raise MessageError(f'frame is {frame!r}, not {self._config.map_frame!r}')
+        return read_pose(message)
+
+    def _newest_ns(self) -> int:
+        state = self._filter.state
+        return state.stamp_ns if state is not None else int(self.get_clock().now().nanoseconds)
+
+    def _reset(self, _: Any, response: Any) -> Any:
+        self._filter.reset()
+        self._path.clear()
+        self._tell_state()
+        response.success, response.message = True, self._status().level.name
+        return response
+
+    def _pause(self, request: Any, response: Any) -> Any:
+        self._paused = bool(request.data)
+        self._tell_state()
+        response.success = True
+        response.message = 'pictures are not fused' if self._paused else 'pictures are fused'
+        return response
+
+    def _clock_jumped(self, jump: TimeJump) -> None:
+        self.get_logger().warning(
+            f'the clock went back by {-jump.delta.nanoseconds * 1e-9:.1f} s: starting anew'
+        )
+        self._filter.reset()
+        self._path.clear()
+
+    # What goes out.
+
+    def _publish_odometry(self, state: State, motion: Motion) -> None:
+        frame = self._config.map_frame
+        self._odometry.publish(
+            to_odometry(
+                state.pose,
+                state.pose_covariance,
+                state.twist,
+                state.twist_covariance,
+                motion.stamp_ns,
+                (frame, self._frames[1]),
+            )
+        )
+        map_to_odom = compose(state.pose, invert(motion.pose))
+        stamp_ns = motion.stamp_ns + round(self._config.transform_tolerance * 1e9)
+        transform = to_transform(map_to_odom, stamp_ns, (frame, self._frames[0]))
+        self._transform.publish(transform)
+        if self._tf is not None:
+            self._tf.publish(TFMessage(transforms=[transform]))
+
+    def _extend_path(self, state: State) -> None:
+        if abs(state.stamp_ns - self._path_ns) < self._config.path_period * 1e9:
+            return
+        self._path_ns = state.stamp_ns
+        self._path.append(to_pose(state.pose, state.stamp_ns, self._config.map_frame))
+        if self._trail.get_subscription_count():
+            path = Path(poses=list(self._path))
+            path.header.stamp = to_stamp(state.stamp_ns)
+            path.header.frame_id = self._config.map_frame
+            self._trail.publish(path)
+
+    def _status(self) -> Status:
+        """The filter's status, and what the wall clock adds: inputs that do not arrive."""
+        status, added = self._filter.status, []
+        for topic, limit in (
+            (_ODOM, self._config.odometry_silence),
+            (_SEEN, self._config.picture_silence),
+        ):
+            silent = self.monitor(topic).silent_for_s()
+            if math.isfinite(silent) and silent > limit:
+                added.append(f'nothing on {topic} for {silent:.0f} s')
+        if self._paused:
+            added.append('paused: pictures are not fused')
+        level = status.level
+        if added and level is Level.LOCALISED:
+            level = Level.DEGRADED
+        return Status(level, (*status.reasons, *added))
+
+    def _tell_state(self) -> None:
+        """Publish the state when its level changes at once, when its reasons do at most at 1 Hz."""
+        if not self.active:
+            return
+        status = self._status()
+        text = ': '.join([status.level.name, '; '.join(status.reasons)]).rstrip(': ')
+        self._since_told += 1
+        changed = status.level is not self._told_level
+        due = text != self._told and self._since_told * _WATCH_PERIOD_S >= _REPEAT_STATE_S
+        if not (changed or due):
+            return
+        self._since_told = 0
+        if changed:
+            self.get_logger().info(text)
+        self._told, self._told_level = text, status.level
+        self._state.publish(String(data=text))
+
+    def health(self) -> tuple[int, str, dict[str, str]]:
+        status, state = self._status(), self._filter.state
+        values = {'state': status.level.name}
+        values.update({name: str(n) for name, n in sorted(self._filter.counts.items())})
+        if state is not None:
+            values['position deviation [m]'] = f'{state.position_std:.3f}'
+            values['heading deviation [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
+            values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
+            values['wheel scale'] = f'{state.wheel_scale:.4f}'
+        return _LEVELS[status.level], '; '.join(status.reasons) or 'localised', values
+
+
+def _verdict(update: Update) -> DiagnosticArray:
+    """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
+    level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
+    status = DiagnosticStatus(level=level, name='ekf_node: measurement', message=update.reason)
+    status.values = [
+        KeyValue(key='accepted', value=str(update.accepted).lower()),
+        KeyValue(key='d2', value=_number(update.d2)),
+        KeyValue(key='threshold', value=_number(update.threshold)),
+    ]
+    message = DiagnosticArray(status=[status])
+    message.header.stamp = to_stamp(max(update.stamp_ns, 0))
+    return message
+
+
+def _number(value: float) -> str:
+    return f'{value:.6g}' if np.isfinite(value) else ''
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(EkfNode, args)

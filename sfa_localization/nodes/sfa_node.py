@@ -1,0 +1,178 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 node: panoramas in; slow features, and the pose that each picture tells, out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import Image as ImageMessage
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+from sfa_localization.config import Settings, SfaNodeConfig
+from sfa_localization.errors import ConfigError, LocalizationError
+from sfa_localization.nodes.conversions import (
+    MessageError,
+    read_image,
+    to_array,
+    to_pose,
+    to_pose_with_covariance,
+)
+from sfa_localization.nodes.lifecycle import (
+    LocalizationNode,
+    run_node,
+    sensor_qos,
+)
+from sfa_localization.picture_watch import PictureWatch, unusable_covariance
+from sfa_localization.place_model import Estimate, PlaceModel
+
+_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class SfaNode(LocalizationNode):
+    """Locates each panorama with the trained model; the `model` parameter may change live."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('sfa_node', [SfaNodeConfig], **options)
+        self._config = self.settings(SfaNodeConfig)
+        self._watch = PictureWatch(self._config)
+        self._model: PlaceModel | None = None
+        self._loaded: tuple[str, PlaceModel] | None = None
+        self._novelty = 0.0
+        self._unusable = ''
+        self.add_on_set_parameters_callback(self._check_model)
+
+    def setup(self) -> None:
+        self._config = self.settings(SfaNodeConfig)
+        self._watch = PictureWatch(self._config)
+        self._model = self._load(self._config.model)
+        self._features = self.publisher(Float64MultiArray, 'sfa/slow_features')
+        self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
+        self._pose = self.publisher(PoseStamped, 'sfa/pose')
+        self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+        self.service(Trigger, '~/reload_model', self._reload)
+        kind = CompressedImage if self._config.compressed else ImageMessage
+        self._topic = 'panorama/compressed' if self._config.compressed else 'panorama'
+        # Depth 1: when pictures come faster than they are located, the oldest is dropped.
+        self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
+
+    def teardown(self) -> None:
+        self._model = None
+
+    # The model.
+
+    def _load(self, path: str) -> PlaceModel:
+        """Read a model, and locate once so that the first picture does not wait."""
+        if not path:
+            raise ConfigError(
+                "parameter 'model' is empty: name the file that the train command wrote "
+                '(--ros-args -p model:=MODEL.npz)'
+            )
+        model = PlaceModel.load(Path(path))
+        size = model.panorama
+        model.locate(np.zeros((size.height, size.width, 3), np.uint8))
+        heading = 'with heading' if model.has_heading else 'without heading'
+        self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}, {heading}')
+        return model
+
+    def _check_model(self, changes: list[Parameter]) -> SetParametersResult:
+        """Refuse a model that cannot be loaded before anything changes."""
+        for change in changes:
+            if change.name == 'model' and self.active:
+                try:
+                    self._loaded = str(change.value), self._load(str(change.value))
+                except LocalizationError as error:
+                    return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def settings_changed(self, settings: Settings) -> None:
+        if not isinstance(settings, SfaNodeConfig):
+            return
+        self._config = self._watch.config = settings
+        if self._loaded is not None and self._loaded[0] == settings.model:
+            self._model = self._loaded[1]
+        self._loaded = None
+
+    def _reload(self, _: Any, response: Any) -> Any:
+        self._model = self._load(self._config.model)
+        response.success, response.message = True, f'loaded {self._config.model}'
+        return response
+
+    # Pictures.
+
+    def _receive(self, message: ImageMessage | CompressedImage) -> None:
+        assert self._model is not None
+        stamp_ns, panorama = read_image(message)
+        size = self._model.panorama
+        if panorama.shape[:2] != (size.height, size.width):
+            height, width = panorama.shape[:2]
+            raise MessageError(
+                f'panorama is {width}x{height}, but the model was trained on '
+                f'{size.width}x{size.height}: set width and height of omnicam_node'
+            )
+        problem = self._watch.judge(panorama)
+        estimate = self._model.locate(panorama)
+        _require_finite(estimate)
+        self._novelty = estimate.novelty
+        self._unusable = problem or self._watch.judge_novelty(estimate.novelty)
+        self._publish(estimate, stamp_ns)
+        if self._unusable:
+            raise MessageError(self._unusable)
+
+    def _publish(self, estimate: Estimate, stamp_ns: int) -> None:
+        """A pose without covariance cannot say that it is worthless, so then there is none."""
+        config = self._config
+        slow = estimate.slow_features
+        self._features.publish(to_array(slow, 'slow features'))
+        self._feature_pose.publish(_feature_pose(slow, stamp_ns, config.feature_frame))
+        pose = [estimate.position[0], estimate.position[1], estimate.yaw]
+        if not self._unusable:
+            self._pose.publish(to_pose(pose, stamp_ns, config.map_frame))
+        covariance = unusable_covariance() if self._unusable else estimate.covariance
+        self._uncertain.publish(
+            to_pose_with_covariance(pose, covariance, stamp_ns, config.map_frame)
+        )
+
+    def health(self) -> tuple[int, str, dict[str, str]]:
+        values = {'model': self._config.model, 'novelty': f'{self._novelty:.2f}'}
+        silent = self.monitor(self._topic).silent_for_s()
+        if math.isinf(silent):
+            return _WARN, f'waiting for pictures on {self._topic}', values
+        if silent > self._config.camera_timeout:
+            return _ERROR, f'no picture on {self._topic} for {silent:.0f} s', values
+        if self.monitor(self._topic).used == 0:
+            return _ERROR, 'no picture has been usable', values
+        if self._unusable:
+            return _ERROR, self._unusable, values
+        if self._novelty > self._config.novelty_warning:
+            return _WARN, 'pictures are unlike those of training', values
+        return _OK, 'locating', values
+
+
+def _feature_pose(slow: Any, stamp_ns: int, frame: str) -> PoseStamped:
+    """The first three slow features as a position, as the paper draws them."""
+    first = [*(float(value) for value in slow[:3]), 0.0, 0.0, 0.0][:3]
+    message = to_pose([first[0], first[1], 0.0], stamp_ns, frame)
+    message.pose.position.z = first[2]
+    return message
+
+
+def _require_finite(estimate: Estimate) -> None:
+    known = np.concatenate([estimate.slow_features, estimate.position, estimate.covariance.ravel()])
+    if not np.all(np.isfinite(known)):
+        raise MessageError('the model gives no finite estimate for this picture')
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(SfaNode, args)

@@ -1,0 +1,82 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A bench for nodes under test: its own context and domain, an executor in a thread, deadlines."""
+
+import contextlib
+import threading
+import time
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+
+DEADLINE_S = 15.0
+
+
+def until(condition, deadline_s=DEADLINE_S):
+    """Wait for a condition, at most until the deadline; returns whether it came true."""
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.005)
+    return bool(condition())
+
+
+class Bench:
+    """Runs nodes, publishes to them and records what they publish."""
+
+    def __init__(self, domain_id):
+        self.context = rclpy.Context()
+        rclpy.init(
+            context=self.context,
+            domain_id=domain_id,
+            signal_handler_options=rclpy.signals.SignalHandlerOptions.NO,
+        )
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.node = rclpy.create_node('bench', context=self.context)
+        self.nodes, self.heard, self._publishers = [], {}, {}
+        self.executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self):
+        with contextlib.suppress(ExternalShutdownException):
+            self.executor.spin()
+
+    def run(self, kind, start=True, **overrides):
+        values = [Parameter(name, value=value) for name, value in overrides.items()]
+        node = kind(context=self.context, parameter_overrides=values)
+        self.nodes.append(node)
+        if start:
+            assert node.start(), node.failure
+        self.executor.add_node(node)
+        return node
+
+    def listen(self, kind, topic, qos=None):
+        heard = self.heard.setdefault(topic, [])
+        self.node.create_subscription(kind, topic, heard.append, qos or QoSProfile(depth=1000))
+        assert until(lambda: self.node.count_publishers(topic) > 0), f'nobody publishes {topic}'
+        return heard
+
+    def publish(self, topic, message, qos=None):
+        if topic not in self._publishers:
+            publisher = self.node.create_publisher(type(message), topic, qos or 1000)
+            self._publishers[topic] = publisher
+            assert until(lambda: publisher.get_subscription_count() > 0), f'nobody hears {topic}'
+        self._publishers[topic].publish(message)
+
+    def call(self, kind, name, request):
+        client = self.node.create_client(kind, name)
+        assert client.wait_for_service(DEADLINE_S), f'no service {name}'
+        future = client.call_async(request)
+        assert until(future.done)
+        return future.result()
+
+    def close(self):
+        self.executor.shutdown()
+        self._thread.join(DEADLINE_S)
+        for node in [*self.nodes, self.node]:
+            node.destroy_node()
+        rclpy.try_shutdown(context=self.context)

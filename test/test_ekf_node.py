@@ -1,0 +1,393 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""ekf_node on real messages: what it publishes, what it survives, how it tells its state."""
+
+import math
+
+import numpy as np
+import pytest
+from filter_drives import START_NS, Drive
+
+from sfa_localization.config import FilterConfig
+from sfa_localization.geometry import compose
+from sfa_localization.pose_filter import PoseFilter
+
+pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from nav_msgs.msg import Odometry, Path  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.time import Time  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+
+from sfa_localization.nodes import ekf_node  # noqa: E402
+from sfa_localization.nodes.conversions import (  # noqa: E402
+    read_pose,
+    read_stamp,
+    read_yaw,
+    to_odometry,
+    to_pose_with_covariance,
+)
+from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
+from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
+
+SEEN = 'sfa/pose_with_covariance'
+SPREAD = np.diag([0.04, 0.04, 0.0025])
+NOISY = {'position_std': 0.1, 'yaw_std': 0.03, 'v_std': 0.02, 'omega_std': 0.01}
+
+
+@pytest.fixture
+def bench():
+    made = Bench(62)
+    yield made
+    made.close()
+
+
+def odometry(drive, i, stamp_ns=None):
+    spread = np.diag(drive.variances())
+    stamp_ns = int(drive.stamps_ns[i]) if stamp_ns is None else stamp_ns
+    frames = ('odom', 'base_link')
+    return to_odometry(drive.poses[i], np.eye(3), drive.read[i], spread, stamp_ns, frames)
+
+
+def picture(drive, k, spread=SPREAD, frame='map'):
+    stamp_ns = int(drive.stamps_ns[drive.pictures[k]])
+    return to_pose_with_covariance(drive.seen[k], spread, stamp_ns, frame)
+
+
+def play(bench, node, drive, events=None):
+    """Send a drive and wait until the node has dealt with it."""
+    events = drive.events() if events is None else events
+    counts = node.monitor('odom'), node.monitor(SEEN)
+    for _, kind, index in events:
+        before = counts[kind].received
+        if kind == 0:
+            bench.publish('odom', odometry(drive, index))
+        else:
+            bench.publish(SEEN, picture(drive, index))
+        # One at a time: the order between topics is then the drive's.
+        assert until(lambda b=before, k=kind: counts[k].received > b)
+
+
+def pose_of(message):
+    p = message.pose.pose
+    return np.array([p.position.x, p.position.y, read_yaw(p.orientation)])
+
+
+def test_live_is_offline_and_stamps_are_the_inputs(bench):
+    drive = Drive(seconds=3, **NOISY)
+    node = bench.run(EkfNode, set_initial_pose=True)
+    heard = bench.listen(Odometry, 'ekf/odometry')
+    poses = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
+    offline = PoseFilter(FilterConfig(set_initial_pose=True))
+    play(bench, node, drive)
+    assert until(lambda: len(heard) == len(drive.stamps_ns) and len(poses) == len(drive.pictures))
+    for event in drive.events():
+        stamp_ns, kind, index = event
+        if kind == 0:
+            offline.add_odometry(stamp_ns, *drive.read[index], drive.variances())
+            told = heard[index]
+            assert read_stamp(told.header.stamp) == stamp_ns
+            assert np.allclose(pose_of(told), offline.at(stamp_ns).pose, atol=1e-9)
+        else:
+            offline.add_measurement(stamp_ns, drive.seen[index], SPREAD)
+            assert np.allclose(pose_of(poses[index]), offline.at(stamp_ns).pose, atol=1e-9)
+            told = np.array(poses[index].pose.covariance).reshape(6, 6)
+            spread = offline.at(stamp_ns).pose_covariance
+            assert np.allclose(told[np.ix_([0, 1, 5], [0, 1, 5])], spread, atol=1e-12)
+    assert heard[-1].header.frame_id == 'map' and heard[-1].child_frame_id == 'base_link'
+
+
+def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench):
+    drive = Drive(seconds=1, **NOISY)
+    node = bench.run(EkfNode, set_initial_pose=True, initial_x=5.0, initial_yaw=2.0,
+                     transform_tolerance=0.25)  # fmt: skip
+    heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
+    told = bench.listen(Odometry, 'ekf/odometry')
+    play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
+    assert until(lambda: len(heard) == len(told) == len(drive.stamps_ns))
+    for i, (transform, message) in enumerate(zip(heard, told, strict=True)):
+        t = transform.transform
+        map_to_odom = [t.translation.x, t.translation.y, read_yaw(t.rotation)]
+        miss = compose(map_to_odom, drive.poses[i]) - pose_of(message)
+        assert np.hypot(*miss[:2]) < 1e-9 and abs(math.remainder(miss[2], 2 * math.pi)) < 1e-9
+        assert read_stamp(transform.header.stamp) == int(drive.stamps_ns[i]) + 250_000_000
+        assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')
+
+
+def test_the_transform_is_broadcast_where_tf2_msgs_is_installed(bench):
+    tf2_msgs = pytest.importorskip('tf2_msgs.msg')
+    drive = Drive(seconds=0.2)
+    node = bench.run(EkfNode, set_initial_pose=True)
+    heard = bench.listen(tf2_msgs.TFMessage, '/tf')
+    play(bench, node, drive)
+    assert until(lambda: len(heard) == 10)
+    assert heard[0].transforms[0].child_frame_id == 'odom'
+
+
+def test_the_broadcast_is_the_published_transform(bench, monkeypatch):
+    # tf2_msgs is not in the pip wheels: what would go to /tf is caught here instead.
+    drive = Drive(seconds=0.2)
+    node = bench.run(EkfNode, set_initial_pose=True)
+    monkeypatch.setattr(ekf_node, 'TFMessage', lambda transforms: transforms)
+    sent = []
+    node._tf = type('Publisher', (), {'publish': lambda self, message: sent.append(message)})()
+    heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
+    play(bench, node, drive)
+    assert until(lambda: len(heard) == len(sent) == 10)
+    assert [message[0] for message in sent] == heard
+
+
+def test_without_tf2_msgs_the_node_runs_and_says_so(bench, monkeypatch):
+    monkeypatch.setattr(ekf_node, 'TFMessage', None)
+    said = []
+    monkeypatch.setattr(
+        ekf_node.EkfNode, 'get_logger', lambda _: type('L', (), {
+            'info': lambda *a, **k: None, 'warning': lambda _, text, **k: said.append(text)})()
+    )  # fmt: skip
+    assert bench.run(EkfNode).active
+    assert len(said) == 1 and 'tf2_msgs is not installed' in said[0]
+
+
+def test_every_measurement_gets_its_verdict(bench):
+    drive = Drive(seconds=2, **NOISY)
+    drive.seen[10, :2] += 9.0
+    node = bench.run(EkfNode, set_initial_pose=True)
+    heard = bench.listen(DiagnosticArray, 'ekf/measurement_status')
+    play(bench, node, drive)
+    assert until(lambda: len(heard) == len(drive.pictures))
+    values = [{v.key: v.value for v in m.status[0].values} for m in heard]
+    assert values[3]['accepted'] == 'true' and values[10]['accepted'] == 'false'
+    assert float(values[10]['d2']) > float(values[10]['threshold'])
+    assert heard[10].status[0].message == 'outside the gate'
+    assert read_stamp(heard[10].header.stamp) == int(drive.stamps_ns[drive.pictures[10]])
+
+
+def test_the_state_is_latched_and_tells_why(bench):
+    drive = Drive(seconds=2, **NOISY)
+    node = bench.run(EkfNode)
+    early = bench.listen(String, 'ekf/state', latched_qos())
+    assert until(lambda: early and early[-1].data.startswith('UNINITIALISED: no odometry'))
+    play(bench, node, drive)
+    assert until(lambda: early[-1].data.startswith('LOCALISED'))
+    late = []
+    bench.node.create_subscription(String, 'ekf/state', late.append, latched_qos())
+    assert until(lambda: late and late[0].data.startswith('LOCALISED'))
+
+
+def test_initialpose_and_set_pose_set_the_pose(bench):
+    drive = Drive(seconds=1)
+    node = bench.run(EkfNode)
+    for topic, x in (('initialpose', 7.0), ('ekf_node/set_pose', -3.0)):
+        message = to_pose_with_covariance([x, 1.0, math.pi], SPREAD, 1, 'map')
+        message.header.stamp = Time(nanoseconds=0).to_msg()
+        bench.publish(topic, message)
+        assert until(lambda x=x: node._filter.state and node._filter.state.pose[0] == x)
+    play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
+    # Before the first odometry the pose was given; it has survived the start.
+    assert abs(node._filter.state.pose[0] - (-3.0 - drive.poses[-1, 0])) < 0.1
+
+
+def test_a_pose_in_another_frame_is_refused(bench):
+    node = bench.run(EkfNode)
+    bench.publish('initialpose', to_pose_with_covariance([1, 1, 0], SPREAD, 5, 'odom'))
+    assert until(lambda: "frame is 'odom', not 'map'" in node.monitor('initialpose').refused)
+    assert node._filter.state is None
+
+
+def test_reset_and_pause(bench):
+    drive = Drive(seconds=4, **NOISY)
+    node = bench.run(EkfNode, set_initial_pose=False)
+    first = [e for e in drive.events() if e[0] < START_NS + 10**9]
+    second = [e for e in drive.events() if 10**9 <= e[0] - START_NS < 2 * 10**9]
+    third = [e for e in drive.events() if e[0] - START_NS >= 2 * 10**9]
+    play(bench, node, drive, first)
+    assert node._filter.state is not None
+    assert bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=True)).success
+    accepted = node._filter.counts['measurement: accepted']
+    play(bench, node, drive, second)
+    assert until(lambda: node.monitor(SEEN).refused['paused'] == len([e for e in second if e[1]]))
+    assert node._filter.counts['measurement: accepted'] == accepted
+    assert 'paused' in ' '.join(node._status().reasons)
+    bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=False))
+    answer = bench.call(Trigger, 'ekf_node/reset', Trigger.Request())
+    assert answer.success and answer.message == 'UNINITIALISED'
+    play(bench, node, drive, third)
+    assert until(lambda: node._status().level.name == 'LOCALISED')
+
+
+def malformed():
+    """Broken messages, each a change of a good one, with the topic it goes to."""
+    drive = Drive(seconds=1)
+
+    def broken(make, change):
+        message = make()
+        change(message)
+        return message
+
+    def odom():
+        return odometry(drive, 40)
+
+    def pose():
+        return picture(drive, 8)
+
+    def fill(name, value):
+        def change(message):
+            covariance = getattr(message, name).covariance
+            covariance[:] = value
+
+        return change
+
+    nan, inf = math.nan, math.inf
+    changes = [
+        (odom, lambda m: setattr(m.twist.twist.linear, 'x', nan)),
+        (odom, lambda m: setattr(m.twist.twist.angular, 'z', inf)),
+        (odom, lambda m: setattr(m.twist.twist.linear, 'x', 1e200)),
+        (odom, lambda m: setattr(m.pose.pose.orientation, 'w', nan)),
+        (odom, lambda m: (setattr(m.pose.pose.orientation, 'w', 0.0),
+                          setattr(m.pose.pose.orientation, 'z', 0.0))),
+        (odom, lambda m: setattr(m.pose.pose.orientation, 'z', 5.0)),
+        (odom, lambda m: setattr(m.header.stamp, 'sec', 0)
+         or setattr(m.header.stamp, 'nanosec', 0)),
+        (odom, lambda m: setattr(m.header.stamp, 'nanosec', 2_000_000_000)),
+        (odom, lambda m: setattr(m.header.stamp, 'sec', 2_000_000_000)),
+        (pose, lambda m: setattr(m.pose.pose.position, 'x', nan)),
+        (pose, lambda m: setattr(m.pose.pose.position, 'y', 1e300)),
+        (pose, lambda m: setattr(m.pose.pose.orientation, 'w', inf)),
+        (pose, lambda m: (setattr(m.pose.pose.orientation, 'w', 0.0),
+                          setattr(m.pose.pose.orientation, 'z', 0.0))),
+        (pose, fill('pose', nan)),
+        (pose, fill('pose', -1.0)),
+        (pose, fill('pose', 1e308)),
+        (pose, lambda m: m.pose.covariance.__setitem__(1, 0.03)),
+        (pose, lambda m: setattr(m.header, 'frame_id', 'elsewhere')),
+        (pose, lambda m: setattr(m.header.stamp, 'sec', 0)
+         or setattr(m.header.stamp, 'nanosec', 0)),
+        (pose, lambda m: setattr(m.header.stamp, 'sec', 2_000_000_000)),
+    ]  # fmt: skip
+    return [('odom' if make is odom else SEEN, broken(make, change)) for make, change in changes]
+
+
+def test_malformed_messages_are_counted_and_change_nothing(bench):
+    drive = Drive(seconds=1, **NOISY)
+    node = bench.run(EkfNode, set_initial_pose=True)
+    odometries = bench.listen(Odometry, 'ekf/odometry')
+    play(bench, node, drive)
+    assert until(lambda: len(odometries) == len(drive.stamps_ns))
+    before = node._filter.state
+    for topic, message in malformed():
+        refused = sum(node.monitor(topic).refused.values())
+        bench.publish(topic, message)
+        assert until(lambda t=topic, r=refused: sum(node.monitor(t).refused.values()) > r), message
+        after = node._filter.state
+        assert np.array_equal(before.mean, after.mean), message
+        assert np.array_equal(before.covariance, after.covariance), message
+    internal = [w for m in node.monitors.values() for w in m.refused if 'internal' in w]
+    assert not internal
+    assert all(np.all(np.isfinite(pose_of(message))) for message in odometries)
+    again = Drive(seconds=0.4)
+    again.stamps_ns = again.stamps_ns + 10**9
+    play(bench, node, again, [(int(s), 0, i) for i, s in enumerate(again.stamps_ns)])
+    assert until(lambda: len(odometries) == len(drive.stamps_ns) + len(again.stamps_ns))
+
+
+def test_diagnostics_tell_rates_latencies_and_counts(bench):
+    drive = Drive(seconds=1, **NOISY)
+    node = bench.run(EkfNode, diagnostics_period=0.1)
+    heard = bench.listen(DiagnosticArray, '/diagnostics')
+    assert until(lambda: any(m.status[0].level == DiagnosticStatus.WARN for m in heard))
+    play(bench, node, drive)
+
+    def told():
+        return {v.key: v.value for v in heard[-1].status[0].values}
+
+    assert until(lambda: told().get('odometry: used') == '50')
+    values = told()
+    assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localised'
+    assert values['odom: received'] == '50' and float(values['odom: rate [Hz]']) > 0
+    assert float(values['odom: latency p99 [ms]']) >= float(values['odom: latency p50 [ms]']) > 0
+    assert 'measurement: accepted' in values and 'position deviation [m]' in values
+
+
+def test_silence_is_told_without_any_clock_moving(bench):
+    drive = Drive(seconds=1, **NOISY)
+    node = bench.run(EkfNode, odometry_silence=0.2, picture_silence=0.2)
+    states = bench.listen(String, 'ekf/state', latched_qos())
+    play(bench, node, drive)
+    assert until(lambda: any(s.data.startswith('DEGRADED: nothing on odom') for s in states))
+
+
+def test_simulated_time_that_steps_back_starts_anew(bench):
+    node = bench.run(EkfNode, use_sim_time=True, set_initial_pose=True)
+    drive = Drive(seconds=0.5)
+    bench.publish('/clock', Clock(clock=Time(nanoseconds=START_NS).to_msg()))
+    assert until(lambda: node.get_clock().now().nanoseconds == START_NS)
+    play(bench, node, drive)
+    bench.publish('/clock', Clock(clock=Time(nanoseconds=START_NS - 10**10).to_msg()))
+    assert until(lambda: node._filter.counts['reset'] == 1)
+
+
+def test_live_parameters_reach_the_filter_and_keep_the_pose(bench):
+    drive = Drive(seconds=1, **NOISY)
+    node = bench.run(EkfNode, set_initial_pose=True)
+    play(bench, node, drive)
+    before = node._filter.state.pose
+    assert node.set_parameters([Parameter('measurement_factor', value=4.0)])[0].successful
+    assert node._filter.config.measurement_factor == 4.0
+    assert np.array_equal(before, node._filter.state.pose)
+    refused = node.set_parameters([Parameter('degraded_std', value=50.0)])[0]
+    assert not refused.successful and 'degraded_std' in refused.reason
+
+
+def test_the_path_is_thinned_and_bounded(bench):
+    drive = Drive(seconds=4, rate_hz=20)
+    node = bench.run(EkfNode, set_initial_pose=True, path_period=0.5, path_length=3)
+    heard = bench.listen(Path, 'ekf/path')
+    play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
+    assert until(lambda: heard and len(heard[-1].poses) == 3)
+    stamps = [read_stamp(pose.header.stamp) for pose in heard[-1].poses]
+    assert np.all(np.diff(stamps) >= 500_000_000)
+
+
+def test_it_obeys_a_lifecycle_manager(bench):
+    node = bench.run(EkfNode, autostart=False)
+    assert not node.active
+    for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert bench.call(ChangeState, 'ekf_node/change_state', request).success
+    assert node.active
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert bench.call(ChangeState, 'ekf_node/change_state', request).success
+    assert not node.active
+
+
+def test_overrides_of_quality_of_service_are_taken(bench):
+    overrides = {
+        'qos_overrides./odom.subscription.reliability': 'reliable',
+        'qos_overrides./ekf/odometry.publisher.depth': 3,
+    }
+    bench.run(EkfNode, **overrides)
+    assert until(lambda: bench.node.get_subscriptions_info_by_topic('/odom'))
+    profile = bench.node.get_subscriptions_info_by_topic('/odom')[0].qos_profile
+    assert profile.reliability.name == 'RELIABLE'
+
+
+def test_measurements_without_heading_are_taken_as_positions(bench):
+    drive = Drive(seconds=1)
+    node = bench.run(EkfNode, set_initial_pose=True)
+    play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
+    spread = np.diag([0.04, 0.04, 0.0])
+    message = picture(drive, 5, spread)
+    _, _, told = read_pose(message)
+    assert told[2, 2] < 1e-5
+    message.pose.covariance[35] = 0.0
+    message.pose.pose.orientation.z, message.pose.pose.orientation.w = 1.0, 0.0  # 180 deg off
+    bench.publish(SEEN, message)
+    assert until(lambda: node._filter.counts['measurement: accepted'] == 1)
