@@ -20,6 +20,7 @@ from sfa_localization.bag_storage import (
     Record,
     Storage,
     inflate_file,
+    load_yaml,
     message_type,
     offered_qos,
 )
@@ -212,7 +213,7 @@ def open_storage(path: Path) -> Storage:
 def parse_metadata(text: str) -> Metadata:
     """Read metadata.yaml of any version. Raises ValueError when it does not make sense."""
     try:
-        tree = yaml.safe_load(text)
+        tree = load_yaml(text)
         information = tree['rosbag2_bagfile_information']
         topics = information['topics_with_message_count']
         pairs = [(_channel(topic['topic_metadata']), topic['message_count']) for topic in topics]

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol
 
+import yaml
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
@@ -18,6 +19,11 @@ if sys.version_info >= (3, 14):
     from compression import zstd as zstd
 else:
     from backports import zstd as zstd
+
+try:
+    from yaml import CSafeLoader as YamlLoader
+except ImportError:  # PyYAML was built without libyaml
+    from yaml import SafeLoader as YamlLoader
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 PIECE = 1 << 20
@@ -61,10 +67,15 @@ def message_type(name: str) -> str:
     return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else name
 
 
+def load_yaml(text: str) -> Any:
+    """Plain data from YAML, by libyaml where PyYAML has it. Raises yaml.YAMLError."""
+    return yaml.load(text, Loader=YamlLoader)
+
+
 def offered_qos(profiles: Any) -> tuple[Qos, ...]:
     """QoS profiles from the text or list that a recorder left; none where it is unreadable."""
     try:
-        return tuple(parse_qos(profiles))
+        return tuple(parse_qos(load_yaml(profiles) if isinstance(profiles, str) else profiles))
     except Exception:  # foreign text; a bag is not refused for its QoS
         return ()
 
