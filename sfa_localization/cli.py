@@ -16,14 +16,17 @@ from sfa_localization import __version__
 from sfa_localization.config import (
     CalibrationConfig,
     CameraConfig,
+    FilterConfig,
     InspectionConfig,
     PanoramaConfig,
     PlayConfig,
     Settings,
     SimulationConfig,
     TopicNames,
+    TuneConfig,
 )
-from sfa_localization.errors import ConfigError, LocalizationError
+from sfa_localization.config_file import load_changes, load_settings, render, write_config
+from sfa_localization.errors import ConfigError, DataError, LocalizationError
 
 S = TypeVar('S', bound=Settings)
 OPTIONAL = {
@@ -297,7 +300,136 @@ CALIBRATE = Command(
 )
 
 
-COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT, CALIBRATE]
+def _configure_filter(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('odometry', type=Path, metavar='ODOM.csv')
+    parser.add_argument('positions', type=Path, metavar='POSITIONS.csv')
+    parser.add_argument('--config', type=Path, help='parameter file; section ekf_node is read')
+    parser.add_argument(
+        '--initial-pose',
+        nargs=3,
+        type=float,
+        metavar=('X', 'Y', 'YAW'),
+        help='start (m, m, rad), where it is known',
+    )
+    parser.add_argument('--output', type=Path, required=True, help='TUM file to write')
+
+
+def _filter(arguments: argparse.Namespace) -> int:
+    from sfa_localization import filtering
+
+    odometry = filtering.read_odometry_table(arguments.odometry)
+    positions = filtering.read_position_table(arguments.positions)
+    config = _filter_config(arguments.config)
+    done = filtering.run_filter(
+        odometry, positions, config, arguments.initial_pose, progress=sys.stderr.isatty()
+    )
+    for name, table in (('odometry rows', odometry), ('position rows', positions)):
+        for reason, count in sorted(table.skipped.items()):
+            print(f'{name}: {reason}: {count}')
+    for reason, count in sorted(done.counts.items()):
+        print(f'{reason}: {count}')
+    print(': '.join([done.status.level.name, '; '.join(done.status.reasons)]).rstrip(': '))
+    if len(done.poses) == 0:
+        raise DataError(
+            'the filter never started: positions without heading need some metres of motion; '
+            'or give --initial-pose X Y YAW'
+        )
+    filtering.write_tum(arguments.output, done.stamps_ns, done.poses)
+    waited = f', {done.before_start} rows before the start' if done.before_start else ''
+    print(f'{arguments.output}: {len(done.poses)} poses{waited}')
+    return 0
+
+
+def _filter_config(path: Path | None) -> FilterConfig:
+    return load_settings(path, 'ekf_node', FilterConfig) if path else FilterConfig()
+
+
+FILTER = Command(
+    'filter',
+    'Fuse a log of odometry and positions, without ROS: what the live filter would have told.',
+    '  filter odom.csv positions.csv --output poses.tum\n'
+    '  filter odom.csv gps.csv --config localization.yaml --initial-pose 0 0 1.57 \\\n'
+    '      --output poses.tum\n\n'
+    'ODOM.csv: stamp_s,v_mps,omega_radps[,var_v,var_omega]\n'
+    'POSITIONS.csv: stamp_s,x_m,y_m[,var_x,var_y][,var_xy][,yaw_rad,var_yaw]\n'
+    'Seconds, metres, radians; variances in their squares; empty: unknown.',
+    _configure_filter,
+    _filter,
+)
+
+
+def _configure_tune(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bags', nargs='+', type=Path, metavar='BAG')
+    parser.add_argument('--model', type=Path, required=True, help='file of the trained model')
+    parser.add_argument('--config', type=Path, help='parameter file to start from')
+    parser.add_argument('--output', type=Path, required=True, help='parameter file to write')
+    _add_settings(parser, TuneConfig)
+    _add_settings(parser, TopicNames)
+
+
+def _tune(arguments: argparse.Namespace) -> int:
+    from sfa_localization import training, tuning
+    from sfa_localization.place_model import PlaceModel
+
+    how, model = _settings(TuneConfig, arguments), PlaceModel.load(arguments.model)
+    camera = CameraConfig()
+    if arguments.config:
+        camera = load_settings(arguments.config, 'omnicam_node', CameraConfig)
+    recipe = training.Recipe(
+        topics=_settings(TopicNames, arguments), camera=camera, panorama=model.panorama
+    )
+    config = _filter_config(arguments.config)
+    progress = sys.stderr.isatty()
+    tours = tuning.read_tours(arguments.bags, model, recipe, how.method == 'grid', progress)
+    best = tuning.tune(tours, config, how, progress)
+    changes = load_changes(arguments.config) if arguments.config else {}
+    found = {
+        item.name: getattr(best.config, item.name)
+        for item in dataclasses.fields(FilterConfig)
+        if getattr(best.config, item.name) != getattr(config, item.name)
+    }
+    changes['ekf_node'] = {**changes.get('ekf_node', {}), **found}
+    write_config(arguments.output, changes)
+    unit = 'm mean error' if how.method == 'grid' else 'negative log-likelihood per component'
+    for name, value in found.items():
+        print(f'{name}: {value:.4g} (was {getattr(config, name):.4g})')
+    print(f'{arguments.output}: {best.cost:.4f} {unit}')
+    return 0
+
+
+TUNE = Command(
+    'tune',
+    "Find the filter's noise parameters from bags; write them into a parameter file.",
+    '  tune bags/test --model model.npz --output tuned.yaml\n'
+    '  tune bags/a bags/b --model model.npz --method grid --output tuned.yaml\n\n'
+    'The default needs no ground truth. Variances count in the squares of m, rad, m/s and rad/s.',
+    _configure_tune,
+    _tune,
+)
+
+
+def _configure_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--output', type=Path, help='file to write; else it is printed')
+
+
+def _config(arguments: argparse.Namespace) -> int:
+    if arguments.output:
+        write_config(arguments.output)
+    else:
+        print(render(), end='')
+    return 0
+
+
+CONFIG = Command(
+    'config',
+    'Write the parameter file of nodes and trainer: every parameter, explained, with its unit.',
+    '  config\n  config --output localization.yaml',
+    _configure_config,
+    _config,
+)
+
+
+COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT, CALIBRATE, FILTER, TUNE, CONFIG]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -363,7 +363,7 @@ class SegmentConfig(Settings):
     line_bend_max: float = setting(
         8.0, 'heading change at which a straight line ends', unit='deg', low=0.1, high=90.0
     )
-    segment_images_min: int = setting(5, 'fewest pictures of a segment', low=3, high=1000)
+    segment_images_min: int = setting(3, 'fewest pictures of a segment', low=2, high=1000)
     image_step_max: float = setting(
         1.5, 'longest stretch without a picture inside a segment', unit='m', low=0.01, high=1e2
     )
@@ -963,3 +963,15 @@ class NetworkConfig(Settings):
         (32, 32, 32), 'custom: slow features that leave a layer', low=1
     )
     clip: float = setting(4.0, 'custom: limit of a slow feature', low=0.1, high=1e6)
+
+
+@dataclass(frozen=True, slots=True)
+class TuneConfig(Settings):
+    """How the filter's noise parameters are sought."""
+
+    method: str = setting(
+        'likelihood',
+        'likelihood (needs no ground truth), or grid (the search of the paper, which does)',
+        choices=('likelihood', 'grid'),
+    )
+    trials: int = setting(120, 'settings to try by likelihood', low=10, high=100_000)

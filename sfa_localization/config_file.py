@@ -75,6 +75,11 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
     return {**shared, **own}
 
 
+def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
+    """Everything that a parameter file sets, by section, for `render`. Raises ConfigError."""
+    return {section: load_section(Path(path), section) for section in SECTIONS}
+
+
 def _read(path: Path) -> Mapping[str, Any]:
     try:
         document = yaml.safe_load(path.read_text(encoding='utf-8'))

@@ -1,0 +1,310 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run the pose filter on a log without ROS: tables of odometry and positions in, a TUM file out."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from sfa_localization.config import FilterConfig
+from sfa_localization.errors import DataError
+from sfa_localization.geometry import Array
+from sfa_localization.pose_filter import PoseFilter, Status
+from sfa_localization.run import Stamps
+
+_NS = Decimal(1_000_000_000)
+_SECOND_NS = 1_000_000_000
+# What people call the columns, in lower case; the first is what this package writes.
+_STAMP = ('stamp_s', 'stamp', 't', 'time', 'time_s', 'timestamp', 'timestamp_s', 'sec', 'seconds')
+_STAMP_NS = ('stamp_ns', 'timestamp_ns', 't_ns', 'time_ns')
+_ODOMETRY = {
+    'v': ('v_mps', 'v', 'vx', 'v_x', 'speed', 'linear_x', 'velocity', 'forward_velocity'),
+    'omega': ('omega_radps', 'omega', 'w', 'wz', 'omega_z', 'yaw_rate', 'angular_z',
+              'angular_velocity', 'yawrate'),
+    'var_v': ('var_v', 'v_var', 'v_variance', 'variance_v', 'cov_vv'),
+    'var_omega': ('var_omega', 'omega_var', 'omega_variance', 'var_w', 'variance_omega'),
+}  # fmt: skip
+_POSITIONS = {
+    'x': ('x_m', 'x', 'px', 'pos_x', 'position_x', 'east', 'easting'),
+    'y': ('y_m', 'y', 'py', 'pos_y', 'position_y', 'north', 'northing'),
+    'var_x': ('var_x', 'x_var', 'var_xx', 'cov_xx', 'variance_x'),
+    'var_y': ('var_y', 'y_var', 'var_yy', 'cov_yy', 'variance_y'),
+    'var_xy': ('var_xy', 'cov_xy', 'covariance_xy'),
+    'yaw': ('yaw_rad', 'yaw', 'heading', 'heading_rad', 'theta'),
+    'var_yaw': ('var_yaw', 'yaw_var', 'cov_yawyaw', 'variance_yaw'),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of a log in the order of time: stamps (N,) and named columns (N,), NaN where empty.
+
+    `skipped` counts the rows that could not be used, by reason.
+    """
+
+    stamps_ns: Stamps
+    columns: dict[str, Array]
+    skipped: Counter[str] = field(default_factory=Counter)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Filtered:
+    """Poses (N, 3) at the odometry's stamps (N,), from the start on, and the rows' fate."""
+
+    stamps_ns: Stamps
+    poses: Array
+    counts: Counter[str]
+    status: Status
+    before_start: int
+
+
+def read_odometry_table(path: Path | str) -> Table:
+    """Read `stamp_s,v_mps,omega_radps[,var_v,var_omega]`. Raises DataError."""
+    return _read_table(Path(path), _ODOMETRY, ('v', 'omega'))
+
+
+def read_position_table(path: Path | str) -> Table:
+    """Read `stamp_s,x_m,y_m[,var_x,var_y][,var_xy][,yaw_rad,var_yaw]`. Raises DataError."""
+    return _read_table(Path(path), _POSITIONS, ('x', 'y'))
+
+
+def run_filter(
+    odometry: Table,
+    positions: Table,
+    config: FilterConfig,
+    start: Sequence[float] | None = None,
+    progress: bool = False,
+) -> Filtered:
+    """Fuse two tables as a live filter would: each pose knows only what came before it.
+
+    `start` is x m, y m, yaw rad, where known. Raises DataError when the tables do not overlap.
+    """
+    _require_overlap(odometry, positions)
+    # Logs may count from zero, but a stamp of zero means that there is none.
+    first = min(int(table.stamps_ns[0]) for table in (odometry, positions) if len(table))
+    shift = _SECOND_NS - first if first <= 0 else 0
+    fused = PoseFilter(config)
+    if start is not None:
+        fused.initialise(int(odometry.stamps_ns[0]) + shift, start)
+    stamps, poses, waiting = [], [], 0
+    for stamp_ns in tqdm(_feed(fused, odometry, positions, shift), disable=not progress,
+                         total=len(odometry), unit=' rows', desc='filter'):  # fmt: skip
+        state = fused.at(stamp_ns)
+        if state is None:
+            waiting += 1
+            continue
+        stamps.append(stamp_ns - shift)
+        poses.append(state.pose)
+    return Filtered(
+        np.array(stamps, np.int64),
+        np.reshape(np.array(poses), (-1, 3)),
+        fused.counts,
+        fused.status,
+        waiting,
+    )
+
+
+def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:
+    """Write `stamp x y z qx qy qz qw` lines, at once or not at all. Raises DataError."""
+    path = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix='.part')
+        with os.fdopen(handle, 'w', encoding='ascii') as file:
+            for stamp_ns, (x, y, yaw) in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
+                turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
+                file.write(f'{_seconds(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n')
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except OSError as error:
+        raise DataError(f'{path}: cannot be written: {error}') from None
+
+
+def _seconds(stamp_ns: int) -> str:
+    sign = '-' if stamp_ns < 0 else ''
+    seconds, rest = divmod(abs(stamp_ns), _SECOND_NS)
+    return f'{sign}{seconds}.{rest:09d}'
+
+
+def _feed(fused: PoseFilter, odometry: Table, positions: Table, shift: int) -> Iterator[int]:
+    """Give both tables to the filter in the order of time; yields each odometry stamp, done."""
+    events = [(int(s) + shift, 0, i) for i, s in enumerate(odometry.stamps_ns)]
+    events += [(int(s) + shift, 1, i) for i, s in enumerate(positions.stamps_ns)]
+    events.sort()
+    pending: int | None = None
+    for stamp_ns, kind, i in events:
+        if pending is not None and stamp_ns > pending:
+            yield pending
+            pending = None
+        if kind == 1:
+            fused.add_measurement(stamp_ns, *_measurement(positions.columns, i))
+        elif not fused.add_odometry(stamp_ns, *_twist(odometry.columns, i)):
+            pending = stamp_ns
+    if pending is not None:
+        yield pending
+
+
+def _twist(columns: dict[str, Array], i: int) -> tuple[float, float, tuple[float, float]]:
+    variances = _cell(columns, 'var_v', i, 0.0), _cell(columns, 'var_omega', i, 0.0)
+    return float(columns['v'][i]), float(columns['omega'][i]), variances
+
+
+def _measurement(columns: dict[str, Array], i: int) -> tuple[Array, Array]:
+    """Position or pose and its covariance; a variance that is not told is 0, for unknown."""
+    value = np.array([columns['x'][i], columns['y'][i]])
+    x, y = _cell(columns, 'var_x', i, 0.0), _cell(columns, 'var_y', i, 0.0)
+    x, y = (x or y, y or x)
+    xy = _cell(columns, 'var_xy', i, 0.0)
+    covariance = np.array([[x, xy], [xy, y]]) if x > 0 else np.zeros((2, 2))
+    yaw, yaw_variance = _cell(columns, 'yaw', i, math.nan), _cell(columns, 'var_yaw', i, 0.0)
+    if not (math.isfinite(yaw) and yaw_variance > 0 and covariance.any()):
+        return value, covariance
+    full = np.zeros((3, 3))
+    full[:2, :2], full[2, 2] = covariance, yaw_variance
+    return np.append(value, yaw), full
+
+
+def _cell(columns: dict[str, Array], name: str, i: int, missing: float) -> float:
+    if name not in columns or not math.isfinite(columns[name][i]):
+        return missing
+    return float(columns[name][i])
+
+
+def _require_overlap(odometry: Table, positions: Table) -> None:
+    if len(positions) == 0:
+        return
+    spans = [(int(t.stamps_ns[0]), int(t.stamps_ns[-1])) for t in (odometry, positions)]
+    if spans[0][0] > spans[1][1] or spans[1][0] > spans[0][1]:
+        told = [f'{_seconds(a)} to {_seconds(b)} s' for a, b in spans]
+        raise DataError(
+            f'odometry ({told[0]}) and positions ({told[1]}) have no time in common: '
+            'bring both to one clock'
+        )
+
+
+# Reading.
+
+
+def _read_table(path: Path, known: dict[str, tuple[str, ...]], needed: tuple[str, ...]) -> Table:
+    try:
+        text = path.read_text(encoding='utf-8-sig')
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f'{path}: cannot be read: {error}') from None
+    rows = [_split(line) for line in text.splitlines() if line.strip()]
+    names, start = _header(rows, known)
+    if not names:
+        raise DataError(f'{path}: holds no rows; the first line must be stamp_s,{",".join(needed)}')
+    places = _places(path, names, known, needed)
+    return _table(path, rows[start:], places, needed)
+
+
+def _split(line: str) -> list[str]:
+    """Cells of a row, whatever separates them."""
+    for separator in (',', ';', '\t'):
+        if separator in line:
+            return [
+                cell.strip().strip('"') for cell in next(csv.reader([line], delimiter=separator))
+            ]
+    return line.split()
+
+
+def _header(rows: list[list[str]], known: dict[str, tuple[str, ...]]) -> tuple[list[str], int]:
+    """Names of the columns and the first row of data; the usual order where there is no header."""
+    for i, row in enumerate(rows):
+        if _number(row[0]) is not None:
+            usual = ['stamp_s', *(aliases[0] for aliases in known.values())]
+            return usual[: len(row)], i
+        names = [cell.lstrip('#%').strip().lower() for cell in row]
+        names = names if names[0] else names[1:]
+        if not row[0].startswith(('#', '%')) or set(names) & {*_STAMP, *_STAMP_NS}:
+            return names, i + 1
+    return [], len(rows)
+
+
+def _places(
+    path: Path, names: list[str], known: dict[str, tuple[str, ...]], needed: tuple[str, ...]
+) -> dict[str, int]:
+    """Which column holds what."""
+    wanted = {'stamp_s': _STAMP, 'stamp_ns': _STAMP_NS, **known}
+    places = {}
+    for name, aliases in wanted.items():
+        found = next((names.index(alias) for alias in aliases if alias in names), None)
+        if found is not None:
+            places[name] = found
+    missing = [known[name][0] for name in needed if name not in places]
+    if 'stamp_s' not in places and 'stamp_ns' not in places:
+        missing.insert(0, 'stamp_s')
+    if missing:
+        raise DataError(f'{path}: no column {" or ".join(missing)} among {", ".join(names)}')
+    return places
+
+
+def _table(
+    path: Path, rows: list[list[str]], places: dict[str, int], needed: tuple[str, ...]
+) -> Table:
+    skipped: Counter[str] = Counter()
+    stamps, values = [], []
+    columns = [name for name in places if not name.startswith('stamp_')]
+    for row in rows:
+        if row[0].startswith(('#', '%')):
+            continue
+        stamp_ns = _stamp(row, places)
+        cells = [_value(row, places[name]) for name in columns]
+        if stamp_ns is None:
+            skipped['no stamp'] += 1
+        elif not all(math.isfinite(cells[columns.index(name)]) for name in needed):
+            skipped['no number'] += 1
+        else:
+            stamps.append(stamp_ns)
+            values.append(cells)
+    if not stamps and skipped:
+        raise DataError(f'{path}: none of the {sum(skipped.values())} rows can be used')
+    order = np.argsort(np.array(stamps, np.int64), kind='stable')
+    if len(order) and np.any(np.diff(order) < 0):
+        skipped['(rows out of order, sorted)'] = int(np.sum(np.diff(order) < 0))
+    data = np.reshape(np.array(values, float), (-1, len(columns)))[order]
+    return Table(
+        np.array(stamps, np.int64)[order],
+        {name: data[:, k] for k, name in enumerate(columns)},
+        skipped,
+    )
+
+
+def _stamp(row: list[str], places: dict[str, int]) -> int | None:
+    """Nanoseconds, exactly: a double does not hold them."""
+    name = 'stamp_ns' if 'stamp_ns' in places else 'stamp_s'
+    number = _number(row[places[name]]) if places[name] < len(row) else None
+    if number is None:
+        return None
+    stamp_ns = int(number if name == 'stamp_ns' else (number * _NS).to_integral_value())
+    return stamp_ns if abs(stamp_ns) < 2**62 else None
+
+
+def _number(cell: str) -> Decimal | None:
+    try:
+        number = Decimal(cell.strip())
+    except InvalidOperation:
+        return None
+    return number if number.is_finite() else None
+
+
+def _value(row: list[str], place: int) -> float:
+    if place >= len(row):
+        return math.nan
+    try:
+        return float(row[place])
+    except ValueError:
+        return math.nan

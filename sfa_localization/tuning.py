@@ -1,0 +1,217 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find the filter's noise parameters from drives: by likelihood, or by the paper's grid search.
+
+The likelihood needs no ground truth: the innovations of a well-tuned filter are as large as it
+says that they are. The grid search of the paper compares poses with ground truth, where there is
+some, and takes the least mean error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from tqdm import tqdm
+
+from sfa_localization.config import FilterConfig, TuneConfig
+from sfa_localization.errors import DataError
+from sfa_localization.geometry import Array, align
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.pose_filter import PoseFilter, Update
+from sfa_localization.run import Odometry, Run, Stamps, Trajectory
+from sfa_localization.training import Recipe, read_drive
+
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""The grid: factors on the variances of pictures and of odometry."""
+TUNED = (
+    'measurement_factor',
+    'odometry_factor',
+    'slip_per_metre',
+    'yaw_per_metre',
+    'decorrelation',
+)
+"""What the likelihood decides, each on a logarithmic scale."""
+_SPREAD = 0.7
+_ENOUGH = 20
+_BATCH = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What the pictures of a drive told: stamps (N,), poses (N, 3), yaw NaN where unknown.
+
+    `covariances` (N, 3, 3), `novelty` (N,).
+    """
+
+    stamps_ns: Stamps
+    poses: Array
+    covariances: Array
+    novelty: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Tour:
+    """One drive to tune on; `truth` only for the grid search."""
+
+    odometry: Odometry
+    sight: Sight
+    truth: Trajectory | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Cost of one setting: negative mean log-likelihood, or mean error in metres."""
+
+    config: FilterConfig
+    cost: float
+
+
+def read_tours(
+    bags: Sequence[Path], model: PlaceModel, recipe: Recipe, want_truth: bool, progress: bool
+) -> list[Tour]:
+    """What the model sees in the pictures of each bag, and the bag's odometry. Raises BagError."""
+    tours = []
+    for bag in bags:
+        with TemporaryDirectory(prefix='sfa_localization_tune_') as cache:
+            run = read_drive(bag, Path(cache), recipe, progress, want_truth=want_truth)
+            tours.append(Tour(run.odometry, _sight(run, model, progress), run.ground_truth))
+    return tours
+
+
+def _sight(run: Run, model: PlaceModel, progress: bool) -> Sight:
+    poses, covariances, novelty = [], [], []
+    with tqdm(total=len(run.panoramas), desc='locating', unit='img', disable=not progress) as bar:
+        for batch in run.panoramas.batches(_BATCH):
+            for estimate in model.locate_all(batch):
+                poses.append([*estimate.position, estimate.yaw])
+                covariances.append(estimate.covariance)
+                novelty.append(estimate.novelty)
+            bar.update(len(batch))
+    return Sight(
+        run.panoramas.stamps_ns,
+        np.reshape(poses, (-1, 3)),
+        np.reshape(covariances, (-1, 3, 3)),
+        np.array(novelty),
+    )
+
+
+def tune(tours: Sequence[Tour], config: FilterConfig, how: TuneConfig, progress: bool) -> Outcome:
+    """The best setting found the way that `how` says. Raises DataError without enough data."""
+    total = len(FACTORS) ** 2 if how.method == 'grid' else how.trials
+    with tqdm(total=total, desc=how.method, unit='trial', disable=not progress) as bar:
+        if how.method == 'grid':
+            return tune_by_grid(tours, config, bar.update)[0]
+        return tune_by_likelihood(tours, config, how.trials, bar.update)
+
+
+def tune_by_likelihood(
+    tours: Sequence[Tour], config: FilterConfig, steps: int, told: Callable[[], object]
+) -> Outcome:
+    """The setting under which the innovations are likeliest; `told` is called after each trial.
+
+    Nelder-Mead over the logarithms of TUNED: the cost is not smooth where the gate decides.
+    """
+    _require_data(tours)
+    start = np.log([getattr(config, name) for name in TUNED])
+
+    def cost(logs: NDArray[np.float64]) -> float:
+        told()
+        # A weak pull to the start keeps what the data say nothing about where it was.
+        pull = 1e-3 * float(np.sum((logs - start) ** 2))
+        return likelihood_cost(tours, _with_logs(config, logs)) + pull
+
+    simplex = np.vstack([start, start + _SPREAD * np.eye(len(TUNED))])
+    found = minimize(
+        cost,
+        start,
+        method='Nelder-Mead',
+        options={'maxfev': steps, 'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 1e-3},
+    )
+    return Outcome(_with_logs(config, found.x), float(found.fun))
+
+
+def tune_by_grid(
+    tours: Sequence[Tour], config: FilterConfig, told: Callable[[], object]
+) -> list[Outcome]:
+    """The paper's grid search: every pair of factors, the least mean error against truth first."""
+    _require_data(tours)
+    if any(tour.truth is None for tour in tours):
+        raise DataError('the grid search needs ground truth in every bag; use the likelihood')
+    outcomes = []
+    for pictures, odometry in itertools.product(FACTORS, FACTORS):
+        trial = dataclasses.replace(config, measurement_factor=pictures, odometry_factor=odometry)
+        outcomes.append(Outcome(trial, error_cost(tours, trial)))
+        told()
+    return sorted(outcomes, key=lambda outcome: outcome.cost)
+
+
+def likelihood_cost(tours: Iterable[Tour], config: FilterConfig) -> float:
+    """Negative log-likelihood per innovation component; one outside the gate counts as at it."""
+    total, count = 0.0, 0
+    for tour in tours:
+        fused = PoseFilter(config)
+        for update in _fuse(fused, tour):
+            if update.covariance is None:
+                continue
+            excess = min(update.d2, update.threshold) - update.d2
+            total -= update.log_likelihood - excess / 2
+            count += len(update.covariance)
+    return total / count if count else math.inf
+
+
+def error_cost(tours: Iterable[Tour], config: FilterConfig) -> float:
+    """Mean position error, m, after rigid alignment of what the pictures alone tell (paper)."""
+    errors = []
+    for tour in tours:
+        if tour.truth is None:
+            continue
+        fused = PoseFilter(config)
+        to_truth = align(tour.sight.poses[:, :2], tour.truth.at(tour.sight.stamps_ns)[:, :2])
+        for update in _fuse(fused, tour):
+            state = fused.at(update.stamp_ns)
+            if state is not None:
+                true = tour.truth.at(np.array([update.stamp_ns]))[0]
+                miss = to_truth.apply(state.pose[None, :2])[0] - true[:2]
+                errors.append(math.hypot(*miss))
+    return float(np.mean(errors)) if errors else math.inf
+
+
+def _fuse(fused: PoseFilter, tour: Tour) -> Iterator[Update]:
+    """Feed a tour in the order of time; yields the updates."""
+    odometry, sight = tour.odometry, tour.sight
+    events = [(int(s), 0, i) for i, s in enumerate(odometry.stamps_ns)]
+    events += [(int(s), 1, i) for i, s in enumerate(sight.stamps_ns)]
+    for stamp_ns, kind, i in sorted(events):
+        if kind == 0:
+            v, omega = odometry.twists[i]
+            fused.add_odometry(stamp_ns, v, omega, odometry.variances[i])
+        else:
+            yield fused.add_measurement(
+                stamp_ns, sight.poses[i], sight.covariances[i], sight.novelty[i]
+            )
+
+
+def _with_logs(config: FilterConfig, logs: NDArray[np.float64]) -> FilterConfig:
+    """The settings with those of TUNED, kept inside their ranges."""
+    ranges = {item.name: item.metadata for item in dataclasses.fields(config)}
+    values: dict[str, Any] = {}
+    for name, log in zip(TUNED, logs, strict=True):
+        meta = ranges[name]
+        values[name] = float(np.clip(math.exp(min(log, 50.0)), meta['low'] or 1e-9, meta['high']))
+    return dataclasses.replace(config, **values)
+
+
+def _require_data(tours: Sequence[Tour]) -> None:
+    pictures = sum(len(tour.sight.stamps_ns) for tour in tours)
+    if pictures < _ENOUGH:
+        raise DataError(f'{pictures} pictures are too few to tune on: {_ENOUGH} at least')
