@@ -117,6 +117,9 @@ class Panoramas(Protocol):
 
     def __len__(self) -> int: ...
 
+    def read(self, start: int, stop: int) -> Image:
+        """Panoramas start .. stop - 1 as a (stop - start, H, W, C) uint8 array."""
+
     def batches(self, size: int) -> Iterator[Image]:
         """Panoramas in order as (<= size, H, W, C) uint8 arrays."""
 
@@ -135,9 +138,19 @@ class PanoramaArray:
     def __len__(self) -> int:
         return len(self.images)
 
+    def read(self, start: int, stop: int) -> Image:
+        if not isinstance(self.images, np.memmap) or self.images.filename is None:
+            return np.asarray(self.images[start:stop])
+        # Read, not mapped: pages of a map would count as memory that grows with the bag.
+        stop = min(stop, len(self))
+        size = int(np.prod(self.shape))
+        offset = self.images.offset + start * size
+        flat = np.fromfile(self.images.filename, np.uint8, (stop - start) * size, offset=offset)
+        return flat.reshape(stop - start, *self.shape)
+
     def batches(self, size: int) -> Iterator[Image]:
-        for start in range(0, len(self.images), size):
-            yield np.asarray(self.images[start : start + size])
+        for start in range(0, len(self), size):
+            yield self.read(start, min(start + size, len(self)))
 
 
 @dataclass(frozen=True, slots=True)

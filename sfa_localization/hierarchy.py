@@ -1,0 +1,270 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Train the network layer by layer from streamed panoramas and mergeable statistics.
+
+Each layer needs two passes: one for its linear SFA, one for the SFA of the expanded signals. A
+pass is a sum over shards of the drives, so it may run in this process or on a cluster; the sums
+are merged in the shards' order, so the result does not depend on who did the work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.config import NetworkConfig
+from sfa_localization.errors import ConfigError, DataError
+from sfa_localization.network import (
+    LAYERS,
+    Architecture,
+    Layer,
+    Network,
+    Node,
+    Weights,
+    expand,
+    linear_stage,
+    prepare,
+)
+from sfa_localization.rotation import FieldStatistics, Map, SampleStatistics
+from sfa_localization.run import Image, Panoramas
+from sfa_localization.sfa import Solution, Statistics, solve
+
+BATCH = 16
+SHARD = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """The panoramas of one drive and the scale (N - 1,) of the differences between neighbors.
+
+    A scale of 0 is a break; 1 is the paper's difference per picture.
+    """
+
+    panoramas: Panoramas
+    scale: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """Pictures start .. stop - 1 of a drive, with the pair that leads into them.
+
+    `photometric_std` and `seed` perturb the light of each picture, by its number `first` + i.
+    """
+
+    drive: Drive
+    start: int
+    stop: int
+    photometric_std: float = 0.0
+    seed: tuple[int, int] = (0, 0)
+
+    def batches(self) -> Iterator[tuple[Image, int, NDArray[np.float32]]]:
+        """Pictures (T, H, W, C), how many of them are fresh, and the scale of their pairs."""
+        for start in range(self.start, self.stop, BATCH):
+            stop = min(start + BATCH, self.stop)
+            lead = max(start - 1, 0)
+            images = self.drive.panoramas.read(lead, stop)
+            yield self._lit(images, lead), stop - start, self.drive.scale[lead : stop - 1]
+
+    def _lit(self, images: Image, first: int) -> Image:
+        if self.photometric_std == 0:
+            return images
+        gains = np.stack(
+            [_gain(self.photometric_std, (*self.seed, first + i)) for i in range(len(images))]
+        )
+        lit = images * gains[:, None, None, :]
+        return np.asarray(np.clip(lit, 0, 255).round().astype(np.uint8))
+
+
+def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
+    """Random exposure and color balance (3,) of one picture, always the same for it."""
+    normal = np.random.default_rng(seed).standard_normal(4).astype(np.float32)
+    return np.exp(std * (normal[0] + normal[1:] / 3))
+
+
+class Executor(Protocol):
+    """Whoever computes the shards' statistics; yields them in order."""
+
+    def __call__(
+        self, work: Callable[[Shard], Statistics], shards: Sequence[Shard]
+    ) -> Iterable[Statistics]: ...
+
+
+def in_this_process(
+    work: Callable[[Shard], Statistics], shards: Sequence[Shard]
+) -> Iterator[Statistics]:
+    """Compute the shards one after the other."""
+    return map(work, shards)
+
+
+@dataclass(frozen=True, slots=True)
+class Partial:
+    """A network in the making: finished layers, and perhaps the linear half of the next."""
+
+    architecture: Architecture
+    nodes: tuple[Node, ...] = ()
+    linear: Solution | None = None
+    deltas: tuple[NDArray[np.float64], ...] = field(default=())
+    ranks: tuple[tuple[int, int], ...] = field(default=())
+
+    @property
+    def depth(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def finished(self) -> bool:
+        return self.depth == len(self.architecture.layers)
+
+    def network(self) -> Network:
+        return Network(self.architecture, self.nodes, self.deltas, self.ranks)
+
+    def advanced(self, statistics: Statistics, relative_cut: float) -> Partial:
+        """The next stage, from the statistics of this one."""
+        layer = self.architecture.layers[self.depth]
+        if self.linear is None:
+            return replace(self, linear=solve(statistics, layer.linear, relative_cut))
+        slow = solve(statistics, layer.outputs, relative_cut)
+        return replace(
+            self,
+            nodes=(*self.nodes, Node.from_solutions(self.linear, slow)),
+            linear=None,
+            deltas=(*self.deltas, slow.delta),
+            ranks=(*self.ranks, (self.linear.rank, slow.rank)),
+        )
+
+
+def stage_statistics(partial: Partial, shard: Shard) -> Statistics:
+    """Statistics of the stage that comes next, over one shard."""
+    architecture, depth = partial.architecture, partial.depth
+    receptive = architecture.fields[depth]
+    network = partial.network()
+    sums: FieldStatistics | SampleStatistics | None = None
+    reduce_ = None if partial.linear is None else _folded_linear(partial.linear)
+    for images, fresh, scale in shard.batches():
+        maps = _below(network, images)
+        if reduce_ is None:
+            sums = sums or FieldStatistics(
+                receptive, architecture.rotations, receptive.rows * maps.shape[-1]
+            )
+            sums.add(maps, fresh, scale)
+        else:
+            expanded = architecture.layers[depth].expanded
+            sums = sums or SampleStatistics(architecture.rotations, expanded)
+            sums.add(expand(linear_stage(maps, receptive, *reduce_)), fresh, scale)
+    assert sums is not None
+    return sums.result()
+
+
+def _folded_linear(linear: Solution) -> tuple[Weights, Weights]:
+    weights = linear.weights.astype(np.float32)
+    return weights, (linear.mean @ linear.weights).astype(np.float32)
+
+
+def _below(network: Network, images: Image) -> Map:
+    """Input map of the layer above all of the network's."""
+    maps = prepare(images, network.architecture)
+    for depth in range(len(network.nodes)):
+        maps = network.layer(maps, depth)
+    return maps
+
+
+def shards_of(drives: Sequence[Drive], config: NetworkConfig) -> list[Shard]:
+    """All drives cut into shards of equal length."""
+    return [
+        Shard(
+            drive,
+            start,
+            min(start + SHARD, len(drive.panoramas)),
+            config.photometric_std,
+            (config.photometric_seed, number),
+        )
+        for number, drive in enumerate(drives)
+        for start in range(0, len(drive.panoramas), SHARD)
+    ]
+
+
+def architecture_of(config: NetworkConfig, size: tuple[int, int]) -> Architecture:
+    """The network that the configuration asks for, for panoramas of (rows, columns).
+
+    Raises ConfigError when the layers do not fit the size; it tells the sizes that would.
+    """
+    if config.layers == 'custom':
+        return Architecture(size, config.binning, config.normalization, _custom(config))
+    if config.layers != 'auto':
+        binning, layers = LAYERS[config.layers]
+        return Architecture(size, binning, config.normalization, layers)
+    refusals = []
+    for binning, layers in LAYERS.values():
+        try:
+            return Architecture(size, binning, config.normalization, layers)
+        except ConfigError as error:
+            refusals.append(str(error))
+    raise ConfigError(f'no standard network fits: {"; ".join(refusals)}; or give layers: custom')
+
+
+def _custom(config: NetworkConfig) -> tuple[Layer, ...]:
+    columns = (
+        config.field_rows,
+        config.field_columns,
+        config.stride_rows,
+        config.stride_columns,
+        config.linear_dimensions,
+        config.output_dimensions,
+    )
+    if len({len(column) for column in columns}) != 1:
+        raise ConfigError('field_*, stride_*, linear_dimensions, output_dimensions: one per layer')
+    return tuple(
+        Layer((fr, fc), (sr, sc), linear, outputs, config.clip)
+        for fr, fc, sr, sc, linear, outputs in zip(*columns, strict=True)
+    )
+
+
+def train_network(
+    architecture: Architecture,
+    drives: Sequence[Drive],
+    config: NetworkConfig,
+    *,
+    start: Partial | None = None,
+    executor: Executor = in_this_process,
+    on_stage: Callable[[Partial], None] = lambda partial: None,
+    on_shard: Callable[[int], None] = lambda images: None,
+) -> Network:
+    """Train all layers on the full simulated rotation of every drive.
+
+    `start` continues a training that was cut off; `on_stage` is told each finished stage, and
+    `on_shard` how many pictures have been worked through since the last call.
+    Raises DataError when the pictures vary too little.
+    """
+    if not any(len(drive.panoramas) > 1 for drive in drives):
+        raise DataError('training needs at least two consecutive panoramas')
+    partial = start or Partial(architecture)
+    shards = shards_of(drives, config)
+    while not partial.finished:
+        sums = executor(_Stage(partial), shards)
+        total = reduce(add, _told(sums, shards, on_shard))
+        partial = partial.advanced(total, config.relative_cut)
+        on_stage(partial)
+    return partial.network()
+
+
+@dataclass(frozen=True, slots=True)
+class _Stage:
+    """The work on one shard: a plain object, so that it can be sent to another machine."""
+
+    partial: Partial
+
+    def __call__(self, shard: Shard) -> Statistics:
+        return stage_statistics(self.partial, shard)
+
+
+def _told(
+    sums: Iterable[Statistics], shards: Sequence[Shard], on_shard: Callable[[int], None]
+) -> Iterator[Statistics]:
+    for statistics, shard in zip(sums, shards, strict=True):
+        on_shard(shard.stop - shard.start)
+        yield statistics

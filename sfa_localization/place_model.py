@@ -1,0 +1,230 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The fitted model: one panorama in, position, heading and their covariance out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.config import PanoramaConfig
+from sfa_localization.errors import ConfigError, ModelError
+from sfa_localization.geometry import Array
+from sfa_localization.heading import UNKNOWN_YAW_VARIANCE, Compass, harmonics
+from sfa_localization.network import Architecture, Layer, Network, Node
+from sfa_localization.novelty import Novelty
+from sfa_localization.regression import MetricMap
+from sfa_localization.rotation import Map
+from sfa_localization.run import Image
+
+FORMAT = 'sfa_localization place model'
+VERSION = 1
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What one panorama tells.
+
+    `slow_features` (K,); `position` (2,) m and `yaw` rad (NaN without a compass) in the map frame;
+    `covariance` (3, 3) of [x, y, yaw], with pi^2 / 3 where yaw is unknown; `novelty` at most 1 for
+    a familiar picture.
+    """
+
+    slow_features: Array
+    position: Array
+    yaw: float
+    covariance: Array
+    novelty: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceModel:
+    """Network, metric map, compass and novelty, learnt from one place.
+
+    `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
+    figures of merit of the training; `slow_features` and `places` are kept out of it.
+    """
+
+    network: Network
+    metric: MetricMap
+    panorama: PanoramaConfig
+    novelty: Novelty
+    compass: Compass | None = None
+    heading_layers: tuple[int, ...] = ()
+    quality: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def has_heading(self) -> bool:
+        return self.compass is not None
+
+    def locate(self, panorama: Image) -> Estimate:
+        """Position and heading from a panorama (H, W, 3) uint8 BGR.
+
+        Raises ModelError when its size is not `self.panorama`'s.
+        """
+        if panorama.ndim != 3 or panorama.dtype != np.uint8:
+            raise ModelError(
+                f'a panorama is (H, W, 3) uint8, not {panorama.shape} {panorama.dtype}'
+            )
+        return self.locate_all(panorama[None])[0]
+
+    def locate_all(self, panoramas: Image) -> list[Estimate]:
+        """Estimates of panoramas (T, H, W, 3)."""
+        maps = self.network.maps(panoramas)
+        slow = top_features(maps)
+        novelty = self.novelty.per_layer(maps).max(1)
+        positions, covariances = self.metric.predict(slow)
+        yaw, yaw_variance = self._headings(maps, slow)
+        return [
+            Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
+            for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
+        ]
+
+    def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
+        if self.compass is None:
+            return np.full(len(slow), np.nan), np.full(len(slow), UNKNOWN_YAW_VARIANCE)
+        return self.compass.predict(slow, heading_input(maps, self.heading_layers))
+
+    def save(self, path: Path) -> None:
+        """Write to `path` at once or not at all; the same model gives the same bytes."""
+        arrays = {**self._arrays(), 'header': np.array(json.dumps(self._header(), sort_keys=True))}
+        write_arrays(path, arrays)
+
+    @classmethod
+    def load(cls, path: Path | str) -> PlaceModel:
+        """Read a model. Raises ModelError when the file is missing, damaged or of another version."""
+        path = Path(path)
+        arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
+        try:
+            return cls._from_arrays(arrays, json.loads(str(arrays['header'])))
+        except (KeyError, ValueError, TypeError, IndexError, ConfigError) as error:
+            raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
+
+    def _header(self) -> dict[str, Any]:
+        architecture = dataclasses.asdict(self.network.architecture)
+        return {
+            'format': FORMAT,
+            'version': VERSION,
+            'architecture': architecture,
+            'ranks': self.network.ranks,
+            'panorama': dataclasses.asdict(self.panorama),
+            'heading_layers': self.heading_layers,
+            'quality': self.quality,
+        }
+
+    def _arrays(self) -> Arrays:
+        arrays: Arrays = {}
+        for depth, node in enumerate(self.network.nodes):
+            parts = {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
+            arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
+        arrays |= _prefixed('metric/', self.metric.to_arrays())
+        arrays |= _prefixed('novelty/', self.novelty.to_arrays())
+        if self.compass is not None:
+            arrays |= _prefixed('compass/', self.compass.to_arrays())
+        return arrays
+
+    @classmethod
+    def _from_arrays(cls, arrays: Arrays, header: dict[str, Any]) -> PlaceModel:
+        compass = _under(arrays, 'compass/')
+        return cls(
+            network_from(arrays, header),
+            MetricMap.from_arrays(_under(arrays, 'metric/')),
+            PanoramaConfig(**header['panorama']),
+            Novelty.from_arrays(_under(arrays, 'novelty/')),
+            Compass.from_arrays(compass) if compass else None,
+            tuple(header['heading_layers']),
+            header['quality'],
+        )
+
+
+def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
+    """The network of a model file's arrays and header."""
+    spec = dict(header['architecture'])
+    spec['size'] = tuple(spec['size'])
+    spec['layers'] = tuple(
+        Layer(**{**layer, 'field': tuple(layer['field']), 'stride': tuple(layer['stride'])})
+        for layer in spec['layers']
+    )
+    architecture = Architecture(**spec)
+    nodes, deltas = [], []
+    for depth in range(len(architecture.layers)):
+        part = _under(arrays, f'network/{depth}/')
+        deltas.append(np.asarray(part.pop('delta'), float))
+        nodes.append(Node(**part))
+    ranks = tuple((int(a), int(b)) for a, b in header['ranks'])
+    return Network(architecture, tuple(nodes), tuple(deltas), ranks)
+
+
+def top_features(maps: list[Map]) -> Array:
+    """Slow features (T, K): the top node averaged over all rotations."""
+    return np.asarray(maps[-1].mean((1, 2), dtype=np.float64))
+
+
+def heading_input(maps: list[Map], layers: tuple[int, ...]) -> NDArray[np.complex128]:
+    """Harmonics of the named layers' maps side by side, (T, J)."""
+    return np.concatenate([harmonics(maps[layer]) for layer in layers], axis=1)
+
+
+def _joined(covariances: Array, yaw_variance: Array, novelty: Array) -> Array:
+    """Covariances (T, 3, 3); those of unfamiliar pictures grow with their novelty squared."""
+    inflation = np.maximum(novelty, 1.0) ** 2
+    joined = np.zeros((len(covariances), 3, 3))
+    joined[:, :2, :2] = covariances * inflation[:, None, None]
+    joined[:, 2, 2] = np.minimum(yaw_variance * inflation, UNKNOWN_YAW_VARIANCE)
+    return joined
+
+
+def _prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    return {prefix + name: np.asarray(array) for name, array in arrays.items()}
+
+
+def _under(arrays: Arrays, prefix: str) -> Arrays:
+    return {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
+
+
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write an .npz file under a temporary name, then rename it. Raises ModelError."""
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp('.npz', f'.{path.name}-', path.parent)
+    except OSError as error:
+        raise ModelError(f'{path}: cannot be written: {error.strerror}') from None
+    try:
+        with os.fdopen(handle, 'wb') as file:
+            np.savez(file, **arrays)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ModelError(f'{path}: cannot be written: {error.strerror}') from None
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
+    """Arrays of an .npz file whose header names its kind and version. Raises ModelError."""
+    if not path.is_file():
+        raise ModelError(f'{path}: no such file: {remedy}')
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays['header']))
+        found, made = header['format'], header['version']
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+        raise ModelError(f'{path}: not a {kind} ({type(error).__name__}): {remedy}') from None
+    if found != kind:
+        raise ModelError(f'{path}: a {found}, not a {kind}: {remedy}')
+    if made != version:
+        raise ModelError(f'{path}: version {made}, this software reads {version}: {remedy} again')
+    return arrays

@@ -1,0 +1,474 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Learn a place model from recorded drives; ground truth is never read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from sfa_localization import metric as metric_learning
+from sfa_localization.bag import load_run
+from sfa_localization.config import (
+    BagConfig,
+    CameraConfig,
+    HeadingConfig,
+    MetricConfig,
+    NetworkConfig,
+    PanoramaConfig,
+    SegmentConfig,
+    TopicNames,
+)
+from sfa_localization.errors import DataError, ModelError
+from sfa_localization.geometry import Array
+from sfa_localization.heading import HeadingFit, fit_compass
+from sfa_localization.hierarchy import (
+    Drive,
+    Executor,
+    Partial,
+    architecture_of,
+    in_this_process,
+    train_network,
+)
+from sfa_localization.metric import MetricResult
+from sfa_localization.network import Architecture, Network, Node
+from sfa_localization.novelty import Novelty, describe
+from sfa_localization.panorama import Unwrapper
+from sfa_localization.place_model import (
+    PlaceModel,
+    heading_input,
+    read_arrays,
+    top_features,
+    write_arrays,
+)
+from sfa_localization.rotation import Map
+from sfa_localization.run import Run
+from sfa_localization.segments import Segments, assignment, cut, join
+from sfa_localization.sfa import Solution
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINT = 'sfa_localization training checkpoint'
+CHECKPOINT_VERSION = 1
+_BATCH = 16
+# Pictures whose maps are kept for the compass and for novelty, however long the drives.
+_SAMPLES = 3000
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Everything that decides what is learnt from a bag."""
+
+    topics: TopicNames = field(default_factory=TopicNames)
+    bag: BagConfig = field(default_factory=BagConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    metric: MetricConfig = field(default_factory=MetricConfig)
+    heading: HeadingConfig = field(default_factory=HeadingConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """The model and everything a report may tell of its making.
+
+    `features` (N, K) of all pictures, drive after drive.
+    """
+
+    model: PlaceModel
+    runs: tuple[Run, ...]
+    features: Array
+    segments: Segments
+    metric: MetricResult
+    heading: HeadingFit | None
+    heading_images: NDArray[np.int64]
+
+
+def train(
+    bags: Sequence[Path],
+    output: Path,
+    recipe: Recipe | None = None,
+    *,
+    progress: bool = False,
+    resume: bool = False,
+    strict: bool = False,
+    executor: Executor = in_this_process,
+) -> Trained:
+    """Learn a place model from bags and write it to `output`.
+
+    A training that was cut off leaves a checkpoint beside the output; with `resume` it goes on
+    from there and gives the same bytes. Raises BagError, ConfigError, DataError or ModelError;
+    then no model is written.
+    """
+    recipe = recipe or Recipe()
+    output = Path(output)
+    with _cache(output) as cache:
+        runs = _load(bags, cache, recipe, progress, strict)
+        architecture = architecture_of(recipe.network, runs[0].panoramas.shape[:2])
+        checkpoint = _Checkpoint.beside(output, recipe, runs)
+        start = checkpoint.read(architecture) if resume else None
+        if not resume:
+            checkpoint.remove()
+        network = _train_network(architecture, runs, recipe, checkpoint, start, executor, progress)
+        trained = learn_place(network, runs, recipe, progress)
+        trained.model.save(output)
+        checkpoint.remove()
+    return trained
+
+
+@contextmanager
+def _cache(output: Path) -> Iterator[Path]:
+    """A folder beside the output for decoded pictures; also clears what a killed run left."""
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        for stale in output.parent.glob(f'.{output.name}.cache-*'):
+            shutil.rmtree(stale, ignore_errors=True)
+        folder = tempfile.mkdtemp(prefix=f'.{output.name}.cache-', dir=output.parent)
+    except OSError as error:
+        raise ModelError(f'{output}: cannot be written: {error.strerror}') from None
+    try:
+        yield Path(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _load(
+    bags: Sequence[Path], cache: Path, recipe: Recipe, progress: bool, strict: bool
+) -> tuple[Run, ...]:
+    """Read all bags; their panoramas must be of one size."""
+    runs = tuple(read_drive(bag, cache, recipe, progress, strict=strict) for bag in bags)
+    sizes = {run.panoramas.shape for run in runs}
+    if len(sizes) > 1:
+        told = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)
+        raise DataError(f'the bags hold panoramas of different sizes ({told}): train on one size')
+    return runs
+
+
+def read_drive(
+    bag: Path,
+    cache: Path,
+    recipe: Recipe,
+    progress: bool = False,
+    *,
+    want_truth: bool = False,
+    strict: bool = False,
+) -> Run:
+    """One bag as a run of panoramas, unwrapped by the recipe's camera where they are none yet."""
+    with tqdm(desc=f'reading {Path(bag).name}', unit='img', disable=not progress) as bar:
+
+        def told(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return load_run(
+            bag,
+            topics=recipe.topics,
+            unwrap=Unwrapper(recipe.camera, recipe.panorama),
+            cache=cache,
+            progress=told,
+            want_truth=want_truth,
+            strict=strict,
+            config=recipe.bag,
+        )
+
+
+def drive_of(run: Run, config: NetworkConfig) -> Drive:
+    """A run's panoramas, and which of them are neighbors."""
+    stamps = run.panoramas.stamps_ns
+    seconds = np.diff(stamps) * 1e-9
+    places = run.odometry.trajectory.at(stamps)[:, :2]
+    metres = np.hypot(*np.diff(places, axis=0).T)
+    joined = (seconds > 0) & (seconds <= config.break_time) & (metres <= config.break_distance)
+    steps = {'picture': np.ones_like(seconds), 'distance': metres, 'time': seconds}
+    scale = _relative_rate(steps[config.difference], joined)
+    return Drive(run.panoramas, np.where(joined, scale, 0).astype(np.float32))
+
+
+def _relative_rate(steps: Array, joined: NDArray[np.bool_]) -> Array:
+    """Median step over step, so that differences keep their size; short steps are limited."""
+    typical = float(np.median(steps[joined])) if joined.any() else 1.0
+    typical = typical if typical > 0 else 1.0
+    return np.asarray(typical / np.maximum(steps, 0.2 * typical))
+
+
+def _train_network(
+    architecture: Architecture,
+    runs: Sequence[Run],
+    recipe: Recipe,
+    checkpoint: _Checkpoint,
+    start: Partial | None,
+    executor: Executor,
+    progress: bool,
+) -> Network:
+    drives = [drive_of(run, recipe.network) for run in runs]
+    stages = 2 * len(architecture.layers)
+    done = _stages_done(start) if start else 0
+    total = sum(len(run.panoramas) for run in runs) * stages
+    with tqdm(
+        desc=f'slow features, {stages} passes',
+        total=total,
+        initial=total // stages * done,
+        unit='img',
+        disable=not progress,
+    ) as bar:
+        return train_network(
+            architecture,
+            drives,
+            recipe.network,
+            start=start,
+            executor=executor,
+            on_stage=checkpoint.write,
+            on_shard=bar.update,
+        )
+
+
+def _stages_done(partial: Partial) -> int:
+    return 2 * partial.depth + (partial.linear is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """What the network makes of all pictures: features of each, more of a sample of them.
+
+    `sampled` (S,) are the sample's indices, `harmonic` (S, J), `descriptions` per layer (S, D).
+    """
+
+    features: Array
+    sampled: NDArray[np.int64]
+    harmonic: NDArray[np.complex128]
+    descriptions: tuple[Array, ...]
+    eta: dict[str, list[float]]
+
+
+def learn_place(
+    network: Network, runs: Sequence[Run], recipe: Recipe, progress: bool = False
+) -> Trained:
+    """Metric map, compass and novelty for a trained network. Raises DataError."""
+    layers = _heading_layers(network, recipe.heading)
+    views = _view(network, runs, layers, progress)
+    offsets = np.cumsum([0, *(len(run.panoramas) for run in runs)])
+    segments = join(
+        [cut(r.odometry, r.panoramas.stamps_ns, recipe.segments, r.yaw_rate) for r in runs],
+        [int(offset) for offset in offsets[:-1]],
+    )
+    result = metric_learning.learn(views.features, segments, recipe.metric)
+    heading, labelled = _learn_heading(views, segments, result, recipe.heading)
+    model = PlaceModel(
+        network,
+        result.map,
+        _panorama_of(runs, recipe),
+        Novelty.fit(views.descriptions),
+        heading.compass if heading else None,
+        layers if heading else (),
+        _quality(network, views, segments, result, heading),
+    )
+    return Trained(model, tuple(runs), views.features, segments, result, heading, labelled)
+
+
+def _panorama_of(runs: Sequence[Run], recipe: Recipe) -> PanoramaConfig:
+    """The panorama that the model expects: the recipe's, in the size that was trained on."""
+    height, width, _ = runs[0].panoramas.shape
+    return PanoramaConfig(**{**asdict(recipe.panorama), 'height': height, 'width': width})
+
+
+def _heading_layers(network: Network, config: HeadingConfig) -> tuple[int, ...]:
+    depth = len(network.nodes)
+    return tuple(sorted({min(layer, depth) - 1 for layer in config.heading_layers}))
+
+
+def _view(network: Network, runs: Sequence[Run], layers: tuple[int, ...], progress: bool) -> _Views:
+    """Run all pictures through the network once."""
+    total = sum(len(run.panoramas) for run in runs)
+    sampled = np.unique(np.linspace(0, total - 1, min(total, _SAMPLES)).round().astype(np.int64))
+    kept = np.zeros(total, bool)
+    kept[sampled] = True
+    features, harmonic, eta = [], [], _Eta(network.architecture.outputs)
+    descriptions: list[list[Array]] = [[] for _ in network.nodes]
+    for start, maps in _all_maps(network, runs, progress):
+        keep = kept[start : start + len(maps[0])]
+        features.append(top_features(maps))
+        eta.add(maps[-1])
+        harmonic.append(heading_input([m[keep] for m in maps], layers))
+        for layer, of_layer in zip(maps, descriptions, strict=True):
+            of_layer.append(describe(layer[keep]))
+    return _Views(
+        np.concatenate(features),
+        sampled,
+        np.concatenate(harmonic),
+        tuple(np.concatenate(d) for d in descriptions),
+        eta.result(),
+    )
+
+
+def _all_maps(
+    network: Network, runs: Sequence[Run], progress: bool
+) -> Iterator[tuple[int, list[Map]]]:
+    """Number of the first picture of each batch, and every layer's maps."""
+    start = 0
+    total = sum(len(run.panoramas) for run in runs)
+    with tqdm(
+        desc='features of all pictures', total=total, unit='img', disable=not progress
+    ) as bar:
+        for run in runs:
+            for images in run.panoramas.batches(_BATCH):
+                yield start, network.maps(images)
+                start += len(images)
+                bar.update(len(images))
+
+
+class _Eta:
+    """Shares of the variance of each slow feature over rotations, and over places.
+
+    eta_phi = variance over the rotation at a place / total, ideally 0; eta_p = variance over the
+    places / total, ideally 1.
+    """
+
+    def __init__(self, outputs: int) -> None:
+        self._count = 0
+        self._mean, self._square, self._place = np.zeros((3, outputs))
+
+    def add(self, top: Map) -> None:
+        """Add top maps (T, 1, R, K)."""
+        views = top.reshape(len(top), -1, top.shape[-1]).astype(np.float64)
+        mean = views.mean(1)
+        self._count += len(top)
+        self._mean += mean.sum(0)
+        self._square += (views**2).mean(1).sum(0)
+        self._place += (mean**2).sum(0)
+
+    def result(self) -> dict[str, list[float]]:
+        mean, square, place = (
+            part / self._count for part in (self._mean, self._square, self._place)
+        )
+        total = np.maximum(square - mean**2, 1e-12)
+        return {
+            'eta_phi': ((square - place) / total).tolist(),
+            'eta_p': ((place - mean**2) / total).tolist(),
+        }
+
+
+def _learn_heading(
+    views: _Views, segments: Segments, result: MetricResult, config: HeadingConfig
+) -> tuple[HeadingFit | None, NDArray[np.int64]]:
+    """The compass from the segments' certified headings, and the pictures that taught it."""
+    labelled, yaw = metric_learning.headings(result, segments)
+    if not config.learn_heading:
+        return None, labelled[:0]
+    known, at_sample, at_label = np.intersect1d(views.sampled, labelled, return_indices=True)
+    owner = assignment(segments, len(views.features))[known]
+    try:
+        fit = fit_compass(
+            views.features[known],
+            views.harmonic[at_sample],
+            yaw[at_label],
+            owner % config.heading_folds,
+            config,
+        )
+    except DataError as error:
+        logger.warning('no heading is learnt: %s', error)
+        return None, labelled[:0]
+    return fit, known
+
+
+def _quality(
+    network: Network,
+    views: _Views,
+    segments: Segments,
+    result: MetricResult,
+    heading: HeadingFit | None,
+) -> dict[str, Any]:
+    """Figures of merit that travel with the model; plain numbers and lists."""
+    quality = {
+        'delta': network.deltas[-1].tolist(),
+        'rank': [list(ranks) for ranks in network.ranks],
+        **views.eta,
+        'pictures': len(views.features),
+        'segments': len(segments),
+        'certified': bool(result.certificate.certified),
+        'certificate': float(result.certificate.eigenvalue),
+        'features_used': result.map.features,
+        'residual_m': float(np.hypot(*result.residuals.T).mean()),
+        'left_out_error_m': result.left_out_error_m,
+        'left_out_within_95': result.consistency.within_95,
+        'coverage': result.diagnostics.as_dict(),
+    }
+    if heading is not None:
+        error = np.abs(heading.left_out_error)
+        quality['left_out_yaw_deg'] = float(np.degrees(error.mean()))
+        quality['left_out_yaw_within_95'] = float((error < 1.96 * heading.left_out_std).mean())
+    return quality
+
+
+@dataclass(frozen=True, slots=True)
+class _Checkpoint:
+    """Finished stages of a training, kept beside the output until the model is written."""
+
+    path: Path
+    fingerprint: str
+
+    @classmethod
+    def beside(cls, output: Path, recipe: Recipe, runs: Sequence[Run]) -> _Checkpoint:
+        """The checkpoint of training `recipe` on `runs`; other data have another fingerprint."""
+        told = [repr(recipe.network), repr(recipe.panorama), repr(recipe.camera)]
+        digest = hashlib.sha256('\n'.join(told).encode())
+        for run in runs:
+            digest.update(run.panoramas.stamps_ns.tobytes())
+            digest.update(run.panoramas.read(0, 1).tobytes())
+        return cls(output.with_name(f'.{output.name}.checkpoint.npz'), digest.hexdigest())
+
+    def write(self, partial: Partial) -> None:
+        """Save the stages finished so far."""
+        arrays: dict[str, NDArray[Any]] = {}
+        for depth, node in enumerate(partial.nodes):
+            for item in fields(Node):
+                arrays[f'{depth}/{item.name}'] = getattr(node, item.name)
+            arrays[f'{depth}/delta'] = partial.deltas[depth]
+        if partial.linear is not None:
+            for name in ('mean', 'weights', 'delta'):
+                arrays[f'linear/{name}'] = getattr(partial.linear, name)
+        header = {
+            'format': CHECKPOINT,
+            'version': CHECKPOINT_VERSION,
+            'fingerprint': self.fingerprint,
+            'ranks': partial.ranks,
+            'linear_rank': None if partial.linear is None else partial.linear.rank,
+        }
+        write_arrays(self.path, {**arrays, 'header': np.array(json.dumps(header))})
+
+    def read(self, architecture: Architecture) -> Partial | None:
+        """The stages finished so far; None when there are none. Raises ModelError."""
+        if not self.path.is_file():
+            return None
+        remedy = 'train without --resume'
+        arrays = read_arrays(self.path, CHECKPOINT, CHECKPOINT_VERSION, remedy)
+        header = json.loads(str(arrays['header']))
+        if header['fingerprint'] != self.fingerprint:
+            raise ModelError(f'{self.path}: of other bags or parameters: {remedy}')
+        ranks = tuple((int(a), int(b)) for a, b in header['ranks'])
+        nodes = tuple(
+            Node(*(arrays[f'{depth}/{item.name}'] for item in fields(Node)))
+            for depth in range(len(ranks))
+        )
+        deltas = tuple(arrays[f'{depth}/delta'] for depth in range(len(ranks)))
+        linear = None
+        if header['linear_rank'] is not None:
+            parts = (arrays[f'linear/{name}'] for name in ('mean', 'weights', 'delta'))
+            linear = Solution(*parts, header['linear_rank'])
+        return Partial(architecture, nodes, linear, deltas, ranks)
+
+    def remove(self) -> None:
+        """Forget the stages."""
+        self.path.unlink(missing_ok=True)
