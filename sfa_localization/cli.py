@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -432,8 +433,18 @@ CONFIG = Command(
 COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT, CALIBRATE, FILTER, TUNE, CONFIG]
 
 
+NODES = {
+    'omnicam_node': 'ROS 2 node: camera pictures to panoramas (--ros-args -p NAME:=VALUE).',
+    'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
+    'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
+}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command named by the first argument; return the exit code."""
+    """Run the command or node named by the first argument; return the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in NODES:
+        return _guarded(_run_node, argparse.Namespace(name=words[0], words=words))
     parser = argparse.ArgumentParser(
         prog='sfa_localization',
         description='Localization from one omnidirectional camera, learnt without ground truth.',
@@ -444,8 +455,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         _prepare(
             commands.add_parser(command.name, help=command.summary, **_texts(command)), command
         )
-    arguments = parser.parse_args(argv)
+    for name, summary in NODES.items():
+        commands.add_parser(name, help=summary)
+    arguments = parser.parse_args(words)
     return _guarded(arguments.run_command, arguments)
+
+
+def _run_node(arguments: argparse.Namespace) -> int:
+    """Run a node, which reads its ROS arguments itself."""
+    node = importlib.import_module(f'sfa_localization.nodes.{arguments.name}')
+    return int(node.main(arguments.words))
 
 
 def executable() -> int:

@@ -132,14 +132,11 @@ class Recorder:
 
 def commands(model: Path, bag: Path, rate: float) -> dict[str, list[str]]:
     """The command lines of the three nodes and of the player of `bag`, by name."""
-    nodes = {
-        name: [sys.executable, '-m', f'sfa_localization.nodes.{name}', '--ros-args']
-        for name in NODES
-    }
+    program = [sys.executable, '-m', 'sfa_localization']
+    nodes = {name: [*program, name, '--ros-args'] for name in NODES}
     nodes['omnicam_node'] += ['-p', 'image_transport:=compressed']
     nodes['sfa_node'] += ['-p', f'model:={model}']
-    player = [sys.executable, '-m', 'sfa_localization', PLAYER, str(bag), '--rate', str(rate)]
-    return {**nodes, PLAYER: player}
+    return {**nodes, PLAYER: [*program, PLAYER, str(bag), '--rate', str(rate)]}
 
 
 def run_live(
