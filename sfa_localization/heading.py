@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +41,9 @@ class Compass:
     """Learnt heading: inducing pictures and their weights.
 
     `features` (M, K) and `harmonic` (M, J) of the inducing pictures, divided by `feature_scale`
-    (K,) and `harmonic_scale` (J,); `weights` (M,) complex; `uncertainty` (M, M) Hermitian, such that
-    the predictive variance is prior - k^H uncertainty k; `calibration` (a, b) makes a raw + b of
-    the raw variance of yaw; `sign` is -1 where columns grow clockwise.
+    (K,) and `harmonic_scale` (J,); `weights` (M,) complex; `uncertainty` (M, M) Hermitian, such
+    that the predictive variance is prior - k^H uncertainty k; `calibration` (a, b) makes a raw + b
+    of the raw variance of yaw; `sign` is -1 where columns grow clockwise.
     """
 
     features: Array
@@ -72,7 +73,7 @@ class Compass:
     def _scaled(self, features: Array, harmonic: Complex) -> tuple[Array, Complex]:
         return _scaled(features, harmonic, self.feature_scale, self.harmonic_scale)
 
-    def to_arrays(self) -> dict[str, Array | Complex]:
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
         return {
             'features': self.features.astype(np.float32),
@@ -124,7 +125,7 @@ def _kernel(s: Array, f: Complex, s_m: Array, f_m: Complex, length: float) -> Co
 
 def _phase_variance(g: Complex, variance: Array) -> Array:
     """Variance of the angle of a complex g of the given variance (of both parts together)."""
-    return variance / (2 * np.maximum(np.abs(g) ** 2, 1e-6))
+    return np.asarray(variance / (2 * np.maximum(np.abs(g) ** 2, 1e-6)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -84,7 +84,7 @@ class Shard:
 def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
     """Random exposure and color balance (3,) of one picture, always the same for it."""
     normal = np.random.default_rng(seed).standard_normal(4).astype(np.float32)
-    return np.exp(std * (normal[0] + normal[1:] / 3))
+    return np.asarray(np.exp(std * (normal[0] + normal[1:] / 3)), np.float32)
 
 
 class Executor(Protocol):

@@ -113,7 +113,8 @@ def _check_columns(architecture: Architecture) -> None:
     if columns % stride:
         raise ConfigError(
             f'a panorama {architecture.size[1]} wide does not hold whole strides of {stride} '
-            f'pixels: use a width of {_multiples(architecture.size[1], stride * architecture.binning)}'
+            f'pixels: use a width of '
+            f'{_multiples(architecture.size[1], stride * architecture.binning)}'
         )
     for depth, receptive in enumerate(architecture.fields):
         if receptive.columns * receptive.spacing > architecture.rotations + receptive.spacing - 1:
@@ -225,20 +226,20 @@ def _plain(images: Image) -> Map:
 
 
 def _grey(images: Image) -> Map:
-    return _plain(images) @ np.array([[0.114], [0.587], [0.299]], np.float32)
+    return np.asarray(_plain(images) @ np.array([[0.114], [0.587], [0.299]], np.float32))
 
 
 def _per_panorama(images: Image) -> Map:
     """Zero mean and unit scale of each channel over the whole picture: blind to exposure."""
     mean = images.mean((1, 2), keepdims=True, dtype=np.float32)
     scale = images.std((1, 2), keepdims=True, dtype=np.float32)
-    return (images - mean) / np.maximum(scale, np.float32(1))
+    return np.asarray((images - mean) / np.maximum(scale, np.float32(1)))
 
 
 def _log(images: Image) -> Map:
     """Logarithm, zero mean of each channel over the whole picture: gains cancel."""
     logs = _LOGS[images]
-    return logs - logs.mean((1, 2), keepdims=True, dtype=np.float32)
+    return np.asarray(logs - logs.mean((1, 2), keepdims=True, dtype=np.float32))
 
 
 _LOGS = np.log(np.arange(256, dtype=np.float32) + 16)
@@ -248,7 +249,7 @@ def _brightness(images: Image) -> Map:
     """Zero mean and unit scale of the whole picture, colours kept in proportion."""
     mean = images.mean((1, 2, 3), keepdims=True, dtype=np.float32)
     scale = images.std((1, 2, 3), keepdims=True, dtype=np.float32)
-    return (images - mean) / np.maximum(scale, np.float32(1))
+    return np.asarray((images - mean) / np.maximum(scale, np.float32(1)))
 
 
 _NORMALIZATIONS = {

@@ -75,7 +75,7 @@ class Familiarity:
         centered = descriptions - self.mean
         inside = (centered @ self.directions) ** 2
         left = (centered**2).sum(1) - ((centered @ self.axes) ** 2).sum(1)
-        return np.sqrt(inside.mean(1) + np.maximum(left, 0.0) / self.rest)
+        return np.asarray(np.sqrt(inside.mean(1) + np.maximum(left, 0.0) / self.rest))
 
 
 @dataclass(frozen=True, slots=True)

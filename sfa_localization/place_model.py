@@ -103,7 +103,7 @@ class PlaceModel:
 
     @classmethod
     def load(cls, path: Path | str) -> PlaceModel:
-        """Read a model. Raises ModelError when the file is missing, damaged or of another version."""
+        """Read a model. Raises ModelError when it is missing, damaged or of another version."""
         path = Path(path)
         arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
         try:
@@ -196,6 +196,7 @@ def _under(arrays: Arrays, prefix: str) -> Arrays:
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write an .npz file under a temporary name, then rename it. Raises ModelError."""
     path = Path(path)
+    plain: dict[str, Any] = dict(arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp('.npz', f'.{path.name}-', path.parent)
@@ -203,7 +204,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         raise ModelError(f'{path}: cannot be written: {error.strerror}') from None
     try:
         with os.fdopen(handle, 'wb') as file:
-            np.savez(file, **arrays)
+            np.savez(file, **plain)
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except OSError as error:

@@ -108,7 +108,7 @@ class FieldStatistics:
         return sorted({i * self.field.spacing + e for i in steps for e in (-1, 0, 1)})
 
     def add(self, maps: Map, fresh: int, scale: Map) -> None:
-        """Add the last `fresh` of the maps (T, ...), and the pairs' differences times scale (T - 1,).
+        """Add the last `fresh` maps (of T), and the differences of pairs times scale (T - 1,).
 
         A scale of 0 marks a break between two images.
         """

@@ -135,7 +135,7 @@ class StreamingSFA:
         self.outputs = outputs
         self.relative_cut = relative_cut
         self.statistics: Statistics | None = None
-        self._last: Array | None = None
+        self._last: Signal | None = None
         self._last_time: float | None = None
 
     def partial_fit(self, x: Signal, time: Array | None = None) -> StreamingSFA:
@@ -143,7 +143,6 @@ class StreamingSFA:
 
         With `time` (N,), seconds or metres driven, differences are divided by its real steps.
         """
-        x = np.asarray(x)
         if x.ndim != 2 or not np.isfinite(x).all():
             raise DataError(f'expected a finite (N, D) signal, got shape {x.shape}')
         if self.statistics is None:

@@ -465,8 +465,8 @@ class _Checkpoint:
         deltas = tuple(arrays[f'{depth}/delta'] for depth in range(len(ranks)))
         linear = None
         if header['linear_rank'] is not None:
-            parts = (arrays[f'linear/{name}'] for name in ('mean', 'weights', 'delta'))
-            linear = Solution(*parts, header['linear_rank'])
+            mean, weights, delta = (arrays[f'linear/{n}'] for n in ('mean', 'weights', 'delta'))
+            linear = Solution(mean, weights, delta, int(header['linear_rank']))
         return Partial(architecture, nodes, linear, deltas, ranks)
 
     def remove(self) -> None:
