@@ -17,11 +17,11 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lz4.frame import LZ4FrameDecompressor
 
-from sfa_localization.bag_storage import Channel, Record, message_type, offered_qos, zstd
+from sfa_localization.bag_storage import Channel, Record, make_channel, zstd
 from sfa_localization.errors import BagError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -161,12 +161,12 @@ class McapStorage:
         """Learn a schema or a channel."""
         if opcode == SCHEMA:
             (key,) = fields.numbers('H')
-            self._schemas[key] = message_type(fields.text())
+            self._schemas[key] = fields.text()
         elif opcode == CHANNEL:
             key, schema = fields.numbers('HH')
             topic, encoding, metadata = fields.text(), fields.text(), Fields(fields.sized())
             kind, qos = self._schemas.get(schema, ''), _offered(metadata)
-            self._channels[key] = Channel(topic, kind, encoding, qos)
+            self._channels[key] = make_channel(topic, kind, encoding, qos)
 
     def _rebuild_index(self) -> None:
         """Decode every stretch of the file once, for its channels, counts and receptions."""
@@ -265,12 +265,13 @@ class McapStorage:
         return plain
 
 
-def _offered(metadata: Fields) -> Any:
+def _offered(metadata: Fields) -> str:
+    """The QoS profiles among a channel's metadata, as text."""
     while metadata:
         name, value = metadata.text(), metadata.text()
         if name == 'offered_qos_profiles':
-            return offered_qos(value)
-    return ()
+            return value
+    return ''
 
 
 def _records(data: bytes) -> Iterator[tuple[int, bytes]]:

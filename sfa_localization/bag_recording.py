@@ -21,8 +21,8 @@ from sfa_localization.bag_storage import (
     Storage,
     inflate_file,
     load_yaml,
-    message_type,
-    offered_qos,
+    make_channel,
+    one_line,
 )
 from sfa_localization.errors import BagError
 
@@ -219,7 +219,7 @@ def parse_metadata(text: str) -> Metadata:
         pairs = [(_channel(topic['topic_metadata']), topic['message_count']) for topic in topics]
         return Metadata(
             version=int(information['version']),
-            files=[PurePath(str(file)).name for file in information['relative_file_paths']],
+            files=[PurePath(one_line(file)).name for file in information['relative_file_paths']],
             channels=[channel for channel, _ in pairs],
             counts=_summed([(channel.topic, int(count)) for channel, count in pairs]),
             file_counts=_file_counts(information.get('files') or []),
@@ -229,12 +229,8 @@ def parse_metadata(text: str) -> Metadata:
 
 
 def _channel(topic: dict[str, Any]) -> Channel:
-    return Channel(
-        str(topic['name']),
-        message_type(str(topic['type'])),
-        str(topic['serialization_format']),
-        offered_qos(topic.get('offered_qos_profiles') or ''),
-    )
+    qos = topic.get('offered_qos_profiles') or ''
+    return make_channel(topic['name'], topic['type'], topic['serialization_format'], qos)
 
 
 def _summed(counts: list[tuple[str, int]]) -> dict[str, int]:

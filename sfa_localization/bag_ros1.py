@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rosbags.rosbag1 import Reader
 
-from sfa_localization.bag_storage import Channel, Record
+from sfa_localization.bag_storage import Record, make_channel, one_line
 from sfa_localization.errors import BagError
 
 MAGIC = b'#ROSBAG V'
@@ -29,17 +29,19 @@ class Ros1Storage:
                 f'{path}: unreadable ROS 1 bag ({_text(error)}); repair it with `rosbag reindex`'
             ) from None
         self._connections = list(self._reader.connections)
-        self._channels = {c.id: Channel(c.topic, c.msgtype, 'ros1', ()) for c in self._connections}
+        self._channels = {
+            c.id: make_channel(c.topic, c.msgtype, 'ros1', '') for c in self._connections
+        }
         self.channels = list(self._channels.values())
         counts: Counter[str] = Counter()
         for connection in self._connections:
-            counts[connection.topic] += connection.msgcount
+            counts[self._channels[connection.id].topic] += connection.msgcount
         self.counts: dict[str, int] = dict(counts)
         self.start_ns = self._reader.start_time
 
     def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
         """Messages by reception, up to the first damage."""
-        wanted = [c for c in self._connections if c.topic in topics]
+        wanted = [c for c in self._connections if self._channels[c.id].topic in topics]
         if not wanted:
             return
         try:
@@ -54,4 +56,4 @@ class Ros1Storage:
 
 
 def _text(error: Exception) -> str:
-    return str(error).rstrip('.') or type(error).__name__
+    return one_line(error).rstrip('.') or type(error).__name__

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sfa_localization.bag_storage import Channel, Record, message_type, offered_qos
+from sfa_localization.bag_storage import Channel, Record, make_channel, one_line
 from sfa_localization.errors import BagError
 
 MAGIC = b'SQLite format 3\x00'
@@ -28,7 +28,7 @@ class SqliteStorage:
             self._by_id = self._read_topics_of_damaged()
         except (sqlite3.Error, ValueError, TypeError) as error:
             self.close()
-            raise BagError(f'{path}: no readable bag database ({error})') from None
+            raise BagError(f'{path}: no readable bag database ({one_line(error)})') from None
         self.channels = list(self._by_id.values())
         counts = self._guarded(self._read_counts, None)
         self.counts: dict[str, int] = counts if counts is not None else self._count_reachable()
@@ -60,7 +60,7 @@ class SqliteStorage:
             return otherwise
 
     def _damaged(self, error: Exception) -> None:
-        text = f'{self._path.name}: damaged database ({error}); what is reachable is read'
+        text = f'{self._path.name}: damaged database ({one_line(error)}); what is reachable is read'
         if text not in self.problems:
             self.problems.append(text)
 
@@ -86,7 +86,7 @@ class SqliteStorage:
             f'SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id'
         )
         return {
-            int(key): Channel(str(topic), message_type(str(kind)), str(serial), offered_qos(qos))
+            int(key): make_channel(topic, kind, serial, qos)
             for key, topic, kind, serial, qos in rows
         }
 

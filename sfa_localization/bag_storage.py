@@ -42,6 +42,18 @@ Record = tuple[Channel, int, bytes]
 """A message: its channel, its reception in nanoseconds, its serialized bytes."""
 
 
+def one_line(text: object) -> str:
+    """Text of a bag, perhaps damaged, fit to be shown in one line."""
+    return ''.join(c if c.isprintable() else '?' for c in str(text))
+
+
+def make_channel(topic: object, kind: object, serialization: object, qos: Any) -> Channel:
+    """A channel from what a file tells."""
+    return Channel(
+        one_line(topic), message_type(one_line(kind)), one_line(serialization), offered_qos(qos)
+    )
+
+
 class Storage(Protocol):
     """One file of a bag, open for reading and never written to."""
 
