@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from sfa_localization import __version__
 from sfa_localization.config import (
@@ -19,8 +19,11 @@ from sfa_localization.config import (
     CameraConfig,
     FilterConfig,
     InspectionConfig,
+    MetricConfig,
+    NetworkConfig,
     PanoramaConfig,
     PlayConfig,
+    SegmentConfig,
     Settings,
     SimulationConfig,
     TopicNames,
@@ -28,6 +31,9 @@ from sfa_localization.config import (
 )
 from sfa_localization.config_file import load_changes, load_settings, render, write_config
 from sfa_localization.errors import ConfigError, DataError, LocalizationError
+
+if TYPE_CHECKING:
+    from sfa_localization.training import Recipe
 
 S = TypeVar('S', bound=Settings)
 OPTIONAL = {
@@ -321,6 +327,10 @@ def _filter(arguments: argparse.Namespace) -> int:
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
     config = _filter_config(arguments.config)
+    if 'var_x' not in positions.columns and config.position_std == FilterConfig().position_std:
+        told = filtering.position_std_of(odometry, positions) or config.position_std
+        print(f'positions tell no variance: their deviation is taken to be {told:.2f} m')
+        config = dataclasses.replace(config, position_std=told)
     done = filtering.run_filter(
         odometry, positions, config, arguments.initial_pose, progress=sys.stderr.isatty()
     )
@@ -430,7 +440,136 @@ CONFIG = Command(
 )
 
 
-COMMANDS: list[Command] = [SIMULATE, PLAY, INSPECT, CALIBRATE, FILTER, TUNE, CONFIG]
+def _recipe(arguments: argparse.Namespace) -> Recipe:
+    """The recipe of --config, with the topics and settings that the command line names."""
+    from sfa_localization.training import Recipe
+
+    topics = {name: vars(arguments)[name] for name in _TOPICS if name in arguments}
+    values = {}
+    for item in dataclasses.fields(Recipe):
+        group = type(getattr(Recipe(), item.name))
+        section = 'omnicam_node' if group in (CameraConfig, PanoramaConfig) else 'training'
+        settings = load_settings(arguments.config, section, group) if arguments.config else group()
+        known = {field.name for field in dataclasses.fields(group)}
+        told = {name: value for name, value in vars(arguments).items() if name in known}
+        values[item.name] = dataclasses.replace(settings, **told) if told else settings
+    values['topics'] = dataclasses.replace(values['topics'], **topics)
+    return Recipe(**values)
+
+
+_TOPICS = ('image', 'odometry', 'imu', 'ground_truth')
+
+
+def _configure_train(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('bags', nargs='+', type=Path, metavar='BAG', help='drives to learn from')
+    parser.add_argument('--output', type=Path, required=True, metavar='MODEL.npz')
+    parser.add_argument('--config', type=Path, help='parameter file')
+    parser.add_argument('--report', type=Path, metavar='DIR', help='write pictures of the training')
+    parser.add_argument('--resume', action='store_true', help='go on where a training was cut off')
+    parser.add_argument('--strict', action='store_true', help='refuse damaged bags')
+    _add_topics(parser, 'image', 'odometry', 'imu')
+    _add_settings(parser, SegmentConfig, ('segments',))
+    _add_settings(parser, MetricConfig, ('solver', 'metric_map'))
+    _add_settings(parser, NetworkConfig, ('normalization',))
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    from sfa_localization import training
+
+    trained = training.train(
+        arguments.bags,
+        arguments.output,
+        _recipe(arguments),
+        progress=sys.stderr.isatty(),
+        resume=arguments.resume,
+        strict=arguments.strict,
+    )
+    print(training.summary(trained))
+    if arguments.report:
+        from sfa_localization.training_report import write_training_report
+
+        write_training_report(arguments.report, trained)
+    print(f'{arguments.output}: written')
+    return 0
+
+
+TRAIN = Command(
+    'train',
+    'Learn a place model from bags of pictures and odometry; ground truth is never read.',
+    '  train bags/coverage --output garden.npz\n'
+    '  train bags/a bags/b --output garden.npz --config localization.yaml --report report\n'
+    '  train recording --output garden.npz --image-topic /front/image_raw --odom-topic /odom',
+    _configure_train,
+    _train,
+)
+
+
+def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('model', type=Path, metavar='MODEL.npz')
+    parser.add_argument('bag', type=Path, metavar='BAG', help='drive with ground truth')
+    parser.add_argument(
+        '--align', type=Path, metavar='TRAIN_BAG', help='drive that lays the map on the truth'
+    )
+    parser.add_argument('--config', type=Path, help='parameter file')
+    parser.add_argument('--report', type=Path, metavar='DIR', help='write pictures and the table')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the figures')
+    _add_topics(parser, *_TOPICS)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from sfa_localization import evaluation, report
+    from sfa_localization.place_model import PlaceModel
+
+    judged = evaluation.evaluate(
+        PlaceModel.load(arguments.model),
+        arguments.bag,
+        align_bag=arguments.align,
+        recipe=_recipe(arguments),
+        config=_filter_config(arguments.config),
+        progress=sys.stderr.isatty(),
+    )
+    print(report.table(judged.scores))
+    print(report.heading_table(judged.scores))
+    for stream in ('images', 'odometry'):
+        count = judged.counts[stream]
+        reasons = ''.join(f'; {n} skipped: {why}' for why, n in sorted(count['skipped'].items()))
+        print(f'{stream}: {count["used"]} used{reasons}')
+    print(f'aligned on {judged.aligned_on}')
+    if arguments.report:
+        report.write_report(
+            arguments.report,
+            judged.truth,
+            judged.estimates,
+            judged.scores,
+            judged.estimates['sfa'].poses[:, :2],
+            judged.features,
+        )
+    if arguments.json:
+        evaluation.write_json(arguments.json, judged.as_dict())
+    return 0
+
+
+EVALUATE = Command(
+    'evaluate',
+    'Compare a model, alone and fused with odometry, with the ground truth of a drive (metres).',
+    '  evaluate garden.npz bags/test --align bags/coverage\n'
+    '  evaluate garden.npz bags/test --align bags/coverage --report report --json results.json',
+    _configure_evaluate,
+    _evaluate,
+)
+
+
+COMMANDS: list[Command] = [
+    SIMULATE,
+    TRAIN,
+    EVALUATE,
+    PLAY,
+    INSPECT,
+    CALIBRATE,
+    FILTER,
+    TUNE,
+    CONFIG,
+]
 
 
 NODES = {

@@ -84,7 +84,7 @@ def trajectories_figure(
     """
     figure = Figure(figsize=(8.0, 7.6), layout='constrained')
     _draw_paths(figure.add_subplot(), truth, estimates, scores or {})
-    _save(figure, path)
+    save(figure, path)
 
 
 def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
@@ -94,7 +94,7 @@ def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
     _draw_position_errors(upper, truth, estimates)
     _draw_heading_errors(lower, truth, estimates)
     upper.set_xlabel('')
-    _save(figure, path)
+    save(figure, path)
 
 
 def heading_figure(path: Path, truth: Trajectory, estimate: Trajectory, name: str = 'ekf') -> None:
@@ -108,7 +108,7 @@ def heading_figure(path: Path, truth: Trajectory, estimate: Trajectory, name: st
     dots = _dots(axes, places, np.abs(error), 16.0, 'viridis', (0.0, top))
     figure.colorbar(dots, label='absolute heading error (°)', shrink=0.85, extend='max')
     axes.set_title(f'Heading error along the path: {_label(name)}')
-    _save(figure, path)
+    save(figure, path)
 
 
 def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
@@ -119,7 +119,7 @@ def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
     figure = Figure(figsize=(12.0, 6.2), layout='compressed')
     grid = figure.subplots(2, MAPS_SHOWN // 2, sharex=True, sharey=True, squeeze=False)
     _draw_firing_maps(figure, list(grid.flat), positions, features)
-    _save(figure, path)
+    save(figure, path)
 
 
 def overview_figure(
@@ -138,7 +138,7 @@ def overview_figure(
     row = upper.subplots(1, 4, sharey=True, squeeze=False)[0]
     _draw_firing_maps(upper, row, positions, features)
     _draw_position_errors(lower.add_subplot(), truth, estimates)
-    _save(figure, path)
+    save(figure, path)
 
 
 def table(scores: Scores) -> str:
@@ -147,6 +147,17 @@ def table(scores: Scores) -> str:
     for name, score in scores.items():
         numbers = [_number(score[column], column) for column in COLUMNS]
         lines.append(f'| {_label(name)} | ' + ' | '.join(numbers) + ' |')
+    return '\n'.join(lines)
+
+
+def heading_table(scores: Mapping[str, Mapping[str, Any]]) -> str:
+    """Lay out heading errors in degrees, one line per estimate that has a heading."""
+    columns = ('mean', 'median', 'p95')
+    lines = ['| heading error (degrees) | ' + ' | '.join(columns) + ' |', '|---|---:|---:|---:|']
+    for name, score in scores.items():
+        if score.get('yaw_deg'):
+            numbers = [f'{score["yaw_deg"][column]:.2f}' for column in columns]
+            lines.append(f'| {_label(name)} | ' + ' | '.join(numbers) + ' |')
     return '\n'.join(lines)
 
 
@@ -172,7 +183,7 @@ def write_report(
         heading_figure(folder / 'heading.png', truth, estimates['ekf'])
         pictures.append('heading')
     images = [f'![{name}]({name}.png)' for name in pictures]
-    _write_text(folder / 'report.md', '\n\n'.join(['# Evaluation', table(scores), *images]) + '\n')
+    write_text(folder / 'report.md', '\n\n'.join(['# Evaluation', table(scores), *images]) + '\n')
 
 
 def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Scores) -> None:
@@ -272,15 +283,19 @@ def _style(name: str) -> dict[str, Any]:
 
 
 def _number(value: float, column: str) -> str:
+    if value is None:
+        return '-'
     return f'{int(value)}' if column == 'n' else f'{value:.3f}'
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, at once or not at all."""
     with _whole(path) as partial:
         figure.savefig(partial, dpi=DOTS_PER_INCH, format='png')
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, at once or not at all."""
     with _whole(path) as partial:
         partial.write_text(text, encoding='utf-8')
 

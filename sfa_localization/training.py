@@ -412,6 +412,42 @@ def _quality(
     return quality
 
 
+def summary(trained: Trained) -> str:
+    """What a person should know of a training, in a few lines; no ground truth is needed."""
+    quality = trained.model.quality
+    coverage = quality['coverage']
+    along, across = coverage['extent_m']
+    proof = 'proven the best' if quality['certified'] else 'NOT proven the best'
+    lines = [
+        f'pictures: {quality["pictures"]} in {quality["segments"]} segments of odometry, '
+        f'{coverage["length_m"]:.0f} m driven, about {along:.0f} m x {across:.0f} m covered',
+        f'map: {quality["features_used"]} slow features, directions {proof} '
+        f'(certificate {quality["certificate"]:.1e})',
+        f'position, on parts of the drive that were left out: {quality["left_out_error_m"]:.2f} m '
+        f'mean error, {100 * quality["left_out_within_95"]:.0f} % inside the 95 % ellipse',
+    ]
+    if 'left_out_yaw_deg' in quality:
+        lines.append(
+            f'heading, likewise: {quality["left_out_yaw_deg"]:.1f} degrees mean error, '
+            f'{100 * quality["left_out_yaw_within_95"]:.0f} % inside the 95 % interval'
+        )
+    for name, count in _counts(trained).items():
+        lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
+    return '\n'.join(lines)
+
+
+def _counts(trained: Trained) -> dict[str, dict[str, int]]:
+    """What was not used, by reason: of every bag, and of the segments."""
+    skipped = {
+        f'{run.name}: {stream}': count.skipped
+        for run in trained.runs
+        for stream, count in run.counts.items()
+    }
+    skipped['metric learning: images'] = trained.segments.images.skipped
+    skipped['metric learning: odometry'] = trained.segments.odometry.skipped
+    return skipped
+
+
 @dataclass(frozen=True, slots=True)
 class _Checkpoint:
     """Finished stages of a training, kept beside the output until the model is written."""

@@ -1,0 +1,244 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How far the estimates are from the truth: the paper's protocol (section 4).
+
+The map is known up to a rotation and a translation. They are fitted on the estimates of a training
+drive and applied unchanged to the drive that is judged; the error is the Euclidean distance.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+from tqdm import tqdm
+
+from sfa_localization.config import FilterConfig
+from sfa_localization.errors import DataError, LocalizationError
+from sfa_localization.geometry import (
+    Array,
+    RigidTransform,
+    align,
+    compose,
+    invert,
+    wrap_angle,
+)
+from sfa_localization.localizer import Localizer
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.run import Run, Stamps, Trajectory
+from sfa_localization.training import Recipe, read_drive
+
+Scores = dict[str, dict[str, Any]]
+_TRUTH_TOLERANCE_NS = 500_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A judged drive. `estimates` are in the truth's frame; `features` (N, K) of the pictures.
+
+    `aligned_on` names the drive on which the transform was fitted.
+    """
+
+    truth: Trajectory
+    estimates: dict[str, Trajectory]
+    scores: Scores
+    counts: dict[str, Any]
+    features: Array
+    aligned_on: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers: one entry per estimate, and the counts."""
+        return {**self.scores, 'counts': self.counts, 'aligned_on': self.aligned_on}
+
+
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """A drive as the model sees it: map poses (N, 3) of its pictures, features (N, K)."""
+
+    run: Run
+    truth: Trajectory
+    sfa: Trajectory
+    features: Array
+
+
+def evaluate(
+    model: PlaceModel,
+    bag: Path,
+    *,
+    align_bag: Path | None = None,
+    recipe: Recipe | None = None,
+    config: FilterConfig | None = None,
+    progress: bool = False,
+) -> Evaluation:
+    """Judge a model on a drive with ground truth.
+
+    The transform to the truth is fitted on `align_bag`, a training drive; without one, on the
+    drive itself. Raises BagError or DataError, also when there is no ground truth.
+    """
+    recipe = replace(recipe or Recipe(), panorama=model.panorama)
+    transform, supervised = None, None
+    if align_bag is not None:
+        with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
+            trained = _seen(model, align_bag, Path(cache), recipe, progress)
+            transform = fit_transform(trained.truth, trained.sfa)
+            supervised = _supervised_weights(model, trained)
+    with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
+        run = _read(bag, Path(cache), recipe, progress)
+        localizer = Localizer(model, config)
+        drive, ekf = _replayed(localizer, run, progress)
+    transform = transform or fit_transform(drive.truth, drive.sfa)
+    estimates = {'odometry': odometry_from_start(drive.truth, run)}
+    estimates['sfa'] = moved(drive.sfa, transform)
+    estimates['ekf'] = moved(ekf, transform)
+    if supervised is not None:
+        estimates['supervised'] = _supervised(model, supervised, drive)
+    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+    counts = {name: count.as_dict() for name, count in run.counts.items()}
+    counts['fusion'] = dict(localizer.filter.counts)
+    aligned_on = str(align_bag or bag)
+    return Evaluation(drive.truth, estimates, scores, counts, drive.features, aligned_on)
+
+
+def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
+    run = read_drive(bag, cache, recipe, progress, want_truth=True)
+    if run.ground_truth is None or len(run.ground_truth) < 2:
+        raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
+    return run
+
+
+def _seen(model: PlaceModel, bag: Path, cache: Path, recipe: Recipe, progress: bool) -> _Drive:
+    """What the model alone makes of a drive."""
+    run = _read(bag, cache, recipe, progress)
+    localizer = Localizer(model)
+    with _bar(run, progress) as bar:
+        seen = []
+        for told in localizer.locate_run(run):
+            seen.append(told)
+            bar.update()
+    return _drive(run, seen)
+
+
+def _replayed(localizer: Localizer, run: Run, progress: bool) -> tuple[_Drive, Trajectory]:
+    """What the model makes of a drive, and the filter at every odometry message."""
+    seen, stamps, poses = [], [], []
+    with _bar(run, progress) as bar:
+        for stamp_ns, estimate, state in localizer.replay(run):
+            if estimate is not None:
+                seen.append((stamp_ns, estimate))
+                bar.update()
+            elif state is not None:
+                stamps.append(stamp_ns)
+                poses.append(state.pose)
+    path = Trajectory(np.array(stamps, np.int64), np.reshape(poses, (-1, 3)))
+    return _drive(run, seen), path
+
+
+def _bar(run: Run, progress: bool) -> Any:
+    title = f'locating {run.name}'
+    return tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress)
+
+
+def _drive(run: Run, seen: list[tuple[int, Any]]) -> _Drive:
+    assert run.ground_truth is not None
+    stamps = np.array([stamp_ns for stamp_ns, _ in seen], np.int64)
+    poses = np.array([np.append(e.position, e.yaw) for _, e in seen]).reshape(-1, 3)
+    features = np.array([e.slow_features for _, e in seen])
+    return _Drive(run, run.ground_truth, Trajectory(stamps, poses), features)
+
+
+def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
+    """Mask (N,) of the stamps at which the truth is known."""
+    return truth.covers(stamps_ns, _TRUTH_TOLERANCE_NS)
+
+
+def fit_transform(truth: Trajectory, estimate: Trajectory) -> RigidTransform:
+    """Rotation and translation that lay the estimates (in the map) on the truth. DataError."""
+    mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
+    if np.count_nonzero(mask) < 2:
+        raise DataError('the ground truth covers fewer than two pictures: are the clocks the same?')
+    return align(estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2])
+
+
+def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:
+    """A trajectory in the frame that the transform leads to."""
+    positions = transform.apply(estimate.poses[:, :2])
+    yaw = transform.apply_yaw(estimate.poses[:, 2])
+    return Trajectory(estimate.stamps_ns, np.column_stack([positions, yaw]))
+
+
+def odometry_from_start(truth: Trajectory, run: Run) -> Trajectory:
+    """Odometry alone, from the true pose where the truth begins."""
+    path = run.odometry.trajectory
+    stamps = path.stamps_ns[known(truth, path.stamps_ns)]
+    if len(stamps) == 0:
+        raise DataError(f'{run.name}: ground truth and odometry share no time')
+    start = compose(truth.at(stamps[:1])[0], invert(path.at(stamps[:1])[0]))
+    return Trajectory(stamps, compose(np.broadcast_to(start, (len(stamps), 3)), path.at(stamps)))
+
+
+def score(truth: Trajectory, estimate: Trajectory) -> dict[str, Any]:
+    """Mean, median, 95th percentile, rmse, max (m) and count of the position errors.
+
+    `yaw_deg` holds mean, median and p95 of the heading errors where there is a heading. The
+    numbers are None where no estimate can be judged.
+    """
+    mask = known(truth, estimate.stamps_ns)
+    at = truth.at(estimate.stamps_ns[mask])
+    errors = np.hypot(*(estimate.poses[mask, :2] - at[:, :2]).T)
+    yaw = np.degrees(np.abs(wrap_angle(estimate.poses[mask, 2] - at[:, 2])))
+    yaw = yaw[np.isfinite(yaw)]
+    if len(errors) == 0:
+        empty = dict.fromkeys(('mean', 'median', 'p95', 'rmse', 'max'))
+        return {**empty, 'n': 0, 'yaw_deg': None}
+    return {
+        **_summary(errors),
+        'rmse': float(np.sqrt((errors**2).mean())),
+        'max': float(errors.max()),
+        'n': len(errors),
+        'yaw_deg': _summary(yaw) if len(yaw) else None,
+    }
+
+
+def _summary(values: Array) -> dict[str, float]:
+    return {
+        'mean': float(values.mean()),
+        'median': float(np.median(values)),
+        'p95': float(np.percentile(values, 95)),
+    }
+
+
+def _supervised_weights(model: PlaceModel, drive: _Drive) -> Array:
+    """The model's own regression, fitted on the ground truth of a training drive: (m, 2)."""
+    basis = model.metric.basis
+    mask = known(drive.truth, drive.sfa.stamps_ns)
+    expanded = basis.expand(drive.features[mask])
+    places = drive.truth.at(drive.sfa.stamps_ns[mask])[:, :2]
+    normal = expanded.T @ expanded + np.diag(basis.ridge)
+    return np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
+
+
+def _supervised(model: PlaceModel, weights: Array, drive: _Drive) -> Trajectory:
+    positions = model.metric.basis.expand(drive.features) @ weights
+    unknown = np.full(len(positions), np.nan)
+    return Trajectory(drive.sfa.stamps_ns, np.column_stack([positions, unknown]))
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON under a temporary name, then rename it. Raises LocalizationError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp('.json', f'.{path.name}-', path.parent)
+        with os.fdopen(handle, 'w') as file:
+            json.dump(content, file, indent=2)
+            file.write('\n')
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise LocalizationError(f'{path}: cannot be written: {error.strerror}') from None
