@@ -22,9 +22,10 @@ from sfa_localization.geometry import Array, wrap_angle
 from sfa_localization.run import Stamps, Trajectory
 
 Estimates = Mapping[str, Trajectory]
-Scores = Mapping[str, Mapping[str, float]]
+Scores = Mapping[str, Mapping[str, Any]]
 
 COLUMNS = ('mean', 'median', 'p95', 'rmse', 'max', 'n')
+YAW_COLUMNS = ('mean', 'median', 'p95')
 LABELS = {
     'odometry': 'wheel odometry',
     'sfa': 'SFA, one picture each',
@@ -142,23 +143,33 @@ def overview_figure(
 
 
 def table(scores: Scores) -> str:
-    """Lay out errors in metres, one line per estimate, as a Markdown table."""
-    lines = ['| error (m) | ' + ' | '.join(COLUMNS) + ' |', '|---|' + '---:|' * len(COLUMNS)]
-    for name, score in scores.items():
-        numbers = [_number(score[column], column) for column in COLUMNS]
-        lines.append(f'| {_label(name)} | ' + ' | '.join(numbers) + ' |')
-    return '\n'.join(lines)
+    """Lay out position errors in metres, one line per estimate, as a Markdown table."""
+    rows = {name: [_number(score[c], c) for c in COLUMNS] for name, score in scores.items()}
+    return _markdown('position error (m)', COLUMNS, rows)
 
 
-def heading_table(scores: Mapping[str, Mapping[str, Any]]) -> str:
+def heading_table(scores: Scores) -> str:
     """Lay out heading errors in degrees, one line per estimate that has a heading."""
-    columns = ('mean', 'median', 'p95')
-    lines = ['| heading error (degrees) | ' + ' | '.join(columns) + ' |', '|---|---:|---:|---:|']
-    for name, score in scores.items():
-        if score.get('yaw_deg'):
-            numbers = [f'{score["yaw_deg"][column]:.2f}' for column in columns]
-            lines.append(f'| {_label(name)} | ' + ' | '.join(numbers) + ' |')
+    known = {name: score['yaw_deg'] for name, score in scores.items() if score.get('yaw_deg')}
+    rows = {name: [f'{yaw[column]:.2f}' for column in YAW_COLUMNS] for name, yaw in known.items()}
+    return _markdown('heading error (degrees)', YAW_COLUMNS, rows)
+
+
+def _markdown(corner: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
+    """A table whose columns are padded, so that it can be read as plain text too."""
+    labels = {name: _label(name) for name in rows}
+    first = max(map(len, [corner, *labels.values()]))
+    width = max(map(len, [*columns, *(cell for row in rows.values() for cell in row)]))
+    lines = [
+        _row(corner.ljust(first), columns, width),
+        f'|{"-" * (first + 2)}|' + f'{"-" * (width + 1)}:|' * len(columns),
+        *(_row(labels[name].ljust(first), row, width) for name, row in rows.items()),
+    ]
     return '\n'.join(lines)
+
+
+def _row(head: str, cells: Sequence[str], width: int) -> str:
+    return f'| {head} | ' + ' | '.join(cell.rjust(width) for cell in cells) + ' |'
 
 
 def write_report(
@@ -183,7 +194,8 @@ def write_report(
         heading_figure(folder / 'heading.png', truth, estimates['ekf'])
         pictures.append('heading')
     images = [f'![{name}]({name}.png)' for name in pictures]
-    write_text(folder / 'report.md', '\n\n'.join(['# Evaluation', table(scores), *images]) + '\n')
+    parts = ['# Evaluation', table(scores), heading_table(scores), *images]
+    write_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
 
 
 def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Scores) -> None:
@@ -192,7 +204,7 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
     x, y = truth.poses[0, :2]
     axes.annotate('start', (x, y), xytext=(7, 7), textcoords='offset points')
     for name, estimate in estimates.items():
-        mean = f': {scores[name]["mean"]:.2f} m' if name in scores else ''
+        mean = f': {_number(scores[name]["mean"], "mean")} m' if name in scores else ''
         points = estimate.poses[truth.covers(estimate.stamps_ns)]
         axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **_style(name))
     _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
@@ -282,7 +294,7 @@ def _style(name: str) -> dict[str, Any]:
     return STYLES.get(name, OTHER)
 
 
-def _number(value: float, column: str) -> str:
+def _number(value: float | None, column: str) -> str:
     if value is None:
         return '-'
     return f'{int(value)}' if column == 'n' else f'{value:.3f}'

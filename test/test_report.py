@@ -34,7 +34,7 @@ def estimate() -> Trajectory:
 @pytest.fixture
 def scores() -> dict[str, dict[str, float]]:
     row = {'mean': 0.12345, 'median': 0.1, 'p95': 0.2, 'rmse': 0.15, 'max': 0.3, 'n': 42}
-    return {'ekf': row, 'my filter': {**row, 'mean': 2.0}}
+    return {'ekf': dict(row), 'my filter': {**row, 'mean': 2.0}}
 
 
 def test_position_errors_by_hand(truth, estimate):
@@ -51,10 +51,24 @@ def test_heading_errors_wrap_and_leave_unknown_headings_out(truth, estimate):
 
 def test_table_has_a_line_for_every_estimate(scores):
     lines = report.table(scores).splitlines()
-    assert lines[0] == '| error (m) | mean | median | p95 | rmse | max | n |'
-    assert lines[2] == '| EKF: SFA + odometry | 0.123 | 0.100 | 0.200 | 0.150 | 0.300 | 42 |'
-    assert lines[3].startswith('| my filter | 2.000 |')
+    cells = [[cell.strip() for cell in line.strip('|').split('|')] for line in lines]
+    assert cells[0] == ['position error (m)', 'mean', 'median', 'p95', 'rmse', 'max', 'n']
+    assert cells[2] == ['EKF: SFA + odometry', '0.123', '0.100', '0.200', '0.150', '0.300', '42']
+    assert cells[3][:2] == ['my filter', '2.000']
     assert len(lines) == 4
+    assert len(set(map(len, lines))) == 1, 'padded to be read as plain text'
+
+
+def test_table_shows_what_could_not_be_judged(scores):
+    scores['ekf'] = {**dict.fromkeys(report.COLUMNS), 'n': 0}
+    assert report.table(scores).splitlines()[2].split('|')[2:7] == ['      - '] * 5
+
+
+def test_heading_table_leaves_out_estimates_without_heading(scores):
+    scores['ekf']['yaw_deg'] = {'mean': 1.234, 'median': 1.0, 'p95': 3.0}
+    lines = report.heading_table(scores).splitlines()
+    assert len(lines) == 3
+    assert lines[2].split('|')[2].strip() == '1.23'
 
 
 def test_report_writes_whole_pictures_and_nothing_else(tmp_path, truth, scores):
