@@ -17,6 +17,7 @@ from sfa_localization import __version__
 from sfa_localization.config import (
     CalibrationConfig,
     CameraConfig,
+    DemoConfig,
     FilterConfig,
     InspectionConfig,
     MetricConfig,
@@ -327,10 +328,9 @@ def _filter(arguments: argparse.Namespace) -> int:
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
     config = _filter_config(arguments.config)
-    if 'var_x' not in positions.columns and config.position_std == FilterConfig().position_std:
-        told = filtering.position_std_of(odometry, positions) or config.position_std
-        print(f'positions tell no variance: their deviation is taken to be {told:.2f} m')
-        config = dataclasses.replace(config, position_std=told)
+    config, text = filtering.fitting_config(odometry, positions, config)
+    if text:
+        print(text)
     done = filtering.run_filter(
         odometry, positions, config, arguments.initial_pose, progress=sys.stderr.isatty()
     )
@@ -556,6 +556,33 @@ EVALUATE = Command(
     '  evaluate garden.npz bags/test --align bags/coverage --report report --json results.json',
     _configure_evaluate,
     _evaluate,
+)
+
+
+def _configure_demo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--out', type=Path, default=Path('demo'), metavar='DIR', help='folder to write [demo]'
+    )
+    _add_settings(parser, DemoConfig)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from sfa_localization import demo, report
+    from sfa_localization.processes import terminable
+
+    with terminable():
+        judged = demo.demonstrate(arguments.out, _settings(DemoConfig, arguments), progress=True)
+    print(report.table(judged.scores))
+    print(report.heading_table(judged.scores))
+    return 0
+
+
+DEMO = Command(
+    'demo',
+    'Simulate, train, run the three nodes live, and print how far they are off (about 5 minutes).',
+    '  demo\n  demo --world 2 --out demo_of_world_2',
+    _configure_demo,
+    _demo,
 )
 
 

@@ -701,7 +701,7 @@ class FilterConfig(Settings):
         3.0, 'pictures more unlike training than this are not used', low=1.0, high=1e6, live=True
     )
     gate_probability: float = setting(
-        0.997,
+        0.999,
         'share of right measurements that the gate lets in',
         low=0.5,
         high=0.999999,
@@ -893,7 +893,7 @@ class InspectionConfig(Settings):
     min_directions: int = setting(3, 'line directions, of six, driven along', low=1, high=6)
     max_lost: float = setting(0.1, 'share of pictures that cannot be used', low=0.0, high=1.0)
     max_gap: float = setting(
-        1.0, 'pause of a topic that is worth telling', unit='s', low=0.0, high=1e6
+        2.0, 'pause of a topic that is worth telling', unit='s', low=0.0, high=1e6
     )
     samples: int = setting(16, 'pictures on the contact sheet', low=1, high=400)
 

@@ -10,7 +10,7 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -19,12 +19,15 @@ from tqdm import tqdm
 
 from sfa_localization.config import FilterConfig
 from sfa_localization.errors import DataError
-from sfa_localization.geometry import Array
+from sfa_localization.geometry import Array, align
 from sfa_localization.pose_filter import PoseFilter, Status
-from sfa_localization.run import Stamps
+from sfa_localization.run import Stamps, Trajectory, integrate
 
 _NS = Decimal(1_000_000_000)
 _SECOND_NS = 1_000_000_000
+_STRETCH = 20
+_UNTRUE = 2.0
+_MEDIAN_OF_RAYLEIGH = 1.1774
 # What people call the columns, in lower case; the first is what this package writes.
 _STAMP = ('stamp_s', 'stamp', 't', 'time', 'time_s', 'timestamp', 'timestamp_s', 'sec', 'seconds')
 _STAMP_NS = ('stamp_ns', 'timestamp_ns', 't_ns', 'time_ns')
@@ -74,7 +77,10 @@ class Filtered:
 
 def read_odometry_table(path: Path | str) -> Table:
     """Read `stamp_s,v_mps,omega_radps[,var_v,var_omega]`. Raises DataError."""
-    return _read_table(Path(path), _ODOMETRY, ('v', 'omega'))
+    table = _read_table(Path(path), _ODOMETRY, ('v', 'omega'))
+    if len(table) == 0:
+        raise DataError(f'{path}: holds no rows below its header')
+    return table
 
 
 def read_position_table(path: Path | str) -> Table:
@@ -116,6 +122,63 @@ def run_filter(
         fused.status,
         waiting,
     )
+
+
+def position_std_of(odometry: Table, positions: Table) -> float | None:
+    """Deviation of positions that tell none: what is left when odometry is laid through them.
+
+    Stretches of positions are aligned with dead reckoning; None where there are too few.
+    """
+    path = integrate(
+        odometry.stamps_ns, np.column_stack([odometry.columns[n] for n in ('v', 'omega')])
+    )
+    inside = (positions.stamps_ns >= odometry.stamps_ns[0]) & (
+        positions.stamps_ns <= odometry.stamps_ns[-1]
+    )
+    driven = Trajectory(odometry.stamps_ns, path).at(positions.stamps_ns[inside])[:, :2]
+    seen = np.column_stack([positions.columns['x'], positions.columns['y']])[inside]
+    left = []
+    for start in range(0, len(seen) - _STRETCH + 1, _STRETCH):
+        part = slice(start, start + _STRETCH)
+        laid = align(driven[part], seen[part]).apply(driven[part])
+        left.append(float(np.median(np.hypot(*(seen[part] - laid).T))))
+    return float(np.median(left)) / _MEDIAN_OF_RAYLEIGH if left else None
+
+
+def fitting_config(
+    odometry: Table, positions: Table, config: FilterConfig
+) -> tuple[FilterConfig, str]:
+    """The settings for positions that tell no variance, or far too small ones; and what was done.
+
+    Settings that differ from the defaults are the user's, and stay.
+    """
+    if (config.position_std, config.measurement_factor) != _default_noise():
+        return config, ''
+    found = position_std_of(odometry, positions) if len(positions) else None
+    if found is None:
+        return config, ''
+    told = math.sqrt(_told_variance(positions))
+    if told == 0:
+        text = f'positions tell no variance: their deviation is taken to be {found:.2f} m'
+        return replace(config, position_std=max(found, config.position_std_floor)), text
+    if found > _UNTRUE * told:
+        text = (
+            f'positions tell a deviation of {told:.2f} m, but err by {found:.2f} m: taken as such'
+        )
+        return replace(config, measurement_factor=(found / told) ** 2), text
+    return config, ''
+
+
+def _default_noise() -> tuple[float, float]:
+    default = FilterConfig()
+    return default.position_std, default.measurement_factor
+
+
+def _told_variance(positions: Table) -> float:
+    """Median of the variances that are told; 0 when none is."""
+    told = positions.columns.get('var_x', np.zeros(0))
+    told = told[np.isfinite(told) & (told > 0)]
+    return float(np.median(told)) if len(told) else 0.0
 
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:

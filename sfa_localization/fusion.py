@@ -30,6 +30,7 @@ _ESTABLISHED = 100
 _DOMINATED = 4.0
 _CERTAIN = 1e-7
 _LASTING = 4
+_AFTER_OUTAGE = 1.4
 _NO_DOUBT = (0.0, 0.0, 0.0)
 
 
@@ -215,8 +216,10 @@ class Fusion:
             dt, twist = (end - belief.stamp_ns) * 1e-9, belief.twist
             belief = self._moved(belief, end, lambda mean: motion.coast(mean, twist, dt, config))
         if stamp_ns > end:
-            rest = (stamp_ns - end) * 1e-9
-            belief = self._moved(belief, stamp_ns, lambda mean: motion.halt(mean, rest, config))
+            rest, last_twist = (stamp_ns - end) * 1e-9, belief.twist
+            belief = self._moved(
+                belief, stamp_ns, lambda mean: motion.halt(mean, last_twist, rest, config)
+            )
             belief = belief._replace(covariance=self._capped(belief.covariance))
         return belief
 
@@ -287,11 +290,42 @@ class Fusion:
             fit = relocate(evidence, self.config)
             if fit is not None and self._sure_of_heading(fit) and self._fair(fit, evidence):
                 found = fit.pose, fit.covariance
+        if found is None and belief.located:
+            return self._followed(belief, event, covariance, evidence)
         if found is None:
             reason = 'heading unknown yet' if event.value.size == 2 else 'too novel to start from'
             memory = replace(belief.memory, evidence=evidence, update=_refused(event, reason))
             return belief._replace(memory=memory)
         return self._restarted(belief, event, found, 'started')
+
+    def _followed(
+        self,
+        belief: Belief,
+        event: MeasurementEvent,
+        covariance: Array,
+        evidence: tuple[Evidence, ...],
+    ) -> Belief:
+        """The heading is lost: follow positions, and draw no conclusion from them on the heading.
+
+        What the heading has to do with the position is linear only for small errors.
+        """
+        own, miss = belief.covariance[:2, :2], event.value[:2] - belief.mean[:2]
+        total = own + covariance[:2, :2]
+        d2, threshold = float(miss @ np.linalg.solve(total, miss)), self._thresholds[2]
+        near = d2 <= threshold
+        reason = 'position only: heading unknown' if near else 'outside the gate'
+        update = Update(event.stamp_ns, near, d2, threshold, reason)
+        memory = replace(belief.memory, evidence=evidence, update=update)
+        if not near:
+            return belief._replace(memory=memory)
+        gain = own @ np.linalg.inv(total)
+        mean, posterior = belief.mean.copy(), belief.covariance.copy()
+        mean[:2] += gain @ miss
+        posterior[:2, :], posterior[:, :2] = 0.0, 0.0
+        rest = np.eye(2) - gain
+        posterior[:2, :2] = rest @ own @ rest.T + gain @ covariance[:2, :2] @ gain.T
+        memory = replace(memory, accepted_ns=event.stamp_ns, accepted_m=belief.travelled_m)
+        return belief._replace(mean=mean, covariance=_symmetric(posterior), memory=memory)
 
     def _sure_of_heading(self, fit: Fit) -> bool:
         return bool(fit.covariance[2, 2] < self.config.start_yaw_std**2) and fit.pictures >= 3
@@ -424,6 +458,7 @@ class Fusion:
         jump = math.hypot(*(fit.pose[:2] - belief.mean[:2]))
         little = jump < config.recovery_jump and support >= config.recovery_pictures
         way = max(config.recovery_distance, 8 * fit.std_m)
+        way *= _AFTER_OUTAGE if belief.memory.outage else 1.0
         if fit.has_yaw and not little:
             seen = fit.pictures >= needed
             # What follows an outage may be a burst of wrong pictures: let them last.

@@ -188,19 +188,23 @@ def coast(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
     return step
 
 
-def halt(mean: Array, dt: float, config: FilterConfig) -> Step:
-    """Odometry has been silent for too long: expect no motion, and any motion."""
+def halt(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
+    """Odometry has been silent for too long: expect no motion, and any motion.
+
+    What a robot may have done since is bounded by `unknown_speed` or its last reading, `twist`.
+    """
     step = _stand(mean)
-    spread = 2 * config.unknown_speed**2 * dt
+    speed = max(config.unknown_speed, abs(twist.v))
+    spread = 2 * speed**2 * dt
     step.noise[X, X] += spread
     step.noise[Y, Y] += spread
     step.noise[YAW, YAW] += config.unknown_rate**2 * dt
-    fade = math.exp(-config.unknown_speed * dt / config.decorrelation)
+    fade = math.exp(-speed * dt / config.decorrelation)
     for i in range(ERROR, SIZE):
         step.mean[i] *= fade
         step.jacobian[i, i] = fade
         step.noise[i, i] += 1 - fade * fade
-    step.noise[V, V] = config.unknown_speed**2
+    step.noise[V, V] = speed**2
     step.noise[OMEGA, OMEGA] = config.unknown_rate**2
     return step
 

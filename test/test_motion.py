@@ -116,7 +116,7 @@ def test_a_standing_robot_neither_moves_nor_becomes_less_sure():
 def test_noise_is_symmetric_and_positive(twist):
     mean = random_mean(np.random.default_rng(5))
     for step in (motion.drive(mean, twist, 0.02, CONFIG), motion.coast(mean, twist, 0.02, CONFIG),
-                 motion.halt(mean, 1.0, CONFIG)):  # fmt: skip
+                 motion.halt(mean, twist, 1.0, CONFIG)):  # fmt: skip
         assert np.allclose(step.noise, step.noise.T)
         assert np.linalg.eigvalsh(step.noise)[0] > -1e-15
 

@@ -289,7 +289,7 @@ def test_a_spike_is_refused_and_moves_nothing(heading):
     assert (
         found[100][1].d2
         > found[100][1].threshold
-        == pytest.approx(chi2.ppf(0.997, 3 if heading else 2))
+        == pytest.approx(chi2.ppf(0.999, 3 if heading else 2))
     )
     assert max(error for _, _, error, _ in found) < 0.6
 
@@ -543,6 +543,24 @@ def test_pictures_alone_carry_it_through_an_outage_of_the_odometry():
     assert drive.error(fused, 999)[0] < 1.0
     found = drive.feed(fused, heading=True, start=20)
     assert found[-1][2] < 0.5 and fused.status.level is Level.LOCALISED
+
+
+def test_after_a_long_gap_positions_are_followed_and_the_heading_is_found_again():
+    drive = Drive(seconds=60, **NOISY)
+    fused = known()
+    found = []
+    for event in drive.events():
+        t = (event[0] - START_NS) * 1e-9
+        if event[1] or not 20 < t < 40:
+            drive.give(fused, event)
+        if event[1]:
+            found.append(drive.error(fused, drive.pictures[event[2]]))
+        if event[1] and 30 < t < 40:
+            assert fused.status.level is Level.LOST
+            assert any('heading' in reason for reason in fused.status.reasons)
+    assert max(error for error, _ in found) < 1.5
+    assert found[-1][0] < 0.4 and abs(found[-1][1]) < 0.2
+    assert fused.status.level is Level.LOCALISED
 
 
 @pytest.mark.parametrize('gap', [0.3, 1.5])

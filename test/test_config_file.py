@@ -1,0 +1,121 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameter file: written from the settings, read back to the same settings, strict."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sfa_localization import config_file
+from sfa_localization.cli import main
+from sfa_localization.config import FilterConfig, NodeConfig, PanoramaConfig
+from sfa_localization.config_file import SECTIONS, load_settings, render, write_config
+from sfa_localization.errors import ConfigError
+
+SHIPPED = Path(__file__).parents[1] / 'config' / 'localization.yaml'
+EVERY = [(section, kind) for section, kinds in SECTIONS.items() for kind in kinds]
+
+
+def saved(tmp_path, text):
+    path = tmp_path / 'c.yaml'
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_file_is_what_the_settings_say():
+    remedy = 'python -m sfa_localization config --output config/localization.yaml'
+    assert SHIPPED.read_text() == render(), f'write it anew: {remedy}'
+
+
+@pytest.mark.parametrize(('section', 'kind'), EVERY)
+def test_the_shipped_file_reads_back_to_the_defaults(section, kind):
+    assert load_settings(SHIPPED, section, kind) == kind()
+
+
+@pytest.mark.parametrize('section', SECTIONS)
+def test_names_of_a_section_do_not_clash_and_all_are_explained(section):
+    names = [item.name for kind in SECTIONS[section] for item in dataclasses.fields(kind)]
+    assert len(names) == len(set(names))
+    lines = render().splitlines()
+    for name in names:
+        places = [i for i, line in enumerate(lines) if line.startswith(f'    {name}: ')]
+        assert places and all(lines[i - 1].startswith('    # ') for i in places)
+    assert max(map(len, lines)) <= 100
+
+
+def test_units_and_ranges_are_told():
+    text = render()
+    assert '# columns of the panorama [px]; 16..8192\n    width: 600\n' in text
+    assert 'may change while running' in text
+
+
+def test_every_value_has_the_type_that_ros_needs():
+    document = yaml.safe_load(render())
+    for section, kind in EVERY:
+        values = document[section]['ros__parameters']
+        for item in dataclasses.fields(kind):
+            default = list(item.default) if isinstance(item.default, tuple) else item.default
+            assert type(values[item.name]) is type(default)
+
+
+def test_changes_are_written_and_the_rest_stays(tmp_path):
+    path = tmp_path / 'c.yaml'
+    write_config(path, {'ekf_node': {'slip_per_metre': 1.5e-7}, 'omnicam_node': {'width': 300}})
+    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(slip_per_metre=1.5e-7)
+    assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
+    assert config_file.load_changes(path)['ekf_node']['slip_per_metre'] == 1.5e-7
+
+
+def test_what_is_not_named_is_default_and_ros_names_are_left_alone(tmp_path):
+    path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    history: 3\n    use_sim_time: true\n'
+                           "    qos_overrides: {/odom: {subscription: {depth: 3}}}\n")  # fmt: skip
+    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(history=3.0)
+    assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig()
+
+
+def test_numbers_as_people_write_them(tmp_path):
+    path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    slip_per_metre: 1e-3\n')
+    assert load_settings(path, 'ekf_node', FilterConfig).slip_per_metre == 1e-3
+
+
+def test_parameters_of_every_node_are_taken_where_they_fit(tmp_path):
+    path = saved(tmp_path, '/**:\n  ros__parameters:\n    autostart: false\n    width: 300\n'
+                           '/ekf_node:\n  ros__parameters:\n    history: 3.0\n')  # fmt: skip
+    assert not load_settings(path, 'ekf_node', NodeConfig).autostart
+    assert load_settings(path, 'ekf_node', FilterConfig).history == 3.0
+    assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
+
+
+@pytest.mark.parametrize(('text', 'why'), [
+    ('ekf_node: [1', 'is not YAML'), ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
+    ('efk_node: {}\n', "unknown section 'efk_node'"),
+    ('ekf_node: {history: 3}\n', 'ros__parameters'),
+    ('ekf_node: {ros__parameters: 3}\n', 'names and values'),
+    ('ekf_node: {ros__parameters: {histroy: 3}}\n', "did you mean 'history'"),
+    ('ekf_node: {ros__parameters: {history: x}}\n', 'history'),
+    ('ekf_node: {ros__parameters: {history: -1}}\n', 'outside'),
+    ('ekf_node: {ros__parameters: {history: .nan}}\n', 'finite'),
+    ('ekf_node: {ros__parameters: {width: 300}}\n', "unknown parameter 'width'"),
+    ('/**: {ros__parameters: {nonsense: 1}}\n', "unknown parameter 'nonsense'"),
+])  # fmt: skip
+def test_a_wrong_file_is_refused_with_file_and_reason(tmp_path, text, why):
+    path = saved(tmp_path, text)
+    with pytest.raises(ConfigError, match=why) as raised:
+        load_settings(path, 'ekf_node', FilterConfig)
+    assert str(path) in str(raised.value) and '\n' not in str(raised.value)
+
+
+def test_a_missing_file_and_an_unwritable_one_are_named(tmp_path):
+    with pytest.raises(ConfigError, match='cannot be read'):
+        load_settings(tmp_path / 'none.yaml', 'ekf_node', FilterConfig)
+    with pytest.raises(ConfigError, match='cannot be written'):
+        write_config(tmp_path / 'no' / 'c.yaml')
+
+
+def test_the_command_prints_and_writes(tmp_path, capsys):
+    assert main(['config']) == 0
+    assert capsys.readouterr().out == render()
+    assert main(['config', '--output', str(tmp_path / 'c.yaml')]) == 0
+    assert (tmp_path / 'c.yaml').read_text() == render()

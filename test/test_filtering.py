@@ -1,0 +1,243 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The filter command on logs as people have them: headers, gaps, disorder, missing variances."""
+
+import math
+
+import numpy as np
+import pytest
+from filter_drives import START_NS, Drive
+
+from sfa_localization import filtering
+from sfa_localization.cli import main
+from sfa_localization.config import FilterConfig
+from sfa_localization.errors import DataError
+from sfa_localization.pose_filter import PoseFilter
+
+NOISY = {'v_std': 0.02, 'omega_std': 0.01, 'position_std': 0.2, 'scale': 1.01, 'bias': 0.002}
+
+
+def seconds(stamp_ns):
+    return f'{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}'
+
+
+def write_logs(folder, drive, shift_ns=0, head='stamp_s,v_mps,omega_radps', sep=',', variance=True):
+    odometry = [head] if head else []
+    for stamp, (v, omega) in zip(drive.stamps_ns, drive.read, strict=True):
+        odometry.append(sep.join([seconds(int(stamp) + shift_ns), f'{v:.12g}', f'{omega:.12g}']))
+    positions = ['stamp_s,x_m,y_m' + (',var_x,var_y' if variance else '')]
+    for k, i in enumerate(drive.pictures):
+        row = [seconds(int(drive.stamps_ns[i]) + shift_ns), *map(repr, drive.seen[k, :2].tolist())]
+        positions.append(','.join(row + (['0.04', '0.04'] if variance else [])))
+    paths = folder / 'odom.csv', folder / 'positions.csv'
+    for path, lines in zip(paths, (odometry, positions), strict=True):
+        path.write_text('\n'.join(lines) + '\n')
+    return paths
+
+
+def run(folder, drive, *options, **how):
+    odometry, positions = write_logs(folder, drive, **how)
+    code = main(['filter', str(odometry), str(positions), '--output', str(folder / 'out.tum'),
+                 *options])  # fmt: skip
+    return code, read_tum(folder / 'out.tum') if code == 0 else None
+
+
+def read_tum(path):
+    rows = [line.split() for line in path.read_text().splitlines()]
+    stamps = np.array([int(s) * 10**9 + int(f) for s, f in (row[0].split('.') for row in rows)])
+    numbers = np.array([[float(cell) for cell in row[1:]] for row in rows])
+    yaw = 2 * np.arctan2(numbers[:, 5], numbers[:, 6])
+    return stamps, np.column_stack([numbers[:, :2], yaw])
+
+
+def errors(drive, found, shift_ns=0):
+    stamps, poses = found
+    at = np.searchsorted(drive.stamps_ns, stamps - shift_ns)
+    assert np.array_equal(drive.stamps_ns[at], stamps - shift_ns)
+    return np.hypot(*(poses[:, :2] - drive.poses[at, :2]).T)
+
+
+def test_the_command_tells_what_the_live_filter_would_have(tmp_path):
+    drive = Drive(seconds=20, **NOISY)
+    code, (stamps, poses) = run(tmp_path, drive)
+    assert code == 0
+    live = PoseFilter(FilterConfig())
+    told = {}
+    for event in drive.events():
+        if event[1]:
+            seen = drive.seen[event[2], :2]
+            live.add_measurement(event[0], seen, 0.04 * np.eye(2))
+        else:
+            live.add_odometry(event[0], *drive.read[event[2]])
+        if live.state is not None:
+            told[event[0]] = live.at(event[0]).pose
+    assert set(stamps) <= set(told) and len(stamps) > 850
+    assert max(np.abs(told[s][:2] - p[:2]).max() for s, p in zip(stamps, poses, strict=True)) < 1e-5
+
+
+def test_without_a_pose_it_starts_from_the_way_and_beats_the_positions(tmp_path):
+    drive = Drive(seconds=60, start=(500.0, -200.0, 2.5), **NOISY)
+    _, found = run(tmp_path, drive)
+    alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T).mean()
+    assert errors(drive, found).mean() < 0.6 * alone
+
+
+def test_with_a_pose_every_row_is_answered(tmp_path):
+    drive = Drive(seconds=10, start=(1.0, 2.0, -3.0), **NOISY)
+    _, found = run(tmp_path, drive, '--initial-pose', '1', '2', '-3')
+    assert len(found[0]) == len(drive.stamps_ns) and errors(drive, found).max() < 0.6
+
+
+@pytest.mark.parametrize('how', [
+    {'head': ''}, {'head': '# stamp_s, v_mps, omega_radps'}, {'head': ' Time , V , Yaw_Rate '},
+    {'head': '"timestamp","linear_x","angular_z"'}, {'sep': ' ', 'head': 't v w'},
+    {'sep': ';', 'head': 't;v;omega'}, {'sep': '\t', 'head': 't\tv\twz'},
+    {'head': '# my robot\n# another remark\nt,v,omega'},
+])  # fmt: skip
+def test_headers_and_separators_of_all_kinds_read_alike(tmp_path, how):
+    drive = Drive(seconds=2)
+    path, _ = write_logs(tmp_path, drive, **how)
+    table = filtering.read_odometry_table(path)
+    assert np.array_equal(table.stamps_ns, drive.stamps_ns)
+    assert np.allclose(table.columns['omega'], drive.read[:, 1])
+    assert not table.skipped
+
+
+def test_columns_are_found_by_name_in_any_order(tmp_path):
+    path = tmp_path / 'p.csv'
+    path.write_text('note,y_m,x_m,stamp_ns,var_y\nhello,2,1,1700000000123456789,\n')
+    table = filtering.read_position_table(path)
+    assert table.stamps_ns[0] == 1700000000123456789
+    assert (table.columns['x'][0], table.columns['y'][0]) == (1, 2)
+    assert math.isnan(table.columns['var_y'][0])
+
+
+def test_nanoseconds_survive(tmp_path):
+    path = tmp_path / 'o.csv'
+    path.write_text('stamp_s,v_mps,omega_radps\n1700000000.123456789,1,0\n')
+    assert filtering.read_odometry_table(path).stamps_ns[0] == 1700000000123456789
+
+
+def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
+    drive = Drive(seconds=10, **NOISY)
+    odometry, positions = write_logs(tmp_path, drive)
+    head, *rows = odometry.read_text().splitlines()
+    np.random.default_rng(0).shuffle(rows)
+    bad = ['nan,1,1', 'x,1,1', ',,', '5', f'{rows[0].split(",")[0]},inf,0', '1700000001.0,,']
+    odometry.write_text('\n'.join([head, *rows[:50], *bad, *rows[50:], rows[0], '', '']))
+    table = filtering.read_odometry_table(odometry)
+    assert len(table) == len(drive.stamps_ns) + 1
+    assert table.skipped['no stamp'] == 3 and table.skipped['no number'] == 3
+    assert np.all(np.diff(table.stamps_ns) >= 0)
+    done = filtering.run_filter(
+        table, filtering.read_position_table(positions), FilterConfig(), (0, 0, 0)
+    )
+    assert done.counts['odometry: duplicate stamp'] == 1
+    assert errors(drive, (done.stamps_ns, done.poses)).max() < 0.6
+
+
+@pytest.mark.parametrize('shift', [-START_NS, -START_NS - 10**12])
+def test_stamps_may_count_from_zero_or_below(tmp_path, shift):
+    drive = Drive(seconds=10, **NOISY)
+    odometry, positions = write_logs(
+        tmp_path, drive, shift_ns=shift if shift > -START_NS - 1 else 0
+    )
+    tables = filtering.read_odometry_table(odometry), filtering.read_position_table(positions)
+    if shift <= -START_NS - 1:
+        tables = tuple(filtering.Table(t.stamps_ns + shift, t.columns, t.skipped) for t in tables)
+    done = filtering.run_filter(*tables, FilterConfig(), (0, 0, 0))
+    assert len(done.stamps_ns) == len(drive.stamps_ns)
+    assert errors(drive, (done.stamps_ns, done.poses), shift).max() < 0.6
+
+
+@pytest.mark.parametrize('rate', [1, 5, 200])
+def test_odd_rates(tmp_path, rate):
+    drive = Drive(seconds=60, rate_hz=rate, every=max(1, rate // 2), **NOISY)
+    _, found = run(tmp_path, drive)
+    assert errors(drive, found)[-rate * 20 :].mean() < 0.3
+
+
+def test_gaps_in_either_log_are_survived(tmp_path):
+    drive = Drive(seconds=90, **NOISY)
+    keep = (drive.stamps_ns - START_NS < 30e9) | (drive.stamps_ns - START_NS > 45e9)
+    odometry = filtering.Table(
+        drive.stamps_ns[keep], {'v': drive.read[keep, 0], 'omega': drive.read[keep, 1]}
+    )
+    stamps = drive.stamps_ns[drive.pictures]
+    seen = (stamps - START_NS < 50e9) | (stamps - START_NS > 70e9)
+    positions = filtering.Table(stamps[seen], {'x': drive.seen[seen, 0], 'y': drive.seen[seen, 1]})
+    done = filtering.run_filter(odometry, positions, FilterConfig())
+    found = errors(drive, (done.stamps_ns, done.poses))
+    assert found.max() < 4 and found[-500:].mean() < 0.3
+
+
+@pytest.mark.parametrize(('std', 'variance'), [(0.2, False), (3.0, False), (1.0, True)])
+def test_missing_and_untrue_variances_are_replaced_by_what_the_log_shows(tmp_path, std, variance):
+    drive = Drive(seconds=300, rate_hz=10, every=5, **{**NOISY, 'position_std': std})
+    code, found = run(tmp_path, drive, variance=variance)  # where told, they tell 0.2 m
+    alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T).mean()
+    assert code == 0 and errors(drive, found).mean() < 0.5 * alone
+
+
+def test_the_deviation_of_positions_is_found(tmp_path):
+    drive = Drive(seconds=200, rate_hz=10, every=5, **{**NOISY, 'position_std': 0.7})
+    odometry, positions = write_logs(tmp_path, drive, variance=False)
+    found = filtering.position_std_of(
+        filtering.read_odometry_table(odometry), filtering.read_position_table(positions)
+    )
+    assert found == pytest.approx(0.7, rel=0.1)
+
+
+def test_settings_of_the_user_are_not_second_guessed(tmp_path):
+    odometry, positions = write_logs(tmp_path, Drive(seconds=30, **NOISY), variance=False)
+    config = FilterConfig(position_std=5.0)
+    tables = filtering.read_odometry_table(odometry), filtering.read_position_table(positions)
+    assert filtering.fitting_config(*tables, config) == (config, '')
+
+
+def test_headings_in_the_log_are_fused(tmp_path):
+    path = tmp_path / 'p.csv'
+    path.write_text('stamp_s,x_m,y_m,var_x,var_y,yaw_rad,var_yaw\n1,5,6,0.04,0.04,1.5,0.01\n')
+    odometry = filtering.Table(
+        np.array([10**9, 2 * 10**9]), {'v': np.zeros(2), 'omega': np.zeros(2)}
+    )
+    done = filtering.run_filter(odometry, filtering.read_position_table(path), FilterConfig())
+    assert done.poses[-1] == pytest.approx([5, 6, 1.5])
+
+
+def test_a_parameter_file_is_obeyed(tmp_path, capsys):
+    (tmp_path / 'c.yaml').write_text('ekf_node:\n  ros__parameters:\n    history: 99999.0\n')
+    code, _ = run(tmp_path, Drive(seconds=1), '--config', str(tmp_path / 'c.yaml'))
+    assert code == 1 and 'history' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('odometry', 'positions', 'why'), [
+    ('', 'stamp_s,x_m,y_m\n1,2,3\n', 'holds no rows'),
+    ('stamp_s,v_mps\n1,2\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'no column omega_radps'),
+    ('a,b,c\n1,2,3\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'no column stamp_s'),
+    ('stamp_s,v_mps,omega_radps\nx,y,z\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'none of the 1 rows'),
+    ('stamp_s,v_mps,omega_radps\n1,2,3\n', 'stamp_s,x_m,y_m\n9,2,3\n', 'no time in common'),
+    ('stamp_s,v_mps,omega_radps\n1,0,0\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'never started'),
+    ('stamp_s,v_mps,omega_radps\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'holds no rows below'),
+])  # fmt: skip
+def test_logs_that_cannot_be_used_are_named_in_one_line(tmp_path, capsys, odometry, positions, why):
+    paths = tmp_path / 'o.csv', tmp_path / 'p.csv'
+    paths[0].write_text(odometry)
+    paths[1].write_text(positions)
+    code = main(['filter', *map(str, paths), '--output', str(tmp_path / 'out.tum')])
+    told = capsys.readouterr().err
+    assert code == 1 and why in told and told.count('\n') == 1
+    assert not (tmp_path / 'out.tum').exists() and len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_missing_or_binary_file_is_named(tmp_path, capsys):
+    (tmp_path / 'b.csv').write_bytes(bytes(range(256)))
+    for name in ('none.csv', 'b.csv'):
+        code = main(['filter', str(tmp_path / name), str(tmp_path / name), '--output', 'x'])
+        assert code == 1 and name in capsys.readouterr().err
+
+
+def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path):
+    with pytest.raises(DataError, match='cannot be written'):
+        filtering.write_tum(tmp_path / 'no' / 'out.tum', np.array([1]), np.zeros((1, 3)))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,113 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""ekf_node and sfa_node as processes: signals, bad parameters, wrong requests."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
+
+DOMAIN = 64
+
+
+@pytest.fixture
+def bench():
+    made = Bench(DOMAIN)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Start a node's process; all are ended with the test."""
+    processes = []
+
+    def begin(node, *parameters):
+        arguments = [part for text in parameters for part in ('-p', text)]
+        code = f'import sys; from sfa_localization.nodes.{node} import main; sys.exit(main())'
+        environment = {
+            **os.environ,
+            'ROS_DOMAIN_ID': str(DOMAIN),
+            'ROS_LOG_DIR': str(tmp_path),
+            'OMP_NUM_THREADS': '1',
+        }
+        command = [sys.executable, '-c', code]
+        if arguments:
+            command += ['--ros-args', *arguments]
+        processes.append(
+            subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        )
+        return processes[-1]
+
+    yield begin
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def running(bench):
+    heard = []
+    bench.node.create_subscription(String, 'ekf/state', heard.append, latched_qos())
+    return until(lambda: heard)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_node_with_exit_code_0(bench, start, number):
+    process = start('ekf_node')
+    assert running(bench)
+    process.send_signal(number)
+    _, told = process.communicate(timeout=15)
+    assert process.returncode == 0, told
+    assert 'Traceback' not in told
+
+
+def test_a_signal_while_unconfigured_too(bench, start):
+    process = start('ekf_node', 'autostart:=false')
+    assert until(lambda: 'ekf_node' in bench.node.get_node_names())
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=15)
+    assert process.returncode == 0 and 'Traceback' not in told
+
+
+@pytest.mark.parametrize(('node', 'parameter', 'why'), [
+    ('sfa_node', 'model:=/nowhere/model.npz', '/nowhere/model.npz'),
+    ('sfa_node', 'dark_level:=-1.0', 'dark_level'),
+    ('ekf_node', 'history:=x', 'history'),
+    ('ekf_node', 'history:=-3', 'history'),
+    ('ekf_node', 'history:=.nan', 'history'),
+    ('ekf_node', 'degraded_std:=50.0', 'degraded_std'),
+])  # fmt: skip
+def test_a_wrong_parameter_ends_the_node_with_its_name(start, node, parameter, why):
+    process = start(node, parameter)
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert why in told and 'Traceback' not in told
+
+
+def test_an_impossible_transition_does_not_end_the_node(bench, start):
+    process = start('ekf_node')
+    assert running(bench)
+    client = bench.node.create_client(ChangeState, 'ekf_node/change_state')
+    assert client.wait_for_service(15.0)
+    wrong = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+    client.call_async(wrong)
+    right = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    answer = client.call_async(right)
+    assert until(answer.done) and answer.result().success
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=15)
+    assert process.returncode == 0

@@ -1,0 +1,283 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""sfa_node on real messages, with a model that reads its answer off the picture."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from sfa_localization.config import PanoramaConfig, SfaNodeConfig
+from sfa_localization.errors import ModelError
+from sfa_localization.picture_watch import UNKNOWN_VARIANCE, PictureWatch, unusable_covariance
+from sfa_localization.place_model import Estimate, PlaceModel
+
+SIZE = PanoramaConfig(width=60, height=12)
+
+
+def panorama(seed=0, level=120, spread=40):
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(level, spread, (SIZE.height, SIZE.width, 3))
+    return np.clip(noise, 0, 255).astype(np.uint8)
+
+
+# The judge of pictures needs no ROS.
+
+
+def test_a_good_picture_is_believed():
+    watch = PictureWatch(SfaNodeConfig())
+    assert [watch.judge(panorama(seed)) for seed in range(20)] == [''] * 20
+
+
+@pytest.mark.parametrize(('level', 'spread', 'reason'), [
+    (2, 2, 'dark'), (0, 0, 'dark'), (120, 0, 'covered'), (250, 1, 'covered'),
+])  # fmt: skip
+def test_dark_and_covered_pictures_are_told_apart(level, spread, reason):
+    assert reason in PictureWatch(SfaNodeConfig()).judge(panorama(level=level, spread=spread))
+
+
+def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
+    watch = PictureWatch(SfaNodeConfig(frozen_pictures=3))
+    told = [watch.judge(panorama(seed)) for seed in (1, 1, 1, 1, 2, 2, 1)]
+    assert ['frozen' in text for text in told] == [False, False, True, True, False, False, False]
+
+
+@pytest.mark.parametrize(('novelty', 'fine'), [(0.5, True), (3.0, True), (3.1, False),
+                                              (math.nan, False)])  # fmt: skip
+def test_foreign_pictures_are_not_believed(novelty, fine):
+    assert (PictureWatch(SfaNodeConfig()).judge_novelty(novelty) == '') == fine
+
+
+def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():
+    from sfa_localization.pose_filter import PoseFilter
+
+    update = PoseFilter().add_measurement(10**9, [0, 0, 0], unusable_covariance())
+    assert not update.accepted and update.reason == 'covariance tells that nothing is known'
+
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
+from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
+from std_msgs.msg import Float64MultiArray  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from sfa_localization.nodes.conversions import (  # noqa: E402
+    read_pose,
+    read_stamp,
+    read_yaw,
+    to_compressed,
+    to_image,
+)
+from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
+
+pytestmark = pytest.mark.ros
+
+
+@dataclasses.dataclass
+class FakeModel:
+    """Says that the position is the first pixel's blue and green; novelty is a thing to set."""
+
+    heading: bool = True
+    novelty: float = 0.5
+    shift: float = 0.0
+    panorama: PanoramaConfig = SIZE
+
+    @property
+    def has_heading(self):
+        return self.heading
+
+    def locate(self, image):
+        yaw = 0.25 if self.heading else math.nan
+        variance = 0.01 if self.heading else math.pi**2 / 3
+        position = image[0, 0, :2].astype(float) + self.shift
+        spread = np.diag([0.04, 0.09, variance])
+        return Estimate(np.arange(1.0, 9.0), position, yaw, spread, self.novelty)
+
+
+@pytest.fixture
+def models(monkeypatch):
+    made = {'a.npz': FakeModel(), 'b.npz': FakeModel(shift=100.0), 'blind.npz': FakeModel(False)}
+
+    def load(path):
+        if str(path) not in made:
+            raise ModelError(f'{path}: no such file; train it with the train command')
+        return made[str(path)]
+
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(load))
+    return made
+
+
+@pytest.fixture
+def bench():
+    made = Bench(63)
+    yield made
+    made.close()
+
+
+def message(seed=1, stamp_ns=5_000_000_001, image=None):
+    return to_image(panorama(seed) if image is None else image, stamp_ns, 'omnicam')
+
+
+def test_all_outputs_carry_the_pictures_stamp(bench, models):
+    bench.run(SfaNode, model='a.npz')
+    slow = bench.listen(Float64MultiArray, 'sfa/slow_features')
+    features = bench.listen(PoseStamped, 'sfa/slow_feature_pose')
+    poses = bench.listen(PoseStamped, 'sfa/pose')
+    uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    sent = panorama(1)
+    bench.publish('panorama', message(image=sent))
+    assert until(lambda: slow and features and poses and uncertain)
+    assert list(slow[0].data) == list(range(1, 9))
+    p = features[0].pose.position
+    assert (p.x, p.y, p.z) == (1, 2, 3)
+    assert features[0].header.frame_id == 'slow_feature_space'
+    for pose, stamped in ((poses[0].pose, poses[0]), (uncertain[0].pose.pose, uncertain[0])):
+        assert read_stamp(stamped.header.stamp) == 5_000_000_001
+        assert stamped.header.frame_id == 'map'
+        assert (pose.position.x, pose.position.y) == (sent[0, 0, 0], sent[0, 0, 1])
+        assert read_yaw(pose.orientation) == pytest.approx(0.25)
+    _, _, covariance = read_pose(uncertain[0])
+    assert np.allclose(covariance, np.diag([0.04, 0.09, 0.01]))
+
+
+def test_without_heading_the_yaw_variance_is_large(bench, models):
+    bench.run(SfaNode, model='blind.npz')
+    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    bench.publish('panorama', message())
+    assert until(lambda: heard)
+    _, pose, covariance = read_pose(heard[0])
+    assert pose[2] == 0 and covariance[2, 2] == pytest.approx(math.pi**2 / 3)
+
+
+def test_compressed_panoramas_are_taken_too(bench, models):
+    bench.run(SfaNode, model='a.npz', compressed=True)
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    bench.publish('panorama/compressed', to_compressed(panorama(), 7, 'omnicam', 90))
+    assert until(lambda: heard) and read_stamp(heard[0].header.stamp) == 7
+
+
+def bad_pictures():
+    flat = np.full((SIZE.height, SIZE.width, 3), 90, np.uint8)
+    return {
+        'dark': np.zeros_like(flat),
+        'covered': flat,
+    }
+
+
+@pytest.mark.parametrize('kind', ['dark', 'covered', 'frozen', 'foreign'])
+def test_an_unusable_picture_says_nothing_and_is_told(bench, models, kind):
+    node = bench.run(SfaNode, model='a.npz', diagnostics_period=0.1, frozen_pictures=3)
+    poses = bench.listen(PoseStamped, 'sfa/pose')
+    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    models['a.npz'].novelty = 9.0 if kind == 'foreign' else 0.5
+    image = bad_pictures().get(kind, panorama(5))
+    for k in range(3):
+        bench.publish('panorama', message(image=image, stamp_ns=100 + k))
+        assert until(lambda n=k: len(heard) == n + 1)
+    covariance = np.reshape(heard[-1].pose.covariance, (6, 6))
+    assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE
+    assert len(poses) == (2 if kind == 'frozen' else 0)
+    assert until(lambda: told and told[-1].status[0].level != b'\x00')
+    models['a.npz'].novelty = 0.5
+    bench.publish('panorama', message(seed=77, stamp_ns=200))
+    assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
+    assert sum(node.monitor('panorama').refused.values()) == (1 if kind == 'frozen' else 3)
+
+
+def test_panoramas_of_another_size_are_refused_with_the_remedy(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+    bench.publish('panorama', message(image=np.zeros((20, 100, 3), np.uint8)))
+    assert until(lambda: node.monitor('panorama').refused)
+    reason = next(iter(node.monitor('panorama').refused))
+    assert '100x20' in reason and '60x12' in reason and 'omnicam_node' in reason
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    bench.publish('panorama', message())
+    assert until(lambda: heard)
+
+
+def malformed():
+    def changed(**fields):
+        made = message()
+        for name, value in fields.items():
+            setattr(made, name, value)
+        return made
+
+    stampless, impossible = message(), message()
+    stampless.header.stamp.sec = stampless.header.stamp.nanosec = 0
+    impossible.header.stamp.nanosec = 3_000_000_000
+    return [
+        Image(), stampless, impossible, changed(encoding='nonsense'), changed(step=1),
+        changed(height=0), changed(width=0), changed(height=4_000_000_000),
+        changed(data=b''), changed(data=bytes(5)), changed(encoding='mono8', step=1),
+    ]  # fmt: skip
+
+
+def test_malformed_pictures_are_counted_and_end_nothing(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    for count, broken in enumerate(malformed(), 1):
+        bench.publish('panorama', broken)
+        assert until(lambda n=count: sum(node.monitor('panorama').refused.values()) == n)
+    assert not heard
+    assert not [why for why in node.monitor('panorama').refused if 'internal' in why]
+    bench.publish('panorama', message())
+    assert until(lambda: heard)
+
+
+def test_malformed_compressed_pictures_too(bench, models):
+    node = bench.run(SfaNode, model='a.npz', compressed=True)
+    for count, data in enumerate((b'', b'no picture', bytes(100)), 1):
+        broken = CompressedImage(format='jpeg', data=data)
+        broken.header.stamp.sec = 1
+        bench.publish('panorama/compressed', broken)
+        topic = node.monitor('panorama/compressed')
+        assert until(lambda n=count, t=topic: sum(t.refused.values()) == n)
+
+
+def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+    models['a.npz'].shift = math.nan
+    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    bench.publish('panorama', message())
+    assert until(lambda: node.monitor('panorama').refused) and not heard
+
+
+def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
+    bench.publish('panorama', message())
+    assert until(lambda: heard) and heard[0].pose.position.x >= 100
+    refused = node.set_parameters([Parameter('model', value='none.npz')])[0]
+    assert not refused.successful and 'none.npz' in refused.reason
+    assert node.get_parameter('model').value == 'b.npz'
+    bench.publish('panorama', message())
+    assert until(lambda: len(heard) == 2) and heard[1].pose.position.x >= 100
+    models['b.npz'] = FakeModel(shift=500.0)
+    assert bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request()).success
+    bench.publish('panorama', message())
+    assert until(lambda: len(heard) == 3) and heard[2].pose.position.x >= 500
+    del models['b.npz']
+    answer = bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request())
+    assert not answer.success and 'b.npz' in answer.message
+
+
+@pytest.mark.parametrize(('model', 'why'), [('', 'is empty'), ('none.npz', 'no such file')])
+def test_a_missing_model_is_named_with_the_remedy(bench, models, model, why):
+    node = bench.run(SfaNode, start=False, model=model)
+    assert not node.start()
+    assert why in node.failure and 'train' in node.failure
+
+
+def test_waiting_for_pictures_is_told(bench, models):
+    bench.run(SfaNode, model='a.npz', diagnostics_period=0.1, camera_timeout=0.2)
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    assert until(lambda: told and 'waiting for pictures' in told[-1].status[0].message)
+    bench.publish('panorama', message())
+    assert until(lambda: 'no picture on panorama for' in told[-1].status[0].message)
