@@ -19,6 +19,7 @@ COMMANDS = (
     'calibrate',
     'filter',
     'tune',
+    'config',
     'demo',
 )
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')

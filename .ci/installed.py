@@ -9,13 +9,11 @@ from pathlib import Path
 from ament_index_python import get_package_prefix, get_package_share_directory
 
 import sfa_localization
+from sfa_localization.cli import COMMANDS, NODES
 
 NAME = 'sfa_localization'
 SHARED = ('package.xml', 'config/localization.launch.py', 'config/localization.yaml')
-EXECUTABLES = (
-    *('simulate', 'train', 'evaluate', 'play', 'inspect', 'calibrate', 'filter', 'tune', 'demo'),
-    *('omnicam_node', 'sfa_node', 'ekf_node'),
-)
+EXECUTABLES = (*(command.name for command in COMMANDS), *NODES)
 
 
 def missing() -> list[str]:

@@ -18,7 +18,7 @@ import setuptools
 
 import sfa_localization
 from sfa_localization import cli
-from sfa_localization.cli import COMMANDS
+from sfa_localization.cli import COMMANDS, NODES
 
 NAME = 'sfa_localization'
 ROOT = Path(__file__).parents[1]
@@ -27,7 +27,6 @@ MODULES = {
     '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'): path
     for path in PACKAGE.rglob('*.py')
 }
-NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 ROS = {
     'rclpy',
     'ament_index_python',
