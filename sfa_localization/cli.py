@@ -596,6 +596,7 @@ COMMANDS: list[Command] = [
     FILTER,
     TUNE,
     CONFIG,
+    DEMO,
 ]
 
 
