@@ -1,0 +1,105 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A world of soft coloured spheres about a lawn, drawn as small panoramas, and drives in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfa_localization.config import PanoramaConfig
+from sfa_localization.hierarchy import Drive
+from sfa_localization.network import Architecture, Layer
+from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
+
+SIZE = (12, 48)
+LAYERS = (
+    Layer(field=(4, 8), stride=(4, 4), linear=6, outputs=5),
+    Layer(field=(2, 3), stride=(1, 1), linear=6, outputs=5),
+    Layer(field=(2, 6), stride=(1, 2), linear=6, outputs=4),
+)
+ARCHITECTURE = Architecture(SIZE, 1, 'none', LAYERS)
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """Spheres at `places` (N, 2) m, of `heights` (N,) and `radii` (N,) m, `colors` (N, 3)."""
+
+    places: np.ndarray
+    heights: np.ndarray
+    radii: np.ndarray
+    colors: np.ndarray
+
+    @classmethod
+    def about(cls, seed: int, count: int = 40, clear_m: float = 3.0) -> Spheres:
+        rng = np.random.default_rng(seed)
+        bearing, reach = rng.uniform(-np.pi, np.pi, count), rng.uniform(clear_m, 10.0, count)
+        places = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], 1)
+        heights, radii = rng.uniform(-2.0, 3.0, count), rng.uniform(0.4, 1.6, count)
+        return cls(places, heights, radii, rng.uniform(-90, 90, (count, 3)))
+
+    def symmetric(self) -> Spheres:
+        """The same world four times over, a quarter turn apart."""
+        turned = [self.places @ np.array([[c, s], [-s, c]]) for c, s in _QUARTERS]
+        again = (np.concatenate([part] * 4) for part in (self.heights, self.radii, self.colors))
+        return Spheres(np.concatenate(turned), *again)
+
+    def panoramas(self, poses: np.ndarray, config: PanoramaConfig) -> np.ndarray:
+        """Panoramas (T, H, W, 3) uint8 from poses (T, 3)."""
+        return np.stack([self._panorama(pose, config) for pose in poses])
+
+    def _panorama(self, pose: np.ndarray, config: PanoramaConfig) -> np.ndarray:
+        h, w = config.height, config.width
+        sense = -1 if config.clockwise else 1
+        azimuth = sense * (np.arange(w) + 0.5 - w / 2) * 2 * np.pi / w
+        elevation = np.linspace(0.6, -0.6, h)
+        offset = self.places - pose[:2]
+        reach = np.hypot(*offset.T)
+        bearing = np.arctan2(offset[:, 1], offset[:, 0]) - pose[2]
+        sideways = np.angle(np.exp(1j * (azimuth - bearing[:, None])))
+        upward = elevation - np.arctan2(self.heights, reach)[:, None]
+        size = (np.arctan2(self.radii, reach) ** 2 * 2)[:, None]
+        blobs = np.einsum(
+            'nh,nw,nc->hwc',
+            np.exp(-(upward**2) / size),
+            np.exp(-(sideways**2) / size),
+            self.colors,
+        )
+        return np.clip(128 + blobs, 0, 255).round().astype(np.uint8)
+
+
+_QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+
+def panorama_config(size: tuple[int, int] = SIZE, clockwise: bool = True) -> PanoramaConfig:
+    return replace(PanoramaConfig(), height=size[0], width=size[1], clockwise=clockwise)
+
+
+def wander(count: int, seed: int, hz: float = 10.0) -> Odometry:
+    """A wandering drive of exact odometry that stays near the origin."""
+    rng = np.random.default_rng(seed)
+    stamps = 10**9 + np.arange(count) * int(1e9 / hz)
+    twists = np.stack([np.full(count, 0.8), np.zeros(count)], 1)
+    pose, poses = np.zeros(3), []
+    omega = 0.0
+    for at in range(count):
+        poses.append(pose)
+        home = np.angle(np.exp(1j * (np.arctan2(-pose[1], -pose[0]) - pose[2])))
+        pull = home if np.hypot(*pose[:2]) > 1.4 else 0.0
+        omega += 0.1 * (rng.normal(0, 3) + 2.0 * pull - omega)
+        twists[at, 1] = np.clip(omega, -2.0, 2.0)
+        pose = integrate(np.array([0, int(1e9 / hz)]), twists[[at, at]], pose)[1]
+    return Odometry(stamps, np.array(poses), twists, np.tile([1e-4, 1e-4], (count, 1)))
+
+
+def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str = 'run') -> Run:
+    """A run whose pictures show the world from the odometry's poses."""
+    images = world.panoramas(odometry.poses, config)
+    return Run(name, PanoramaArray(odometry.stamps_ns, images), odometry)
+
+
+def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> Drive:
+    """Panoramas of a short drive, all neighbors."""
+    run = run_in(Spheres.about(seed), wander(count, seed), panorama_config(size))
+    return Drive(run.panoramas, np.ones(count - 1, np.float32))

@@ -1,0 +1,175 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics of the full rotation against brute force over explicitly rotated pictures."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfa_localization.rotation import (
+    Field,
+    FieldStatistics,
+    SampleStatistics,
+    shifted,
+    strips,
+    unfold,
+)
+from sfa_localization.sfa import Statistics
+
+FIELDS = (
+    Field(2, 3, 1),
+    Field(2, 3, 2, spacing=2),
+    Field(1, 4, 1, spacing=3),
+    Field(3, 8, 1),
+    Field(1, 1, 1),
+)
+
+
+def maps(seed: int, count: int, rows: int = 5, columns: int = 12, channels: int = 3) -> np.ndarray:
+    """Maps with a mean, changing slowly from picture to picture."""
+    rng = np.random.default_rng(seed)
+    drift = rng.normal(size=(count, rows, columns, channels)).cumsum(0)
+    return (0.5 + drift).astype(np.float32)
+
+
+def sequence(of: np.ndarray) -> np.ndarray:
+    """The training sequence: map 0 at all rotations, then map 1, ...; (T * R, ...)."""
+    turns = range(of.shape[2])
+    return np.concatenate([[np.roll(m, -turn, axis=1) for turn in turns] for m in of])
+
+
+def views(of: np.ndarray, field: Field) -> np.ndarray:
+    """What each node sees, cut out pixel by pixel in float64: (T, rows_out, R, D)."""
+    t, rows, columns, _ = of.shape
+    seen = []
+    for top in range(0, rows - field.rows + 1, field.row_stride):
+        for c in range(columns):
+            at = [(c + i * field.spacing) % columns for i in range(field.columns)]
+            cut = of[:, top : top + field.rows][:, :, at].astype(np.float64)
+            seen.append(cut.transpose(0, 2, 1, 3).reshape(t, -1))
+    return np.stack(seen, 1).reshape(t, -1, columns, seen[0].shape[-1])
+
+
+def brute_force(signals: np.ndarray, rotations: int, scale: np.ndarray) -> Statistics:
+    """Sums over nodes of an explicit sequence (T * R, rows, nodes, D), divided by R."""
+    d = signals.shape[-1]
+    per_node = signals.reshape(len(signals), -1, d)
+    weight = np.ones(len(signals) - 1)
+    weight[rotations - 1 :: rotations] = scale
+    difference = np.diff(per_node, axis=0) * weight[:, None, None]
+    samples, steps = per_node.reshape(-1, d), difference.reshape(-1, d)
+    counted = float((weight > 0).sum()) * per_node.shape[1]
+    sums = (samples.T @ samples, steps.T @ steps)
+    return Statistics(
+        len(samples) / rotations,
+        samples.sum(0) / rotations,
+        sums[0] / rotations,
+        counted / rotations,
+        sums[1] / rotations,
+    )
+
+
+def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) -> None:
+    assert ours.weight == pytest.approx(theirs.weight, rel=1e-12)
+    assert ours.steps == pytest.approx(theirs.steps, rel=1e-12)
+    for name in ('total', 'second', 'difference'):
+        a, b = getattr(ours, name), getattr(theirs, name)
+        assert np.abs(a - b).max() < tolerance * np.abs(b).max(), name
+
+
+def field_statistics(of, field, scale, batch=1000):
+    sums = FieldStatistics(field, of.shape[2], field.rows * of.shape[3])
+    feed(sums, of, scale, batch)
+    return sums.result()
+
+
+def sample_statistics(of, scale, batch=1000):
+    sums = SampleStatistics(of.shape[2], of.shape[-1])
+    for lead, start, stop in cuts(len(of), batch):
+        sums.add(of[lead:stop].transpose(3, 0, 1, 2).copy(), stop - start, scale[lead : stop - 1])
+    return sums.result()
+
+
+def feed(sums, of, scale, batch):
+    for lead, start, stop in cuts(len(of), batch):
+        sums.add(of[lead:stop], stop - start, scale[lead : stop - 1])
+
+
+def cuts(count: int, batch: int):
+    for start in range(0, count, batch):
+        yield max(start - 1, 0), start, min(start + batch, count)
+
+
+@pytest.mark.parametrize('field', FIELDS)
+@pytest.mark.parametrize('scale', ['paper', 'uneven', 'broken'])
+def test_fields_equal_brute_force(field, scale):
+    of, scales = maps(1, 6), scale_of(scale)
+    explicit = views(sequence(of), field)
+    assert_equal(field_statistics(of, field, scales), brute_force(explicit, 12, scales))
+
+
+@pytest.mark.parametrize('scale', ['paper', 'uneven', 'broken'])
+def test_samples_equal_brute_force(scale):
+    of, scales = maps(2, 6), scale_of(scale)
+    explicit = sequence(of).astype(np.float64)
+    assert_equal(sample_statistics(of, scales), brute_force(explicit, 12, scales))
+
+
+def scale_of(kind: str) -> np.ndarray:
+    scales = {'paper': [1] * 5, 'uneven': [1, 0.5, 2, 1.7, 0.3], 'broken': [1, 0, 1, 0, 0.5]}
+    return np.array(scales[kind], np.float32)
+
+
+def test_paper_sized_field_equals_brute_force():
+    """60 rotations, fields of 14 columns."""
+    of, field, scale = maps(3, 2, 3, 60, 4), Field(2, 14, 1), np.ones(1, np.float32)
+    assert_equal(
+        field_statistics(of, field, scale), brute_force(views(sequence(of), field), 60, scale)
+    )
+
+
+@given(batch=st.integers(1, 9), broken=st.integers(0, 7), seed=st.integers(0, 50))
+@settings(max_examples=25, deadline=None)
+def test_batches_equal_the_whole(batch, broken, seed):
+    of, field = maps(seed, 9), Field(2, 3, 1, spacing=2)
+    scale = np.ones(8, np.float32)
+    scale[broken] = 0
+    assert_equal(field_statistics(of, field, scale, batch), field_statistics(of, field, scale))
+    assert_equal(sample_statistics(of, scale, batch), sample_statistics(of, scale))
+
+
+def test_a_break_equals_two_drives():
+    of, field = maps(4, 9), FIELDS[0]
+    broken = np.array([1, 1, 1, 0, 1, 1, 1, 1], np.float32)
+    halves = [
+        field_statistics(part, field, np.ones(len(part) - 1, np.float32))
+        for part in (of[:4], of[4:])
+    ]
+    assert_equal(field_statistics(of, field, broken), halves[0] + halves[1])
+
+
+def test_a_single_picture_turns_but_does_not_move():
+    of, field = maps(5, 1), FIELDS[0]
+    none = np.zeros(0, np.float32)
+    explicit = brute_force(views(sequence(of), field), 12, none)
+    assert_equal(field_statistics(of, field, none), explicit)
+    assert_equal(sample_statistics(of, none), brute_force(sequence(of), 12, none))
+
+
+@pytest.mark.parametrize('field', FIELDS)
+def test_unfold_shows_what_nodes_see(field):
+    of = maps(6, 3)
+    assert np.array_equal(unfold(of, field), views(of, field).astype(np.float32))
+
+
+def test_turning_shifts_the_views():
+    of, field = maps(7, 2), FIELDS[1]
+    turned = unfold(np.roll(of, -5, axis=2), field)
+    assert np.array_equal(turned, np.roll(unfold(of, field), -5, axis=2))
+
+
+def test_strips_and_shifts_by_hand():
+    of = np.arange(12, dtype=np.float32).reshape(1, 3, 4, 1)
+    assert strips(of, Field(2, 1, 1))[0, 1].tolist() == [[4, 8], [5, 9], [6, 10], [7, 11]]
+    assert shifted(of, [1, -1])[0, 0].tolist() == [[1, 3], [2, 0], [3, 1], [0, 2]]
