@@ -1,0 +1,197 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The network: its geometry, what it refuses, and that its maps turn with the robot."""
+
+import cv2
+import numpy as np
+import pytest
+from cylinder_worlds import ARCHITECTURE, LAYERS, SIZE
+from test_rotation import views
+
+from sfa_localization.errors import ConfigError, ModelError
+from sfa_localization.network import (
+    NORMALIZATIONS,
+    Architecture,
+    Layer,
+    Network,
+    Node,
+    expand,
+    linear_stage,
+    prepare,
+)
+from sfa_localization.network import LAYERS as STANDARD
+
+
+def random_network(architecture: Architecture, seed: int = 0) -> Network:
+    """Weights at random: the network's algebra does not care."""
+    rng = np.random.default_rng(seed)
+    nodes, channels = [], prepare(pictures(architecture.size, 1), architecture).shape[-1]
+    for layer, receptive in zip(architecture.layers, architecture.fields, strict=True):
+        inputs = receptive.columns * receptive.rows * channels
+        shapes = ((inputs, layer.linear), (layer.linear,))
+        shapes += ((layer.expanded, layer.outputs), (layer.outputs,))
+        scales = (inputs**-0.5, 0.1, layer.expanded**-0.5, 0.1)
+        parts = (rng.normal(0, s, shape) for s, shape in zip(scales, shapes, strict=True))
+        nodes.append(Node(*(part.astype(np.float32) for part in parts)))
+        channels = layer.outputs
+    return Network(architecture, tuple(nodes))
+
+
+def pictures(size: tuple[int, int], count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, *size, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ('name', 'size', 'rotations', 'rows'),
+    [('600x60', (60, 600), 60, [30, 6, 4, 1]), ('320x40', (40, 320), 64, [40, 9, 2, 1])],
+)
+def test_standard_layers(name, size, rotations, rows):
+    binning, layers = STANDARD[name]
+    architecture = Architecture(size, binning, 'panorama', layers)
+    assert (architecture.rotations, architecture.map_rows) == (rotations, rows)
+    made = random_network(architecture).maps(pictures(size, 2))
+    assert [m.shape for m in made] == [
+        (2, row, rotations, layer.outputs) for row, layer in zip(rows[1:], layers, strict=True)
+    ]
+
+
+@pytest.mark.parametrize('normalization', NORMALIZATIONS)
+@pytest.mark.parametrize('name', STANDARD)
+def test_maps_turn_with_the_robot(name, normalization):
+    binning, layers = STANDARD[name]
+    width, height = map(int, name.split('x'))
+    architecture = Architecture((height, width), binning, normalization, layers)
+    network, images = random_network(architecture), pictures((height, width), 2)
+    step = binning * layers[0].stride[1]
+    turned = network.maps(np.roll(images, 7 * step, axis=2))
+    for one, other in zip(network.maps(images), turned, strict=True):
+        assert np.allclose(np.roll(one, 7, axis=2), other, atol=1e-5)
+    slow = [network.slow_features(p) for p in (images, np.roll(images, 7 * step, axis=2))]
+    assert np.allclose(*slow, atol=1e-5)
+
+
+def test_maps_by_definition():
+    """Each layer is clip(expand(field @ linear - offset) @ slow - offset), node by node."""
+    network, images = random_network(ARCHITECTURE), pictures(SIZE, 3)
+    below = prepare(images, ARCHITECTURE)
+    for depth, (node, made) in enumerate(zip(network.nodes, network.maps(images), strict=True)):
+        seen = views(below, ARCHITECTURE.fields[depth])
+        z = seen @ node.linear - node.linear_offset
+        i, j = np.triu_indices(z.shape[-1])
+        s = np.concatenate([z, z[..., i] * z[..., j]], -1) @ node.slow - node.slow_offset
+        assert np.allclose(made, np.clip(s, -4, 4), atol=1e-5)
+        below = made
+
+
+def test_one_by_one_equals_all_together():
+    network, images = random_network(ARCHITECTURE), pictures(SIZE, 4)
+    together = network.maps(images)
+    for t in range(4):
+        for one, all_ in zip(network.maps(images[t : t + 1]), together, strict=True):
+            assert np.allclose(one[0], all_[t], atol=1e-6)
+
+
+def test_results_stay_when_the_network_is_used_again():
+    network, images = random_network(ARCHITECTURE), pictures(SIZE, 2)
+    first = network.maps(images[:1])
+    kept = [m.copy() for m in first]
+    network.maps(images[1:])
+    assert all(np.array_equal(a, b) for a, b in zip(first, kept, strict=True))
+
+
+def test_outputs_are_clipped():
+    layer = Layer((4, 8), (4, 4), 6, 5, clip=0.01)
+    network = random_network(Architecture(SIZE, 1, 'none', (layer,)))
+    assert np.abs(network.maps(pictures(SIZE, 1))[0]).max() == pytest.approx(0.01)
+
+
+def test_expansion_by_hand():
+    z = np.array([[1.0, 2.0], [3.0, 4.0]], np.float32)
+    assert expand(z).tolist() == [[1, 2], [3, 4], [1, 4], [3, 8], [9, 16]]
+    assert len(expand(np.zeros((7, 1), np.float32))) == Layer((1, 1), (1, 1), 7, 1).expanded
+
+
+@pytest.mark.parametrize('depth', range(3))
+def test_linear_stage_is_the_product_of_whole_fields(depth):
+    receptive = ARCHITECTURE.fields[depth]
+    rng = np.random.default_rng(depth)
+    maps = rng.normal(size=(2, ARCHITECTURE.map_rows[depth], 12, 3)).astype(np.float32)
+    inputs = receptive.columns * receptive.rows * 3
+    weights = rng.normal(size=(inputs, 6)).astype(np.float32)
+    offset = rng.normal(size=6).astype(np.float32)
+    expected = views(maps, receptive) @ weights - offset
+    got = linear_stage(maps, receptive, weights, offset).transpose(1, 2, 3, 0)
+    assert np.allclose(got, expected, atol=1e-4)
+
+
+class TestPreparing:
+    """Binning and normalization."""
+
+    def architecture(self, normalization: str, binning: int = 1) -> Architecture:
+        layer = Layer((12 // binning, 8), (1, 4), 6, 5)
+        return Architecture(SIZE, binning, normalization, (layer,))
+
+    def test_binning_averages_squares(self):
+        images = pictures(SIZE, 1)
+        binned = prepare(images, self.architecture('none', 2)).reshape(6, 24, 3)
+        mean = images[0].reshape(6, 2, 24, 2, 3).mean((1, 3))
+        assert np.abs((binned + 1) * 128 - mean).max() <= 0.51
+
+    @pytest.mark.parametrize('gain', [0.8, 0.5])
+    def test_gain_does_not_matter(self, gain):
+        bright = cv2.GaussianBlur(pictures(SIZE, 1)[0], (0, 0), 2)[None]
+        dark = (bright * gain).round().astype(np.uint8)
+        for normalization, tolerance in (('panorama', 0.1), ('brightness', 0.1), ('log', 0.2)):
+            a, b = (prepare(i, self.architecture(normalization)) for i in (bright, dark))
+            assert np.abs(a - b).max() < tolerance * np.abs(a).max(), normalization
+        a, b = (prepare(i, self.architecture('none')) for i in (bright, dark))
+        assert np.abs(a - b).max() > 0.1
+
+    def test_each_channel_has_zero_mean_and_unit_scale(self):
+        maps = prepare(pictures(SIZE, 2), self.architecture('panorama')).reshape(2, -1, 3)
+        assert np.allclose(maps.mean(1), 0, atol=1e-5)
+        assert np.allclose(maps.std(1), 1, atol=1e-5)
+
+    def test_a_black_picture_is_finite(self):
+        for normalization in NORMALIZATIONS:
+            maps = prepare(np.zeros((1, *SIZE, 3), np.uint8), self.architecture(normalization))
+            assert np.isfinite(maps).all()
+
+    def test_grey_has_one_channel(self):
+        image = np.zeros((1, *SIZE, 3), np.uint8)
+        image[..., 1] = 128
+        maps = prepare(image, self.architecture('grey'))
+        assert maps.shape == (1, 12, 12, 4)
+        assert np.allclose(maps, 0.587 - 1, atol=1e-6)
+
+    def test_another_size_is_refused(self):
+        with pytest.raises(ModelError, match=r'48 x 12 pixels, got 50 x 12.*omnicam'):
+            prepare(np.zeros((1, 12, 50, 3), np.uint8), ARCHITECTURE)
+
+
+@pytest.mark.parametrize(
+    ('size', 'binning', 'told'),
+    [
+        ((60, 601), 2, 'use 600 x 60'),
+        ((61, 600), 2, r'use 600 x (60|62)'),
+        ((60, 604), 2, 'use a width of 600 or 610'),
+        ((62, 600), 2, r'layer 1: fields of 10 rows, stride 4, do not fill 31 rows: use 30 or 34'),
+        ((52, 600), 2, r'layer 3'),
+        ((10, 600), 2, r'do not fill 5 rows: use 10 or 14'),
+        ((60, 100), 2, 'wider than the 10 columns'),
+    ],
+)
+def test_odd_sizes_are_refused_with_those_that_fit(size, binning, told):
+    with pytest.raises(ConfigError, match=told):
+        Architecture(size, binning, 'panorama', STANDARD['600x60'][1])
+
+
+def test_the_sizes_told_fit():
+    layers = STANDARD['600x60'][1]
+    for size in ((60, 600), (60, 610)):
+        Architecture(size, 2, 'panorama', layers)
+
+
+def test_fields_hold_whole_strides():
+    with pytest.raises(ConfigError, match='no multiple of the stride 4: use 8 or 12'):
+        Architecture(SIZE, 1, 'none', (Layer((4, 10), (4, 4), 6, 5), *LAYERS[1:]))
