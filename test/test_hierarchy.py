@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cylinder_worlds import ARCHITECTURE, SIZE, drive
-from test_rotation import assert_equal, brute_force, sequence, views
+from test_rotation import assert_equal, brute_force, views
 
 from sfa_localization import hierarchy
 from sfa_localization.config import NetworkConfig

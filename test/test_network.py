@@ -9,6 +9,7 @@ from cylinder_worlds import ARCHITECTURE, LAYERS, SIZE
 from test_rotation import views
 
 from sfa_localization.errors import ConfigError, ModelError
+from sfa_localization.network import LAYERS as STANDARD
 from sfa_localization.network import (
     NORMALIZATIONS,
     Architecture,
@@ -19,7 +20,6 @@ from sfa_localization.network import (
     linear_stage,
     prepare,
 )
-from sfa_localization.network import LAYERS as STANDARD
 
 
 def random_network(architecture: Architecture, seed: int = 0) -> Network:
