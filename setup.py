@@ -23,6 +23,7 @@ COMMANDS = (
     'demo',
 )
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+BAGS = ('bags', 'bags/sample', 'bags/sample_test')
 
 setup(
     name=NAME,
@@ -40,7 +41,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', glob('config/*.*')),
-        (f'share/{NAME}/bags', glob('bags/*.*')),
+        *((f'share/{NAME}/{folder}', glob(f'{folder}/*.*')) for folder in BAGS),
     ],
     zip_safe=False,
     python_requires='>=3.10',

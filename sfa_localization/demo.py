@@ -77,15 +77,15 @@ def _prepare(out: Path, config: DemoConfig) -> None:
     """Make the folder, or clear what a demonstration with other settings left in it."""
     settings = json.dumps({'version': __version__, 'world': config.world, 'seed': config.seed})
     marker = out / MARKER
-    if out.exists() and any(out.iterdir()) and not marker.exists():
-        raise LocalizationError(f'{out}: not a folder of the demo: name another one with --out')
     try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()) and not marker.exists():
+            raise LocalizationError(f'{out}: not a folder of the demo: name another one with --out')
         if marker.exists() and marker.read_text(encoding='utf-8') != settings:
             for name in ('coverage', 'test', 'logs', 'report'):
                 shutil.rmtree(out / name, ignore_errors=True)
         for name in ('model.npz', 'results.json'):
             (out / name).unlink(missing_ok=True)
-        out.mkdir(parents=True, exist_ok=True)
         marker.write_text(settings, encoding='utf-8')
     except OSError as error:
         raise LocalizationError(f'{out}: cannot be written: {error.strerror}') from None

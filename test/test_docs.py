@@ -25,10 +25,11 @@ import yaml
 from sfa_localization import cli, config
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md')])
+DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md')])
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 COMMANDS = {command.name: command for command in cli.COMMANDS}
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
+INLINE = re.compile(r'`([a-z_]+ [^`]+)`')
 LINK = re.compile(r'\]\(([^)#\s]+)\)')
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
 # Programs of others, whose arguments are theirs to check.
@@ -40,11 +41,17 @@ def commands() -> list:
     """Return every command line in the documents as words."""
     found = []
     for path in DOCUMENTS:
-        for block in BLOCK.findall(path.read_text('utf-8')):
-            for line in block.replace('\\\n', ' ').splitlines():
-                words = shlex.split(line, comments=True)
-                if words:
-                    found.append(pytest.param(words, id=f'{path.name}: {line}'))
+        text = path.read_text('utf-8')
+        lines = [
+            line
+            for block in BLOCK.findall(text)
+            for line in block.replace('\\\n', ' ').splitlines()
+        ]
+        lines += [code for code in INLINE.findall(text) if code.split()[0] in {*COMMANDS, 'make'}]
+        for line in lines:
+            words = shlex.split(line, comments=True)
+            if words:
+                found.append(pytest.param(words, id=f'{path.name}: {line.strip()}'))
     return found
 
 
@@ -95,7 +102,7 @@ def launch_arguments(path: Path) -> set[str]:
 
 
 def check_arguments(command: cli.Command, words: list[str]) -> None:
-    if words == ['...']:
+    if words in (['...'], ['--help']):
         return
     parser = argparse.ArgumentParser(prog=command.name)
     command.configure(parser)
@@ -131,7 +138,7 @@ def topics() -> set[str]:
     return {text.lstrip('/') for text in strings if re.fullmatch(r'/?[a-z_]+(/[a-z_]+)*', text)}
 
 
-@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_somewhere(path):
     for target in LINK.findall(path.read_text('utf-8')):
         assert target.startswith('https://') or (path.parent / target).exists(), target

@@ -1,0 +1,123 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The README's commands, run in its order: from a recording to the three live nodes.
+
+They are taken from the text, and run as they stand; only the replay is faster than real time.
+"""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfa_localization.bag_reader import Bag
+from sfa_localization.config import DemoConfig
+from sfa_localization.geometry import align
+from sfa_localization.place_model import PlaceModel
+
+ROOT = Path(__file__).parents[1]
+BLOCK = re.compile(r'<!-- run: (\w+) -->\s*```(\w+)\n(.*?)```', re.DOTALL)
+NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+# The demo's drive, in the garden of the sample; the sample's panoramas are of half the size.
+DRIVE = 'simulate demo/test --trajectory test --seed 2 --area 10x10 --length 40 --compressed'
+LIVE_EXTRA = {'omnicam_node': '-p width:=300 -p height:=30', 'play': '--rate 3'}
+pytestmark = pytest.mark.slow
+
+
+def blocks(kind: str, language: str) -> list[str]:
+    text = (ROOT / 'README.md').read_text('utf-8')
+    return [code for k, lang, code in BLOCK.findall(text) if (k, lang) == (kind, language)]
+
+
+def commands(kind: str) -> list[list[str]]:
+    lines = '\n'.join(blocks(kind, 'bash')).splitlines()
+    return [shlex.split(line) for line in lines if line.strip()]
+
+
+def program(words: list[str]) -> list[str]:
+    """Return what the shell would run, with this interpreter and without an installed package."""
+    return [sys.executable, '-m', 'sfa_localization', *words]
+
+
+def complete(words: list[str], folder: Path) -> None:
+    """Run a command to its end, in a folder."""
+    done = subprocess.run(
+        program(words),
+        cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, f'{shlex.join(words)}\n{done.stdout}{done.stderr}'
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory) -> Path:
+    """A folder like a clone, in which all commands that need no ROS were run, in order."""
+    folder = tmp_path_factory.mktemp('newcomer')
+    (folder / 'bags').symlink_to(ROOT / 'bags')
+    for words in commands('offline'):
+        complete(words, folder)
+    return folder
+
+
+def test_commands_are_found_in_the_text():
+    assert [words[0] for words in commands('offline')] == ['inspect', 'train', 'evaluate']
+    assert [words[0] for words in commands('live')] == [*NODES, 'play']
+
+
+def test_results_beat_odometry_and_the_mean_position(folder):
+    results = json.loads((folder / 'results.json').read_text())
+    errors = {name: results[name]['mean'] for name in ('odometry', 'sfa', 'ekf')}
+    with Bag(ROOT / 'bags/sample_test') as bag:
+        positions = bag.trajectory().poses[:, :2]
+    mean_position = np.hypot(*(positions - positions.mean(0)).T).mean()
+    assert errors['ekf'] < errors['odometry']
+    assert errors['ekf'] < errors['sfa'] < 0.3 * mean_position
+
+
+def test_report_holds_its_pictures(folder):
+    names = {path.name for path in (folder / 'report').iterdir()}
+    assert {'trajectories.png', 'errors.png', 'firing_maps.png', 'report.md'} <= names
+
+
+@pytest.mark.ros
+def test_nodes_run_as_told(folder, monkeypatch):
+    pytest.importorskip('rclpy')
+    from sfa_localization import demo_nodes
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv('PYTHONPATH', str(ROOT))
+    complete(shlex.split(DRIVE), folder)
+    os.link(folder / 'model.npz', folder / 'demo/model.npz')
+    programs = {
+        words[0]: program([*words, *shlex.split(LIVE_EXTRA.get(words[0], ''))])
+        for words in commands('live')
+    }
+    live = demo_nodes.run_live(programs, folder / 'logs', DemoConfig())
+    with Bag(folder / 'demo/test') as bag:
+        truth, pictures = bag.trajectory(), len(list(bag.images()))
+    assert len(live['sfa']) > 0.8 * pictures
+    for name, estimate in live.items():
+        true = truth.at(estimate.stamps_ns)[:, :2]
+        aligned = align(estimate.poses[:, :2], true).apply(estimate.poses[:, :2])
+        assert np.hypot(*(aligned - true).T).mean() < 0.5, name
+
+
+def test_library_example_runs(folder, monkeypatch, capsys):
+    import cv2
+
+    (code,) = blocks('library', 'python')
+    model = PlaceModel.load(folder / 'model.npz')
+    size = model.panorama
+    picture = np.full((size.height, size.width, 3), 127, np.uint8)
+    cv2.imwrite(str(folder / 'panorama.png'), picture)
+    monkeypatch.chdir(folder)
+    exec(compile(code, 'README.md', 'exec'), {})
+    assert len(capsys.readouterr().out.split()) > 4
