@@ -53,6 +53,7 @@ setup(
         'filterpy>=1.4.5',
         'rosbags>=0.10',
         'PyYAML>=5.4',
+        'threadpoolctl>=3.1',
         'tqdm>=4.60',
         'matplotlib>=3.6',
     ],

@@ -57,6 +57,7 @@ from sfa_localization.rotation import Map
 from sfa_localization.run import Run
 from sfa_localization.segments import Segments, assignment, cut, join
 from sfa_localization.sfa import Solution
+from sfa_localization.threads import one_core
 
 logger = logging.getLogger(__name__)
 
@@ -123,7 +124,8 @@ def train(
         if not resume:
             checkpoint.remove()
         network = _train_network(architecture, runs, recipe, checkpoint, start, executor, progress)
-        trained = learn_place(network, runs, recipe, progress)
+        with one_core():
+            trained = learn_place(network, runs, recipe, progress)
         trained.model.save(output)
         checkpoint.remove()
     return trained

@@ -62,6 +62,7 @@ ROOMS: dict[str, set[str]] = {
     'demo': {'numpy', 'tqdm'} | ROS,
     'nodes': {'numpy', 'yaml'} | ROS,
     'distributed': {'numpy', 'dask', 'distributed'},
+    'threads': {'threadpoolctl'},
     'training': {'numpy', 'tqdm'},
     '': {'numpy', 'scipy', 'cv2', 'yaml', 'tqdm'},
 }

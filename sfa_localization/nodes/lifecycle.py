@@ -26,6 +26,7 @@ from sfa_localization.config import NodeConfig, Settings
 from sfa_localization.errors import LocalizationError
 from sfa_localization.nodes import parameters
 from sfa_localization.nodes.monitor import Monitor
+from sfa_localization.threads import one_core
 
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -249,7 +250,8 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
         node = make()
         if not node.start():
             return 1
-        _spin(node)
+        with one_core():
+            _spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     except LocalizationError as error:

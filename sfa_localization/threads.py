@@ -1,0 +1,23 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How many cores matrix products may take: one, where the products are small.
+
+Several threads gain nothing there, and on a busy robot they wait for each other many times over.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+
+
+def one_core() -> AbstractContextManager[object]:
+    """Keep linear algebra on the calling core inside the block.
+
+    Does nothing where threadpoolctl is not installed: it makes things faster, never different.
+    """
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        return nullcontext()
+    limits: AbstractContextManager[object] = threadpool_limits(limits=1)
+    return limits
