@@ -194,7 +194,7 @@ def _under(arrays: Arrays, prefix: str) -> Arrays:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write an .npz file under a temporary name, then rename it. Raises ModelError."""
+    """Write named arrays (N, ...) as .npz: a temporary name, then a rename. ModelError."""
     path = Path(path)
     plain: dict[str, Any] = dict(arrays)
     try:

@@ -37,7 +37,7 @@ def write_training_report(folder: Path, trained: Trained) -> None:
 
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
-    """Draw where the pictures were taken, colored by the left-out error of the map there."""
+    """Draw where pictures were taken, (M, 2) m, colored by the left-out error of the map."""
     figure, axes = _figure()
     error = np.hypot(*trained.metric.left_out.T)
     dots = axes.scatter(*places.T, c=error, s=9, cmap='viridis', vmax=np.quantile(error, 0.98))
@@ -47,7 +47,7 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
 
 
 def line_fits_figure(path: Path, trained: Trained, places: Array) -> None:
-    """Draw every segment where odometry and where the slow features put it."""
+    """Draw every segment where odometry (places (M, 2) m) and the slow features put it."""
     figure, axes = _figure()
     seen = places - trained.metric.residuals
     start = 0
@@ -81,7 +81,7 @@ def headings_figure(path: Path, trained: Trained) -> None:
 
 
 def convergence_figure(path: Path, history: Array) -> None:
-    """Draw the cost of the paper's descent over its iterations."""
+    """Draw the cost (I,) of the paper's descent over its iterations."""
     figure, axes = _figure()
     axes.loglog(np.arange(1, len(history) + 1), history)
     axes.set(xlabel='iteration', ylabel='cost (m²)', title='Momentum descent (equations 7, 8)')

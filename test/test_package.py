@@ -63,6 +63,7 @@ ROOMS: dict[str, set[str]] = {
     'nodes': {'numpy', 'yaml'} | ROS,
     'distributed': {'numpy', 'dask', 'distributed'},
     'threads': {'threadpoolctl'},
+    'training_report': {'numpy', 'matplotlib'},
     'training': {'numpy', 'tqdm'},
     '': {'numpy', 'scipy', 'cv2', 'yaml', 'tqdm'},
 }
