@@ -922,7 +922,7 @@ class NetworkConfig(Settings):
     layers: str = setting(
         'auto',
         'sizes of the layers: by the size of the panorama, a standard set, or the arrays below',
-        choices=('auto', '600x60', '320x40', 'custom'),
+        choices=('auto', '600x60', '300x30', '320x40', 'custom'),
     )
     normalization: str = setting(
         'panorama',

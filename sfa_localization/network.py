@@ -154,7 +154,11 @@ SMALL_LAYERS = (
 )
 
 # Name -> (binning, layers).
-LAYERS = {'600x60': (2, PAPER_LAYERS), '320x40': (1, SMALL_LAYERS)}
+LAYERS = {
+    '600x60': (2, PAPER_LAYERS),
+    '300x30': (1, PAPER_LAYERS),
+    '320x40': (1, SMALL_LAYERS),
+}
 
 
 @dataclass(frozen=True, slots=True)
