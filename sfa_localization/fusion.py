@@ -9,8 +9,6 @@ known pose and the recovery of a displaced robot stand around it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ from sfa_localization.config import FilterConfig
 from sfa_localization.gate import Evidence, Fit, consistent, relocate, remember
 from sfa_localization.geometry import Array
 from sfa_localization.motion import ERROR, SCALE, SIZE, YAW, State, Step, V
+from sfa_localization.readings import lower_root, symmetric
 
 DISTRUST_AFTER = 3
 """Pictures refused in a row from which on the estimate is in doubt."""
@@ -32,10 +31,10 @@ _CERTAIN = 1e-7
 _LASTING = 4
 _AFTER_OUTAGE = 1.4
 _NO_DOUBT = (0.0, 0.0, 0.0)
+_OBSERVE = np.eye(3, SIZE)
 
 
-@dataclass(frozen=True, slots=True)
-class Update:
+class Update(NamedTuple):
     """What became of one measurement.
 
     `d2` is the squared Mahalanobis distance of the whole innovation, with `threshold` its gate;
@@ -70,17 +69,20 @@ class PoseEvent(NamedTuple):
 
 
 class MeasurementEvent(NamedTuple):
+    """`jacobian` (2 or 3, 10) of the measurement and its `white` noise follow from covariance."""
+
     stamp_ns: int
     value: Array
     covariance: Array
     novelty: float
+    jacobian: Array
+    white: Array
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent
 
 
-@dataclass(frozen=True, slots=True)
-class Memory:
+class Memory(NamedTuple):
     """What the gate remembers: accepted pictures, refused ones in a row, and what they said."""
 
     support: int = 0
@@ -118,8 +120,8 @@ class Belief(NamedTuple):
             return None
         doubt = self.memory.doubt
         if doubt is _NO_DOUBT:
-            return State(self.stamp_ns, self.mean, self.covariance)
-        told = self.covariance.copy()
+            return State(self.stamp_ns, self.mean, symmetric(self.covariance))
+        told = symmetric(self.covariance)
         for i, variance in enumerate(doubt):
             told[i, i] += variance
         return State(self.stamp_ns, self.mean, told)
@@ -137,7 +139,7 @@ class _Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x, self.P, self._next = mean, covariance, step.mean
         self.F, self.Q = step.jacobian, step.noise
         self.predict()
-        return _symmetric(self.P)
+        return np.asarray(self.P)
 
     def predict_x(self, u: object = 0) -> None:
         self.x = self._next
@@ -148,8 +150,8 @@ class _Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         """Mean, covariance (Joseph form) and squared Mahalanobis distance of the innovation."""
         self.x, self.P = mean, covariance
         self.update(z, lambda _: jacobian, lambda x: jacobian @ x, noise, residual=_residual)
-        self.x[YAW] = motion._wrap(float(self.x[YAW]))
-        return self.x, _symmetric(self.P), float(self.y @ self.SI @ self.y)
+        self.x[YAW] = motion.wrap(float(self.x[YAW]))
+        return self.x, symmetric(self.P), float(self.y @ self.SI @ self.y)
 
 
 class Fusion:
@@ -160,6 +162,17 @@ class Fusion:
         self._kalman = _Kalman()
         self._many = _LASTING * config.recovery_pictures
         self._thresholds = {n: float(chi2.ppf(config.gate_probability, n)) for n in (2, 3)}
+
+    def measurement(
+        self, stamp_ns: int, value: Array, covariance: Array, novelty: float
+    ) -> MeasurementEvent:
+        """Split the noise into what neighbouring pictures share and what is each one's own."""
+        size, share = len(value), self.config.correlated_share
+        jacobian = _OBSERVE[:size].copy()
+        jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
+        return MeasurementEvent(
+            stamp_ns, value, covariance, novelty, jacobian, (1 - share) * covariance
+        )
 
     def blank(self, stamp_ns: int) -> Belief:
         covariance = self._prior_covariance(np.eye(3))
@@ -198,10 +211,8 @@ class Fusion:
         if belief.odometry_ns is not None and silence > self.config.odometry_timeout:
             twist = _between(belief.twist, event.twist)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
-        moved = self._moved(
-            belief, event.stamp_ns, lambda mean: motion.drive(mean, twist, dt, self.config)
-        )
-        return moved._replace(twist=event.twist, odometry_ns=event.stamp_ns)
+        step = motion.drive(belief.mean, twist, dt, self.config)
+        return self._moved(belief, event.stamp_ns, step, event)
 
     def coasted(self, belief: Belief, stamp_ns: int) -> Belief:
         """Go on to a stamp without new odometry."""
@@ -213,34 +224,39 @@ class Fusion:
         if belief.odometry_ns is None:
             end = belief.stamp_ns
         if end > belief.stamp_ns:
-            dt, twist = (end - belief.stamp_ns) * 1e-9, belief.twist
-            belief = self._moved(belief, end, lambda mean: motion.coast(mean, twist, dt, config))
+            dt = (end - belief.stamp_ns) * 1e-9
+            step = motion.coast(belief.mean, belief.twist, dt, config)
+            belief = self._moved(belief, end, step)
         if stamp_ns > end:
-            rest, last_twist = (stamp_ns - end) * 1e-9, belief.twist
-            belief = self._moved(
-                belief, stamp_ns, lambda mean: motion.halt(mean, last_twist, rest, config)
-            )
+            rest = (stamp_ns - end) * 1e-9
+            step = motion.halt(belief.mean, belief.twist, rest, config)
+            belief = self._moved(belief, stamp_ns, step)
             belief = belief._replace(covariance=self._capped(belief.covariance))
         return belief
 
-    def _moved(self, belief: Belief, stamp_ns: int, predict: Callable[[Array], Step]) -> Belief:
-        """Predict mean, covariance and the dead-reckoned path."""
-        step = predict(belief.mean)
-        before, after = belief.mean, step.mean
-        dx, dy = float(after[0] - before[0]), float(after[1] - before[1])
-        turn = motion._wrap(float(after[YAW] - before[YAW]))
+    def _moved(
+        self, belief: Belief, stamp_ns: int, step: Step, event: OdometryEvent | None = None
+    ) -> Belief:
+        """Apply a prediction to mean, covariance and path; `event` is the odometry behind it."""
+        before_x, before_y, before_yaw = belief.mean[:3].tolist()
+        after_x, after_y, after_yaw = step.mean[:3].tolist()
+        dx, dy = after_x - before_x, after_y - before_y
         x, y, yaw = belief.reckoned
-        c, s = math.cos(yaw - before[YAW]), math.sin(yaw - before[YAW])
-        way = math.hypot(dx, dy)
+        c, s = math.cos(yaw - before_yaw), math.sin(yaw - before_yaw)
+        turned = motion.wrap(yaw + after_yaw - before_yaw)
         covariance = belief.covariance
         if belief.located:
-            covariance = self._kalman.move(before, covariance, step)
-        return belief._replace(
-            stamp_ns=stamp_ns,
-            mean=after,
-            covariance=covariance,
-            reckoned=(x + c * dx - s * dy, y + s * dx + c * dy, motion._wrap(yaw + turn)),
-            travelled_m=belief.travelled_m + way,
+            covariance = self._kalman.move(belief.mean, covariance, step)
+        return Belief(
+            stamp_ns,
+            step.mean,
+            covariance,
+            belief.located,
+            (x + c * dx - s * dy, y + s * dx + c * dy, turned),
+            belief.travelled_m + math.hypot(dx, dy),
+            event.twist if event else belief.twist,
+            event.stamp_ns if event else belief.odometry_ns,
+            belief.memory,
         )
 
     def _placed(self, belief: Belief, event: PoseEvent) -> Belief:
@@ -248,7 +264,7 @@ class Fusion:
         covariance = self._with_pose(belief, event.covariance, 0.0)
         mean = belief.mean.copy()
         mean[:3], mean[ERROR:] = event.pose, 0.0
-        mean[YAW] = motion._wrap(float(mean[YAW]))
+        mean[YAW] = motion.wrap(float(mean[YAW]))
         memory = Memory(accepted_m=belief.travelled_m)
         return belief._replace(mean=mean, covariance=covariance, located=True, memory=memory)
 
@@ -266,8 +282,7 @@ class Fusion:
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
         if event.novelty > self.config.novelty_limit:
-            memory = replace(
-                belief.memory,
+            memory = belief.memory._replace(
                 novel=belief.memory.novel + 1,
                 update=_refused(event, 'unlike any picture of training'),
             )
@@ -294,7 +309,7 @@ class Fusion:
             return self._followed(belief, event, covariance, evidence)
         if found is None:
             reason = 'heading unknown yet' if event.value.size == 2 else 'too novel to start from'
-            memory = replace(belief.memory, evidence=evidence, update=_refused(event, reason))
+            memory = belief.memory._replace(evidence=evidence, update=_refused(event, reason))
             return belief._replace(memory=memory)
         return self._restarted(belief, event, found, 'started')
 
@@ -315,7 +330,7 @@ class Fusion:
         near = d2 <= threshold
         reason = 'position only: heading unknown' if near else 'outside the gate'
         update = Update(event.stamp_ns, near, d2, threshold, reason)
-        memory = replace(belief.memory, evidence=evidence, update=update)
+        memory = belief.memory._replace(evidence=evidence, update=update)
         if not near:
             return belief._replace(memory=memory)
         gain = own @ np.linalg.inv(total)
@@ -324,8 +339,8 @@ class Fusion:
         posterior[:2, :], posterior[:, :2] = 0.0, 0.0
         rest = np.eye(2) - gain
         posterior[:2, :2] = rest @ own @ rest.T + gain @ covariance[:2, :2] @ gain.T
-        memory = replace(memory, accepted_ns=event.stamp_ns, accepted_m=belief.travelled_m)
-        return belief._replace(mean=mean, covariance=_symmetric(posterior), memory=memory)
+        memory = memory._replace(accepted_ns=event.stamp_ns, accepted_m=belief.travelled_m)
+        return belief._replace(mean=mean, covariance=symmetric(posterior), memory=memory)
 
     def _sure_of_heading(self, fit: Fit) -> bool:
         return bool(fit.covariance[2, 2] < self.config.start_yaw_std**2) and fit.pictures >= 3
@@ -340,7 +355,7 @@ class Fusion:
         pose, spread = found
         mean = belief.mean.copy()
         mean[:3], mean[ERROR:] = pose, 0.0
-        mean[YAW] = motion._wrap(float(mean[YAW]))
+        mean[YAW] = motion.wrap(float(mean[YAW]))
         covariance = self._with_pose(belief, spread, self.config.correlated_share)
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(
@@ -353,15 +368,10 @@ class Fusion:
 
     def _gated(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> Belief:
         """Accept what fits; weigh what does not against what else did not fit."""
-        value, size = event.value, event.value.size
-        jacobian = np.zeros((size, SIZE))
-        jacobian[range(size), range(size)] = 1.0
-        share = self.config.correlated_share
-        jacobian[:, ERROR : ERROR + size] = math.sqrt(share) * np.linalg.cholesky(covariance)
         mean, posterior, d2 = self._kalman.correct(
-            belief.mean, belief.covariance, value, jacobian, (1 - share) * covariance
+            belief.mean, belief.covariance, event.value, event.jacobian, event.white
         )
-        threshold = self._thresholds[size]
+        threshold = self._thresholds[len(event.value)]
         innovation, spread = self._kalman.y, self._kalman.S
         update = Update(event.stamp_ns, True, d2, threshold, 'accepted', innovation, spread)
         if d2 <= threshold and (
@@ -370,7 +380,7 @@ class Fusion:
         ):
             return self._accepted(belief, event, covariance, (mean, posterior), update)
         reason = 'outside the gate' if d2 > threshold else 'not confirmed after an outage yet'
-        refused = replace(update, accepted=False, reason=reason)
+        refused = update._replace(accepted=False, reason=reason)
         return self._doubted(belief, event, covariance, refused)
 
     def _accepted(
@@ -388,7 +398,17 @@ class Fusion:
             evidence=self._remembered(belief, event, covariance, True),
             update=update,
         )
-        return belief._replace(mean=posterior[0], covariance=posterior[1], memory=memory)
+        return Belief(
+            belief.stamp_ns,
+            posterior[0],
+            posterior[1],
+            True,
+            belief.reckoned,
+            belief.travelled_m,
+            belief.twist,
+            belief.odometry_ns,
+            memory,
+        )
 
     def _surprising(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> bool:
         """The gate is wide because the estimate is poor, and the picture would move it far."""
@@ -420,8 +440,7 @@ class Fusion:
             return self._restarted(belief, event, (fit.pose, fit.covariance), 're-initialised')
         outside = update.d2 > update.threshold
         refused = belief.memory.refused + int(outside)
-        memory = replace(
-            belief.memory,
+        memory = belief.memory._replace(
             refused=refused,
             excess=update.d2 / update.threshold,
             outage=self._outage(belief, event),
@@ -454,6 +473,8 @@ class Fusion:
         config, support = self.config, belief.memory.support
         needed = min(config.recovery_pictures, max(2, support + 1))
         if fit.contradicting * 3 > fit.pictures or fit.covariance[2, 2] > config.start_yaw_std**2:
+            return False
+        if fit.dissenting >= fit.pictures:
             return False
         jump = math.hypot(*(fit.pose[:2] - belief.mean[:2]))
         little = jump < config.recovery_jump and support >= config.recovery_pictures
@@ -530,9 +551,5 @@ def _residual(z: Array, predicted: Array) -> Array:
     """Innovation, its angle wrapped."""
     difference = z - predicted
     if len(difference) == 3:
-        difference[2] = motion._wrap(float(difference[2]))
+        difference[2] = motion.wrap(float(difference[2]))
     return difference
-
-
-def _symmetric(matrix: Array) -> Array:
-    return (matrix + matrix.T) * 0.5

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from sfa_localization.config import FilterConfig
 from sfa_localization.geometry import Array, wrap_angle
 
-CAPACITY = 40
-"""Measurements remembered; beyond, the one whose neighbours are nearest is dropped."""
+CAPACITY = 60
+"""Measurements remembered at most; beyond, every other one of the older half is dropped."""
 _REACH = 9.0
 """Squared standard deviations within which two measurements agree."""
 _DRIFT = 0.05
@@ -43,7 +43,8 @@ class Evidence(NamedTuple):
 class Fit(NamedTuple):
     """Where agreeing measurements put the robot now: pose (3,), covariance (3, 3).
 
-    `contradicting` counts those that the filter accepted over the same stretch of way.
+    Over the same stretch of way, `contradicting` counts what the filter accepted, `dissenting`
+    what it refused but does not agree either.
     """
 
     pose: Array
@@ -52,6 +53,7 @@ class Fit(NamedTuple):
     span_m: float
     std_m: float
     contradicting: int
+    dissenting: int
     has_yaw: bool
 
 
@@ -63,13 +65,11 @@ def remember(
     start = 0
     while start < len(evidence) and evidence[start].travelled_m < oldest:
         start += 1
-    kept = (*evidence[start:], item)
+    kept = (*evidence[start:], item) if start else (*evidence, item)
     if len(kept) <= CAPACITY:
         return kept
-    # The last third stays whole: it is what the next decision counts.
-    gaps = [kept[i + 1].travelled_m - kept[i - 1].travelled_m for i in range(1, 2 * CAPACITY // 3)]
-    crowded = 1 + min(range(len(gaps)), key=gaps.__getitem__)
-    return (*kept[:crowded], *kept[crowded + 1 :])
+    # What is recent stays whole: it is what the next decision counts.
+    return kept[: CAPACITY // 2 : 2] + kept[CAPACITY // 2 :]
 
 
 def relocate(evidence: Sequence[Evidence], config: FilterConfig) -> Fit | None:
@@ -89,8 +89,9 @@ def relocate(evidence: Sequence[Evidence], config: FilterConfig) -> Fit | None:
         return None
     fit = table.fit(best, turn, config)
     oldest = evidence[-1].travelled_m - fit.span_m
-    against = sum(item.agreed and item.travelled_m >= oldest for item in evidence)
-    return fit._replace(contradicting=against)
+    recent = [item for item in evidence if item.travelled_m >= oldest]
+    against = sum(item.agreed for item in recent)
+    return fit._replace(contradicting=against, dissenting=len(recent) - against - fit.pictures)
 
 
 def consistent(evidence: Sequence[Evidence], heading_offset: float, yaw_std: float) -> int:
@@ -168,6 +169,7 @@ class _Table:
             span_m=span,
             std_m=math.sqrt(float(self.variance[agree].mean())),
             contradicting=0,
+            dissenting=0,
             has_yaw=bool(knows.any()),
         )
 

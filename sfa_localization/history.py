@@ -31,6 +31,7 @@ class History(Generic[E, B]):
         self._step = step
         self._base = start
         self._horizon_ns = start_ns
+        self._until_forgetting = _SLACK
         self._keys: list[Key] = []
         self._events: list[E] = []
         self._beliefs: list[B] = []
@@ -67,7 +68,9 @@ class History(Generic[E, B]):
             self._keys.append(key)
             self._events.append(event)
             self._beliefs.append(belief)
-            self._forget()
+            self._until_forgetting -= 1
+            if self._until_forgetting <= 0:
+                self._forget()
             return belief
         at = bisect_left(self._keys, key)
         if self._keys[at] == key:
@@ -89,12 +92,10 @@ class History(Generic[E, B]):
         return self._beliefs[at - 1] if at else self._base
 
     def _forget(self) -> None:
-        """Drop what lies beyond the span, some at a time; its last belief is the new base."""
-        oldest = self._keys[-1][0] - self._span_ns
-        if self._keys[0][0] >= oldest or len(self._keys) < _SLACK:
-            return
-        cut = bisect_left(self._keys, (oldest, 0))
-        if cut < _SLACK and self._keys[-1][0] - self._keys[0][0] < 2 * self._span_ns:
+        """Drop what lies beyond the span, now and then; its last belief is the new base."""
+        self._until_forgetting = _SLACK
+        cut = bisect_left(self._keys, (self._keys[-1][0] - self._span_ns, 0))
+        if cut == 0:
             return
         self._base = self._beliefs[cut - 1]
         self._horizon_ns = self._keys[cut - 1][0]

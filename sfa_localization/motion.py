@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,8 +75,7 @@ class State:
         return math.sqrt(max(float(self.covariance[YAW, YAW]), 0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """A prediction: the new mean (10,), its Jacobian (10, 10), the noise it adds (10, 10)."""
 
     mean: Array
@@ -83,8 +83,7 @@ class Step:
     noise: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Twist:
+class Twist(NamedTuple):
     """An odometry reading, with variances: v m/s, omega rad/s."""
 
     v: float
@@ -96,8 +95,7 @@ class Twist:
         return abs(self.v) < config.standstill_speed and abs(self.omega) < config.standstill_rate
 
 
-@dataclass(frozen=True, slots=True)
-class _Arc:
+class _Arc(NamedTuple):
     """A motion over dt at constant v and omega, and its derivatives."""
 
     dx: float
@@ -142,7 +140,7 @@ def drive(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
     moved = abs(v) * dt + config.turn_radius * abs(omega) * dt
     fade = math.exp(-moved / config.decorrelation)
     after = np.array(
-        [x + arc.dx, y + arc.dy, _wrap(yaw + arc.dyaw), v, omega, bias, scale]
+        [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
         + [fade * error for error in errors]
     )
     jacobian = _arc_jacobian(arc, dt, fade)
@@ -173,7 +171,7 @@ def coast(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
         moved = abs(v) * dt + config.turn_radius * abs(omega) * dt
         fade = math.exp(-moved / config.decorrelation)
         after = np.array(
-            [x + arc.dx, y + arc.dy, _wrap(yaw + arc.dyaw), v, omega, bias, scale]
+            [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
             + [fade * error for error in errors]
         )
         jacobian = _arc_jacobian(arc, dt, fade)
@@ -259,6 +257,6 @@ def _add_drift(
         noise[i, i] += 1 - fade * fade
 
 
-def _wrap(angle: float) -> float:
+def wrap(angle: float) -> float:
     """Wrap to [-pi, pi): the scalar form of geometry.wrap_angle, which costs too much here."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -12,6 +12,7 @@ from __future__ import annotations
 import enum
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,6 @@ from sfa_localization.fusion import (
     Belief,
     Event,
     Fusion,
-    MeasurementEvent,
     OdometryEvent,
     PoseEvent,
     Update,
@@ -126,7 +126,7 @@ class PoseFilter:
         self._history.add((stamp_ns, _POSE), PoseEvent(stamp_ns, value, spread))
 
     def add_odometry(
-        self, stamp_ns: int, v: float, omega: float, variances: ArrayLike = (0.0, 0.0)
+        self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)
     ) -> str:
         """Take speed m/s and turn rate rad/s, held since the message before; '' or why not.
 
@@ -161,7 +161,7 @@ class PoseFilter:
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        event = MeasurementEvent(stamp_ns, fused, spread, float(novelty))
+        event = self._fusion.measurement(stamp_ns, fused, spread, float(novelty))
         update = self._history.add((stamp_ns, _MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
@@ -212,8 +212,11 @@ class PoseFilter:
         newest = self._history.newest_ns
         if newest is None:
             return
-        if stamp_ns > newest + self.config.time_jump * 1e9:
-            self._far_ahead(stamp_ns)
+        if stamp_ns > newest:
+            if stamp_ns > newest + self.config.time_jump * 1e9:
+                self._far_ahead(stamp_ns)
+            if rank == _ODOMETRY or self._history.newest.odometry_ns is None:
+                self._backward = 0
         elif not self._history.reaches(stamp_ns):
             self._behind('too old', stamp_ns, rank)
         elif self._history.holds((stamp_ns, rank)):
