@@ -9,10 +9,11 @@ are merged in the shards' order, so the result does not depend on who did the wo
 
 from __future__ import annotations
 
+import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import reduce
-from operator import add
 from typing import Protocol
 
 import numpy as np
@@ -27,16 +28,19 @@ from sfa_localization.network import (
     Network,
     Node,
     Weights,
-    expand,
+    expand_into,
     linear_stage,
     prepare,
 )
-from sfa_localization.rotation import FieldStatistics, Map, SampleStatistics
+from sfa_localization.rotation import FieldStatistics, Map, SampleStatistics, Sums
 from sfa_localization.run import Image, Panoramas
 from sfa_localization.sfa import Solution, Statistics, solve
+from sfa_localization.threads import one_core
 
+# Pictures read at once, in a shard, and multiplied at once.
 BATCH = 16
-SHARD = 256
+SHARD = 64
+_TOGETHER = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +58,7 @@ class Drive:
 class Shard:
     """Pictures start .. stop - 1 of a drive, with the pair that leads into them.
 
-    `photometric_std` and `seed` perturb the light of each picture, by its number `first` + i.
+    `photometric_std` and `seed` perturb the light of each picture, by its number.
     """
 
     drive: Drive
@@ -63,19 +67,23 @@ class Shard:
     photometric_std: float = 0.0
     seed: tuple[int, int] = (0, 0)
 
-    def batches(self) -> Iterator[tuple[Image, int, NDArray[np.float32]]]:
-        """Pictures (T, H, W, C), how many of them are fresh, and the scale of their pairs."""
+    def batches(self) -> Iterator[tuple[Image, NDArray[np.float32]]]:
+        """Pictures (T, H, W, C), and the scale (T,) of the difference that leads into each."""
+        scale = np.concatenate([np.zeros(1, np.float32), self.drive.scale])
         for start in range(self.start, self.stop, BATCH):
             stop = min(start + BATCH, self.stop)
-            lead = max(start - 1, 0)
-            images = self.drive.panoramas.read(lead, stop)
-            yield self._lit(images, lead), stop - start, self.drive.scale[lead : stop - 1]
+            yield self._lit(start, stop), scale[start:stop]
 
-    def _lit(self, images: Image, first: int) -> Image:
+    def lead(self) -> Image | None:
+        """The picture (1, H, W, C) before the first one; None at the drive's start."""
+        return self._lit(self.start - 1, self.start) if self.start else None
+
+    def _lit(self, start: int, stop: int) -> Image:
+        images = self.drive.panoramas.read(start, stop)
         if self.photometric_std == 0:
             return images
         gains = np.stack(
-            [_gain(self.photometric_std, (*self.seed, first + i)) for i in range(len(images))]
+            [_gain(self.photometric_std, (*self.seed, at)) for at in range(start, stop)]
         )
         lit = images * gains[:, None, None, :]
         return np.asarray(np.clip(lit, 0, 255).round().astype(np.uint8))
@@ -88,18 +96,36 @@ def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
 
 
 class Executor(Protocol):
-    """Whoever computes the shards' statistics; yields them in order."""
+    """Whoever computes the sums over the shards; yields them in the shards' order."""
 
     def __call__(
-        self, work: Callable[[Shard], Statistics], shards: Sequence[Shard]
-    ) -> Iterable[Statistics]: ...
+        self, work: Callable[[Shard], Sums], shards: Sequence[Shard]
+    ) -> Iterable[Sums]: ...
 
 
-def in_this_process(
-    work: Callable[[Shard], Statistics], shards: Sequence[Shard]
-) -> Iterator[Statistics]:
-    """Compute the shards one after the other."""
-    return map(work, shards)
+def one_by_one(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
+    """Compute the shards one after the other, on one core."""
+    with one_core():
+        yield from map(work, shards)
+
+
+def in_this_process(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
+    """Compute the shards on all cores, a few ahead of the one that is merged."""
+    workers = _cores()
+    with one_core(), ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[Sums]] = deque()
+        for shard in shards:
+            waiting.append(pool.submit(work, shard))
+            if len(waiting) > workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    affinity = getattr(os, 'sched_getaffinity', None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,26 +164,53 @@ class Partial:
         )
 
 
+def stage_sums(partial: Partial, shard: Shard) -> Sums:
+    """Sums of the stage that comes next, over one shard."""
+    network = partial.network()
+    sums = _sums(partial)
+    signals = _signals(partial)
+    lead = shard.lead()
+    if lead is not None:
+        sums.lead(signals(_below(network, lead)))
+    for images, scale in shard.batches():
+        maps = _below(network, images)
+        for start in range(0, len(maps), _TOGETHER):
+            part = slice(start, start + _TOGETHER)
+            sums.add(signals(maps[part]), scale[part])
+    return sums
+
+
 def stage_statistics(partial: Partial, shard: Shard) -> Statistics:
     """Statistics of the stage that comes next, over one shard."""
+    return stage_sums(partial, shard).result()
+
+
+def _sums(partial: Partial) -> Sums:
+    """Empty sums for the stage that comes next."""
     architecture, depth = partial.architecture, partial.depth
-    receptive = architecture.fields[depth]
-    network = partial.network()
-    sums: FieldStatistics | SampleStatistics | None = None
-    reduce_ = None if partial.linear is None else _folded_linear(partial.linear)
-    for images, fresh, scale in shard.batches():
-        maps = _below(network, images)
-        if reduce_ is None:
-            sums = sums or FieldStatistics(
-                receptive, architecture.rotations, receptive.rows * maps.shape[-1]
-            )
-            sums.add(maps, fresh, scale)
-        else:
-            expanded = architecture.layers[depth].expanded
-            sums = sums or SampleStatistics(architecture.rotations, expanded)
-            sums.add(expand(linear_stage(maps, receptive, *reduce_)), fresh, scale)
-    assert sums is not None
-    return sums.result()
+    layer, receptive = architecture.layers[depth], architecture.fields[depth]
+    if partial.linear is not None:
+        return SampleStatistics(architecture.rotations, layer.expanded)
+    strip = receptive.rows * architecture.channels[depth]
+    return FieldStatistics(receptive, architecture.rotations, strip)
+
+
+def _signals(partial: Partial) -> Callable[[Map], Map]:
+    """From the maps below to the signals whose SFA comes next."""
+    if partial.linear is None:
+        return lambda maps: maps
+    receptive = partial.architecture.fields[partial.depth]
+    linear, offset = _folded_linear(partial.linear)
+
+    def expanded(maps: Map) -> Map:
+        dimensions = partial.architecture.layers[partial.depth].expanded
+        rows = receptive.rows_out(maps.shape[1])
+        out = np.empty((dimensions, len(maps), rows, maps.shape[2]), np.float32)
+        for t, below in enumerate(maps):
+            expand_into(linear_stage(below, receptive, linear, offset), out[:, t])
+        return out
+
+    return expanded
 
 
 def _folded_linear(linear: Solution) -> tuple[Weights, Weights]:
@@ -245,9 +298,8 @@ def train_network(
     partial = start or Partial(architecture)
     shards = shards_of(drives, config)
     while not partial.finished:
-        sums = executor(_Stage(partial), shards)
-        total = reduce(add, _told(sums, shards, on_shard))
-        partial = partial.advanced(total, config.relative_cut)
+        total = _merged(_told(executor(_Stage(partial), shards), shards, on_shard))
+        partial = partial.advanced(total.result(), config.relative_cut)
         on_stage(partial)
     return partial.network()
 
@@ -258,13 +310,21 @@ class _Stage:
 
     partial: Partial
 
-    def __call__(self, shard: Shard) -> Statistics:
-        return stage_statistics(self.partial, shard)
+    def __call__(self, shard: Shard) -> Sums:
+        return stage_sums(self.partial, shard)
 
 
 def _told(
-    sums: Iterable[Statistics], shards: Sequence[Shard], on_shard: Callable[[int], None]
-) -> Iterator[Statistics]:
-    for statistics, shard in zip(sums, shards, strict=True):
+    sums: Iterable[Sums], shards: Sequence[Shard], on_shard: Callable[[int], None]
+) -> Iterator[Sums]:
+    for part, shard in zip(sums, shards, strict=True):
         on_shard(shard.stop - shard.start)
-        yield statistics
+        yield part
+
+
+def _merged(parts: Iterator[Sums]) -> Sums:
+    """All parts merged into the first, in their order."""
+    total = next(parts)
+    for part in parts:
+        total.merge(part)
+    return total

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.errors import ConfigError, ModelError
 from sfa_localization.geometry import Array
-from sfa_localization.rotation import Field, Map, strips
+from sfa_localization.rotation import Field, Map, unfold
 from sfa_localization.run import Image
 from sfa_localization.sfa import Solution
 
@@ -87,6 +87,13 @@ class Architecture:
         for receptive in self.fields:
             rows.append(receptive.rows_out(rows[-1]))
         return rows
+
+    @property
+    def channels(self) -> list[int]:
+        """Channels of the map below each layer."""
+        colors = 1 if self.normalization == 'grey' else 3
+        above = (layer.outputs for layer in self.layers[:-1])
+        return [self.layers[0].stride[1] * colors, *above]
 
     @property
     def outputs(self) -> int:
@@ -184,7 +191,7 @@ def _folded(solution: Solution) -> tuple[Weights, Weights]:
 
 
 def expand(z: Map) -> Map:
-    """All monomials of degree 1 and 2 of signals (L, N): (L + L (L + 1) / 2, N)."""
+    """All monomials of degree 1 and 2 of signals (L, ...): (L + L (L + 1) / 2, ...)."""
     n = len(z)
     out = np.empty((n + n * (n + 1) // 2, *z.shape[1:]), z.dtype)
     expand_into(z, out)
@@ -212,10 +219,9 @@ def prepare(images: Image, architecture: Architecture) -> Map:
             f'the model expects panoramas of {width} x {height} pixels, got {images.shape[-2]} x '
             f'{images.shape[-3]}: set the panorama size of the omnicam node, or train again'
         )
-    binned = np.stack([_binned(image, architecture.binning) for image in images])
-    maps = _NORMALIZATIONS[architecture.normalization](binned)
-    rows, channels = maps.shape[1], maps.shape[3]
-    return maps.reshape(len(maps), rows, architecture.rotations, -1 if len(maps) else channels)
+    normalize = _NORMALIZATIONS[architecture.normalization]
+    maps = np.stack([normalize(_binned(image, architecture.binning)) for image in images])
+    return maps.reshape(len(maps), maps.shape[1], architecture.rotations, -1)
 
 
 def _binned(image: Image, binning: int) -> Image:
@@ -225,36 +231,53 @@ def _binned(image: Image, binning: int) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _plain(images: Image) -> Map:
-    return images.astype(np.float32) * np.float32(1 / 128) - np.float32(1)
+def _plain(image: Image) -> Map:
+    channels = image.shape[2]
+    return _affine(image, np.full(channels, 1 / 128), np.full(channels, -1.0))
 
 
-def _grey(images: Image) -> Map:
-    return np.asarray(_plain(images) @ np.array([[0.114], [0.587], [0.299]], np.float32))
+def _affine(image: Image, gain: Array, offset: Array) -> Map:
+    """image * gain + offset, both per channel (C,): (H, W, C) float32."""
+    rows, columns, _ = image.shape
+    out = np.multiply(
+        image.reshape(rows, -1), np.tile(gain.astype(np.float32), columns), dtype=np.float32
+    )
+    out += np.tile(offset.astype(np.float32), columns)
+    return out.reshape(image.shape)
 
 
-def _per_panorama(images: Image) -> Map:
+def _grey(image: Image) -> Map:
+    return np.asarray(_plain(image) @ np.array([[0.114], [0.587], [0.299]], np.float32))
+
+
+def _per_panorama(image: Image) -> Map:
     """Zero mean and unit scale of each channel over the whole picture: blind to exposure."""
-    mean = images.mean((1, 2), keepdims=True, dtype=np.float32)
-    scale = images.std((1, 2), keepdims=True, dtype=np.float32)
-    return np.asarray((images - mean) / np.maximum(scale, np.float32(1)))
+    mean, std = _moments(image)
+    gain = 1 / np.maximum(std, 1.0)
+    return _affine(image, gain, -mean * gain)
 
 
-def _log(images: Image) -> Map:
+def _moments(image: Image) -> tuple[Array, Array]:
+    """Mean and standard deviation of each channel, (C,)."""
+    mean, std = cv2.meanStdDev(image)
+    return np.asarray(mean, np.float64).ravel(), np.asarray(std, np.float64).ravel()
+
+
+def _brightness(image: Image) -> Map:
+    """Zero mean and unit scale of the whole picture, colours kept in proportion."""
+    mean, std = _moments(image)
+    variance = float((std**2 + mean**2).mean() - mean.mean() ** 2)
+    gain = np.full(len(mean), 1 / max(np.sqrt(variance), 1.0))
+    return _affine(image, gain, -mean.mean() * gain)
+
+
+def _log(image: Image) -> Map:
     """Logarithm, zero mean of each channel over the whole picture: gains cancel."""
-    logs = _LOGS[images]
-    return np.asarray(logs - logs.mean((1, 2), keepdims=True, dtype=np.float32))
+    logs = _LOGS[image]
+    return np.asarray(logs - logs.mean((0, 1), dtype=np.float32))
 
 
 _LOGS = np.log(np.arange(256, dtype=np.float32) + 16)
-
-
-def _brightness(images: Image) -> Map:
-    """Zero mean and unit scale of the whole picture, colours kept in proportion."""
-    mean = images.mean((1, 2, 3), keepdims=True, dtype=np.float32)
-    scale = images.std((1, 2, 3), keepdims=True, dtype=np.float32)
-    return np.asarray((images - mean) / np.maximum(scale, np.float32(1)))
-
 
 _NORMALIZATIONS = {
     'none': _plain,
@@ -266,37 +289,22 @@ _NORMALIZATIONS = {
 NORMALIZATIONS = tuple(_NORMALIZATIONS)
 
 
-def linear_stage(maps: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
-    """First half of a layer: reduced signals (L, T, rows, R).
-
-    The field's product is summed over its columns, so that no field is ever copied out.
-    """
-    cut = strips(maps, receptive)
-    width = cut.shape[-1]
-    steps = linear.reshape(receptive.columns, width, -1).transpose(1, 0, 2).reshape(width, -1)
-    partial = (cut.reshape(-1, width) @ steps).reshape(*cut.shape[:3], receptive.columns, -1)
-    out = np.array(partial[:, :, :, 0], order='C')
-    for i in range(1, receptive.columns):
-        _add_rolled(out, partial[:, :, :, i], i * receptive.spacing)
-    out -= offset
-    return np.ascontiguousarray(out.transpose(3, 0, 1, 2))
+def linear_stage(below: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
+    """First half of a layer: reduced signals (L, rows, R) of one map (rows, R, channels)."""
+    fields = unfold(below[None], receptive)[0]
+    reduced = linear.T @ fields.reshape(-1, fields.shape[-1]).T
+    reduced -= offset[:, None]
+    return np.asarray(reduced.reshape(-1, *fields.shape[:2]))
 
 
-def _add_rolled(out: Map, part: Map, shift: int) -> None:
-    """out[..., c, :] += part[..., (c + shift) mod R, :]."""
-    k = shift % part.shape[2]
-    out[:, :, : part.shape[2] - k] += part[:, :, k:]
-    if k:
-        out[:, :, part.shape[2] - k :] += part[:, :, :k]
-
-
-def slow_stage(reduced: Map, node: Node, clip: float) -> Map:
-    """Second half: slow features as a map (T, rows, R, outputs), clipped."""
-    shape = reduced.shape[1:]
-    flat = expand(reduced.reshape(len(reduced), -1))
-    slow = (flat.T @ node.slow) - node.slow_offset
-    np.clip(slow, -clip, clip, out=slow)
-    return slow.reshape(*shape, -1)
+def slow_stage(reduced: Map, node: Node, clip: float, out: Map) -> None:
+    """Second half: slow features of reduced signals (L, rows, R) into (rows, R, K), clipped."""
+    expanded = expand(reduced.reshape(len(reduced), -1))
+    slow = out.reshape(-1, out.shape[-1])
+    np.matmul(expanded.T, node.slow, out=slow)
+    slow -= node.slow_offset
+    np.minimum(slow, np.float32(clip), out=slow)
+    np.maximum(slow, np.float32(-clip), out=slow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,10 +321,15 @@ class Network:
 
     def layer(self, maps: Map, depth: int) -> Map:
         """Output map of layer `depth` (0-based) from the map below."""
-        node = self.nodes[depth]
+        node, layer = self.nodes[depth], self.architecture.layers[depth]
         receptive = self.architecture.fields[depth]
-        reduced = linear_stage(maps, receptive, node.linear, node.linear_offset)
-        return slow_stage(reduced, node, self.architecture.layers[depth].clip)
+        count, rows, columns, _ = maps.shape
+        out = np.empty((count, receptive.rows_out(rows), columns, layer.outputs), np.float32)
+        # One picture at a time: its signals stay in the processor's cache.
+        for below, above in zip(maps, out, strict=True):
+            reduced = linear_stage(below, receptive, node.linear, node.linear_offset)
+            slow_stage(reduced, node, layer.clip, above)
+        return out
 
     def maps(self, images: Image) -> list[Map]:
         """Every layer's output map (T, rows, R, outputs) for panoramas (T, H, W, C)."""

@@ -19,8 +19,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from sfa_localization.geometry import Array
@@ -60,7 +62,17 @@ def strips(maps: Map, field: Field) -> Map:
 
 def unfold(maps: Map, field: Field) -> Map:
     """All fields: (T, rows_out, R, field.columns * field.rows * channels), columns outermost."""
-    return shifted(strips(maps, field), [i * field.spacing for i in range(field.columns)])
+    return windows(strips(maps, field), field.columns, field.spacing)
+
+
+def windows(columns: Map, count: int, spacing: int) -> Map:
+    """The columns c, c + spacing, ... (cyclic), `count` of them: (..., R, count * P)."""
+    *lead, period, width = columns.shape
+    wrapped = np.concatenate([columns, columns[..., : (count - 1) * spacing, :]], axis=-2)
+    step = wrapped.strides[-2]
+    shape = (*lead, period, count, width)
+    strides = (*wrapped.strides[:-1], spacing * step, wrapped.strides[-1])
+    return as_strided(wrapped, shape, strides, writeable=False).reshape(*lead, period, -1)
 
 
 def shifted(columns: Map, shifts: list[int]) -> Map:
@@ -76,13 +88,20 @@ def shifted(columns: Map, shifts: list[int]) -> Map:
     return out
 
 
-def between_images(maps: Map, scale: Map) -> Map:
-    """scale[t] (x_{t+1,c} - x_{t,c-1}) for the pairs of nonzero scale: (pairs, rows, R, P)."""
-    joined = scale > 0
-    first, second = maps[:-1][joined], maps[1:][joined]
-    difference = second - np.roll(first, 1, axis=2)
-    difference *= scale[joined, None, None, None]
-    return difference
+class Sums(Protocol):
+    """Sums over the rotation sequence, fed picture after picture."""
+
+    def lead(self, maps: Map) -> None:
+        """Tell the map (1, ...) before the first one, which counts only as a neighbor."""
+
+    def add(self, maps: Map, scale: Map) -> None:
+        """Add maps (T, ...), and differences to the map before times scale (T,); 0: a break."""
+
+    def merge(self, other: Any) -> None:
+        """Add what another has seen."""
+
+    def result(self) -> Statistics:
+        """The sums over the explicit rotation sequence, divided by the number of rotations."""
 
 
 class FieldStatistics:
@@ -101,39 +120,41 @@ class FieldStatistics:
         self.same = np.zeros((strip, len(self.lags) * strip))
         self.between = np.zeros((strip, field.columns * strip))
         self.samples = self.pairs = 0
+        self._last: Map | None = None
 
     def _lags(self) -> list[int]:
         """Column lags of the blocks of samples and of differences within images."""
         steps = range(self.field.columns)
         return sorted({i * self.field.spacing + e for i in steps for e in (-1, 0, 1)})
 
-    def add(self, maps: Map, fresh: int, scale: Map) -> None:
-        """Add the last `fresh` maps (of T), and the differences of pairs times scale (T - 1,).
+    def lead(self, maps: Map) -> None:
+        self._last = strips(maps, self.field)
 
-        A scale of 0 marks a break between two images.
-        """
+    def add(self, maps: Map, scale: Map) -> None:
         columns = strips(maps, self.field)
-        new = columns[len(columns) - fresh :]
-        self.samples += new.shape[0] * new.shape[1]
-        self.total += new.sum((0, 1, 2), dtype=np.float64)
-        self.same += _product(new, shifted(new, self.lags))
-        difference = between_images(columns, scale)
+        self.samples += columns.shape[0] * columns.shape[1]
+        self.total += columns.sum((0, 1, 2), dtype=np.float64)
+        self.same += _product(columns, shifted(columns, self.lags))
+        difference = _between_images(columns, self._last, scale)
         self.pairs += difference.shape[0] * difference.shape[1]
-        steps = [i * self.field.spacing for i in range(self.field.columns)]
         if len(difference):
-            self.between += _product(difference, shifted(difference, steps))
+            neighbors = windows(difference, self.field.columns, self.field.spacing)
+            self.between += _product(difference, neighbors)
+        self._last = columns[-1:]
+
+    def merge(self, other: FieldStatistics) -> None:
+        self.samples += other.samples
+        self.pairs += other.pairs
+        self.total += other.total
+        self.same += other.same
+        self.between += other.between
 
     def result(self) -> Statistics:
-        """The sums over the explicit rotation sequence, divided by the number of rotations."""
         count, r = self.samples * self.rotations, self.rotations
-        within = self._blocks(self._within)
-        second = self._blocks(self._lag)
-        between = self._blocks(self._lag_between)
         steps = self.samples * (r - 1) + self.pairs
         total = np.tile(self.total, self.field.columns)
-        return Statistics(
-            float(count), total, second, float(steps), within * (r - 1) / r + between / r
-        )
+        second, difference = self._blocks(self._lag), self._blocks(self._difference)
+        return Statistics(float(count), total, second, float(steps), difference)
 
     def _blocks(self, block_of: Callable[[int], Array]) -> Array:
         """Assemble (D, D) from the blocks of column lags l >= 0."""
@@ -146,16 +167,32 @@ class FieldStatistics:
                 out[i + lag, :, i] = block.T
         return out.reshape(n * p, n * p)
 
+    def _difference(self, lag: int) -> Array:
+        """Within images R - 1 times, between images once."""
+        r = self.rotations
+        within = 2 * self._lag(lag) - self._lag(lag + 1) - self._lag(lag - 1)
+        return within * ((r - 1) / r) + self._lag_between(lag) / r
+
     def _lag(self, lag: int) -> Array:
         p, at = len(self.total), self.lags.index(lag)
         return self.same[:, at * p : (at + 1) * p]
 
-    def _within(self, lag: int) -> Array:
-        return 2 * self._lag(lag) - self._lag(lag + 1) - self._lag(lag - 1)
-
     def _lag_between(self, lag: int) -> Array:
         p, at = len(self.total), lag // self.field.spacing
         return self.between[:, at * p : (at + 1) * p]
+
+
+def _between_images(columns: Map, last: Map | None, scale: Map) -> Map:
+    """scale[t] (x_{t,c} - x_{t-1,c-1}) for the pairs of nonzero scale: (pairs, rows, R, P)."""
+    if last is None:
+        columns, last, scale = columns[1:], columns[:1], scale[1:]
+        before = np.concatenate([last, columns[:-1]]) if len(columns) else columns
+    else:
+        before = np.concatenate([last, columns[:-1]])
+    joined = scale > 0
+    difference = columns[joined] - np.roll(before[joined], 1, axis=2)
+    difference *= scale[joined, None, None, None]
+    return np.asarray(difference)
 
 
 def _product(a: Map, b: Map) -> Array:
@@ -164,36 +201,62 @@ def _product(a: Map, b: Map) -> Array:
 
 
 class SampleStatistics:
-    """Statistics of linear SFA on the nodes' own signals, signal-major: (D, T, rows, R)."""
+    """Statistics of linear SFA on signals of D dimensions, given signal-major: (D, T, rows, R)."""
 
     def __init__(self, rotations: int, dimensions: int) -> None:
         self.rotations = rotations
         self.sums = Statistics.empty(dimensions)
+        self._last: Map | None = None
 
-    def add(self, signals: Map, fresh: int, scale: Map) -> None:
-        """Add the last `fresh` of T images, and the pairs' differences times scale (T - 1,)."""
+    def lead(self, maps: Map) -> None:
+        self._last = maps[:, -1]
+
+    def add(self, maps: Map, scale: Map) -> None:
         r, s = self.rotations, self.sums
-        new = signals[:, signals.shape[1] - fresh :]
-        nodes = new.shape[1] * new.shape[2]
+        nodes = maps.shape[1] * maps.shape[2]
         s.weight += nodes * r
-        s.total += new.sum((1, 2, 3), dtype=np.float64)
-        s.second += _square(new)
-        s.difference += _square(_turned(new)) * ((r - 1) / r)
+        s.total += maps.sum((1, 2, 3), dtype=np.float64)
+        s.second += _square(maps)
+        s.difference += _square(_turned(maps)) * ((r - 1) / r)
         s.steps += nodes * (r - 1)
-        self._add_pairs(signals, scale)
+        self._add_pairs(maps, scale)
+        self._last = maps[:, -1].copy()
+
+    def merge(self, other: SampleStatistics) -> None:
+        s, o = self.sums, other.sums
+        s.weight += o.weight
+        s.steps += o.steps
+        s.total += o.total
+        s.second += o.second
+        s.difference += o.difference
 
     def result(self) -> Statistics:
         return self.sums
 
-    def _add_pairs(self, signals: Map, scale: Map) -> None:
-        joined = scale > 0
-        if not joined.any():
-            return
-        first, second = signals[:, :-1][:, joined], signals[:, 1:][:, joined]
-        pairs = second - np.roll(first, 1, axis=3)
-        pairs *= scale[joined, None, None]
-        self.sums.difference += _square(pairs) / self.rotations
-        self.sums.steps += pairs.shape[1] * pairs.shape[2]
+    def _add_pairs(self, maps: Map, scale: Map) -> None:
+        joined = np.flatnonzero(scale > 0)
+        if self._last is None:
+            joined = joined[joined > 0]
+        pairs = np.empty((len(maps), len(joined), *maps.shape[2:]), maps.dtype)
+        for at, t in enumerate(joined.tolist()):
+            _difference_into(maps[:, t], self._before(maps, t), float(scale[t]), pairs[:, at])
+        if len(joined):
+            self.sums.difference += _square(pairs) / self.rotations
+            self.sums.steps += pairs.shape[1] * pairs.shape[2]
+
+    def _before(self, maps: Map, t: int) -> Map:
+        if t > 0:
+            return maps[:, t - 1]
+        assert self._last is not None
+        return self._last
+
+
+def _difference_into(second: Map, first: Map, scale: float, out: Map) -> None:
+    """scale (x_{t,c} - x_{t-1,c-1}), cyclic in the last axis."""
+    np.subtract(second[..., 1:], first[..., :-1], out=out[..., 1:])
+    np.subtract(second[..., 0], first[..., -1], out=out[..., 0])
+    if scale != 1.0:
+        out *= np.float32(scale)
 
 
 def _turned(signals: Map) -> Map:

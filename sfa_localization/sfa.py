@@ -109,7 +109,7 @@ def solve(statistics: Statistics, outputs: int, relative_cut: float = 1e-7) -> S
 
 def _whitening(covariance: Array, relative_cut: float, least: int) -> Array:
     """Matrix (D, rank) that makes the kept part of the signal white."""
-    variance, axes = linalg.eigh(covariance)
+    variance, axes = linalg.eigh(covariance, driver='evd')
     cut = min(relative_cut * variance[-1], variance[-min(least, len(variance))])
     kept = (variance >= cut) & (variance > max(_ROUNDING * variance[-1], np.finfo(float).tiny))
     return np.asarray(axes[:, kept] / np.sqrt(variance[kept]))

@@ -115,12 +115,12 @@ def test_expansion_by_hand():
 def test_linear_stage_is_the_product_of_whole_fields(depth):
     receptive = ARCHITECTURE.fields[depth]
     rng = np.random.default_rng(depth)
-    maps = rng.normal(size=(2, ARCHITECTURE.map_rows[depth], 12, 3)).astype(np.float32)
+    below = rng.normal(size=(ARCHITECTURE.map_rows[depth], 12, 3)).astype(np.float32)
     inputs = receptive.columns * receptive.rows * 3
     weights = rng.normal(size=(inputs, 6)).astype(np.float32)
     offset = rng.normal(size=6).astype(np.float32)
-    expected = views(maps, receptive) @ weights - offset
-    got = linear_stage(maps, receptive, weights, offset).transpose(1, 2, 3, 0)
+    expected = views(below[None], receptive)[0] @ weights - offset
+    got = linear_stage(below, receptive, weights, offset).transpose(1, 2, 0)
     assert np.allclose(got, expected, atol=1e-4)
 
 

@@ -80,25 +80,20 @@ def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) 
 
 def field_statistics(of, field, scale, batch=1000):
     sums = FieldStatistics(field, of.shape[2], field.rows * of.shape[3])
-    feed(sums, of, scale, batch)
-    return sums.result()
+    return fed(sums, of, scale, batch)
 
 
 def sample_statistics(of, scale, batch=1000):
-    sums = SampleStatistics(of.shape[2], of.shape[-1])
-    for lead, start, stop in cuts(len(of), batch):
-        sums.add(of[lead:stop].transpose(3, 0, 1, 2).copy(), stop - start, scale[lead : stop - 1])
+    signals = of.transpose(3, 0, 1, 2).copy()
+    return fed(SampleStatistics(of.shape[2], of.shape[-1]), signals, scale, batch, axis=1)
+
+
+def fed(sums, of, scale, batch, axis=0):
+    scale = np.concatenate([[9], scale])
+    cuts = range(batch, of.shape[axis], batch)
+    for maps, part in zip(np.split(of, cuts, axis), np.split(scale, cuts), strict=True):
+        sums.add(maps, part.astype(np.float32))
     return sums.result()
-
-
-def feed(sums, of, scale, batch):
-    for lead, start, stop in cuts(len(of), batch):
-        sums.add(of[lead:stop], stop - start, scale[lead : stop - 1])
-
-
-def cuts(count: int, batch: int):
-    for start in range(0, count, batch):
-        yield max(start - 1, 0), start, min(start + batch, count)
 
 
 @pytest.mark.parametrize('field', FIELDS)
@@ -147,6 +142,28 @@ def test_a_break_equals_two_drives():
         for part in (of[:4], of[4:])
     ]
     assert_equal(field_statistics(of, field, broken), halves[0] + halves[1])
+
+
+def test_merging_with_a_lead_equals_the_whole():
+    of, field, scale = maps(4, 9), FIELDS[1], np.linspace(0.5, 2, 8).astype(np.float32)
+    for whole, make, part in (
+        (
+            field_statistics(of, field, scale),
+            lambda: FieldStatistics(field, 12, 6),
+            lambda start, stop: of[start:stop],
+        ),
+        (
+            sample_statistics(of, scale),
+            lambda: SampleStatistics(12, 3),
+            lambda start, stop: of[start:stop].transpose(3, 0, 1, 2).copy(),
+        ),
+    ):
+        first, second = make(), make()
+        first.add(part(0, 5), np.concatenate([[0], scale[:4]]).astype(np.float32))
+        second.lead(part(4, 5))
+        second.add(part(5, 9), scale[4:])
+        first.merge(second)
+        assert_equal(first.result(), whole)
 
 
 def test_a_single_picture_turns_but_does_not_move():
