@@ -8,7 +8,6 @@ ARGS ?=
 
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
-CORE := $(filter-out sfa_localization/play.py sfa_localization/demo.py,$(wildcard sfa_localization/*.py))
 
 .DEFAULT_GOAL := help
 .PHONY: help env demo test lint format colcon matrix clean
@@ -30,7 +29,7 @@ test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 lint: $(READY)  ## ruff, ruff format, mypy
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/mypy $(CORE)
+	$(VENV)/bin/mypy sfa_localization
 
 format: $(READY)  ## let ruff sort imports and lay out the code
 	$(VENV)/bin/ruff check --fix .

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sfa_localization import __version__
 from sfa_localization.config import (
@@ -648,7 +648,7 @@ def _run_alone(command: Command) -> int:
     return _guarded(arguments.run_command, arguments)
 
 
-def _texts(command: Command) -> dict[str, object]:
+def _texts(command: Command) -> dict[str, Any]:
     return {
         'description': f'{command.summary}\n\nexamples:\n{command.example}',
         'formatter_class': argparse.RawDescriptionHelpFormatter,
