@@ -12,12 +12,13 @@ headings that metric learning found. |g| < 1 and the predictive variance tell ho
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
+from scipy.linalg import blas
 
 from sfa_localization.config import HeadingConfig
 from sfa_localization.errors import DataError
@@ -56,6 +57,10 @@ class Compass:
     noise: float
     sign: float
     calibration: Array
+    _fast: _Fast = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, '_fast', _Fast.of(self))
 
     def predict(self, features: Array, harmonic: Complex) -> tuple[Array, Array]:
         """Yaw (T,) rad and its variance (T,) rad^2, at most pi^2 / 3 (knowing nothing)."""
@@ -66,9 +71,10 @@ class Compass:
 
     def _field(self, features: Array, harmonic: Complex) -> tuple[Complex, Array]:
         s, f = self._scaled(features, harmonic)
-        kernel = _kernel(s, f, self.features, self.harmonic, self.length)
-        explained = np.einsum('tm,tm->t', kernel @ self.uncertainty, kernel.conj()).real
-        return kernel @ self.weights, np.maximum(_prior(f) - explained, 0.0) + self.noise
+        near = _near(s, self.features, self.length)
+        kernel = near.astype(np.float32) * (f.astype(np.complex64) @ self._fast.adjoint)
+        left = np.maximum(_prior(f) - self._fast.explained(kernel), 0.0)
+        return kernel @ self.weights, left + self.noise
 
     def _scaled(self, features: Array, harmonic: Complex) -> tuple[Array, Complex]:
         return _scaled(features, harmonic, self.feature_scale, self.harmonic_scale)
@@ -103,6 +109,40 @@ class Compass:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _Fast:
+    """What a prediction multiplies by: the harmonics' adjoint (J, M), complex64, and a factor.
+
+    `factor` (M, M) is lower triangular in Fortran order, factor factor^H = uncertainty.
+    """
+
+    adjoint: NDArray[np.complex64]
+    factor: NDArray[np.complex64]
+
+    @classmethod
+    def of(cls, compass: Compass) -> _Fast:
+        adjoint = np.ascontiguousarray(compass.harmonic.conj().T, np.complex64)
+        return cls(adjoint, np.asfortranarray(_root(compass.uncertainty), np.complex64))
+
+    def explained(self, kernel: NDArray[np.complex64]) -> Array:
+        """|k factor|^2 (T,), reading only the lower triangle for a single picture."""
+        if len(kernel) > 1:
+            whole = kernel @ self.factor
+        else:
+            whole = blas.ctrmv(self.factor, kernel[0], lower=1, trans=1)[None]
+        return np.asarray((whole.real**2 + whole.imag**2).sum(1, dtype=np.float64))
+
+
+def _root(hermitian: Complex) -> Complex:
+    """Lower triangular L with L L^H = a matrix, its negative part (rounding) left out."""
+    try:
+        return np.asarray(linalg.cholesky(hermitian, lower=True))
+    except linalg.LinAlgError:
+        values, axes = linalg.eigh(hermitian)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(linalg.qr(root.conj().T, mode='r')[0].conj().T)
+
+
 def _scaled(
     features: Array, harmonic: Complex, feature_scale: Array, harmonic_scale: Array
 ) -> tuple[Array, Complex]:
@@ -118,9 +158,13 @@ def _prior(f: Complex) -> Array:
 
 def _kernel(s: Array, f: Complex, s_m: Array, f_m: Complex, length: float) -> Complex:
     """k[t, m] = exp(-|s_t - s_m|^2 / 2 l^2) <f_m, f_t>: (T, M)."""
+    return np.asarray(_near(s, s_m, length) * (f @ f_m.conj().T))
+
+
+def _near(s: Array, s_m: Array, length: float) -> Array:
+    """exp(-|s_t - s_m|^2 / 2 l^2): (T, M)."""
     apart = (s**2).sum(1)[:, None] + (s_m**2).sum(1) - 2 * s @ s_m.T
-    near = np.exp(-np.maximum(apart, 0.0) / (2 * length**2))
-    return np.asarray(near * (f @ f_m.conj().T))
+    return np.asarray(np.exp(-np.maximum(apart, 0.0) / (2 * length**2)))
 
 
 def _phase_variance(g: Complex, variance: Array) -> Array:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.config import PanoramaConfig
 from sfa_localization.errors import ConfigError, ModelError
+from sfa_localization.fast_map import Predictor, fast_map
 from sfa_localization.geometry import Array
 from sfa_localization.heading import UNKNOWN_YAW_VARIANCE, Compass, harmonics
 from sfa_localization.network import Architecture, Layer, Network, Node
@@ -26,6 +27,7 @@ from sfa_localization.novelty import Novelty
 from sfa_localization.regression import MetricMap
 from sfa_localization.rotation import Map
 from sfa_localization.run import Image
+from sfa_localization.threads import one_core
 
 FORMAT = 'sfa_localization place model'
 VERSION = 1
@@ -63,6 +65,7 @@ class PlaceModel:
     compass: Compass | None = None
     heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
+    _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def has_heading(self) -> bool:
@@ -84,12 +87,19 @@ class PlaceModel:
         maps = self.network.maps(panoramas)
         slow = top_features(maps)
         novelty = self.novelty.per_layer(maps).max(1)
-        positions, covariances = self.metric.predict(slow)
+        positions, covariances = self._predictor().predict(slow)
         yaw, yaw_variance = self._headings(maps, slow)
         return [
             Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
             for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
         ]
+
+    def _predictor(self) -> Predictor:
+        """The metric map's quickest form, compiled once."""
+        if not self._fast:
+            with one_core():
+                self._fast.append(fast_map(self.metric))
+        return self._fast[0]
 
     def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         if self.compass is None:
@@ -107,9 +117,11 @@ class PlaceModel:
         path = Path(path)
         arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
         try:
-            return cls._from_arrays(arrays, json.loads(str(arrays['header'])))
+            model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
         except (KeyError, ValueError, TypeError, IndexError, ConfigError) as error:
             raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
+        model._predictor()
+        return model
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
