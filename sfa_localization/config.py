@@ -399,7 +399,7 @@ class SegmentConfig(Settings):
         choices=('auto', 'odometry', 'gyro'),
     )
     distance_noise: float = setting(
-        0.02, 'random error of driven distance', unit='m/sqrt(m)', low=0.0, high=1.0
+        0.01, 'random error of driven distance', unit='m/sqrt(m)', low=0.0, high=1.0
     )
     yaw_noise: float = setting(
         0.003,
@@ -408,7 +408,7 @@ class SegmentConfig(Settings):
         low=0.0,
         high=1.0,
     )
-    yaw_slip: float = setting(0.01, 'error of a turn per turn', unit='rad/rad', low=0.0, high=1.0)
+    yaw_slip: float = setting(0.005, 'error of a turn per turn', unit='rad/rad', low=0.0, high=1.0)
     turn_slide: float = setting(
         0.05, 'sideways slide of the wheels per turn', unit='m/rad', low=0.0, high=10.0
     )
@@ -695,7 +695,7 @@ class FilterConfig(Settings):
         live=True,
     )
     decorrelation: float = setting(
-        0.6, 'way over which the picture error changes', unit='m', low=1e-3, high=1e3
+        1.0, 'way over which the picture error changes', unit='m', low=1e-3, high=1e3
     )
     novelty_limit: float = setting(
         3.0, 'pictures more unlike training than this are not used', low=1.0, high=1e6, live=True
@@ -919,6 +919,12 @@ class HeadingConfig(Settings):
 class NetworkConfig(Settings):
     """The hierarchical SFA network and its training."""
 
+    engine: str = setting(
+        'rotation',
+        'exact sums over the rotation, or the same from MDP on really turned pictures '
+        '(hundreds of times slower; needs the extra mdp)',
+        choices=('rotation', 'mdp'),
+    )
     layers: str = setting(
         'auto',
         'sizes of the layers: by the size of the panorama, a standard set, or the arrays below',

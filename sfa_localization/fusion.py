@@ -30,6 +30,8 @@ _DOMINATED = 4.0
 _CERTAIN = 1e-7
 _LASTING = 4
 _AFTER_OUTAGE = 1.4
+_PLAIN = 8.0
+_PLAIN_TURN = 0.5
 _NO_DOUBT = (0.0, 0.0, 0.0)
 _OBSERVE = np.eye(3, SIZE)
 
@@ -476,8 +478,7 @@ class Fusion:
             return False
         if fit.dissenting >= fit.pictures:
             return False
-        jump = math.hypot(*(fit.pose[:2] - belief.mean[:2]))
-        little = jump < config.recovery_jump and support >= config.recovery_pictures
+        little = support >= config.recovery_pictures and not self._plain(belief, fit)
         way = max(config.recovery_distance, 8 * fit.std_m)
         way *= _AFTER_OUTAGE if belief.memory.outage else 1.0
         if fit.has_yaw and not little:
@@ -487,6 +488,13 @@ class Fusion:
             return seen and (lasting or not belief.memory.outage)
         enough = fit.pictures >= needed or (fit.pictures >= 3 and fit.span_m >= 1.25 * way)
         return enough and fit.span_m >= way
+
+    def _plain(self, belief: Belief, fit: Fit) -> bool:
+        """The robot is elsewhere, or turned, by so much that no error of pictures explains it."""
+        jump = math.hypot(*(fit.pose[:2] - belief.mean[:2]))
+        turn = abs(motion.wrap(float(fit.pose[YAW] - belief.mean[YAW])))
+        elsewhere = jump >= max(self.config.recovery_jump, _PLAIN * fit.std_m)
+        return elsewhere or turn >= max(_PLAIN_TURN, _PLAIN * fit.yaw_std)
 
     def _widened(self, belief: Belief, evidence: tuple[Evidence, ...]) -> Array:
         """In doubt, the pose becomes less sure with every new place that contradicts it."""

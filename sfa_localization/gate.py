@@ -44,7 +44,7 @@ class Fit(NamedTuple):
     """Where agreeing measurements put the robot now: pose (3,), covariance (3, 3).
 
     Over the same stretch of way, `contradicting` counts what the filter accepted, `dissenting`
-    what it refused but does not agree either.
+    what it refused but does not agree either. `std_m` and `yaw_std` are those told by pictures.
     """
 
     pose: Array
@@ -52,6 +52,7 @@ class Fit(NamedTuple):
     pictures: int
     span_m: float
     std_m: float
+    yaw_std: float
     contradicting: int
     dissenting: int
     has_yaw: bool
@@ -168,6 +169,7 @@ class _Table:
             pictures=int(agree.sum()),
             span_m=span,
             std_m=math.sqrt(float(self.variance[agree].mean())),
+            yaw_std=math.sqrt(float(self.yaw_variance[knows].mean())) if knows.any() else math.inf,
             contradicting=0,
             dissenting=0,
             has_yaw=bool(knows.any()),

@@ -44,6 +44,7 @@ TUNED = (
 _SPREAD = 0.7
 _ENOUGH = 20
 _BATCH = 16
+_TAIL = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,16 +157,20 @@ def tune_by_grid(
 
 
 def likelihood_cost(tours: Iterable[Tour], config: FilterConfig) -> float:
-    """Negative log-likelihood per innovation component; one outside the gate counts as at it."""
+    """Negative log-likelihood per innovation component, under Student's distribution.
+
+    Its tails let the gate's outliers count without ruling; under a Gaussian cut at the gate the
+    best filter would be one that refuses everything.
+    """
     total, count = 0.0, 0
     for tour in tours:
-        fused = PoseFilter(config)
-        for update in _fuse(fused, tour):
+        for update in _fuse(PoseFilter(config), tour):
             if update.covariance is None:
                 continue
-            excess = min(update.d2, update.threshold) - update.d2
-            total -= update.log_likelihood - excess / 2
-            count += len(update.covariance)
+            size = len(update.covariance)
+            spread = float(np.linalg.slogdet(update.covariance)[1])
+            total += spread / 2 + (_TAIL + size) / 2 * math.log1p(update.d2 / _TAIL)
+            count += size
     return total / count if count else math.inf
 
 
