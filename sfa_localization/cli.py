@@ -470,7 +470,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     _add_topics(parser, 'image', 'odometry', 'imu')
     _add_settings(parser, SegmentConfig, ('segments',))
     _add_settings(parser, MetricConfig, ('solver', 'metric_map'))
-    _add_settings(parser, NetworkConfig, ('normalization',))
+    _add_settings(parser, NetworkConfig, ('engine', 'normalization'))
 
 
 def _train(arguments: argparse.Namespace) -> int:

@@ -509,6 +509,9 @@ class MetricConfig(Settings):
     )
     use_turns: bool = setting(True, 'use signed turns between segments')
     use_displacements: bool = setting(True, 'use displacements between segments')
+    link_weight: float = setting(
+        2.0, 'weight of odometry between segments over what its noise says', low=0.0, high=1e3
+    )
     yaw_bias_std: float = setting(
         0.003,
         'yaw-rate bias to expect, estimated per run; 0: none',

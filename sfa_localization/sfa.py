@@ -94,29 +94,32 @@ def solve(statistics: Statistics, outputs: int, relative_cut: float = 1e-7) -> S
     if statistics.steps <= 0 or statistics.weight <= 1:
         raise DataError('SFA needs at least two consecutive samples')
     mean, covariance = statistics.covariance()
-    whitening = _whitening(covariance, relative_cut, outputs)
-    rank = whitening.shape[1]
+    white = whitening(covariance, relative_cut, outputs)
+    rank = white.shape[1]
     if rank < outputs:
         raise DataError(
             f'the signal has rank {rank}, fewer than the {outputs} slow features asked for: '
             'record more varied pictures or ask for fewer'
         )
-    slow = whitening.T @ (statistics.difference / statistics.steps) @ whitening
+    slow = white.T @ (statistics.difference / statistics.steps) @ white
     delta, rotation = linalg.eigh((slow + slow.T) / 2, subset_by_index=[0, outputs - 1])
-    weights = _signed(whitening @ rotation)
+    weights = signed(white @ rotation)
     return Solution(mean, weights, delta, rank)
 
 
-def _whitening(covariance: Array, relative_cut: float, least: int) -> Array:
-    """Matrix (D, rank) that makes the kept part of the signal white."""
+def whitening(covariance: Array, relative_cut: float, least: int) -> Array:
+    """Matrix (D, rank) that makes the kept part of a signal of this covariance (D, D) white.
+
+    At least `least` directions are kept, as long as they are no mere rounding.
+    """
     variance, axes = linalg.eigh(covariance, driver='evd')
     cut = min(relative_cut * variance[-1], variance[-min(least, len(variance))])
     kept = (variance >= cut) & (variance > max(_ROUNDING * variance[-1], np.finfo(float).tiny))
     return np.asarray(axes[:, kept] / np.sqrt(variance[kept]))
 
 
-def _signed(weights: Array) -> Array:
-    """Flip columns so that the entry of largest magnitude is positive."""
+def signed(weights: Array) -> Array:
+    """Weights (D, K) with each column flipped so that its largest entry is positive."""
     largest = np.argmax(np.abs(weights), axis=0)
     signs = np.sign(weights[largest, np.arange(weights.shape[1])])
     return np.asarray(weights * np.where(signs == 0, 1.0, signs))

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from sfa_localization import mdp_engine
 from sfa_localization import metric as metric_learning
 from sfa_localization.bag import load_run
 from sfa_localization.config import (
@@ -111,8 +112,8 @@ def train(
     """Learn a place model from bags and write it to `output`.
 
     A training that was cut off leaves a checkpoint beside the output; with `resume` it goes on
-    from there and gives the same bytes. Raises BagError, ConfigError, DataError or ModelError;
-    then no model is written.
+    from there and gives the same bytes (the engine mdp begins anew). Raises BagError,
+    ConfigError, DataError or ModelError; then no model is written.
     """
     recipe = recipe or Recipe()
     output = Path(output)
@@ -226,6 +227,10 @@ def _train_network(
         unit='img',
         disable=not progress,
     ) as bar:
+        if recipe.network.engine == 'mdp':
+            return mdp_engine.train_network(
+                architecture, drives, recipe.network, on_shard=bar.update
+            )
         return train_network(
             architecture,
             drives,

@@ -1,0 +1,120 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The engine made of MDP's nodes learns the same network; its shim leaves nothing behind."""
+
+import inspect
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cylinder_worlds import ARCHITECTURE, drive
+from test_hierarchy import correlations
+
+from sfa_localization import hierarchy, mdp_engine, mdp_shim
+from sfa_localization.config import NetworkConfig
+from sfa_localization.errors import ConfigError, DataError
+from sfa_localization.network import prepare
+from sfa_localization.rotation import unfold
+
+CONFIG = NetworkConfig(relative_cut=1e-7)
+
+try:
+    mdp = mdp_shim.import_mdp()
+except ConfigError as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+
+@pytest.mark.parametrize('relative_cut', [1e-7, 1e-2])
+@pytest.mark.parametrize('broken', [False, True])
+def test_engines_learn_the_same_features(broken, relative_cut):
+    of, config = drive(24), replace(CONFIG, relative_cut=relative_cut)
+    if broken:
+        of.scale[[7, 15]] = 0
+    images = of.panoramas.read(0, 24)
+    ours = hierarchy.train_network(ARCHITECTURE, [of], config)
+    theirs = mdp_engine.train_network(ARCHITECTURE, [of], config)
+    assert ours.ranks == theirs.ranks
+    for depth, (one, other) in enumerate(zip(ours.maps(images), theirs.maps(images), strict=True)):
+        assert correlations(one, other).min() > 0.9999, f'layer {depth + 1}'
+    for one, other in zip(ours.deltas, theirs.deltas, strict=True):
+        assert np.allclose(one, other, rtol=2e-3)
+
+
+def test_the_network_is_the_flow():
+    of = drive(12)
+    flow, network = mdp_engine.train_flow(ARCHITECTURE, [of], CONFIG)
+    images = of.panoramas.read(3, 5)
+    flat = prepare(images, ARCHITECTURE).reshape(2, -1).astype(float)
+    assert np.allclose(flow.execute(flat).reshape(2, 1, 12, 4), network.maps(images)[-1], atol=2e-3)
+
+
+def test_several_drives():
+    drives = [drive(10), drive(12, seed=3)]
+    images = drives[0].panoramas.read(0, 10)
+    ours = hierarchy.train_network(ARCHITECTURE, drives, CONFIG).maps(images)
+    theirs = mdp_engine.train_network(ARCHITECTURE, drives, CONFIG).maps(images)
+    assert correlations(ours[-1], theirs[-1]).min() > 0.9999
+
+
+@pytest.mark.parametrize('receptive', ARCHITECTURE.fields)
+def test_switchboards_show_what_fields_see(receptive):
+    maps = np.random.default_rng(0).normal(size=(1, 5, 12, 3)).astype(np.float32)
+    wires = mdp_engine.connections((5, 12, 3), receptive)
+    seen = unfold(maps, receptive)
+    assert np.array_equal(maps.ravel()[wires], seen.reshape(-1, seen.shape[-1]))
+
+
+def test_progress_counts_every_picture_in_every_pass():
+    told = []
+    mdp_engine.train_network(ARCHITECTURE, [drive(6)], CONFIG, on_shard=told.append)
+    assert sum(told) == 6 * 6
+
+
+def test_only_differences_per_picture():
+    of = drive(6)
+    of.scale[2] = 0.5
+    with pytest.raises(ConfigError, match='set difference'):
+        mdp_engine.train_network(ARCHITECTURE, [of], CONFIG)
+
+
+def test_blank_pictures_are_refused():
+    of = drive(6)
+    of.panoramas.images[:] = 99
+    with pytest.raises(DataError, match='rank'):
+        mdp_engine.train_network(ARCHITECTURE, [of], CONFIG)
+
+
+def test_shim_leaves_no_patch_behind():
+    """In a fresh interpreter; it also tells what it repaired."""
+    code = (
+        'import inspect, logging, numpy\n'
+        'logging.basicConfig(level=logging.INFO)\n'
+        'before = set(vars(numpy)), inspect.getfullargspec\n'
+        'from sfa_localization.mdp_shim import import_mdp\n'
+        'mdp = import_mdp()\n'
+        'assert import_mdp() is mdp\n'
+        'gone = set(vars(numpy)) - before[0]\n'
+        "assert 'typeDict' not in gone, gone\n"
+        'assert inspect.getfullargspec is before[1]\n'
+        'mdp.nodes.SFANode(output_dim=1).train(numpy.eye(9).cumsum(0))\n'
+    )
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    repairs = 'typeDict' in done.stderr
+    assert repairs == (tuple(map(int, np.__version__.split('.')[:2])) >= (1, 24))
+
+
+def test_shim_does_nothing_where_mdp_imports(monkeypatch):
+    monkeypatch.setattr(mdp_shim, '_lent_type_names', lambda: pytest.fail('patched'))
+    monkeypatch.setattr(mdp_shim, '_patient_argspec', lambda: pytest.fail('patched'))
+    before = inspect.getfullargspec
+    assert mdp_shim.import_mdp() is mdp
+    assert inspect.getfullargspec is before
+
+
+def test_missing_mdp_tells_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'mdp', None)
+    with pytest.raises(ConfigError, match=r'pip install "sfa_localization\[mdp\]"'):
+        mdp_shim.import_mdp()
