@@ -141,13 +141,21 @@ def eliminate(expanded: Array, ridge: Array, weights: Array, stack: Stack) -> El
     weighted = expanded * weights[:, None]
     normal = weighted.T @ expanded
     normal[np.diag_indices_from(normal)] += ridge
-    normal[np.diag_indices_from(normal)] += 1e-14 * np.trace(normal) / len(normal)
-    factor = scipy.linalg.cholesky(normal, lower=True, overwrite_a=True)
+    factor = _cholesky(normal)
     columns = np.column_stack([np.ones(len(weights)), stack.path, stack.drift])
     cross = np.vstack([_products(weighted, column, stack) for column in columns.T]).T
     half = _halve(factor, cross)
     gram = _moments(columns, weights, stack) - half.conj().T @ half
     return Elimination((gram + gram.conj().T) / 2, factor, cross)
+
+
+def _cholesky(matrix: Array) -> Array:
+    """Lower factor; what nothing holds is held weakly, and only then."""
+    try:
+        return np.asarray(scipy.linalg.cholesky(matrix, lower=True))
+    except np.linalg.LinAlgError:
+        held = matrix + 1e-12 * max(np.trace(matrix), 1e-300) / len(matrix) * np.eye(len(matrix))
+        return np.asarray(scipy.linalg.cholesky(held, lower=True))
 
 
 def _products(weighted: Array, column: Complex, stack: Stack) -> Complex:
@@ -290,7 +298,7 @@ class Problem:
             step = np.clip(step, -self.bias_std, self.bias_std)
             bias = bias + step
             z, slope = self._settle(bias, z)
-            if np.abs(step).max() < 1e-6 * self.bias_std:
+            if np.abs(step).max() < 1e-9 * self.bias_std:
                 break
         return bias, z
 
@@ -300,8 +308,8 @@ def schur(system: Complex) -> tuple[Complex, Complex]:
     n = len(system) // 2
     own = np.real(system[:n, :n]).copy()
     level = max(float(np.trace(own)) / n, 1e-300)
-    # Moving everything together costs nothing: pin the mean, and what nothing holds.
-    own += level / n + 1e-13 * level * np.eye(n)
-    origins = -np.asarray(_solve(scipy.linalg.cholesky(own, lower=True), system[:n, n:]))
+    # Moving everything together costs nothing: pin the mean.
+    own += level / n
+    origins = -np.asarray(_solve(_cholesky(own), system[:n, n:]))
     h = system[n:, n:] + system[n:, :n] @ origins
     return np.asarray((h + h.conj().T) / 2), origins

@@ -41,7 +41,9 @@ class Fit:
     elimination: Elimination
     solution: Solution
     correlation: float
-    """How many neighbouring pictures count as one: their residuals go together."""
+    """How many pictures count as one beside odometry's links: residuals of neighbours go together,
+    and noise of the features, which least squares takes for noise of the place, contracts the map;
+    the link weight makes up for that."""
     residuals: Complex
     """(M,) where odometry puts a picture minus where the map does."""
     map_weights: Complex
@@ -67,7 +69,7 @@ def fit(
     missing = 1.0 + basis.missing(expanded)
     trust = np.ones(len(expanded)) if start is None else start.point_weights
     variance = 0.04 if start is None else start.variance
-    correlation = 1.0 if start is None else start.correlation
+    correlation = config.link_weight if start is None else start.correlation
     links = links if start is None else start.links
     solution = None if start is None else start.solution
     for _ in range(max(rounds, 1)):
@@ -75,7 +77,8 @@ def fit(
         solution = _solve(elimination, links, stack, variance * correlation, config, solution)
         weights = elimination.weights(solution.coefficients(stack.run))
         residuals = targets(solution, stack) - _product(expanded, weights)
-        before, correlation = variance, _correlation(residuals, stack)
+        before = variance
+        correlation = config.link_weight * _correlation(residuals, stack)
         variance = _variance(elimination, basis, trust / missing, residuals, stack)
         if config.robust:
             trust = _point_trust(residuals, variance * missing)

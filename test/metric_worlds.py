@@ -1,0 +1,109 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Drives through a world whose slow features are known functions of the place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfa_localization.run import Odometry, Stamps, Trajectory, YawRate, integrate
+
+RATE = 50
+STEP_NS = 1_000_000_000 // RATE
+
+
+@dataclass
+class Drive:
+    """What a robot records, and where it was: `poses` (N, 3) at the pictures."""
+
+    odometry: Odometry
+    stamps_ns: Stamps
+    poses: np.ndarray
+    gyro: YawRate
+
+
+def drive(twists, *, start=(0.0, 0.0, 0.0), bias=0.0, yaw_noise=0.0, speed_noise=0.0, seed=0):
+    """Drive twists (T, 2) at 50 Hz; odometry adds a yaw-rate bias and white noise. 5 pictures/s."""
+    rng = np.random.default_rng(seed)
+    twists = np.asarray(twists, float)
+    stamps = 1_000_000_000 + STEP_NS * np.arange(len(twists) + 1)
+    held = np.vstack([twists, np.zeros((1, 2))])
+    truth = integrate(stamps, held, np.array(start))
+    measured = held * (1 + speed_noise * rng.standard_normal((len(held), 1)) * [1, 0])
+    measured[:, 1] += bias + yaw_noise * rng.standard_normal(len(held))
+    poses = integrate(stamps, measured)
+    odometry = Odometry(stamps, poses, measured, np.zeros((len(stamps), 2)))
+    # The rate between two stamps, as the trapezoid of the rates at both would have it.
+    omega = np.interp(np.arange(len(held)), np.arange(len(held) - 1) + 0.5, measured[:-1, 1])
+    gyro = YawRate(stamps, omega, np.zeros(len(stamps)))
+    pictures = stamps[::10]
+    return Drive(odometry, pictures, Trajectory(stamps, truth).at(pictures), gyro)
+
+
+def straight(length, speed=1.0):
+    """Twists of a straight line."""
+    steps = round(abs(length / speed) * RATE)
+    return np.tile([length / steps * RATE, 0.0], (steps, 1))
+
+
+def turn(angle, rate=0.6):
+    """Twists of a turn on the spot."""
+    steps = max(round(abs(angle) / rate * RATE), 1)
+    return np.tile([0.0, angle / steps * RATE], (steps, 1))
+
+
+def stand(seconds):
+    return np.zeros((round(seconds * RATE), 2))
+
+
+def criss_cross(lines, half=(8.0, 9.0), seed=0, shortest=8.0):
+    """Twists from corner point to corner point of a garden, turning on the spot; start pose."""
+    rng = np.random.default_rng(seed)
+    place, yaw = rng.uniform(-1, 1, 2) * half, 0.0
+    start, parts = (*place, yaw), []
+    for _ in range(lines):
+        goal = rng.uniform(-1, 1, 2) * half
+        while np.hypot(*(goal - place)) < shortest:
+            goal = rng.uniform(-1, 1, 2) * half
+        direction = np.arctan2(*(goal - place)[::-1])
+        angle = (direction - yaw + np.pi) % (2 * np.pi) - np.pi
+        parts += [turn(angle), straight(np.hypot(*(goal - place)))]
+        place, yaw = goal, direction
+    return np.vstack(parts), start
+
+
+def meander(length, half=(8.0, 9.0), seed=0, speed=1.0):
+    """Twists of a curved drive that stays in the garden, never straight; start pose."""
+    rng = np.random.default_rng(seed)
+    place, yaw, rate, twists = np.zeros(2), 0.0, 0.0, []
+    for _ in range(round(length / speed * RATE)):
+        rate += -rate / RATE + 0.5 * rng.standard_normal() / np.sqrt(RATE)
+        home = (np.arctan2(*-place[::-1]) - yaw + np.pi) % (2 * np.pi) - np.pi
+        outside = np.abs(place / half).max() > 0.85
+        omega = 0.8 * np.sign(home) if outside and abs(home) > 0.5 else rate
+        twists.append((speed, omega))
+        middle = yaw + omega / RATE / 2
+        place = place + speed / RATE * np.array([np.cos(middle), np.sin(middle)])
+        yaw += omega / RATE
+    return np.array(twists), (0.0, 0.0, 0.0)
+
+
+def exact_features(places):
+    """Slow features whose second-degree monomials hold the place exactly: (N, 5)."""
+    x, y = places[:, 0] / 8, places[:, 1] / 9
+    return np.column_stack(
+        [x + 0.3 * y**2, y, np.sin(2 * x + y), np.cos(x - 2 * y), np.sin(3 * x) * np.cos(2 * y)]
+    )
+
+
+def garden_features(places, *, noise=0.0, count=12, seed=0, world=0):
+    """Smooth random functions of the place, the slowest first, with noise: (N, count)."""
+    rng = np.random.default_rng(world)
+    waves = rng.standard_normal((count, 3, 2)) * np.linspace(0.08, 0.35, count)[:, None, None]
+    phases = rng.uniform(0, 2 * np.pi, (count, 3))
+    values = np.cos(np.einsum('nd,kwd->nkw', places, waves) + phases).sum(2)
+    x = np.cos(np.pi * (places / [8.0, 9.0] + 1) / 2)
+    values[:, :2] += 3 * x
+    return values + noise * np.random.default_rng(seed).standard_normal(values.shape)

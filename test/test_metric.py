@@ -1,0 +1,392 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Unsupervised metric learning against worlds whose every place is known."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from metric_worlds import (
+    criss_cross,
+    drive,
+    exact_features,
+    garden_features,
+    meander,
+    straight,
+    turn,
+)
+
+from sfa_localization.config import MetricConfig, SegmentConfig
+from sfa_localization.elimination import Links, Problem, Stack, eliminate
+from sfa_localization.errors import DataError
+from sfa_localization.geometry import RigidTransform, align, compose, invert, wrap_angle
+from sfa_localization.metric import headings, learn, positions, with_frame
+from sfa_localization.phases import certify
+from sfa_localization.paper_solver import Lines, Parameters, odometry_start
+from sfa_localization.regression import MetricMap, Monomials, monomials
+from sfa_localization.segments import assignment, cut, join
+
+ANY = SegmentConfig()
+STRAIGHT = SegmentConfig(segments='straight')
+EXACT = MetricConfig(metric_map='monomials', slow_features=5, ridge=0.0)
+PLAIN = dataclasses.replace(EXACT, use_turns=False, use_displacements=False)
+GP = MetricConfig(slow_features=12, inducing_points=300)
+LINES, LINES_START = criss_cross(10)
+CURVES, CURVES_START = meander(150.0)
+
+
+@cache
+def lines_drive():
+    return drive(LINES, start=LINES_START)
+
+
+@cache
+def curved_drive():
+    return drive(CURVES, start=CURVES_START)
+
+
+def noisy_drive(twists, start, seed=0, bias=1.4e-3):
+    return drive(twists, start=start, bias=bias, yaw_noise=0.01, speed_noise=0.03, seed=seed)
+
+
+def in_odometry_frame(run):
+    """True poses (N, 3) as the odometry would have them had it not drifted."""
+    return compose(invert(run.poses[0]), run.poses)
+
+
+def grid_twists():
+    """Boustrophedon lanes along x, then along y: directions only 90 degrees apart."""
+    lanes = []
+    for k in range(9):
+        side = np.pi / 2 if k % 2 == 0 else -np.pi / 2
+        lanes += [straight(10.0), turn(side), straight(1.2), turn(side)]
+    return np.vstack([*lanes, turn(np.pi / 2), *lanes])
+
+
+MODES = {
+    'lines': (lines_drive, STRAIGHT, EXACT),
+    'lines without turns': (lines_drive, STRAIGHT, PLAIN),
+    'lines without displacements': (
+        lines_drive,
+        STRAIGHT,
+        dataclasses.replace(EXACT, use_displacements=False),
+    ),
+    'curves': (curved_drive, ANY, EXACT),
+    'curves without links': (curved_drive, ANY, PLAIN),
+    'lines as pieces': (lines_drive, ANY, EXACT),
+    'ridge and count chosen': (lines_drive, STRAIGHT, MetricConfig(metric_map='monomials')),
+}
+
+
+@pytest.mark.parametrize('mode', MODES)
+def test_noiseless_data_gives_no_error(mode):
+    make, cutter, config = MODES[mode]
+    run = make()
+    segments = cut(run.odometry, run.stamps_ns, cutter)
+    result = learn(exact_features(run.poses), segments, config)
+    truth = in_odometry_frame(run)
+    predicted, _ = result.map.predict(exact_features(run.poses))
+    assert np.abs(predicted - truth[:, :2]).max() < 1e-9
+    images, places = positions(result, segments)
+    assert np.abs(places - truth[images, :2]).max() < 1e-9
+    images, yaw = headings(result, segments)
+    assert np.abs(wrap_angle(yaw - truth[images, 2])).max() < 1e-9
+    assert result.certificate.certified
+    assert np.abs(result.residuals).max() < 1e-9
+    # A left-out segment that nothing links is held by rounding alone.
+    assert result.left_out_error_m < 1e-7
+
+
+def test_noiseless_process_is_exact_up_to_its_interpolation():
+    run = curved_drive()
+    features = garden_features(run.poses[:, :2])
+    segments = cut(run.odometry, run.stamps_ns, ANY)
+    result = learn(features, segments, GP)
+    predicted, _ = result.map.predict(features)
+    assert np.abs(predicted - in_odometry_frame(run)[:, :2]).max() < 0.05
+    assert result.certificate.certified
+
+
+@pytest.mark.parametrize('kind', ['straight', 'any'])
+def test_without_ground_truth_it_comes_close_to_regression_on_ground_truth(kind):
+    twists, start = criss_cross(24, seed=2) if kind == 'straight' else meander(250.0, seed=2)
+    run = noisy_drive(twists, start)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments=kind))
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    result = learn(features, segments, GP)
+    unseen = another_drive(run.poses[:, :2])
+    seen_from = garden_features(unseen, noise=0.05, seed=9)
+    images = result.images
+    frame = align(result.map.predict(features[images])[0], run.poses[images, :2])
+    unsupervised = errors(frame.apply(result.map.predict(seen_from)[0]), unseen).mean()
+    supervised = supervised_map(result, features, run.poses[:, :2], seen_from)
+    reckoned = run.odometry.poses[::10, :2]
+    odometry = errors(align(reckoned, run.poses[:, :2]).apply(reckoned), run.poses[:, :2]).mean()
+    assert unsupervised < 1.15 * errors(supervised, unseen).mean()
+    assert unsupervised < 0.5 * odometry
+    assert result.certificate.certified
+    assert 0.5 < result.left_out_error_m / unsupervised < 3.0
+
+
+def another_drive(known):
+    """Places (N, 2) of an unseen drive, where it comes within a metre of the known places."""
+    twists, start = meander(120.0, seed=77)
+    places = drive(twists, start=start).poses[:, :2]
+    return places[[errors(known, place).min() < 1.0 for place in places]]
+
+
+def errors(a, b):
+    return np.hypot(*(a - b).T)
+
+
+def supervised_map(result, features, truth, unseen):
+    """The same process regressed on ground truth."""
+    basis, rows = result.map.basis, result.images
+    terms = basis.expand(features[rows])
+    weights = 1 / (1 + basis.missing(terms))
+    normal = (terms * weights[:, None]).T @ terms + np.diag(basis.ridge)
+    return basis.expand(unseen) @ np.linalg.solve(
+        normal, (terms * weights[:, None]).T @ truth[rows]
+    )
+
+
+@cache
+def noisy_result():
+    twists, start = meander(200.0, seed=4)
+    run = noisy_drive(twists, start, seed=4)
+    segments = cut(run.odometry, run.stamps_ns, ANY)
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    return run, segments, features, learn(features, segments, GP)
+
+
+def test_the_gyros_bias_is_found():
+    result = noisy_result()[3]
+    assert result.yaw_bias == pytest.approx([1.4e-3], abs=3e-4)
+    blind = learn(*noisy_inputs(), dataclasses.replace(GP, yaw_bias_std=0.0))
+    assert blind.yaw_bias == pytest.approx([0.0])
+
+
+def noisy_inputs():
+    _, segments, features, _ = noisy_result()
+    return features, segments
+
+
+def test_the_map_is_the_odometry_frame_at_the_start():
+    run, segments, _, result = noisy_result()
+    images, places = positions(result, segments)
+    _, yaw = headings(result, segments)
+    truth = in_odometry_frame(run)[images]
+    start = images < 40
+    assert errors(places[start], truth[start, :2]).mean() < 0.15
+    assert np.abs(wrap_angle(yaw - truth[:, 2])[start]).mean() < np.deg2rad(1.5)
+
+
+def test_an_anchor_moves_the_start_of_the_map():
+    _, segments, features, result = noisy_result()
+    anchored = learn(
+        features,
+        segments,
+        dataclasses.replace(GP, use_anchor=True, anchor_x=5.0, anchor_y=-2.0, anchor_yaw=2.0),
+    )
+    expected = RigidTransform(5.0, -2.0, 2.0).apply(result.map.predict(features)[0])
+    assert np.allclose(anchored.map.predict(features)[0], expected, atol=1e-6)
+    assert np.allclose(anchored.origins, RigidTransform(5.0, -2.0, 2.0).apply(result.origins))
+
+
+def test_covariances_are_honest_about_unseen_places():
+    _, _, _, result = noisy_result()
+    run = noisy_result()[0]
+    unseen = another_drive(run.poses[:, :2])
+    predicted, covariances = result.map.predict(garden_features(unseen, noise=0.05, seed=9))
+    first = run.poses[0]
+    truth = RigidTransform(*invert(first)).apply(unseen)
+    off = predicted - truth
+    squared = np.einsum('ni,nij,nj->n', off, np.linalg.inv(covariances), off)
+    assert 0.35 < np.mean(squared < 1.386) < 0.9
+    assert np.mean(squared < 5.99) > 0.85
+
+
+def test_strange_features_have_a_large_variance():
+    _, _, features, result = noisy_result()
+    usual = result.map.predict(features)[1][:, 0, 0]
+    strange = result.map.predict(features[:5] * 4 + 3)[1][:, 0, 0]
+    assert strange.min() > 20 * np.median(usual)
+
+
+def test_left_out_segments_calibrate_the_covariance():
+    consistency = noisy_result()[3].consistency
+    assert consistency.within_half >= 0.5 - 1e-3
+    assert consistency.within_95 >= 0.95 - 2e-3
+
+
+def test_left_out_errors_exceed_those_of_the_fit():
+    result = noisy_result()[3]
+    assert result.left_out_error_m > np.hypot(*result.residuals.T).mean()
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    _, _, _, result = noisy_result()
+    again = learn(*noisy_inputs(), GP)
+    for name, array in result.map.to_arrays().items():
+        assert array.tobytes() == again.map.to_arrays()[name].tobytes(), name
+
+
+def test_a_result_moves_as_a_whole():
+    _, segments, features, result = noisy_result()
+    frame = RigidTransform(1.0, 2.0, -0.5)
+    moved = with_frame(result, frame)
+    assert np.allclose(
+        moved.map.predict(features)[0], frame.apply(result.map.predict(features)[0]), atol=1e-9
+    )
+    assert np.allclose(
+        positions(moved, segments)[1], frame.apply(positions(result, segments)[1]), atol=1e-9
+    )
+    assert np.allclose(np.hypot(*moved.left_out.T), np.hypot(*result.left_out.T))
+
+
+def test_arrays_bring_back_the_map():
+    _, _, features, result = noisy_result()
+    again = MetricMap.from_arrays(result.map.to_arrays())
+    assert np.array_equal(again.predict(features)[0], result.map.predict(features)[0])
+
+
+def test_two_runs_share_one_map():
+    one, two = noisy_drive(*criss_cross(10, seed=1), seed=1), noisy_drive(*meander(80.0), seed=2)
+    parts = [cut(r.odometry, r.stamps_ns, ANY) for r in (one, two)]
+    places = np.vstack([one.poses, two.poses])
+    segments = join(parts, [0, len(one.poses)])
+    result = learn(garden_features(places[:, :2], noise=0.05), segments, GP)
+    images, found = positions(result, segments)
+    frame = align(found, places[images, :2])
+    assert errors(frame.apply(found), places[images, :2]).mean() < 0.2
+    assert len(result.yaw_bias) == 2
+    assert np.array_equal(np.flatnonzero(assignment(segments, len(places)) >= 0), np.sort(images))
+
+
+# --- what cannot be learnt, and what must not be believed -------------------------------------
+
+
+def test_a_mirrored_map_is_told_by_the_turns_and_not_certified():
+    run = lines_drive()
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    stack = Stack.of(segments)
+    features = exact_features(run.poses)[stack.images]
+    basis = Monomials.fit(features, 5, 0.0)
+    elimination = eliminate(basis.expand(features), basis.ridge, np.ones(len(features)), stack)
+    truth = np.exp(1j * run.poses[stack.images[stack.first], 2])
+
+    def problem(turns):
+        links = Links.of(segments, turns, False)
+        return Problem(elimination.gram, links, stack.run, 1e-4, 0.0).reduced(np.zeros(1))
+
+    # Without turns the mirror image is as good, and as proven, as the truth.
+    assert certify(problem(False), truth).certified
+    assert certify(problem(False), np.conj(truth)).certified
+    assert certify(problem(True), truth).certified
+    assert not certify(problem(True), np.conj(truth)).certified
+
+
+def test_without_any_turn_the_mirror_image_is_admitted_to_be_possible():
+    run = lines_drive()
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    lone = [dataclasses.replace(s, turn_rad=np.nan) for s in segments]
+    apart = dataclasses.replace(segments, items=tuple(lone))
+    features = exact_features(run.poses)
+    assert learn(features, apart, EXACT).diagnostics.mirror_ambiguous
+    assert not learn(features, segments, EXACT).diagnostics.mirror_ambiguous
+    assert not learn(features, segments, PLAIN).diagnostics.mirror_ambiguous
+
+
+def test_a_sheared_grid_is_refused_without_turns_and_right_with_them():
+    run = drive(grid_twists())
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    features = exact_features(run.poses - [3.0, 3.0, 0.0])
+    with pytest.raises(DataError, match='three well-spread directions'):
+        learn(features, segments, PLAIN)
+    result = learn(features, segments, EXACT)
+    predicted = result.map.predict(features)[0]
+    assert errors(predicted, in_odometry_frame(run)[:, :2]).max() < 1e-6
+
+
+def test_a_collapsed_drive_is_refused():
+    back_and_forth = np.vstack([straight(8.0), turn(np.pi), straight(8.0), turn(np.pi)] * 3)
+    run = drive(back_and_forth)
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    features = exact_features(run.poses)
+    for config in (EXACT, PLAIN):
+        with pytest.raises(DataError, match='directions'):
+            learn(features, segments, config)
+
+
+def test_too_few_segments_are_refused():
+    run = drive(np.vstack([straight(5.0), turn(1.0), straight(5.0)]))
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    with pytest.raises(DataError, match='only 2 segments'):
+        learn(exact_features(run.poses), segments, EXACT)
+
+
+def test_features_that_say_nothing_are_refused():
+    run = curved_drive()
+    segments = cut(run.odometry, run.stamps_ns, ANY)
+    noise = np.random.default_rng(0).standard_normal((len(run.poses), 5))
+    plain = dataclasses.replace(PLAIN, require_certificate=False)
+    with pytest.raises(DataError, match=r'uncertain|cover|directions'):
+        learn(noise, segments, plain)
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'message'),
+    [
+        (lambda f: f[:10], 'one row per picture'),
+        (
+            lambda f: np.where(np.arange(len(f))[:, None] == 60, np.nan, f),
+            'of 1 pictures are not finite',
+        ),
+        (lambda f: np.ones_like(f), 'constant'),
+        (lambda f: f[:, :3], 'only 3'),
+    ],
+)
+def test_unusable_features_are_named(spoil, message):
+    run = lines_drive()
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    with pytest.raises(DataError, match=message):
+        learn(spoil(exact_features(run.poses)), segments, EXACT)
+
+
+# --- the paper's solver through the same door ------------------------------------------------
+
+
+def test_the_papers_descent_from_odometry_comes_close_and_tells_its_history():
+    run = noisy_drive(LINES, LINES_START, bias=0.0)
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    features = exact_features(run.poses)
+    paper = learn(features, segments, dataclasses.replace(EXACT, solver='paper'))
+    best = learn(features, segments, EXACT)
+    assert len(paper.history) == 1001
+    assert paper.history[-1] < paper.history[0]
+    off = errors(paper.map.predict(features)[0], best.map.predict(features)[0]).mean()
+    assert off < 0.5
+    assert best.certificate.certified
+    assert not paper.certificate.certified
+
+
+def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
+    run = noisy_drive(LINES, LINES_START, bias=0.0)
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    stack = Stack.of(segments)
+    turns = np.array([s.turn_rad for s in segments.items[:-1]])
+    regressors = monomials(exact_features(run.poses)[stack.images])
+    lines = Lines(regressors, stack.path.real, stack.owner, turns)
+    theta = odometry_start(lines, stack.starts)
+    mirror = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
+    assert lines.cost(mirror) == pytest.approx(lines.cost(theta), rel=1e-9)
+    # Odometry that starts mirrored would lead the descent there; learn() turns it back.
+    flipped = dataclasses.replace(
+        segments,
+        items=tuple(dataclasses.replace(s, start=s.start * [1, -1, -1]) for s in segments),
+    )
+    config = dataclasses.replace(EXACT, solver='paper', require_certificate=False)
+    result = learn(exact_features(run.poses), flipped, config)
+    step = np.diff(result.angles)
+    assert np.cos(step - turns).mean() > 0.99

@@ -1,0 +1,122 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's equations 1 to 8, by hand and by finite differences."""
+
+import numpy as np
+import pytest
+from metric_worlds import criss_cross, drive, exact_features
+
+from sfa_localization.config import MetricConfig, SegmentConfig
+from sfa_localization.elimination import Links, Stack
+from sfa_localization.errors import DataError
+from sfa_localization.paper_solver import (
+    Lines,
+    Parameters,
+    descend,
+    learn,
+    odometry_start,
+    random_start,
+)
+from sfa_localization.regression import monomials
+from sfa_localization.segments import cut
+
+
+def problem(turns=True, seed=0):
+    rng = np.random.default_rng(seed)
+    line = np.repeat(np.arange(4), 6)
+    measured = np.array([0.5, np.nan, -1.2]) if turns else np.zeros(0)
+    lines = Lines(rng.standard_normal((24, 6)), rng.uniform(0, 8, 24), line, measured)
+    theta = Parameters(
+        rng.uniform(0, 6, 4), rng.standard_normal((4, 2)), rng.standard_normal((6, 2))
+    )
+    return lines, theta
+
+
+def test_cost_of_one_point_by_hand():
+    # o = (1, 2), d = 3 along alpha = 90 deg gives (1, 5); W^T s = 2 * (1, 1) = (2, 2).
+    lines = Lines(np.array([[2.0]]), np.array([3.0]), np.array([0]), np.zeros(0))
+    theta = Parameters(np.array([np.pi / 2]), np.array([[1.0, 2.0]]), np.array([[1.0, 1.0]]))
+    assert lines.cost(theta) == pytest.approx(0.5 * (1 + 9))
+
+
+def test_cost_of_turns_by_hand():
+    lines = Lines(np.zeros((3, 1)), np.zeros(3), np.arange(3), np.array([np.pi / 2, np.pi / 3]))
+    theta = Parameters(np.array([0.0, 0.0, np.pi / 3]), np.zeros((3, 2)), np.zeros((1, 2)))
+    # cos 0 - cos 90 deg = 1; cos(-60 deg) - cos 60 deg = 0.
+    assert lines.cost(theta) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize('turns', [False, True])
+def test_gradients_are_the_slopes_of_the_costs(turns):
+    lines, theta = problem(turns)
+    flat, small = theta.flat(), 1e-6
+    gradient = lines.gradient(theta).flat()
+    for k in range(len(flat)):
+        step = np.eye(len(flat))[k] * small
+        up, down = (lines.cost(Parameters.of(flat + s * step, 4)) for s in (1, -1))
+        assert gradient[k] == pytest.approx((up - down) / (2 * small), rel=1e-5, abs=1e-5)
+
+
+def test_one_step_is_equations_7_and_8():
+    lines, theta = problem()
+    config = MetricConfig(paper_iterations=2, paper_learning_rate=1e-3, paper_momentum=0.9)
+    first = theta.flat() - 1e-3 * lines.gradient(theta).flat()
+    velocity = theta.flat() - first
+    slope = lines.gradient(Parameters.of(first, 4)).flat()
+    second = first - (0.9 * velocity + 1e-3 * slope)
+    end, history = descend(lines, theta, config)
+    assert np.allclose(end.flat(), second, atol=1e-12)
+    assert history == pytest.approx(
+        [lines.cost(theta), lines.cost(Parameters.of(first, 4)), lines.cost(end)]
+    )
+
+
+def test_both_stopping_rules():
+    lines, theta = problem()
+    all_used = descend(lines, theta, MetricConfig(paper_iterations=50))[1]
+    assert len(all_used) == 51
+    settled = descend(lines, theta, MetricConfig(paper_iterations=10**6, paper_change_min=1e-3))[1]
+    assert len(settled) < 10**5
+    assert abs(settled[-1] - settled[-2]) < 1e-3 <= abs(settled[-2] - settled[-3])
+
+
+@pytest.mark.filterwarnings('ignore:overflow', 'ignore:invalid value')
+def test_a_diverging_descent_names_its_parameter():
+    lines, theta = problem()
+    with pytest.raises(DataError, match='paper_learning_rate'):
+        descend(lines, theta, MetricConfig(paper_learning_rate=1.0, paper_iterations=10000))
+
+
+def test_random_starts_repeat_with_their_seed_and_fill_the_area():
+    lines, _ = problem()
+    one, two = (random_start(lines, MetricConfig(metric_seed=s)) for s in (1, 1))
+    assert np.array_equal(one.flat(), two.flat())
+    starts = [random_start(lines, MetricConfig(metric_seed=s)) for s in range(200)]
+    origins = np.vstack([s.origins for s in starts])
+    assert np.abs(origins).max(0) == pytest.approx([8, 9], rel=0.02)
+    assert np.abs(np.vstack([s.weights for s in starts])).max() <= 1
+
+
+def lines_of_a_drive():
+    twists, start = criss_cross(10)
+    run = drive(twists, start=start)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments='straight'))
+    return run, Stack.of(segments), segments
+
+
+def test_the_odometry_start_of_perfect_odometry_costs_nothing():
+    run, stack, _ = lines_of_a_drive()
+    regressors = monomials(exact_features(run.poses[stack.images]))
+    lines = Lines(regressors, stack.path.real, stack.owner, np.zeros(0))
+    assert lines.cost(odometry_start(lines, stack.starts)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_curved_segments_are_refused():
+    _, stack, segments = lines_of_a_drive()
+    bent = type(stack)(
+        **{n: getattr(stack, n) for n in stack.__slots__} | {'path': 1j * stack.path}
+    )
+    with pytest.raises(DataError, match='segments: straight'):
+        learn(
+            np.zeros((len(stack.images), 3)), bent, Links.of(segments, True, True), MetricConfig()
+        )

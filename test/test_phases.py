@@ -1,0 +1,119 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Phase synchronization: global minima, proofs, and their absence."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from sfa_localization.phases import (
+    angle_hessian,
+    certify,
+    metric_upgrade,
+    phase_cost,
+    refine,
+    synchronize,
+    unit,
+)
+
+
+def ring(angles, noise, rng):
+    """A connection Laplacian of all pairs with noisy angles."""
+    n = len(angles)
+    h = np.zeros((n, n), complex)
+    for i, j in itertools.combinations(range(n), 2):
+        w = np.exp(1j * (angles[j] - angles[i] + noise * rng.standard_normal()))
+        h[i, i] += 1
+        h[j, j] += 1
+        h[j, i] -= w
+        h[i, j] -= np.conj(w)
+    return h
+
+
+def best_of_grid(h, steps=60):
+    """Smallest cost over a grid of angles, the first fixed."""
+    angles = 2 * np.pi * np.arange(steps) / steps
+    grid = itertools.product(angles, repeat=len(h) - 1)
+    return min(phase_cost(h, np.exp(1j * np.array((0.0, *a)))) for a in grid)
+
+
+def test_noiseless_angles_are_recovered_up_to_one_rotation():
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-np.pi, np.pi, 20)
+    z, certificate = synchronize(ring(angles, 0.0, rng))
+    turned = z * np.exp(-1j * angles)
+    assert np.abs(turned - turned[0]).max() < 1e-10
+    assert certificate.certified
+    assert certificate.gap > 0.5
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_no_grid_point_beats_a_certified_minimum(seed):
+    rng = np.random.default_rng(seed)
+    a = rng.standard_normal((4, 4)) + 1j * rng.standard_normal((4, 4))
+    h = a.conj().T @ a
+    z, certificate = synchronize(h)
+    if certificate.certified:
+        assert phase_cost(h, z) <= best_of_grid(h) + 1e-9
+    # Even uncertified, it is no worse than a grid of 6 degrees finds.
+    assert phase_cost(h, z) <= best_of_grid(h) + 1e-9
+
+
+def test_a_worse_minimum_is_not_certified():
+    # On a ring of n equal links, angles that wind once around are a local minimum.
+    n = 12
+    h = np.zeros((n, n), complex)
+    for i in range(n):
+        j = (i + 1) % n
+        h[[i, j], [i, j]] += 1
+        h[i, j] = h[j, i] = -1
+    wound = refine(h, np.exp(2j * np.pi * np.arange(n) / n))
+    assert phase_cost(h, wound) > 1.0
+    assert np.linalg.eigvalsh(angle_hessian(h, wound))[0] > -1e-9
+    assert not certify(h, wound).certified
+    z, certificate = synchronize(h, [wound])
+    assert certificate.certified
+    assert phase_cost(h, z) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_newton_ends_where_the_gradient_vanishes():
+    rng = np.random.default_rng(3)
+    h = ring(rng.uniform(-3, 3, 15), 0.5, rng)
+    z = refine(h, unit(rng.standard_normal(15) + 1j * rng.standard_normal(15)))
+    assert np.abs(np.imag(np.conj(z) * (h @ z))).max() < 1e-8
+    assert np.linalg.eigvalsh(angle_hessian(h, z))[0] > -1e-8
+
+
+def test_the_hessian_is_the_slope_of_the_gradient():
+    rng = np.random.default_rng(4)
+    h = ring(rng.uniform(-3, 3, 6), 0.3, rng)
+    angles, small = rng.uniform(-3, 3, 6), 1e-5
+    hessian = angle_hessian(h, np.exp(1j * angles))
+    for i, j in itertools.product(range(6), repeat=2):
+        e, f = np.eye(6)[i] * small, np.eye(6)[j] * small
+        corners = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+        costs = [phase_cost(h, np.exp(1j * (angles + s * e + t * f))) for s, t in corners]
+        numeric = (costs[0] - costs[1] - costs[2] + costs[3]) / (4 * small**2)
+        assert hessian[i, j] == pytest.approx(numeric, abs=1e-4)
+
+
+def lines_only(angles):
+    """G of lines whose directions are all that a linear map has to explain."""
+    u = np.column_stack([np.cos(angles), np.sin(angles)])
+    q = np.linalg.qr(u)[0]
+    return np.eye(len(u)) - q @ q.T
+
+
+def test_the_metric_upgrade_undoes_any_affine_map():
+    angles = np.random.default_rng(1).uniform(0, np.pi, 10)
+    z, condition = metric_upgrade(lines_only(angles))
+    same, mirrored = z * np.exp(-1j * angles), z * np.exp(1j * angles)
+    off = min(np.abs(w - w[0]).max() for w in (same, mirrored))
+    assert off < 1e-9
+    assert condition > 0.1
+
+
+def test_two_directions_leave_the_upgrade_without_condition():
+    angles = np.array([0.0, np.pi / 2] * 5)
+    assert metric_upgrade(lines_only(angles))[1] < 1e-9

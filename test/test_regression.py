@@ -1,0 +1,136 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps from slow features to metres: monomials and Gaussian process."""
+
+import numpy as np
+import pytest
+
+from sfa_localization.errors import DataError, ModelError
+from sfa_localization.geometry import RigidTransform
+from sfa_localization.regression import MetricMap, Monomials, Process, matern, monomials, spread
+
+RNG = np.random.default_rng(0)
+FEATURES = RNG.standard_normal((80, 6))
+
+
+def test_eight_features_make_the_papers_45_monomials():
+    assert monomials(np.zeros((3, 8))).shape == (3, 45)
+    # By hand: 1, a, b, a^2, a b, b^2.
+    assert monomials(np.array([[2.0, 3.0]])).tolist() == [[1, 2, 3, 4, 6, 9]]
+
+
+def test_monomials_span_every_quadratic_function():
+    basis = Monomials.fit(FEATURES, 4, 0.0)
+    terms = basis.expand(FEATURES)
+    target = 3 + FEATURES[:, 0] - 2 * FEATURES[:, 1] * FEATURES[:, 3] + FEATURES[:, 2] ** 2
+    weights = np.linalg.lstsq(terms, target, rcond=None)[0]
+    assert np.allclose(terms @ weights, target, atol=1e-12)
+    assert np.allclose(terms.T @ terms, 80 * np.eye(15), atol=1e-9)
+
+
+def test_the_ridge_is_that_of_standardized_monomials():
+    ridge, target = 0.3, FEATURES[:, 0] ** 2 + 0.1 * FEATURES[:, 1]
+    basis = Monomials.fit(FEATURES, 2, ridge)
+    terms = basis.expand(FEATURES)
+    weights = np.linalg.solve(terms.T @ terms + np.diag(basis.ridge), terms.T @ target)
+    plain = monomials(FEATURES[:, :2])[:, 1:]
+    plain = (plain - plain.mean(0)) / plain.std(0)
+    own = np.linalg.solve(
+        plain.T @ plain + ridge * 80 * np.eye(5), plain.T @ (target - target.mean())
+    )
+    assert np.allclose(terms @ weights, plain @ own + target.mean(), atol=1e-10)
+
+
+def test_the_kernel_is_positive_and_one_at_home():
+    kernel = matern(FEATURES, FEATURES)
+    assert np.allclose(np.diag(kernel), 1.0, atol=1e-7)
+    assert np.linalg.eigvalsh(kernel)[0] > 0
+    # By hand, at distance 2: (1 + 2 sqrt 5 + 20 / 3) exp(-2 sqrt 5).
+    assert matern(np.zeros((1, 1)), np.full((1, 1), 2.0))[0, 0] == pytest.approx(0.13866, abs=1e-4)
+
+
+def test_all_points_inducing_make_the_exact_process():
+    scale, noise = np.full(3, 0.5), 0.01
+    basis = Process.fit(FEATURES, scale, noise, 1000)
+    target = np.sin(FEATURES[:, 0])
+    terms = basis.expand(FEATURES)[:, :-1]
+    weights = np.linalg.solve(terms.T @ terms + noise * np.eye(80), terms.T @ target)
+    scaled = FEATURES[:, :3] * scale
+    unseen = RNG.standard_normal((20, 6))
+    cross = matern(unseen[:, :3] * scale, scaled)
+    exact = cross @ np.linalg.solve(matern(scaled, scaled) + noise * np.eye(80), target)
+    assert np.allclose(basis.expand(unseen)[:, :-1] @ weights, exact, atol=1e-5)
+
+
+def test_fewer_inducing_points_leave_variance_missing_far_from_them():
+    basis = Process.fit(FEATURES, np.full(3, 0.5), 0.01, 10)
+    assert len(basis.points) == 10
+    near, far = basis.points[:1] / 0.5, np.full((1, 3), 50.0)
+    assert basis.missing(basis.expand(near))[0] == pytest.approx(0.0, abs=1e-5)
+    assert basis.missing(basis.expand(far))[0] == pytest.approx(100.0, rel=1e-6)
+
+
+def test_spread_points_are_distinct_and_far_apart():
+    chosen = spread(FEATURES, 8)
+    assert len(set(chosen)) == 8
+    apart = np.linalg.norm(FEATURES[chosen][:, None] - FEATURES[chosen][None], axis=-1)
+    random = np.linalg.norm(FEATURES[:8][:, None] - FEATURES[:8][None], axis=-1)
+    assert apart[np.triu_indices(8, 1)].min() > random[np.triu_indices(8, 1)].min()
+
+
+def a_map(basis):
+    m = len(basis.ridge)
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((m, m)) * 0.1
+    return MetricMap(
+        basis, rng.standard_normal((m, 2)), root, rng.standard_normal((m, 3, 2)) * 0.1, 0.1, 2.0
+    )
+
+
+@pytest.fixture(params=['monomials', 'gp'])
+def metric_map(request):
+    if request.param == 'monomials':
+        return a_map(Monomials.fit(FEATURES, 3, 1e-3))
+    return a_map(Process.fit(FEATURES, np.full(3, 0.5), 0.01, 20))
+
+
+def test_arrays_bring_back_the_same_map(metric_map):
+    again = MetricMap.from_arrays(metric_map.to_arrays())
+    for a, b in zip(metric_map.predict(FEATURES), again.predict(FEATURES), strict=True):
+        assert np.array_equal(a, b)
+
+
+def test_one_row_predicts_as_many_do(metric_map):
+    positions, covariances = metric_map.predict(FEATURES)
+    position, covariance = metric_map.predict(FEATURES[7])
+    assert np.allclose(position[0], positions[7], atol=1e-9)
+    assert np.allclose(covariance[0], covariances[7], atol=1e-9)
+
+
+def test_covariances_are_symmetric_and_positive(metric_map):
+    covariances = metric_map.predict(FEATURES)[1]
+    assert np.array_equal(covariances, covariances.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(covariances).min() >= 2.0 * 0.1**2
+
+
+def test_moving_the_map_moves_positions_and_turns_covariances(metric_map):
+    frame = RigidTransform(3.0, -1.0, 0.7)
+    before, spread_before = metric_map.predict(FEATURES)
+    after, spread_after = metric_map.moved(frame).predict(FEATURES)
+    assert np.allclose(after, frame.apply(before), atol=1e-9)
+    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    assert np.allclose(spread_after, turn @ spread_before @ turn.T, atol=1e-9)
+
+
+def test_too_few_features_are_named(metric_map):
+    with pytest.raises(DataError, match='reads 3 slow features, not 2'):
+        metric_map.predict(FEATURES[:, :2])
+
+
+def test_a_missing_array_is_named(metric_map):
+    arrays = metric_map.to_arrays()
+    del arrays['spread']
+    with pytest.raises(ModelError, match='spread'):
+        MetricMap.from_arrays(arrays)
+    with pytest.raises(ModelError, match='train the model again'):
+        MetricMap.from_arrays({**metric_map.to_arrays(), 'basis_kind': np.array('spline')})

@@ -1,0 +1,229 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Segments: both cutters against drives whose every pose is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from metric_worlds import criss_cross, drive, meander, stand, straight, turn
+
+from sfa_localization.config import SegmentConfig
+from sfa_localization.errors import DataError
+from sfa_localization.geometry import relative, wrap_angle
+from sfa_localization.run import Odometry
+from sfa_localization.segments import assignment, cut, join
+
+ANY = SegmentConfig()
+STRAIGHT = SegmentConfig(segments='straight')
+SQUARE = np.vstack([np.vstack([straight(5.0), turn(np.pi / 2)]) for _ in range(4)])
+
+
+def frame(segment, poses):
+    """True pose of the segment's frame."""
+    first = poses[segment.images[0]].copy()
+    first[2] -= segment.headings[0]
+    return first
+
+
+def check_segments(segments, poses, tolerance=1e-6):
+    """Paths, headings, turns and displacements against the truth."""
+    for segment in segments:
+        local = relative(frame(segment, poses), poses[segment.images])
+        assert np.allclose(segment.path, local[:, 0] + 1j * local[:, 1], atol=tolerance)
+        assert np.allclose(wrap_angle(segment.headings - local[:, 2]), 0, atol=tolerance)
+    for a, b in zip(segments.items[:-1], segments.items[1:], strict=True):
+        step = relative(frame(a, poses), frame(b, poses))
+        assert abs(wrap_angle(a.turn_rad - step[2])) < tolerance
+        assert abs(a.displacement - (step[0] + 1j * step[1])) < tolerance
+
+
+def test_a_square_gives_its_four_sides():
+    run = drive(SQUARE)
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    assert len(segments) == 4
+    assert [round(s.length_m, 1) for s in segments] == pytest.approx([4.8] * 4, abs=0.25)
+    turns = [s.turn_rad for s in segments.items[:-1]]
+    assert turns == pytest.approx([np.pi / 2] * 3, abs=1e-6)
+    assert not segments[3].linked
+    check_segments(segments, run.poses)
+
+
+def test_turns_keep_their_sign():
+    left = cut(*drive_of(straight(3.0), turn(0.5), straight(3.0)), STRAIGHT)
+    right = cut(*drive_of(straight(3.0), turn(-0.5), straight(3.0)), STRAIGHT)
+    assert left[0].turn_rad == pytest.approx(0.5, abs=1e-6)
+    assert right[0].turn_rad == pytest.approx(-0.5, abs=1e-6)
+
+
+def drive_of(*parts):
+    run = drive(np.vstack(parts))
+    return run.odometry, run.stamps_ns
+
+
+def test_pieces_of_a_curved_drive_follow_the_truth():
+    twists, start = meander(60.0, seed=3)
+    run = drive(twists, start=start)
+    segments = cut(run.odometry, run.stamps_ns, ANY)
+    assert all(s.length_m <= ANY.piece_length + 1e-6 for s in segments)
+    assert segments.images.used == len(run.stamps_ns)
+    check_segments(segments, run.poses)
+
+
+def test_pieces_bounded_by_error_are_shorter():
+    run = drive(meander(60.0)[0])
+    loose = cut(run.odometry, run.stamps_ns, ANY)
+    tight = cut(run.odometry, run.stamps_ns, dataclasses.replace(ANY, piece_std=0.04))
+    assert len(tight) > len(loose)
+
+
+def test_every_picture_is_used_once_or_counted():
+    twists, start = criss_cross(6)
+    run = drive(np.vstack([twists, stand(5.0)]), start=start)
+    for config in (ANY, STRAIGHT):
+        segments = cut(run.odometry, run.stamps_ns, config)
+        images = np.concatenate([s.images for s in segments])
+        assert len(np.unique(images)) == len(images) == segments.images.used
+        assert segments.images.used + sum(segments.images.skipped.values()) == len(run.stamps_ns)
+
+
+def test_standing_still_is_left_out_and_does_not_break_the_line():
+    odometry, stamps = drive_of(straight(4.0), stand(4.0), straight(4.0))
+    segments = cut(odometry, stamps, ANY)
+    assert segments.images.skipped['standing still'] == pytest.approx(20, abs=2)
+    assert sum(s.length_m for s in segments) > 7.0
+    assert all(s.linked for s in segments.items[:-1])
+
+
+def test_reversing_makes_the_distance_shrink():
+    odometry, stamps = drive_of(straight(4.0), straight(-3.0))
+    (segment,) = cut(odometry, stamps, STRAIGHT)
+    assert segment.path.real.max() == pytest.approx(4.0, abs=0.21)
+    assert segment.path[-1] == pytest.approx(1.0, abs=0.21)
+    assert np.all(segment.path.imag == 0)
+
+
+def test_an_odometry_reset_breaks_the_drive():
+    run = drive(straight(12.0))
+    poses = run.odometry.poses.copy()
+    half = len(poses) // 2
+    poses[half:, 0] -= poses[half, 0]
+    odometry = dataclasses.replace(run.odometry, poses=poses)
+    segments = cut(odometry, run.stamps_ns, ANY)
+    assert segments.odometry.skipped == {'resets': 1}
+    assert sum(not s.linked for s in segments) == 2
+    assert all(np.abs(s.path).max() <= ANY.piece_length + 1e-6 for s in segments)
+
+
+def test_a_pause_of_the_odometry_breaks_the_drive_and_its_pictures_are_counted():
+    run = drive(straight(12.0))
+    keep = np.ones(len(run.odometry.stamps_ns), bool)
+    keep[250:350] = False
+    segments = cut(picked(run.odometry, keep), run.stamps_ns, ANY)
+    assert segments.odometry.skipped == {'pauses': 1}
+    assert segments.images.skipped['in a break of odometry'] == pytest.approx(10, abs=1)
+    assert sum(not s.linked for s in segments) == 2
+
+
+def picked(odometry, keep):
+    names = ('stamps_ns', 'poses', 'twists', 'variances')
+    return Odometry(*(getattr(odometry, name)[keep] for name in names))
+
+
+def test_pictures_outside_the_odometry_are_counted():
+    run = drive(straight(8.0))
+    stamps = np.concatenate([[0], run.stamps_ns, [10**12, 2 * 10**12]])
+    segments = cut(run.odometry, stamps, ANY)
+    assert segments.images.skipped == {'without odometry': 3}
+    assert segments[0].images[0] == 1
+
+
+def test_broken_messages_are_left_out_and_counted():
+    run = drive(straight(8.0))
+    poses, stamps = run.odometry.poses.copy(), run.odometry.stamps_ns.copy()
+    poses[100] = np.nan
+    stamps[200] = stamps[150]
+    segments = cut(
+        dataclasses.replace(run.odometry, poses=poses, stamps_ns=stamps), run.stamps_ns, ANY
+    )
+    assert segments.odometry.skipped == {'not finite': 1, 'out of order': 1}
+    check_segments(segments, run.poses)
+
+
+def test_odometry_without_twists_is_cut_all_the_same():
+    run = drive(SQUARE)
+    silent = dataclasses.replace(run.odometry, twists=np.zeros_like(run.odometry.twists))
+    assert len(cut(silent, run.stamps_ns, STRAIGHT)) == 4
+
+
+def test_the_gyro_replaces_the_wheels_yaw():
+    run = drive(meander(40.0)[0], start=(0.0, 0.0, 0.0))
+    biased = drive(meander(40.0)[0], bias=0.02)
+    segments = cut(biased.odometry, biased.stamps_ns, ANY, run.gyro)
+    check_segments(segments, run.poses, tolerance=1e-2)
+    wheels = dataclasses.replace(ANY, yaw_source='odometry')
+    ignored = cut(biased.odometry, biased.stamps_ns, wheels, run.gyro)
+    assert abs(ignored[0].turn_rad - segments[0].turn_rad) > 0.02
+    with pytest.raises(DataError, match='imu topic'):
+        cut(run.odometry, run.stamps_ns, dataclasses.replace(ANY, yaw_source='gyro'))
+
+
+def test_what_a_yaw_rate_bias_does_is_known_to_first_order():
+    twists, start = meander(40.0, seed=2)
+    clean, bias = drive(twists, start=start), 1e-3
+    biased = drive(twists, start=start, bias=bias)
+    for s in cut(biased.odometry, biased.stamps_ns, ANY):
+        local = relative(clean.poses[s.images[0]], clean.poses[s.images])
+        truth = local[:, 0] + 1j * local[:, 1]
+        assert np.abs(s.path - truth).max() > 1e-4
+        assert np.abs(s.path - bias * s.path_drift - truth).max() < 2e-5
+        assert np.allclose(s.headings - bias * s.times_s, np.unwrap(local[:, 2]), atol=1e-9)
+
+
+def test_a_stretch_without_pictures_splits_but_keeps_the_link():
+    run = drive(straight(12.0))
+    keep = np.abs(run.poses[:, 0] - 6.0) > 1.0
+    stamps = run.stamps_ns[keep]
+    segments = cut(run.odometry, stamps, STRAIGHT)
+    assert len(segments) == 2
+    assert segments[0].displacement == pytest.approx(7.0, abs=0.21)
+    check_segments(segments, run.poses[keep])
+
+
+def test_message_variances_rule_over_the_configured_noise():
+    run = drive(straight(12.0))
+    told = dataclasses.replace(run.odometry, variances=np.full((601, 2), 4.0))
+    ours = cut(run.odometry, run.stamps_ns, STRAIGHT_TWO)[0].turn_variance
+    theirs = cut(told, run.stamps_ns, STRAIGHT_TWO)[0].turn_variance
+    # 4 rad^2/s^2 per message of 0.02 s: 4 * 0.02^2 rad^2 each, over the messages between.
+    between = 3.0 * 50
+    assert theirs == pytest.approx(4.0 * 0.02**2 * between, rel=0.1)
+    assert ours < theirs / 100
+
+
+STRAIGHT_TWO = SegmentConfig(piece_length=3.0, piece_std=10.0)
+
+
+def test_joined_runs_keep_their_pictures_apart():
+    run = drive(SQUARE)
+    one = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    both = join([one, one], [0, len(run.stamps_ns)])
+    assert len(both) == 8
+    assert not both[3].linked
+    assert [s.run for s in both] == [0] * 4 + [1] * 4
+    assert both.images.used == 2 * one.images.used
+    owner = assignment(both, 2 * len(run.stamps_ns))
+    assert np.array_equal(np.flatnonzero(owner == 4), one[0].images + len(run.stamps_ns))
+    assert (owner == -1).sum() == 2 * len(run.stamps_ns) - both.images.used
+
+
+@pytest.mark.parametrize(
+    ('parts', 'config', 'remedy'),
+    [
+        ([stand(10.0)], ANY, 'robot drives'),
+        ([turn(6.0)], STRAIGHT, 'straight lines'),
+    ],
+)
+def test_a_drive_without_segments_says_what_to_do(parts, config, remedy):
+    with pytest.raises(DataError, match=remedy):
+        cut(*drive_of(*parts), config)
