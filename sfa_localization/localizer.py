@@ -8,12 +8,12 @@ evaluation of bags.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sfa_localization.config import FilterConfig
+from sfa_localization.geometry import Array
 from sfa_localization.place_model import Estimate, PlaceModel
 from sfa_localization.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.run import Image, Run
@@ -35,7 +35,7 @@ class Localizer:
         self.filter = PoseFilter(config)
 
     def add_odometry(
-        self, stamp_ns: int, v: float, omega: float, variances: ArrayLike = (0.0, 0.0)
+        self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)
     ) -> None:
         """Take speed m/s and yaw rate rad/s at a stamp, with their variances (0: unknown)."""
         self.filter.add_odometry(stamp_ns, v, omega, variances)

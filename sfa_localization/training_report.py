@@ -40,7 +40,9 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw where pictures were taken, (M, 2) m, colored by the left-out error of the map."""
     figure, axes = _figure()
     error = np.hypot(*trained.metric.left_out.T)
-    dots = axes.scatter(*places.T, c=error, s=9, cmap='viridis', vmax=np.quantile(error, 0.98))
+    dots = axes.scatter(
+        places[:, 0], places[:, 1], c=error, s=9, cmap='viridis', vmax=np.quantile(error, 0.98)
+    )
     figure.colorbar(dots, ax=axes, label='left-out position error (m)')
     _places(axes, 'Pictures in the map, and how well the rest predicts them')
     report.save(figure, path)
