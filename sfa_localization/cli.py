@@ -467,6 +467,9 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--report', type=Path, metavar='DIR', help='write pictures of the training')
     parser.add_argument('--resume', action='store_true', help='go on where a training was cut off')
     parser.add_argument('--strict', action='store_true', help='refuse damaged bags')
+    parser.add_argument(
+        '--dask', metavar='ADDRESS', help='train on a cluster whose workers see the output folder'
+    )
     _add_topics(parser, 'image', 'odometry', 'imu')
     _add_settings(parser, SegmentConfig, ('segments',))
     _add_settings(parser, MetricConfig, ('solver', 'metric_map'))
@@ -475,15 +478,18 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
 
 def _train(arguments: argparse.Namespace) -> int:
     from sfa_localization import training
+    from sfa_localization.cluster import executor_at
 
-    trained = training.train(
-        arguments.bags,
-        arguments.output,
-        _recipe(arguments),
-        progress=sys.stderr.isatty(),
-        resume=arguments.resume,
-        strict=arguments.strict,
-    )
+    with executor_at(arguments.dask) as executor:
+        trained = training.train(
+            arguments.bags,
+            arguments.output,
+            _recipe(arguments),
+            progress=sys.stderr.isatty(),
+            resume=arguments.resume,
+            strict=arguments.strict,
+            executor=executor,
+        )
     print(training.summary(trained))
     if arguments.report:
         from sfa_localization.training_report import write_training_report

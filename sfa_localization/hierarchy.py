@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -96,30 +96,50 @@ def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
 
 
 class Executor(Protocol):
-    """Whoever computes the sums over the shards; yields them in the shards' order."""
+    """Whoever computes the sums over the shards and merges them; the same way every time.
+
+    It tells `on_shard` the number of pictures of each finished shard.
+    """
 
     def __call__(
-        self, work: Callable[[Shard], Sums], shards: Sequence[Shard]
-    ) -> Iterable[Sums]: ...
+        self,
+        work: Callable[[Shard], Sums],
+        shards: Sequence[Shard],
+        on_shard: Callable[[int], None],
+    ) -> Sums: ...
 
 
-def one_by_one(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
-    """Compute the shards one after the other, on one core."""
-    with one_core():
-        yield from map(work, shards)
+def in_this_process(
+    work: Callable[[Shard], Sums], shards: Sequence[Shard], on_shard: Callable[[int], None]
+) -> Sums:
+    """Compute the shards on all cores, and merge them in their order."""
+    parts = _in_threads(work, shards)
+    total: Sums | None = None
+    for part, shard in zip(parts, shards, strict=True):
+        if total is None:
+            total = part
+        else:
+            total.merge(part)
+        on_shard(shard.stop - shard.start)
+    assert total is not None
+    return total
 
 
-def in_this_process(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
-    """Compute the shards on all cores, a few ahead of the one that is merged."""
+def _in_threads(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
+    """The shards' sums in order; one more shard than there are cores is on its way."""
     workers = _cores()
     with one_core(), ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Sums]] = deque()
-        for shard in shards:
-            waiting.append(pool.submit(work, shard))
-            if len(waiting) > workers:
+        try:
+            for shard in shards:
+                waiting.append(pool.submit(work, shard))
+                if len(waiting) > workers:
+                    yield waiting.popleft().result()
+            while waiting:
                 yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 def _cores() -> int:
@@ -298,7 +318,7 @@ def train_network(
     partial = start or Partial(architecture)
     shards = shards_of(drives, config)
     while not partial.finished:
-        total = _merged(_told(executor(_Stage(partial), shards), shards, on_shard))
+        total = executor(_Stage(partial), shards, on_shard)
         partial = partial.advanced(total.result(), config.relative_cut)
         on_stage(partial)
     return partial.network()
@@ -312,19 +332,3 @@ class _Stage:
 
     def __call__(self, shard: Shard) -> Sums:
         return stage_sums(self.partial, shard)
-
-
-def _told(
-    sums: Iterable[Sums], shards: Sequence[Shard], on_shard: Callable[[int], None]
-) -> Iterator[Sums]:
-    for part, shard in zip(sums, shards, strict=True):
-        on_shard(shard.stop - shard.start)
-        yield part
-
-
-def _merged(parts: Iterator[Sums]) -> Sums:
-    """All parts merged into the first, in their order."""
-    total = next(parts)
-    for part in parts:
-        total.merge(part)
-    return total

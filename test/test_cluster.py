@@ -1,0 +1,192 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Training over a Dask cluster gives the same network, also when a worker is lost."""
+
+import os
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cylinder_worlds import ARCHITECTURE, drive
+from test_hierarchy import correlations
+
+from sfa_localization import cluster, hierarchy
+from sfa_localization.config import NetworkConfig
+from sfa_localization.errors import ConfigError, DataError
+from sfa_localization.hierarchy import Drive, train_network
+from sfa_localization.run import PanoramaArray
+
+distributed = pytest.importorskip('distributed', reason='the extra distributed is not installed')
+
+CONFIG = NetworkConfig(relative_cut=1e-7)
+
+
+@contextmanager
+def cluster_of(workers: int):
+    """A scheduler and workers, each a process of its own, on this host."""
+    with distributed.LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=':0',
+        host='127.0.0.1',
+        memory_limit=0,
+    ) as made:
+        yield made
+
+
+@pytest.fixture(scope='module')
+def local():
+    with cluster_of(2) as made:
+        yield made
+
+
+@pytest.fixture
+def on_disk(tmp_path, monkeypatch) -> Drive:
+    """A drive of 40 pictures in a file, in shards of 4."""
+    monkeypatch.setattr(hierarchy, 'SHARD', 4)
+    of = drive(40)
+    images = of.panoramas.read(0, 40)
+    path = tmp_path / 'panoramas.u8'
+    path.write_bytes(b'12345678' + images.tobytes())
+    mapped = np.memmap(path, np.uint8, 'r', 8, images.shape)
+    return Drive(PanoramaArray(of.panoramas.stamps_ns, mapped), of.scale)
+
+
+def assert_same(one, other, images):
+    for a, b in zip(one.nodes, other.nodes, strict=True):
+        scale = np.abs(a.slow).max()
+        assert np.abs(a.slow - b.slow).max() < 1e-4 * scale
+    for a, b in zip(one.maps(images), other.maps(images), strict=True):
+        assert (1 - correlations(a, b)).max() < 1e-6
+
+
+def test_a_cluster_learns_the_same(local, on_disk):
+    told = []
+    with cluster.dask_executor(local.scheduler_address) as executor:
+        theirs = train_network(
+            ARCHITECTURE, [on_disk], CONFIG, executor=executor, on_shard=told.append
+        )
+    assert sum(told) == 6 * 40
+    assert_same(
+        train_network(ARCHITECTURE, [on_disk], CONFIG), theirs, on_disk.panoramas.read(0, 40)
+    )
+
+
+def test_a_cluster_learns_the_same_bytes_again(local, on_disk):
+    with cluster.dask_executor(local.scheduler_address) as executor:
+        one, other = (
+            train_network(ARCHITECTURE, [on_disk], CONFIG, executor=executor) for _ in range(2)
+        )
+    assert all(
+        a.slow.tobytes() == b.slow.tobytes() for a, b in zip(one.nodes, other.nodes, strict=True)
+    )
+
+
+class Deadly:
+    """Work that kills its worker, once, at a shard in the middle."""
+
+    def __init__(self, work, flag: Path) -> None:
+        self.work = work
+        self.flag = flag
+
+    def __call__(self, shard):
+        if shard.start == 20:
+            try:
+                self.flag.touch(exist_ok=False)
+            except FileExistsError:
+                return self.work(shard)
+            os._exit(1)
+        return self.work(shard)
+
+
+def test_a_lost_worker_is_survived(on_disk, tmp_path):
+    """A worker dies in the midst of the second stage; the others compute its shards again."""
+    stages = []
+    flag = tmp_path / 'died'
+    with cluster_of(2) as made, cluster.dask_executor(made.scheduler_address) as executor:
+
+        def dying(work, shards, on_shard):
+            stages.append(len(shards))
+            return executor(Deadly(work, flag) if len(stages) == 2 else work, shards, on_shard)
+
+        theirs = train_network(ARCHITECTURE, [on_disk], CONFIG, executor=dying)
+    assert flag.exists() and len(stages) == 6
+    assert_same(
+        train_network(ARCHITECTURE, [on_disk], CONFIG), theirs, on_disk.panoramas.read(0, 40)
+    )
+
+
+def test_workers_that_cannot_read_the_pictures(local, on_disk):
+    Path(on_disk.panoramas.images.filename).unlink()
+    with (
+        cluster.dask_executor(local.scheduler_address) as executor,
+        pytest.raises(DataError, match=r'cannot read .*panoramas\.u8.*folder'),
+    ):
+        train_network(ARCHITECTURE, [on_disk], CONFIG, executor=executor)
+
+
+def test_pictures_in_memory_are_refused(local):
+    with (
+        cluster.dask_executor(local.scheduler_address) as executor,
+        pytest.raises(DataError, match='in a file'),
+    ):
+        train_network(ARCHITECTURE, [drive(8)], CONFIG, executor=executor)
+
+
+def test_nobody_answers(monkeypatch):
+    monkeypatch.setattr(cluster, '_CONNECT_TIMEOUT_S', 0.5)
+    with (
+        pytest.raises(ConfigError, match=r'no Dask scheduler answers at tcp://127\.0\.0\.1:9'),
+        cluster.dask_executor('tcp://127.0.0.1:9'),
+    ):
+        pytest.fail('connected')
+
+
+def test_a_scheduler_without_workers():
+    with (
+        cluster_of(0) as made,
+        pytest.raises(ConfigError, match='no worker'),
+        cluster.dask_executor(made.scheduler_address),
+    ):
+        pytest.fail('went on')
+
+
+def test_without_an_address_this_process_trains():
+    with cluster.executor_at(None) as executor:
+        assert executor is hierarchy.in_this_process
+
+
+def test_a_file_of_panoramas(on_disk):
+    shard = hierarchy.shards_of([on_disk], CONFIG)[2]
+    file = cluster._portable(shard).drive.panoramas
+    assert np.array_equal(file.read(5, 9), on_disk.panoramas.read(5, 9))
+    assert np.array_equal(np.concatenate(list(file.batches(16))), on_disk.panoramas.read(0, 40))
+    assert (len(file), file.shape) == (40, on_disk.panoramas.shape)
+
+
+def test_threads_give_the_same_bytes(on_disk, monkeypatch):
+    networks = []
+    for cores in (1, 3):
+        monkeypatch.setattr(hierarchy, '_cores', lambda cores=cores: cores)
+        networks.append(train_network(ARCHITECTURE, [replace(on_disk)], CONFIG))
+    for one, other in zip(networks[0].nodes, networks[1].nodes, strict=True):
+        assert one.slow.tobytes() == other.slow.tobytes()
+
+
+def test_a_failing_shard_stops_the_others(on_disk):
+    started = []
+    lock = threading.Lock()
+
+    def work(shard):
+        with lock:
+            started.append(shard.start)
+        raise DataError('no')
+
+    shards = hierarchy.shards_of([on_disk], CONFIG)
+    with pytest.raises(DataError, match='no'):
+        hierarchy.in_this_process(work, shards, lambda images: None)
+    assert len(started) < len(shards)
