@@ -10,7 +10,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint format colcon matrix clean
+.PHONY: help env demo test bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -25,6 +25,11 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)
+
+bench: $(READY)  ## compare speeds side by side; the chain of nodes with the model of the demo
+	set -e; for bench in $(filter-out %/bench_chain.py,$(wildcard test/benchmarks/bench_*.py)); do \
+	    echo "== $$bench"; PYTHONPATH=. $(PY) $$bench; done
+	if [ -f demo/model.npz ]; then PYTHONPATH=. $(PY) test/benchmarks/bench_chain.py demo/model.npz; fi
 
 lint: $(READY)  ## ruff, ruff format, mypy
 	$(VENV)/bin/ruff check .

@@ -218,7 +218,12 @@ def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
     if estimates:
-        axes.legend(loc='upper left', ncols=len(estimates), fontsize='small')
+        above: dict[str, Any] = {
+            'loc': 'lower left',
+            'bbox_to_anchor': (0.0, 1.0),
+            'frameon': False,
+        }
+        axes.legend(**above, ncols=len(estimates), fontsize='small')
 
 
 def _draw_heading_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
