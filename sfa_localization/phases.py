@@ -60,19 +60,26 @@ def certify(h: Complex, z: Complex) -> Certificate:
 def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Certificate]:
     """Global minimizer z (N,) and its certificate.
 
-    Starts from the smallest eigenvector, from the metric upgrade and from `starts`; where none
-    leads to a certified minimum, from the semidefinite relaxation, which the certificate is dual
-    to. What is returned may be uncertified: ask the certificate.
+    Starts from `starts`, then from the smallest eigenvector, from the metric upgrade, and at last
+    from the semidefinite relaxation, which the certificate is dual to; the first certified minimum
+    ends the search. What is returned may be uncertified: ask the certificate.
     """
-    candidates = [refine(h, unit(start)) for start in (*starts, spectral_start(h))]
-    z = min(candidates, key=lambda c: phase_cost(h, c))
+    z = min([refine(h, unit(s)) for s in starts] or [_spectral(h)], key=lambda c: phase_cost(h, c))
     certificate = certify(h, z)
-    for fallback in (_upgraded_starts, _relaxed_starts):
+    for more in (_spectral_starts, _upgraded_starts, _relaxed_starts):
         if certificate.certified:
             break
-        z = min([z, *(refine(h, c) for c in fallback(h, z))], key=lambda c: phase_cost(h, c))
+        z = min([z, *(refine(h, c) for c in more(h, z))], key=lambda c: phase_cost(h, c))
         certificate = certify(h, z)
     return z, certificate
+
+
+def _spectral(h: Complex) -> Complex:
+    return refine(h, spectral_start(h))
+
+
+def _spectral_starts(h: Complex, z: Complex) -> list[Complex]:
+    return [spectral_start(h)]
 
 
 def unit(z: Complex) -> Complex:

@@ -106,6 +106,11 @@ def check(diagnostics: Diagnostics, config: MetricConfig) -> None:
             f'the drive covers {diagnostics.extent_m[0]:.1f} m by {diagnostics.extent_m[1]:.1f} m: '
             'drive in other directions too, so that the area is covered'
         )
+    if diagnostics.crossings == 0:
+        raise DataError(
+            'no segment crosses another, so nothing ties them together but odometry: drive across '
+            'earlier tracks, from well-spread directions'
+        )
     if np.rad2deg(diagnostics.angle_std_rad) > config.angle_std_max:
         raise DataError(
             f'directions are uncertain by up to {np.rad2deg(diagnostics.angle_std_rad):.0f} deg: '

@@ -74,6 +74,20 @@ def criss_cross(lines, half=(8.0, 9.0), seed=0, shortest=8.0):
     return np.vstack(parts), start
 
 
+def lanes(length, gap, count, left=True):
+    """Twists of parallel lanes to and fro, `gap` apart, the first turn to the left or the right."""
+    parts = []
+    for k in range(count):
+        side = np.pi / 2 if (k % 2 == 0) == left else -np.pi / 2
+        parts += [straight(length), turn(side), straight(gap), turn(side)]
+    return np.vstack(parts)
+
+
+def grid(length, gap, count):
+    """Twists of a mower's square: an odd number of lanes along x, then as many across them."""
+    return np.vstack([lanes(length, gap, count), turn(np.pi / 2), lanes(length, gap, count, False)])
+
+
 def meander(length, half=(8.0, 9.0), seed=0, speed=1.0):
     """Twists of a curved drive that stays in the garden, never straight; start pose."""
     rng = np.random.default_rng(seed)

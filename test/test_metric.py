@@ -12,6 +12,8 @@ from metric_worlds import (
     drive,
     exact_features,
     garden_features,
+    grid,
+    lanes,
     meander,
     straight,
     turn,
@@ -22,8 +24,8 @@ from sfa_localization.elimination import Links, Problem, Stack, eliminate
 from sfa_localization.errors import DataError
 from sfa_localization.geometry import RigidTransform, align, compose, invert, wrap_angle
 from sfa_localization.metric import headings, learn, positions, with_frame
-from sfa_localization.phases import certify
 from sfa_localization.paper_solver import Lines, Parameters, odometry_start
+from sfa_localization.phases import certify
 from sfa_localization.regression import MetricMap, Monomials, monomials
 from sfa_localization.segments import assignment, cut, join
 
@@ -53,15 +55,6 @@ def noisy_drive(twists, start, seed=0, bias=1.4e-3):
 def in_odometry_frame(run):
     """True poses (N, 3) as the odometry would have them had it not drifted."""
     return compose(invert(run.poses[0]), run.poses)
-
-
-def grid_twists():
-    """Boustrophedon lanes along x, then along y: directions only 90 degrees apart."""
-    lanes = []
-    for k in range(9):
-        side = np.pi / 2 if k % 2 == 0 else -np.pi / 2
-        lanes += [straight(10.0), turn(side), straight(1.2), turn(side)]
-    return np.vstack([*lanes, turn(np.pi / 2), *lanes])
 
 
 MODES = {
@@ -299,7 +292,7 @@ def test_without_any_turn_the_mirror_image_is_admitted_to_be_possible():
 
 
 def test_a_sheared_grid_is_refused_without_turns_and_right_with_them():
-    run = drive(grid_twists())
+    run = drive(grid(10.0, 1.2, 9))
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     features = exact_features(run.poses - [3.0, 3.0, 0.0])
     with pytest.raises(DataError, match='three well-spread directions'):
@@ -317,6 +310,13 @@ def test_a_collapsed_drive_is_refused():
     for config in (EXACT, PLAIN):
         with pytest.raises(DataError, match='directions'):
             learn(features, segments, config)
+
+
+def test_lanes_that_nothing_crosses_are_refused():
+    run = drive(lanes(10.0, 1.2, 9))
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
+    with pytest.raises(DataError, match='drive across earlier tracks'):
+        learn(exact_features(run.poses - [3.0, 3.0, 0.0]), segments, EXACT)
 
 
 def test_too_few_segments_are_refused():

@@ -1,0 +1,199 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Metric learning on random problems of the paper's sizes, beside the paper's own descent.
+
+Ten random lines, eighteen lines of a grid, and ninety pieces of a curved drive, in turn; features
+are the paper's 45 monomials of eight smooth functions of the place, with noise. Run
+`python bench_metric.py [PROBLEMS]`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from metric_worlds import Drive, criss_cross, drive, garden_features, grid, meander
+
+from sfa_localization.config import MetricConfig, SegmentConfig
+from sfa_localization.elimination import Links, Stack
+from sfa_localization.errors import DataError
+from sfa_localization.fitting import fit
+from sfa_localization.geometry import align
+from sfa_localization.paper_solver import (
+    Lines,
+    descend,
+    odometry_start,
+    random_start,
+)
+from sfa_localization.phases import phase_cost
+from sfa_localization.regression import Monomials, monomials
+from sfa_localization.segments import Segments, cut
+from sfa_localization.sufficiency import check, diagnose
+
+NOISE = {'bias': 1e-3, 'yaw_noise': 0.01, 'speed_noise': 0.03}
+# The paper's eight features and no ridge; the yaw-rate bias has no place in its costs.
+CONFIG = MetricConfig(metric_map='monomials', slow_features=8, ridge=0.0)
+# The descent has succeeded when it ends this close to the global minimum of its own cost.
+SUCCESS = 1.1
+
+
+@dataclass
+class Problem:
+    """One random problem: a drive, its segments, and features of all its pictures."""
+
+    run: Drive
+    segments: Segments
+    features: np.ndarray
+
+
+def random_lines(seed: int) -> Problem:
+    twists, start = criss_cross(10, seed=seed)
+    return problem(drive(twists, start=start, seed=seed, **NOISE), 'straight', seed)
+
+
+def grid_lines(seed: int) -> Problem:
+    start = (-6.5, -6.5, 0.0)
+    return problem(drive(grid(13.0, 1.5, 9), start=start, seed=seed, **NOISE), 'straight', seed)
+
+
+def pieces(seed: int) -> Problem:
+    twists, start = meander(230.0, seed=seed)
+    return problem(drive(twists, start=start, seed=seed, **NOISE), 'any', seed)
+
+
+def problem(run: Drive, kind: str, seed: int) -> Problem:
+    config = SegmentConfig(segments=kind, line_length_min=4.0, piece_length=4.0)
+    segments = cut(run.odometry, run.stamps_ns, config)
+    features = garden_features(run.poses[:, :2], noise=0.05, count=8, seed=seed, world=seed)
+    return Problem(run, segments, features)
+
+
+KINDS: dict[str, Callable[[int], Problem]] = {
+    'random': random_lines,
+    'grid': grid_lines,
+    'pieces': pieces,
+}
+
+
+def certified(trial: Problem) -> dict[str, float]:
+    """Solve one problem; its certificate, time, and error beside regression on ground truth."""
+    stack = Stack.of(trial.segments)
+    links = Links.of(trial.segments, True, True)
+    features = trial.features[stack.images]
+    started = time.perf_counter()
+    basis = Monomials.fit(features, 8, 0.0)
+    result = fit(basis, features, stack, links, CONFIG)
+    seconds = time.perf_counter() - started
+    truth = trial.run.poses[stack.images, :2]
+    found = result.expanded @ result.map_weights
+    own = np.column_stack([found.real, found.imag])
+    weights = np.linalg.lstsq(result.expanded, truth, rcond=None)[0]
+    return {
+        'certified': result.solution.certificate.certified,
+        'ms': 1e3 * seconds,
+        'uml': error(align(own, truth).apply(own), truth),
+        'supervised': error(result.expanded @ weights, truth),
+        'sufficient': sufficient(result, stack),
+        'segments': stack.segments,
+    }
+
+
+def sufficient(result, stack: Stack) -> bool:
+    """Whether the diagnostics call the data sufficient."""
+    try:
+        check(diagnose(result, stack), CONFIG)
+    except DataError:
+        return False
+    return True
+
+
+def error(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.hypot(*(a - b).T).mean())
+
+
+def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
+    """Cost of the paper's descent over the least that its own cost can be, by start.
+
+    The least is that of equation 1 at certified angles, found without turns from the true ones.
+    """
+    stack = Stack.of(trial.segments)
+    regressors = monomials(trial.features[stack.images])
+    lines = Lines(regressors, stack.path.real, stack.owner, np.zeros(0))
+    config = replace(CONFIG, paper_iterations=iterations, metric_seed=seed)
+    least = best_cost(trial, stack)
+    starts = {
+        'random': random_start(lines, config),
+        'odometry': odometry_start(lines, stack.starts),
+    }
+    return {name: descend(lines, start, config)[1][-1] / least for name, start in starts.items()}
+
+
+def best_cost(trial: Problem, stack: Stack) -> float:
+    """Global minimum of equation 1 (certified; the cost of noisy lines is never zero)."""
+    features = trial.features[stack.images]
+    plain = replace(CONFIG, yaw_bias_std=0.0)
+    links = Links.of(trial.segments, False, False)
+    result = fit(Monomials.fit(features, 8, 0.0), features, stack, links, plain, rounds=1)
+    return phase_cost(result.solution.h, result.solution.z)
+
+
+def run(problems: int, descended: int) -> dict[str, object]:
+    """All figures; the descent, thousands of times slower, on the first problems only."""
+    rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
+    ratios: dict[str, list[float]] = {}
+    for seed in range(problems):
+        kind = list(KINDS)[seed % len(KINDS)]
+        trial = KINDS[kind](seed)
+        rows[kind].append(certified(trial))
+        if kind == 'random' and seed < descended * len(KINDS):
+            for iterations in (1000, 10000):
+                for start, ratio in descents(trial, seed, iterations).items():
+                    ratios.setdefault(f'{start} start, {iterations}', []).append(ratio)
+    return figures(rows, ratios)
+
+
+def figures(
+    rows: dict[str, list[dict[str, float]]], ratios: dict[str, list[float]]
+) -> dict[str, object]:
+    every = [row for group in rows.values() for row in group]
+    enough = [row for row in every if row['sufficient']]
+    over = [row['uml'] / row['supervised'] for row in enough]
+    success = {name: float(np.mean(np.array(r) < SUCCESS)) for name, r in ratios.items()}
+    return {
+        'uml_certified_share': float(np.mean([row['certified'] for row in enough])),
+        'uml_median_ms': float(np.median([row['ms'] for row in every])),
+        'uml_over_supervised': float(np.median(over)),
+        'paper_solver_success_share': success.get('random start, 1000', float('nan')),
+        'sufficient_share': len(enough) / len(every),
+        'by_kind': {kind: summary(group) for kind, group in rows.items() if group},
+        'paper_success': success,
+        'paper_cost_over_least': {name: float(np.median(r)) for name, r in ratios.items()},
+    }
+
+
+def summary(group: list[dict[str, float]]) -> dict[str, float]:
+    names = ('segments', 'ms', 'uml', 'supervised')
+    medians = {name: float(np.median([row[name] for row in group])) for name in names}
+    shares = {name: float(np.mean([row[name] for row in group])) for name in SHARES}
+    return medians | shares
+
+
+SHARES = ('certified', 'sufficient')
+
+
+def bench_metric(n: int = 1000) -> dict[str, object]:
+    """Figures over `n` problems, and over at most 20 of them for the paper's descent."""
+    return run(n, min(20, -(-n // len(KINDS))))
+
+
+if __name__ == '__main__':
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    print(json.dumps(bench_metric(count), indent=2))
