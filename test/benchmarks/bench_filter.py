@@ -130,6 +130,6 @@ def bench_long_run(steps: int = 1_000_000) -> dict[str, float]:
 
 
 if __name__ == '__main__':
-    print(json.dumps(bench_filter()))
+    sys.stdout.write(json.dumps(bench_filter()) + '\n')
     if '--long' in sys.argv:
-        print(json.dumps(bench_long_run()))
+        sys.stdout.write(json.dumps(bench_long_run()) + '\n')
