@@ -60,11 +60,15 @@ class Update(NamedTuple):
 
 
 class OdometryEvent(NamedTuple):
+    """An odometry reading at its stamp."""
+
     stamp_ns: int
     twist: motion.Twist
 
 
 class PoseEvent(NamedTuple):
+    """A pose (3,) set from outside, with its covariance (3, 3)."""
+
     stamp_ns: int
     pose: Array
     covariance: Array
@@ -177,6 +181,7 @@ class Fusion:
         )
 
     def blank(self, stamp_ns: int) -> Belief:
+        """What is believed before anything is known."""
         covariance = self._prior_covariance(np.eye(3))
         still = motion.Twist(0.0, 0.0, self.config.speed_std**2, self.config.rate_std**2)
         return Belief(
@@ -194,6 +199,7 @@ class Fusion:
     # One event after another: pure functions of belief and event.
 
     def step(self, belief: Belief, event: Event) -> Belief:
+        """The belief after an event no earlier than it."""
         if isinstance(event, OdometryEvent):
             return self._driven(belief, event)
         belief = self.coasted(belief, event.stamp_ns)

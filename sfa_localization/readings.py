@@ -27,7 +27,10 @@ _LARGEST_YAW = 1e6
 def read_twist(
     v: float, omega: float, variances: Sequence[float] | Array, config: FilterConfig
 ) -> Twist:
-    """A reading with the noise it is believed to have; DataError says why it cannot be one."""
+    """A reading with the noise it is believed to have, from the `variances` (2,) it tells.
+
+    DataError says why it cannot be one.
+    """
     v, omega = float(v), float(omega)
     if not (math.isfinite(v) and math.isfinite(omega)):
         raise DataError('not finite')
