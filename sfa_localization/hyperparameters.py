@@ -22,8 +22,9 @@ Indices = NDArray[np.int64]
 
 _COUNTS = {'gp': (8, 12, 16, 24, 32), 'monomials': (3, 4, 5, 6, 8, 10, 12)}
 _RIDGES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-# The search works on fewer inducing points than the map it is for.
+# The search, and the choice, work on fewer inducing points than the map they are for.
 _SEARCH_POINTS = 300
+_SCORE_POINTS = 700
 _FLOOR_M = 1e-12
 
 
@@ -177,24 +178,39 @@ def _choose_process(features: Array, stack: Stack, links: Links, config: MetricC
     best: tuple[float, Fit, tuple[float, float]] | None = None
     knobs = config.gp_length or 1.0, config.gp_noise or 1e-3
     for count in _counts(features, config):
-        scale = feature_scale(features, stack, count)
-        chosen = spread(features[:, :count] * scale, _SEARCH_POINTS)
-        points = features[chosen, :count] * scale
-
-        def make(length: float, noise: float) -> Process:
-            return Process.at(points / length, scale / length, noise)  # noqa: B023
-
-        now = fit(make(*knobs), features, stack, links, config, best[1] if best else None, 3)
-        knobs = _descend(make, knobs, features, stack, links, now, config)
-        now = fit(make(*knobs), features, stack, links, config, now, 3)
+        now, knobs = _searched(count, knobs, features, stack, links, best and best[1], config)
         error = leave_out(now, stack, config).typical_m
         if best is None or error < best[0]:
             best = error, now, knobs
     assert best is not None
-    (_, now, (length, noise)), basis = best, best[1].basis
-    scale = feature_scale(features, stack, basis.features) / length
+    _, now, (length, noise) = best
+    scale = feature_scale(features, stack, now.basis.features) / length
     basis = Process.fit(features, scale, noise, config.inducing_points)
     return fit(basis, features, stack, links, config, now)
+
+
+def _searched(
+    count: int,
+    knobs: tuple[float, float],
+    features: Array,
+    stack: Stack,
+    links: Links,
+    start: Fit | None,
+    config: MetricConfig,
+) -> tuple[Fit, tuple[float, float]]:
+    """The process over `count` features at its best length and noise, and these."""
+    scale = feature_scale(features, stack, count)
+    chosen = spread(features[:, :count] * scale, _SEARCH_POINTS)
+    points = features[chosen, :count] * scale
+
+    def make(length: float, noise: float) -> Process:
+        return Process.at(points / length, scale / length, noise)
+
+    now = fit(make(*knobs), features, stack, links, config, start, 3)
+    length, noise = _descend(make, knobs, features, stack, links, now, config)
+    size = min(_SCORE_POINTS, config.inducing_points)
+    basis = Process.fit(features, scale / length, noise, size)
+    return fit(basis, features, stack, links, config, now, 2), (length, noise)
 
 
 def _descend(
@@ -217,7 +233,7 @@ def _descend(
     for factor in (2.0, 1.4):
         while True:
             best = min(_around(knobs, factor, config), key=value)
-            if value(best) >= value(knobs):
+            if not value(best) < value(knobs):
                 break
             knobs = best
     return knobs
