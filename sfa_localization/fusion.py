@@ -32,6 +32,7 @@ _LASTING = 4
 _AFTER_OUTAGE = 1.4
 _PLAIN = 8.0
 _PLAIN_TURN = 0.5
+_BRIDGED_S = 10.0
 _NO_DOUBT = (0.0, 0.0, 0.0)
 _OBSERVE = np.eye(3, SIZE)
 
@@ -213,13 +214,16 @@ class Fusion:
                 stamp_ns=event.stamp_ns, twist=event.twist, odometry_ns=event.stamp_ns
             )
         silence = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
-        if silence > self.config.coast_time:
+        if silence > _BRIDGED_S:
             belief = self.coasted(belief, event.stamp_ns)
         twist = event.twist
         if belief.odometry_ns is not None and silence > self.config.odometry_timeout:
             twist = _between(belief.twist, event.twist)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         step = motion.drive(belief.mean, twist, dt, self.config)
+        if silence > self.config.coast_time:
+            unknown = min(dt, silence - self.config.coast_time)
+            motion.doubt(step.noise, twist, unknown, self.config)
         return self._moved(belief, event.stamp_ns, step, event)
 
     def coasted(self, belief: Belief, stamp_ns: int) -> Belief:

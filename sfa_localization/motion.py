@@ -192,11 +192,7 @@ def halt(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
     What a robot may have done since is bounded by `unknown_speed` or its last reading, `twist`.
     """
     step = _stand(mean)
-    speed = max(config.unknown_speed, abs(twist.v))
-    spread = 2 * speed**2 * dt
-    step.noise[X, X] += spread
-    step.noise[Y, Y] += spread
-    step.noise[YAW, YAW] += config.unknown_rate**2 * dt
+    speed = doubt(step.noise, twist, dt, config)
     fade = math.exp(-speed * dt / config.decorrelation)
     for i in range(ERROR, SIZE):
         step.mean[i] *= fade
@@ -205,6 +201,16 @@ def halt(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
     step.noise[V, V] = speed**2
     step.noise[OMEGA, OMEGA] = config.unknown_rate**2
     return step
+
+
+def doubt(noise: Array, twist: Twist, dt: float, config: FilterConfig) -> float:
+    """Add to `noise` (10, 10) what a robot may have done unseen for `dt` s; returns its speed."""
+    speed = max(config.unknown_speed, abs(twist.v))
+    spread = 2 * speed**2 * dt
+    noise[X, X] += spread
+    noise[Y, Y] += spread
+    noise[YAW, YAW] += config.unknown_rate**2 * dt
+    return speed
 
 
 def _stand(mean: Array) -> Step:

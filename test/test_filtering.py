@@ -157,6 +157,13 @@ def test_odd_rates(tmp_path, rate):
     assert errors(drive, found)[-rate * 20 :].mean() < 0.3
 
 
+def test_odometry_every_four_seconds_still_helps(tmp_path):
+    drive = Drive(twists=np.tile([0.5, 0.05], (100, 1)), rate_hz=0.25, every=1, position_std=0.5)
+    _, found = run(tmp_path, drive)
+    alone = np.hypot(*(drive.seen[:, :2] - drive.poses[drive.pictures, :2]).T).mean()
+    assert errors(drive, found)[-50:].mean() < alone
+
+
 def test_gaps_in_either_log_are_survived(tmp_path):
     drive = Drive(seconds=90, **NOISY)
     keep = (drive.stamps_ns - START_NS < 30e9) | (drive.stamps_ns - START_NS > 45e9)
