@@ -534,8 +534,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         config=_filter_config(arguments.config),
         progress=sys.stderr.isatty(),
     )
-    print(report.table(judged.scores))
-    print(report.heading_table(judged.scores))
+    print(report.table(judged.scores), report.heading_table(judged.scores), sep='\n\n')
     for stream in ('images', 'odometry'):
         count = judged.counts[stream]
         reasons = ''.join(f'; {n} skipped: {why}' for why, n in sorted(count['skipped'].items()))
@@ -578,8 +577,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 
     with terminable():
         judged = demo.demonstrate(arguments.out, _settings(DemoConfig, arguments), progress=True)
-    print(report.table(judged.scores))
-    print(report.heading_table(judged.scores))
+    print(report.table(judged.scores), report.heading_table(judged.scores), sep='\n\n')
     return 0
 
 

@@ -25,9 +25,8 @@ from sfa_localization.place_model import PlaceModel
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r'<!-- run: (\w+) -->\s*```(\w+)\n(.*?)```', re.DOTALL)
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
-# The demo's drive, in the garden of the sample; the sample's panoramas are of half the size.
+# The demo's drive, in the garden of the sample.
 DRIVE = 'simulate demo/test --trajectory test --seed 2 --area 10x10 --length 40 --compressed'
-LIVE_EXTRA = {'omnicam_node': '-p width:=300 -p height:=30', 'play': '--rate 3'}
 pytestmark = pytest.mark.slow
 
 
@@ -97,10 +96,12 @@ def test_nodes_run_as_told(folder, monkeypatch):
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
     complete(shlex.split(DRIVE), folder)
     os.link(folder / 'model.npz', folder / 'demo/model.npz')
-    programs = {
-        words[0]: program([*words, *shlex.split(LIVE_EXTRA.get(words[0], ''))])
-        for words in commands('live')
+    size = PlaceModel.load(folder / 'model.npz').panorama
+    extra = {
+        'omnicam_node': ['-p', f'width:={size.width}', '-p', f'height:={size.height}'],
+        'play': ['--rate', '3'],
     }
+    programs = {words[0]: program(words + extra.get(words[0], [])) for words in commands('live')}
     live = demo_nodes.run_live(programs, folder / 'logs', DemoConfig())
     with Bag(folder / 'demo/test') as bag:
         truth, pictures = bag.trajectory(), len(list(bag.images()))
