@@ -40,11 +40,11 @@ format: $(READY)  ## let ruff sort imports and lay out the code
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-colcon: $(READY)  ## colcon build and colcon test in a clean environment
-	PYTHON='$(PYTHON)' sh .ci/colcon
+colcon:  ## colcon build and colcon test in a clean environment
+	PYTHON='$(PYTHON)' sh .ci/colcon $(ARGS)
 
-matrix: ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
-	sh .ci/matrix
+matrix:  ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
+	sh .ci/matrix $(ARGS)
 
 clean:  ## remove what the targets built, but not the environment
 	rm -rf build install log demo .pytest_cache .mypy_cache .ruff_cache
