@@ -115,7 +115,10 @@ def _judged(
     }
     scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}
     apart = _distance(estimates['ekf'], offline.estimates['ekf'])
-    return dataclasses.replace(offline, estimates=estimates, scores=scores), apart
+    counts = {name: count for name, count in offline.counts.items() if name != 'fusion'}
+    counts['published'] = {name: len(estimate) for name, estimate in live.items()}
+    judged = dataclasses.replace(offline, estimates=estimates, scores=scores, counts=counts)
+    return judged, apart
 
 
 def _seen_in_training(trained: Trained) -> Trajectory:
