@@ -43,8 +43,8 @@ class Compass:
 
     `features` (M, K) and `harmonic` (M, J) of the inducing pictures, divided by `feature_scale`
     (K,) and `harmonic_scale` (J,); `weights` (M,) complex; `uncertainty` (M, M) Hermitian, such
-    that the predictive variance is prior - k^H uncertainty k; `calibration` (a, b) makes a raw + b
-    of the raw variance of yaw; `sign` is -1 where columns grow clockwise.
+    that the predictive variance is prior - k^H uncertainty k; `calibration` (power, floor) of the
+    variance of yaw; `sign` is -1 where columns grow clockwise.
     """
 
     features: Array
@@ -65,9 +65,8 @@ class Compass:
     def predict(self, features: Array, harmonic: Complex) -> tuple[Array, Array]:
         """Yaw (T,) rad and its variance (T,) rad^2, at most pi^2 / 3 (knowing nothing)."""
         g, variance = self._field(features, harmonic)
-        raw = _phase_variance(g, variance)
-        inflated = self.calibration[0] * raw + self.calibration[1]
-        return wrap_angle(self.sign * np.angle(g)), np.minimum(inflated, UNKNOWN_YAW_VARIANCE)
+        yaw = wrap_angle(self.sign * np.angle(g))
+        return yaw, _calibrated(_phase_variance(g, variance), self.calibration)
 
     def _field(self, features: Array, harmonic: Complex) -> tuple[Complex, Array]:
         s, f = self._scaled(features, harmonic)
@@ -209,7 +208,7 @@ def fit_compass(
     error = wrap_angle(sign * np.angle(g) - yaw)
     raw = _phase_variance(g, variance)
     calibration = _calibrate(error, raw)
-    std = np.sqrt(np.minimum(calibration[0] * raw + calibration[1], UNKNOWN_YAW_VARIANCE))
+    std = np.sqrt(_calibrated(raw, calibration))
     return HeadingFit(problem.compass(sign, length, noise, calibration), error, std, np.abs(g))
 
 
@@ -313,12 +312,29 @@ def _solve(
 
 
 def _calibrate(error: Array, raw: Array) -> Array:
-    """(a, b) such that yaw's variance a raw + b covers 95 % of the left-out errors.
+    """(power, floor) such that the variance covers 95 % of the left-out errors, and little more.
 
-    b is the error where the process is surest, a what is needed elsewhere.
+    The floor is the error where the process is surest, the power the largest that covers.
     """
     surest = np.abs(error[raw <= np.quantile(raw, 0.25)])
     floor = float((1.4826 * np.median(surest)) ** 2) + 1e-8
-    excess = (error / 1.96) ** 2 - floor
-    factor = float(np.quantile(np.maximum(excess, 0.0) / raw, 0.95))
-    return np.array([factor, floor])
+    for power in _POWERS:
+        variance = _calibrated(raw, np.array([power, floor]))
+        if (error**2 <= 1.96**2 * variance).mean() >= _COVERAGE:
+            break
+    return np.array([power, floor])
+
+
+_POWERS = tuple(np.geomspace(6.0, 0.05, 60).tolist())
+_COVERAGE = 0.95
+
+
+def _calibrated(raw: Array, calibration: Array) -> Array:
+    """floor + raw^power pi^2 / 3: sure pictures have the floor, unsure ones know nothing.
+
+    Raw variances are too large where the process is sure (its noise is a coarse choice), yet 1,
+    the prior, always means that nothing is known; hence a power and no factor.
+    """
+    power, floor = calibration
+    unsure = np.minimum(raw, 1.0) ** power
+    return np.asarray(np.minimum(floor + unsure * UNKNOWN_YAW_VARIANCE, UNKNOWN_YAW_VARIANCE))

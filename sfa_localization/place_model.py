@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.agreement import Agreement, disagreement
 from sfa_localization.config import PanoramaConfig
 from sfa_localization.errors import ConfigError, ModelError
 from sfa_localization.fast_map import Predictor, fast_map
@@ -62,7 +63,9 @@ class PlaceModel:
     metric: MetricMap
     panorama: PanoramaConfig
     novelty: Novelty
+    agreement: Agreement
     compass: Compass | None = None
+    yaw_agreement: Agreement | None = None
     heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
     _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
@@ -87,8 +90,12 @@ class PlaceModel:
         maps = self.network.maps(panoramas)
         slow = top_features(maps)
         novelty = self.novelty.per_layer(maps).max(1)
+        spread = disagreement(maps[-1])
         positions, covariances = self._predictor().predict(slow)
+        covariances = covariances * self.agreement.factor(spread)[:, None, None]
         yaw, yaw_variance = self._headings(maps, slow)
+        if self.yaw_agreement is not None:
+            yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
         return [
             Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
             for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
@@ -120,6 +127,8 @@ class PlaceModel:
             model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
         except (KeyError, ValueError, TypeError, IndexError, ConfigError) as error:
             raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
+        except ModelError as error:
+            raise ModelError(f'{path}: {error}') from None
         model._predictor()
         return model
 
@@ -142,19 +151,24 @@ class PlaceModel:
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('novelty/', self.novelty.to_arrays())
+        arrays |= _prefixed('agreement/', self.agreement.to_arrays())
         if self.compass is not None:
             arrays |= _prefixed('compass/', self.compass.to_arrays())
+        if self.yaw_agreement is not None:
+            arrays |= _prefixed('yaw_agreement/', self.yaw_agreement.to_arrays())
         return arrays
 
     @classmethod
     def _from_arrays(cls, arrays: Arrays, header: dict[str, Any]) -> PlaceModel:
-        compass = _under(arrays, 'compass/')
+        compass, yaw_agreement = (_under(arrays, name) for name in ('compass/', 'yaw_agreement/'))
         return cls(
             network_from(arrays, header),
             MetricMap.from_arrays(_under(arrays, 'metric/')),
             PanoramaConfig(**header['panorama']),
             Novelty.from_arrays(_under(arrays, 'novelty/')),
+            Agreement.from_arrays(_under(arrays, 'agreement/')),
             Compass.from_arrays(compass) if compass else None,
+            Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,
             tuple(header['heading_layers']),
             header['quality'],
         )

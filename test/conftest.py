@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""For all tests: ROS stays on this machine, checks its messages, and logs to a temporary folder."""
+"""For all tests: ROS stays on this machine, checks messages, logs to a temporary folder; one core."""
 
 import os
 import tempfile
@@ -10,3 +10,5 @@ _LOGS = tempfile.TemporaryDirectory(prefix='sfa_localization_ros_log_')
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 os.environ.setdefault('ROS_LOG_DIR', _LOGS.name)
+# Small products on many cores of a busy machine wait for each other.
+os.environ.setdefault('OMP_NUM_THREADS', '1')

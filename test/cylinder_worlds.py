@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
-from sfa_localization.config import PanoramaConfig
-from sfa_localization.hierarchy import Drive
+from sfa_localization.config import MetricConfig, NetworkConfig, PanoramaConfig
+from sfa_localization.hierarchy import Drive, architecture_of, train_network
 from sfa_localization.network import Architecture, Layer
 from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.training import Recipe, Trained, drive_of, learn_place
 
 SIZE = (12, 48)
 LAYERS = (
@@ -97,6 +99,51 @@ def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str
     """A run whose pictures show the world from the odometry's poses."""
     images = world.panoramas(odometry.poses, config)
     return Run(name, PanoramaArray(odometry.stamps_ns, images), odometry)
+
+
+PLACE_SIZE = (12, 72)
+COLUMN_STEP = 4
+"""Columns of a picture of PLACE_SIZE that are one rotation step."""
+
+
+def recipe(clockwise: bool = True) -> Recipe:
+    """A small network for pictures of PLACE_SIZE."""
+    network = NetworkConfig(
+        layers='custom',
+        normalization='none',
+        binning=1,
+        field_rows=(4, 2, 2),
+        field_columns=(8, 4, 6),
+        stride_rows=(4, 1, 1),
+        stride_columns=(COLUMN_STEP, 1, 1),
+        linear_dimensions=(10, 10, 12),
+        output_dimensions=(8, 8, 8),
+    )
+    panorama = panorama_config(PLACE_SIZE, clockwise)
+    return Recipe(panorama=panorama, network=network, metric=MetricConfig(slow_features=6))
+
+
+@cache
+def place(clockwise: bool = True) -> Trained:
+    """A place learnt from a wandering drive of 400 pictures."""
+    config = recipe(clockwise)
+    run = run_in(Spheres.about(1), wander(400, 2, hz=4.0), config.panorama)
+    architecture = architecture_of(config.network, PLACE_SIZE)
+    network = train_network(architecture, [drive_of(run, config.network)], config.network)
+    return learn_place(network, [run], config)
+
+
+@cache
+def visit(clockwise: bool = True) -> Run:
+    """Another drive in the place, with truth for odometry."""
+    config = recipe(clockwise).panorama
+    odometry = wander(400, 2, hz=4.0)
+    part = slice(20, 400, 9)
+    poses = odometry.poses[part] + np.array([0.05, -0.05, 0.4])
+    moved = Odometry(
+        odometry.stamps_ns[part], poses, odometry.twists[part], odometry.variances[part]
+    )
+    return run_in(Spheres.about(1), moved, config, 'visit')
 
 
 def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> Drive:

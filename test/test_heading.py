@@ -1,0 +1,191 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The visual compass: exactly equivariant, honest about what it cannot know."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from cylinder_worlds import place, visit
+
+from sfa_localization.config import HeadingConfig
+from sfa_localization.errors import DataError
+from sfa_localization.geometry import wrap_angle
+from sfa_localization.heading import (
+    UNKNOWN_YAW_VARIANCE,
+    Compass,
+    HeadingFit,
+    _kernel,
+    _prior,
+    fit_compass,
+    harmonics,
+)
+
+CONFIG = HeadingConfig(heading_inducing_points=80)
+
+
+@cache
+def scene(count: int = 240, seed: int = 0):
+    """Features, harmonics and yaw of pictures along a smooth path, columns clockwise."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 1, count)[:, None]
+    features = np.sin(2 * np.pi * t * np.array([1, 2, 3]) + np.array([0, 1, 2]))
+    mix = rng.normal(size=(3, 12, 2)) @ np.array([1, 1j])
+    own = features @ mix + 3 * (rng.normal(size=12) + 1j * rng.normal(size=12))
+    yaw = wrap_angle(np.cumsum(rng.normal(0, 0.2, count)))
+    noise = rng.normal(0, 0.05, (count, 12, 2)) @ np.array([1, 1j])
+    return features, own * np.exp(-1j * yaw)[:, None] + noise, yaw
+
+
+def fitted(yaw=None, harmonic=None, config=CONFIG) -> HeadingFit:
+    features, own, true = scene()
+    yaw = true if yaw is None else yaw
+    harmonic = own if harmonic is None else harmonic
+    return fit_compass(features, harmonic, yaw, np.arange(len(yaw)) // 20 % 6, config)
+
+
+def test_harmonics_by_hand():
+    maps = np.zeros((1, 1, 4, 2), np.float32)
+    maps[0, 0, :, 0] = [1, 0, -1, 0]
+    maps[0, 0, :, 1] = [0, 1, 0, 0]
+    assert np.allclose(harmonics(maps), [[2, -1j]])
+
+
+def test_harmonics_turn_with_the_columns():
+    maps = np.random.default_rng(0).normal(size=(2, 3, 12, 4)).astype(np.float32)
+    phase = np.exp(-2j * np.pi * 5 / 12)
+    assert np.allclose(harmonics(np.roll(maps, 5, axis=2)), phase * harmonics(maps), atol=1e-5)
+
+
+def test_headings_are_learnt():
+    fit = fitted()
+    assert np.degrees(np.abs(fit.left_out_error).mean()) < 2
+    features, harmonic, yaw = scene()
+    told, variance = fit.compass.predict(features, harmonic)
+    assert np.degrees(np.abs(wrap_angle(told - yaw)).max()) < 5
+    assert (variance > 0).all() and (variance <= UNKNOWN_YAW_VARIANCE).all()
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_column_direction_is_found(sign):
+    features, harmonic, yaw = scene()
+    fit = fitted(sign * yaw, harmonic)
+    told, _ = fit.compass.predict(features, harmonic)
+    assert fit.compass.sign == -sign
+    assert np.degrees(np.abs(wrap_angle(told - sign * yaw)).max()) < 5
+
+
+@pytest.mark.parametrize('turn', [0.1, 1.0, -2.5, 3.1])
+def test_turning_is_exact(turn):
+    features, harmonic, _ = scene()
+    compass = fitted().compass
+    yaw, variance = compass.predict(features, harmonic)
+    turned, same = compass.predict(features, harmonic * np.exp(-1j * turn))
+    assert np.abs(wrap_angle(turned - yaw - turn)).max() < 1e-4
+    assert np.allclose(same, variance, rtol=1e-3)
+
+
+def test_contrast_does_not_matter():
+    features, harmonic, _ = scene()
+    compass = fitted().compass
+    yaw, variance = compass.predict(features, harmonic)
+    faint, same = compass.predict(features, 0.1 * harmonic)
+    assert np.abs(wrap_angle(faint - yaw)).max() < 1e-5
+    assert np.allclose(same, variance, rtol=1e-3)
+
+
+def test_variance_holds_on_left_out_pictures():
+    fit = fitted()
+    within = (np.abs(fit.left_out_error) < 1.96 * fit.left_out_std).mean()
+    assert 0.9 <= within <= 1.0
+    assert np.median(fit.left_out_std) < np.radians(10)
+
+
+def test_ambiguous_scenes_are_unsure():
+    """Every picture with two opposite headings: the compass must not pretend to know."""
+    features, harmonic, yaw = scene()
+    both = fit_compass(
+        np.repeat(features, 2, axis=0),
+        np.repeat(harmonic, 2, axis=0),
+        np.stack([yaw, yaw + np.pi], 1).ravel(),
+        np.arange(2 * len(yaw)) // 40 % 6,
+        CONFIG,
+    )
+    _, variance = both.compass.predict(features, harmonic)
+    assert np.sqrt(np.median(variance)) > np.radians(60)
+
+
+def test_foreign_pictures_are_unsure():
+    features, harmonic, _ = scene()
+    compass = fitted().compass
+    rng = np.random.default_rng(1)
+    noise = rng.normal(size=(*harmonic.shape, 2)) @ np.array([1, 1j])
+    known, lost = (compass.predict(features, h)[1] for h in (harmonic, noise))
+    assert np.median(lost) > 10 * np.median(known)
+
+
+def test_unknown_places_are_unsure():
+    features, harmonic, _ = scene()
+    _, variance = fitted().compass.predict(features + 100, harmonic)
+    assert variance.min() > 0.5 * UNKNOWN_YAW_VARIANCE
+
+
+@pytest.mark.parametrize('folds', [2, 4])
+def test_symmetric_panoramas_raise_the_variance(folds):
+    """Scenes that look alike in several directions have no first harmonic to tell them by."""
+    pictures, model = visit().panoramas.read(0, 43), place().model
+    step = pictures.shape[2] // folds
+    copies = [np.roll(pictures, i * step, axis=2).astype(float) for i in range(folds)]
+    symmetric = np.mean(copies, axis=0).round().astype(np.uint8)
+    known, lost = (
+        np.median([e.covariance[2, 2] for e in model.locate_all(p)]) for p in (pictures, symmetric)
+    )
+    assert lost > 20 * known
+    assert np.sqrt(lost) > np.radians(30)
+
+
+def test_prediction_by_definition():
+    """The triangular products equal the process's equations in double precision."""
+    features, harmonic, _ = scene()
+    compass = fitted().compass
+    s, f = compass._scaled(features, harmonic)
+    kernel = _kernel(s, f, compass.features, compass.harmonic, compass.length)
+    explained = np.einsum('tm,mn,tn->t', kernel, compass.uncertainty, kernel.conj()).real
+    expected = np.maximum(_prior(f) - explained, 0) + compass.noise
+    g, variance = compass._field(features, harmonic)
+    assert np.allclose(g, kernel @ compass.weights, atol=1e-3)
+    assert np.allclose(variance, expected, rtol=0.02)
+    for t in range(0, len(features), 29):
+        alone = compass._field(features[t : t + 1], harmonic[t : t + 1])
+        assert alone[0][0] == pytest.approx(g[t], abs=1e-4)
+        assert alone[1][0] == pytest.approx(variance[t], rel=0.02)
+
+
+def test_arrays_round_trip():
+    features, harmonic, _ = scene()
+    compass = fitted().compass
+    again = Compass.from_arrays(compass.to_arrays())
+    for one, other in zip(
+        compass.predict(features, harmonic), again.predict(features, harmonic), strict=True
+    ):
+        assert np.allclose(one, other, atol=1e-4, rtol=1e-2)
+
+
+def test_same_data_same_bytes():
+    one, other = fitted(), fitted()
+    assert one.compass.weights.tobytes() == other.compass.weights.tobytes()
+    assert one.left_out_error.tobytes() == other.left_out_error.tobytes()
+
+
+@pytest.mark.parametrize(('count', 'folds'), [(19, 6), (0, 6), (100, 1)])
+def test_too_few_labels_are_refused(count, folds):
+    features, harmonic, yaw = (part[:count] for part in scene())
+    with pytest.raises(DataError, match='too few to learn a compass'):
+        fit_compass(features, harmonic, yaw, np.arange(count) % folds, CONFIG)
+
+
+def test_no_features_still_tell_heading():
+    """Of one place only, the harmonics alone suffice."""
+    fit = fitted(config=HeadingConfig(heading_inducing_points=80, heading_features=0))
+    assert np.isfinite(fit.left_out_error).all()
+    assert np.degrees(np.median(np.abs(fit.left_out_error))) < 30

@@ -1,0 +1,252 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The place model: where a picture was taken, and how it is saved and loaded."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
+
+from sfa_localization.errors import ModelError
+from sfa_localization.fast_map import FastProcess, fast_map
+from sfa_localization.geometry import wrap_angle
+from sfa_localization.heading import UNKNOWN_YAW_VARIANCE
+from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, read_arrays
+
+
+@pytest.fixture(scope='module')
+def model() -> PlaceModel:
+    return place().model
+
+
+@pytest.fixture(scope='module')
+def pictures() -> np.ndarray:
+    return visit().panoramas.read(0, 43)
+
+
+@pytest.fixture
+def saved(model, tmp_path) -> Path:
+    model.save(tmp_path / 'model.npz')
+    return tmp_path / 'model.npz'
+
+
+def test_pictures_are_located(model, pictures):
+    truth = visit().odometry.poses
+    estimates = model.locate_all(pictures)
+    error = np.array([e.position for e in estimates]) - truth[:, :2]
+    yaw_error = wrap_angle(np.array([e.yaw for e in estimates]) - truth[:, 2])
+    assert np.median(np.hypot(*error.T)) < 0.3
+    assert np.degrees(np.median(np.abs(yaw_error))) < 3
+
+
+def test_one_by_one_equals_all_together(model, pictures):
+    for picture, together in zip(pictures, model.locate_all(pictures), strict=True):
+        alone = model.locate(picture)
+        assert np.allclose(alone.position, together.position, atol=1e-5)
+        assert wrap_angle(alone.yaw - together.yaw) == pytest.approx(0, abs=1e-4)
+        assert np.allclose(alone.covariance, together.covariance, rtol=1e-2, atol=1e-6)
+        assert alone.novelty == pytest.approx(together.novelty, rel=1e-4)
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+@pytest.mark.parametrize('steps', [1, 5, -7, 9, 17])
+def test_rolled_columns_turn_the_robot(clockwise, steps):
+    """k columns are 2 pi k / W of yaw, its sign that of the column direction, and no way at all."""
+    model, columns = place(clockwise).model, steps * COLUMN_STEP
+    # A robot that turned left sees everything farther right: at larger columns when clockwise.
+    turn = (1 if clockwise else -1) * 2 * np.pi * columns / PLACE_SIZE[1]
+    for picture in visit(clockwise).panoramas.read(0, 20):
+        one, other = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
+        assert abs(wrap_angle(other.yaw - one.yaw - turn)) < 1e-4
+        assert np.abs(other.position - one.position).max() < 1e-4
+        assert np.allclose(other.covariance, one.covariance, rtol=1e-2)
+        assert other.novelty == pytest.approx(one.novelty, rel=1e-3)
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+def test_yaw_is_counterclockwise_from_the_maps_x(clockwise):
+    """REP-103, whichever way the columns go: checked against the true headings."""
+    truth = visit(clockwise).odometry.poses
+    estimates = place(clockwise).model.locate_all(visit(clockwise).panoramas.read(0, 43))
+    error = wrap_angle(np.array([e.yaw for e in estimates]) - truth[:, 2])
+    assert np.degrees(np.median(np.abs(error))) < 3
+
+
+def test_covariances_are_positive_definite(model, pictures):
+    strange = np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8)
+    for estimate in model.locate_all(np.concatenate([pictures, strange])):
+        assert np.allclose(estimate.covariance, estimate.covariance.T)
+        assert np.linalg.eigvalsh(estimate.covariance).min() > 0
+        assert 0 < estimate.covariance[2, 2] <= UNKNOWN_YAW_VARIANCE
+
+
+def test_covariance_of_strange_pictures_is_larger(model, pictures):
+    strange = np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8)
+    familiar, foreign = (
+        np.median([np.trace(e.covariance[:2, :2]) for e in model.locate_all(p)])
+        for p in (pictures, strange)
+    )
+    assert foreign > 10 * familiar
+
+
+def test_without_a_compass_yaw_is_unknown(model, pictures):
+    estimate = replace(model, compass=None, heading_layers=()).locate(pictures[0])
+    assert np.isnan(estimate.yaw)
+    assert estimate.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
+    assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    'picture',
+    [
+        np.zeros((12, 72), np.uint8),
+        np.zeros((12, 72, 3), np.float32),
+        np.zeros((12, 60, 3), np.uint8),
+        np.zeros((1, 12, 72, 3), np.uint8),
+    ],
+)
+def test_other_pictures_are_refused(model, picture):
+    with pytest.raises(ModelError):
+        model.locate(picture)
+
+
+class TestFastMap:
+    """The compiled metric map tells what the map tells."""
+
+    def features(self, model: PlaceModel) -> np.ndarray:
+        seen = place().features[::7]
+        return np.concatenate([seen, 3 * np.random.default_rng(0).normal(size=(20, 8))])
+
+    def test_equals_the_map(self, model):
+        features, fast = self.features(model), fast_map(model.metric)
+        assert isinstance(fast, FastProcess)
+        positions, covariances = model.metric.predict(features)
+        fast_positions, fast_covariances = fast.predict(features)
+        assert np.allclose(fast_positions, positions, atol=1e-6)
+        scale = np.trace(covariances, axis1=1, axis2=2)[:, None, None]
+        assert (np.abs(fast_covariances - covariances) / scale).max() < 0.02
+
+    def test_a_single_row_equals_many(self, model):
+        features, fast = self.features(model), fast_map(model.metric)
+        together = fast.predict(features)
+        for row, position, covariance in zip(features, *together, strict=True):
+            alone = fast.predict(row[None])
+            assert np.allclose(alone[0][0], position, atol=1e-9)
+            assert np.allclose(alone[1][0], covariance, rtol=1e-2)
+
+    def test_monomials_are_quick_as_they_are(self, model):
+        other = replace(model.metric, basis=_Other())
+        assert fast_map(other) is other
+
+
+class _Other:
+    """Some basis that is no process."""
+
+
+class TestFile:
+    """Saving and loading."""
+
+    def test_round_trip(self, model, saved, pictures):
+        again = PlaceModel.load(saved)
+        for one, other in zip(model.locate_all(pictures), again.locate_all(pictures), strict=True):
+            assert np.array_equal(one.position, other.position)
+            assert np.allclose(one.covariance, other.covariance, rtol=1e-2)
+            assert one.yaw == pytest.approx(other.yaw, abs=1e-5)
+            assert one.novelty == other.novelty
+        assert again.quality == json.loads(json.dumps(model.quality))
+        assert again.panorama == model.panorama
+        assert again.network.ranks == model.network.ranks
+
+    def test_same_model_same_bytes(self, model, saved, tmp_path):
+        model.save(tmp_path / 'again.npz')
+        PlaceModel.load(saved).save(tmp_path / 'loaded.npz')
+        assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
+        assert (tmp_path / 'loaded.npz').read_bytes() == saved.read_bytes()
+
+    def test_without_heading(self, model, tmp_path, pictures):
+        blind = replace(model, compass=None, heading_layers=())
+        blind.save(tmp_path / 'blind.npz')
+        again = PlaceModel.load(tmp_path / 'blind.npz')
+        assert not again.has_heading and model.has_heading
+        assert np.isnan(again.locate(pictures[0]).yaw)
+
+    def test_nothing_but_the_model_is_left(self, saved):
+        assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
+
+    def test_a_folder_that_cannot_be(self, model, tmp_path):
+        (tmp_path / 'file').write_text('')
+        with pytest.raises(ModelError, match='cannot be written'):
+            model.save(tmp_path / 'file' / 'model.npz')
+
+    def test_a_failed_write_leaves_the_old_model(self, model, saved, monkeypatch):
+        before = saved.read_bytes()
+
+        def full(file, **arrays):
+            file.write(b'half')
+            raise OSError(28, 'No space left on device')
+
+        monkeypatch.setattr(np, 'savez', full)
+        with pytest.raises(ModelError, match='No space left'):
+            model.save(saved)
+        assert saved.read_bytes() == before
+        assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
+
+    def test_missing(self, tmp_path):
+        with pytest.raises(ModelError, match=r'none\.npz: no such file: train it'):
+            PlaceModel.load(tmp_path / 'none.npz')
+
+    @pytest.mark.parametrize('content', [b'', b'no zip', b'PK\x03\x04 broken'])
+    def test_no_model(self, tmp_path, content):
+        (tmp_path / 'x.npz').write_bytes(content)
+        refused(tmp_path / 'x.npz', 'not a sfa_localization place model')
+
+    def test_other_arrays(self, tmp_path):
+        np.savez(tmp_path / 'x.npz', a=np.zeros(3))
+        refused(tmp_path / 'x.npz', 'not a sfa_localization place model')
+
+    def test_another_kind(self, saved):
+        rewrite(saved, format='something else')
+        refused(saved, 'a something else, not a')
+
+    def test_another_version(self, saved):
+        rewrite(saved, version=VERSION + 1)
+        refused(saved, f'version {VERSION + 1}, this software reads {VERSION}: train it')
+
+    @pytest.mark.parametrize('cut', [0.1, 0.5, 0.99])
+    def test_cut_off(self, saved, cut):
+        data = saved.read_bytes()
+        saved.write_bytes(data[: int(len(data) * cut)])
+        refused(saved, 'not a sfa_localization place model')
+
+    @pytest.mark.parametrize(
+        'name', ['network/1/slow', 'metric/weights', 'novelty/0/scalars', 'compass/weights']
+    )
+    def test_an_array_is_missing(self, saved, name):
+        rewrite(saved, without=name)
+        refused(saved, 'train')
+
+    def test_a_header_without_panorama(self, saved):
+        rewrite(saved, panorama={'nonsense': 1})
+        refused(saved, 'damaged.*train it again')
+
+    def test_no_pickle_is_read(self, saved):
+        arrays = read_arrays(saved, FORMAT, VERSION, '')
+        np.savez(saved, **{**arrays, 'evil': np.array([object()], dtype=object)})
+        refused(saved, 'not a sfa_localization place model')
+
+
+def rewrite(path: Path, without: str = '', **header) -> None:
+    """Change the header of a saved model, or leave an array out."""
+    arrays = read_arrays(path, FORMAT, VERSION, '')
+    arrays['header'] = np.array(json.dumps({**json.loads(str(arrays['header'])), **header}))
+    np.savez(path, **{name: array for name, array in arrays.items() if name != without})
+
+
+def refused(path: Path, told: str) -> None:
+    with pytest.raises(ModelError, match=told) as error:
+        PlaceModel.load(path)
+    assert str(path) in str(error.value)
+    assert 'train' in str(error.value) and '\n' not in str(error.value)
