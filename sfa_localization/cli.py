@@ -112,7 +112,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
     from sfa_localization.simulation import simulate
 
     config = _settings(SimulationConfig, arguments)
-    drive = simulate(config, arguments.out, _panorama_of(arguments.size), progress=True)
+    panorama, progress = _panorama_of(arguments.size), sys.stderr.isatty()
+    drive = simulate(config, arguments.out, panorama, progress=progress)
     seconds = (drive.truth.stamps_ns[-1] - drive.truth.stamps_ns[0]) * 1e-9
     print(f'{arguments.out}: {len(drive.image_stamps_ns)} pictures in {seconds:.0f} s')
     return 0

@@ -74,6 +74,8 @@ class MetricResult:
     noise_m: float
     left_out: Array
     """(M, 2) m: as `residuals`, but the map had not seen the picture's stretch of the drive."""
+    left_out_variance: Array
+    """(M,) m^2 per axis: what the map claimed for `left_out`, with its inflation."""
     left_out_rigid_m: float
     """Mean left-out error once each left-out segment is moved rigidly onto its predictions."""
     consistency: Consistency
@@ -171,6 +173,7 @@ def _result(
         residuals=_plane(whole.residuals * turn),
         noise_m=float(np.sqrt(whole.variance)),
         left_out=_plane(left.errors * turn),
+        left_out_variance=left.variances * inflation,
         left_out_rigid_m=_rigid_error(left, whole, stack),
         consistency=_consistency(left, inflation),
         diagnostics=diagnostics,

@@ -17,10 +17,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from tqdm import tqdm
 
 from sfa_localization import mdp_engine
 from sfa_localization import metric as metric_learning
+from sfa_localization.agreement import Agreement, disagreement
 from sfa_localization.bag import load_run
 from sfa_localization.config import (
     BagConfig,
@@ -250,10 +252,12 @@ def _stages_done(partial: Partial) -> int:
 class _Views:
     """What the network makes of all pictures: features of each, more of a sample of them.
 
+    `disagreement` (N,) of the views of each picture.
     `sampled` (S,) are the sample's indices, `harmonic` (S, J), `descriptions` per layer (S, D).
     """
 
     features: Array
+    disagreement: Array
     sampled: NDArray[np.int64]
     harmonic: NDArray[np.complex128]
     descriptions: tuple[Array, ...]
@@ -272,15 +276,24 @@ def learn_place(
         [int(offset) for offset in offsets[:-1]],
     )
     result = metric_learning.learn(views.features, segments, recipe.metric)
+    agreement = Agreement.fit(
+        views.disagreement[result.images],
+        (result.left_out**2).sum(1),
+        result.left_out_variance,
+        axes=2,
+    )
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
+    yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled])
     model = PlaceModel(
         network,
         result.map,
         _panorama_of(runs, recipe),
         Novelty.fit(views.descriptions),
+        agreement,
         heading.compass if heading else None,
+        yaw_agreement,
         layers if heading else (),
-        _quality(network, views, segments, result, heading),
+        _quality(network, views, segments, result, agreement, heading, yaw_agreement, labelled),
     )
     return Trained(model, tuple(runs), views.features, segments, result, heading, labelled)
 
@@ -302,17 +315,20 @@ def _view(network: Network, runs: Sequence[Run], layers: tuple[int, ...], progre
     sampled = np.unique(np.linspace(0, total - 1, min(total, _SAMPLES)).round().astype(np.int64))
     kept = np.zeros(total, bool)
     kept[sampled] = True
-    features, harmonic, eta = [], [], _Eta(network.architecture.outputs)
+    features, spread, harmonic = [], [], []
+    eta = _Eta(network.architecture.outputs)
     descriptions: list[list[Array]] = [[] for _ in network.nodes]
     for start, maps in _all_maps(network, runs, progress):
         keep = kept[start : start + len(maps[0])]
         features.append(top_features(maps))
+        spread.append(disagreement(maps[-1]))
         eta.add(maps[-1])
         harmonic.append(heading_input([m[keep] for m in maps], layers))
         for layer, of_layer in zip(maps, descriptions, strict=True):
             of_layer.append(describe(layer[keep]))
     return _Views(
         np.concatenate(features),
+        np.concatenate(spread),
         sampled,
         np.concatenate(harmonic),
         tuple(np.concatenate(d) for d in descriptions),
@@ -390,12 +406,21 @@ def _learn_heading(
     return fit, known
 
 
+def _yaw_agreement(heading: HeadingFit | None, spread: Array) -> Agreement | None:
+    if heading is None:
+        return None
+    return Agreement.fit(spread, heading.left_out_error**2, heading.left_out_std**2, axes=1)
+
+
 def _quality(
     network: Network,
     views: _Views,
     segments: Segments,
     result: MetricResult,
+    agreement: Agreement,
     heading: HeadingFit | None,
+    yaw_agreement: Agreement | None,
+    labelled: NDArray[np.int64],
 ) -> dict[str, Any]:
     """Figures of merit that travel with the model; plain numbers and lists."""
     quality = {
@@ -409,13 +434,20 @@ def _quality(
         'features_used': result.map.features,
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
         'left_out_error_m': result.left_out_error_m,
-        'left_out_within_95': result.consistency.within_95,
+        'left_out_within_95': _share_within_95(
+            agreement.factor(views.disagreement[result.images]) * result.left_out_variance,
+            (result.left_out**2).sum(1),
+            axes=2,
+        ),
         'coverage': result.diagnostics.as_dict(),
     }
     if heading is not None:
-        error = np.abs(heading.left_out_error)
-        quality['left_out_yaw_deg'] = float(np.degrees(error.mean()))
-        quality['left_out_yaw_within_95'] = float((error < 1.96 * heading.left_out_std).mean())
+        error = heading.left_out_error
+        variance = heading.left_out_std**2
+        if yaw_agreement is not None:
+            variance = variance * yaw_agreement.factor(views.disagreement[labelled])
+        quality['left_out_yaw_deg'] = float(np.degrees(np.abs(error).mean()))
+        quality['left_out_yaw_within_95'] = _share_within_95(variance, error**2, axes=1)
     return quality
 
 
@@ -455,6 +487,11 @@ def _counts(trained: Trained) -> dict[str, dict[str, int]]:
     return skipped
 
 
+def _share_within_95(variance: Array, squared_error: Array, axes: int) -> float:
+    """Share of errors inside the 95 % region that variances per axis (M,) claim."""
+    return float(np.mean(squared_error <= stats.chi2.ppf(0.95, axes) * variance))
+
+
 @dataclass(frozen=True, slots=True)
 class _Checkpoint:
     """Finished stages of a training, kept beside the output until the model is written."""
@@ -469,7 +506,9 @@ class _Checkpoint:
         digest = hashlib.sha256('\n'.join(told).encode())
         for run in runs:
             digest.update(run.panoramas.stamps_ns.tobytes())
-            digest.update(run.panoramas.read(0, 1).tobytes())
+            digest.update(run.odometry.poses.tobytes())
+            for at in range(0, len(run.panoramas), max(1, len(run.panoramas) // 16)):
+                digest.update(run.panoramas.read(at, at + 1).tobytes())
         return cls(output.with_name(f'.{output.name}.checkpoint.npz'), digest.hexdigest())
 
     def write(self, partial: Partial) -> None:

@@ -64,7 +64,7 @@ ROOMS: dict[str, set[str]] = {
     'distributed': {'numpy', 'dask', 'distributed'},
     'threads': {'threadpoolctl'},
     'training_report': {'numpy', 'matplotlib'},
-    'training': {'numpy', 'tqdm'},
+    'training': {'numpy', 'scipy', 'tqdm'},
     '': {'numpy', 'scipy', 'cv2', 'yaml', 'tqdm'},
 }
 # Never at run time on the robot, nor in anything its nodes import.

@@ -1,0 +1,51 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The disagreement of rotated views must find the errors that it is told of, and no others."""
+
+import numpy as np
+import pytest
+
+from sfa_localization.agreement import Agreement, disagreement
+
+
+def drawn(exponent, axes, count=20_000, seed=0):
+    """Disagreements, squared errors whose variance follows them, and the variances claimed."""
+    rng = np.random.default_rng(seed)
+    u = np.exp(0.5 * rng.standard_normal(count))
+    claimed = np.exp(0.3 * rng.standard_normal(count))
+    error = rng.standard_normal((count, axes)) * np.sqrt(claimed * 2.0 * u**exponent)[:, None]
+    return u, (error**2).sum(1), claimed
+
+
+@pytest.mark.parametrize('axes', [1, 2])
+@pytest.mark.parametrize('exponent', [0.0, 2.0])
+def test_exponent_and_level_of_the_errors_are_found(exponent, axes):
+    u, squared, claimed = drawn(exponent, axes)
+    fit = Agreement.fit(u, squared, claimed, axes)
+    assert fit.exponent == pytest.approx(exponent, abs=0.26)
+    assert fit.factor(np.array([1.0]))[0] == pytest.approx(2.0, rel=0.1)
+
+
+def test_fit_covers_half_and_most_of_heavy_tailed_errors():
+    rng = np.random.default_rng(1)
+    u = np.exp(0.5 * rng.standard_normal(20_000))
+    squared = (rng.standard_t(2.5, (20_000, 2)) ** 2).sum(1)
+    fit = Agreement.fit(u, squared, np.ones(20_000), 2)
+    variance = fit.factor(u)
+    assert (squared <= 1.386 * variance).mean() >= 0.49
+    assert (squared <= 5.991 * variance).mean() >= 0.945
+
+
+def test_disagreement_is_zero_for_equal_views_and_does_not_depend_on_heading():
+    rng = np.random.default_rng(2)
+    top = rng.standard_normal((3, 1, 12, 5)).astype(np.float32)
+    assert disagreement(np.repeat(top[:, :, :1], 12, axis=2)) == pytest.approx(0.0, abs=1e-7)
+    assert disagreement(np.roll(top, 4, axis=2)) == pytest.approx(disagreement(top), rel=1e-6)
+    assert disagreement(top) == pytest.approx(top[:, 0].std(1).mean(1), rel=1e-5)
+
+
+def test_arrays_bring_the_same_factors_back():
+    fit = Agreement(0.2, 3.0, 1.5)
+    u = np.array([0.1, 0.2, 5.0])
+    assert np.array_equal(Agreement.from_arrays(fit.to_arrays()).factor(u), fit.factor(u))
+    assert fit.factor(u)[1] == pytest.approx(3.0)
