@@ -93,7 +93,9 @@ def test_covariance_of_strange_pictures_is_larger(model, pictures):
 
 
 def test_without_a_compass_yaw_is_unknown(model, pictures):
-    estimate = replace(model, compass=None, heading_layers=()).locate(pictures[0])
+    estimate = replace(model, compass=None, heading_layers=(), yaw_agreement=None).locate(
+        pictures[0]
+    )
     assert np.isnan(estimate.yaw)
     assert estimate.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
     assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=1e-9)
@@ -167,7 +169,7 @@ class TestFile:
         assert (tmp_path / 'loaded.npz').read_bytes() == saved.read_bytes()
 
     def test_without_heading(self, model, tmp_path, pictures):
-        blind = replace(model, compass=None, heading_layers=())
+        blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
         blind.save(tmp_path / 'blind.npz')
         again = PlaceModel.load(tmp_path / 'blind.npz')
         assert not again.has_heading and model.has_heading

@@ -1,0 +1,241 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Training from bags: what it leaves behind, how it goes on, and what it refuses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres, panorama_config, recipe, run_in, wander
+
+from sfa_localization import training
+from sfa_localization.bag import BagWriter
+from sfa_localization.config import NetworkConfig
+from sfa_localization.errors import DataError, LocalizationError, ModelError
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.run import Count, Odometry, PanoramaArray, Run
+from sfa_localization.training import Recipe, drive_of, read_drive, train
+
+PICTURES = 160
+NETWORK = replace(recipe().network, linear_dimensions=(6, 6, 8), output_dimensions=(6, 6, 6))
+RECIPE = replace(
+    recipe(),
+    network=NETWORK,
+    metric=replace(recipe().metric, slow_features=4, gp_length=2.0, gp_noise=0.01),
+)
+
+
+def write_bag(path: Path, seed: int = 2, size: tuple[int, int] = (12, 72)) -> Path:
+    run = run_in(Spheres.about(1), wander(PICTURES, seed, hz=4.0), panorama_config(size))
+    odometry = run.odometry
+    with BagWriter(path) as bag:
+        for stamp, pose, twist, image in zip(
+            odometry.stamps_ns.tolist(),
+            odometry.poses,
+            odometry.twists,
+            run.panoramas.read(0, PICTURES),
+            strict=True,
+        ):
+            bag.odometry('/odom', stamp, pose, twist, np.array([1e-4, 1e-4]))
+            bag.image('/panorama', stamp, image, 'base_link')
+    return path
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory) -> Path:
+    return write_bag(tmp_path_factory.mktemp('bags') / 'drive')
+
+
+@pytest.fixture(scope='module')
+def whole(bag, tmp_path_factory) -> bytes:
+    """The bytes of an undisturbed training."""
+    output = tmp_path_factory.mktemp('whole') / 'model.npz'
+    train([bag], output, RECIPE)
+    return output.read_bytes()
+
+
+class Cut(Exception):
+    """As a kill would, it passes through everything."""
+
+
+def cut_off(bag: Path, output: Path, stages: int, error: BaseException) -> None:
+    """Train until `stages` stages are finished, and be cut off there."""
+    with pytest.MonkeyPatch.context() as patch:
+        write, done = training._Checkpoint.write, []
+
+        def write_then_fail(self, partial):
+            write(self, partial)
+            done.append(partial)
+            if len(done) == stages:
+                raise error
+
+        patch.setattr(training._Checkpoint, 'write', write_then_fail)
+        with pytest.raises(type(error)):
+            train([bag], output, RECIPE)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_only_the_model_is_left(bag, tmp_path):
+    trained = train([bag], tmp_path / 'new' / 'model.npz', RECIPE)
+    assert names(tmp_path / 'new') == ['model.npz']
+    model = PlaceModel.load(tmp_path / 'new' / 'model.npz')
+    assert model.quality['pictures'] == PICTURES
+    assert model.quality['certified']
+    assert trained.features.shape == (PICTURES, 6)
+
+
+def test_same_bag_same_bytes(bag, whole, tmp_path):
+    train([bag], tmp_path / 'model.npz', RECIPE)
+    assert (tmp_path / 'model.npz').read_bytes() == whole
+
+
+@pytest.mark.parametrize('stages', [1, 4, 6])
+@pytest.mark.parametrize('error', [Cut(), KeyboardInterrupt()])
+def test_resuming_gives_the_same_bytes(bag, whole, tmp_path, stages, error):
+    output = tmp_path / 'model.npz'
+    cut_off(bag, output, stages, error)
+    assert names(tmp_path) == ['.model.npz.checkpoint.npz']
+    train([bag], output, RECIPE, resume=True)
+    assert output.read_bytes() == whole
+    assert names(tmp_path) == ['model.npz']
+
+
+def test_resuming_leaves_out_finished_stages(bag, tmp_path, monkeypatch):
+    cut_off(bag, tmp_path / 'model.npz', 4, Cut())
+    stages = []
+    monkeypatch.setattr(training._Checkpoint, 'write', lambda self, partial: stages.append(partial))
+    train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
+    assert len(stages) == 2
+
+
+def test_without_resume_it_starts_anew(bag, tmp_path, monkeypatch):
+    cut_off(bag, tmp_path / 'model.npz', 4, Cut())
+    stages = []
+    monkeypatch.setattr(training._Checkpoint, 'write', lambda self, partial: stages.append(partial))
+    train([bag], tmp_path / 'model.npz', RECIPE)
+    assert len(stages) == 6
+
+
+def test_resuming_without_a_checkpoint_starts_anew(bag, whole, tmp_path):
+    train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
+    assert (tmp_path / 'model.npz').read_bytes() == whole
+
+
+def test_a_killed_training_s_pictures_are_cleared(bag, tmp_path):
+    stale = tmp_path / '.model.npz.cache-1234'
+    stale.mkdir()
+    (stale / 'panoramas.u8').write_bytes(b'x')
+    train([bag], tmp_path / 'model.npz', RECIPE)
+    assert names(tmp_path) == ['model.npz']
+
+
+@pytest.mark.parametrize('other', ['recipe', 'bag'])
+def test_a_checkpoint_of_something_else_is_refused(bag, tmp_path, other):
+    cut_off(bag, tmp_path / 'model.npz', 2, Cut())
+    changed = replace(RECIPE, network=replace(NETWORK, relative_cut=1e-5))
+    bags = [write_bag(tmp_path / 'other', seed=8)] if other == 'bag' else [bag]
+    with pytest.raises(ModelError, match='other bags or parameters: train without --resume'):
+        train(bags, tmp_path / 'model.npz', changed if other == 'recipe' else RECIPE, resume=True)
+
+
+def test_a_damaged_checkpoint_is_refused(bag, tmp_path):
+    cut_off(bag, tmp_path / 'model.npz', 2, Cut())
+    checkpoint = tmp_path / '.model.npz.checkpoint.npz'
+    checkpoint.write_bytes(checkpoint.read_bytes()[:500])
+    with pytest.raises(ModelError, match='train without --resume'):
+        train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
+
+
+@pytest.mark.parametrize('late', [False, True])
+def test_after_an_error_no_model_is_left(bag, tmp_path, late, monkeypatch):
+    if late:
+        monkeypatch.setattr(training, 'learn_place', _fail)
+    network = NETWORK if late else replace(NETWORK, linear_dimensions=(6, 6))
+    with pytest.raises(LocalizationError):
+        train([bag], tmp_path / 'model.npz', replace(RECIPE, network=network))
+    assert 'model.npz' not in names(tmp_path)
+    assert not any('cache' in name for name in names(tmp_path))
+
+
+def _fail(*args, **kwargs):
+    raise DataError('the drive cannot fix a map')
+
+
+def test_an_old_model_survives_an_error(bag, tmp_path, monkeypatch):
+    (tmp_path / 'model.npz').write_bytes(b'old')
+    monkeypatch.setattr(training, 'learn_place', _fail)
+    with pytest.raises(DataError):
+        train([bag], tmp_path / 'model.npz', RECIPE)
+    assert (tmp_path / 'model.npz').read_bytes() == b'old'
+
+
+def test_bags_of_other_sizes_are_refused(bag, tmp_path):
+    other = write_bag(tmp_path / 'other', size=(12, 96))
+    with pytest.raises(DataError, match=r'different sizes \(drive: 72x12, other: 96x12\)'):
+        train([bag, other], tmp_path / 'model.npz', RECIPE)
+
+
+def test_an_output_that_cannot_be(bag, tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(ModelError, match='cannot be written'):
+        train([bag], tmp_path / 'file' / 'model.npz', RECIPE)
+
+
+def test_the_mdp_engine_learns_the_same_place(bag, tmp_path):
+    pytest.importorskip('future', reason='the extra mdp is not installed')
+    ours = train([bag], tmp_path / 'ours.npz', RECIPE)
+    config = replace(RECIPE, network=replace(NETWORK, engine='mdp'))
+    theirs = train([bag], tmp_path / 'theirs.npz', config)
+    for a, b in zip(ours.features.T, theirs.features.T, strict=True):
+        assert abs(np.corrcoef(a, b)[0, 1]) > 0.999
+
+
+def test_two_bags_are_two_drives(bag, tmp_path):
+    other = write_bag(tmp_path / 'other', seed=5)
+    trained = train([bag, other], tmp_path / 'model.npz', RECIPE)
+    assert len(trained.runs) == 2 and len(trained.features) == 2 * PICTURES
+
+
+class TestDrive:
+    """Which pictures are neighbors, and how far apart."""
+
+    def run(self, x_m: list[float], seconds: list[float]) -> Run:
+        stamps = (np.array(seconds) * 1e9).astype(np.int64)
+        poses = np.zeros((len(stamps), 3))
+        poses[:, 0] = x_m
+        images = np.zeros((len(stamps), 12, 72, 3), np.uint8)
+        odometry = Odometry(stamps, poses, np.zeros((len(stamps), 2)), np.zeros((len(stamps), 2)))
+        return Run('run', PanoramaArray(stamps, images), odometry, counts={'images': Count()})
+
+    def scale(self, run: Run, **config) -> list[float]:
+        return drive_of(run, NetworkConfig(**config)).scale.tolist()
+
+    def test_every_picture_counts_the_same(self):
+        run = self.run([0, 0.1, 0.4, 0.5], [0, 1, 2, 3])
+        assert self.scale(run) == [1, 1, 1]
+
+    def test_pauses_and_jumps_are_breaks(self):
+        run = self.run([0, 0.1, 0.2, 3.0, 3.1], [0, 1, 9, 10, 11])
+        assert self.scale(run, break_time=5.0, break_distance=2.0) == [1, 0, 0, 1]
+
+    def test_per_metre(self):
+        run = self.run([0, 0.1, 0.3, 0.4], [0, 1, 2, 3])
+        assert np.allclose(self.scale(run, difference='distance'), [1, 0.5, 1])
+
+    def test_per_second(self):
+        run = self.run([0, 0.1, 0.2, 0.3], [0, 1, 2, 6])
+        assert np.allclose(self.scale(run, difference='time'), [1, 1, 0.25])
+
+    def test_a_robot_that_hardly_moves_counts_little(self):
+        run = self.run([0, 0.1, 0.2, 0.2], [0, 1, 2, 3])
+        assert np.allclose(self.scale(run, difference='distance'), [1, 1, 5])
+
+
+def test_a_drive_is_streamed_from_the_cache(bag, tmp_path):
+    run = read_drive(bag, tmp_path, Recipe(panorama=RECIPE.panorama))
+    assert isinstance(run.panoramas.images, np.memmap)
+    assert tmp_path in Path(run.panoramas.images.filename).parents
