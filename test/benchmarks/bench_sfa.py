@@ -1,0 +1,375 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Training and inference against MDP and against bare matrix products: `python bench_sfa.py`.
+
+Ratios compare two ways of doing the same, measured in turns, in one run, on one core. `--quick`
+takes fewer pictures; `--model FILE` measures inference of a trained model, not of a made-up one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy import linalg
+
+from sfa_localization import hierarchy, mdp_engine
+from sfa_localization.agreement import Agreement
+from sfa_localization.config import HeadingConfig, MetricConfig, NetworkConfig, PanoramaConfig
+from sfa_localization.errors import ConfigError
+from sfa_localization.fast_map import FastProcess
+from sfa_localization.heading import Compass, _kernel, _solve, harmonics
+from sfa_localization.hierarchy import Drive, architecture_of, in_this_process, train_network
+from sfa_localization.network import prepare
+from sfa_localization.novelty import Novelty, describe
+from sfa_localization.place_model import PlaceModel, heading_input, top_features
+from sfa_localization.regression import MetricMap, Process
+from sfa_localization.run import PanoramaArray
+from sfa_localization.sfa import StreamingSFA
+from sfa_localization.threads import one_core
+
+SIZE = (60, 600)
+PAPER_PICTURES = 1773
+CONFIG = NetworkConfig()
+ARCHITECTURE = architecture_of(CONFIG, SIZE)
+
+
+def panoramas(path: Path, count: int, seed: int = 0) -> Drive:
+    """Colour textures that change and turn slowly, in a memory-mapped file."""
+    rng = np.random.default_rng(seed)
+    tiles = [_texture(rng) for _ in range(count // 60 + 3)]
+    images = np.memmap(path, np.uint8, 'w+', shape=(count, *SIZE, 3))
+    turn = rng.normal(0, 12, count).cumsum().astype(int)
+    for t in range(count):
+        k, share = divmod(t / 60, 1.0)
+        blend = np.tensordot(_spline(share), np.stack(tiles[int(k) : int(k) + 3]), 1)
+        images[t] = np.roll(np.clip(blend, 0, 255), turn[t], axis=1)
+    images.flush()
+    read_only = np.memmap(path, np.uint8, 'r', shape=images.shape)
+    return Drive(PanoramaArray(np.arange(count), read_only), np.ones(count - 1, np.float32))
+
+
+def _texture(rng: np.random.Generator) -> np.ndarray:
+    """Soft spots of many sizes that wrap around."""
+    noise = np.zeros((*SIZE, 3), np.float32)
+    for width in (1.5, 4, 12):
+        spots = rng.normal(size=(SIZE[0], 3 * SIZE[1], 3)).astype(np.float32)
+        spots[:, : SIZE[1]] = spots[:, SIZE[1] : 2 * SIZE[1]] = spots[:, 2 * SIZE[1] :]
+        noise += cv2.GaussianBlur(spots, (0, 0), width)[:, SIZE[1] : 2 * SIZE[1]] * width
+    return 128 + 40 * noise / noise.std()
+
+
+def _spline(x: float) -> np.ndarray:
+    return np.array([(1 - x) ** 2 / 2, 0.5 + x - x * x, x * x / 2])
+
+
+def bench_training(folder: Path, quick: bool = False) -> dict[str, float]:
+    """Seconds to train the network on the paper's number of pictures; all cores, a warm file."""
+    count = 200 if quick else PAPER_PICTURES
+    drive = panoramas(folder / 'paper.u8', count)
+    wall, cpu = time.perf_counter(), time.process_time()
+    train_network(ARCHITECTURE, [drive], CONFIG)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    name = 'train_200_pictures' if quick else 'train_paper_size'
+    return {f'{name}_s': wall, f'{name}_cpu_s': cpu, 'cores': float(hierarchy._cores())}
+
+
+def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
+    """Seconds of one core per picture and in all, by MDP on the explicit sequence and by ours.
+
+    Both are measured at two sizes, in turns; time is a + b pictures.
+    """
+    sizes = (2, 4) if quick else (4, 8)
+    drive = panoramas(folder / 'engines.u8', sizes[1] * 8)
+    seconds: dict[str, list[float]] = {'mdp': [], 'ours': []}
+    flow = None
+    for size in sizes:
+        part = _first(drive, size)
+        with one_core():
+            start = time.process_time()
+            flow, _ = mdp_engine.train_flow(ARCHITECTURE, [part], CONFIG)
+            seconds['mdp'].append(time.process_time() - start)
+            part = _first(drive, size * 8)
+            start = time.process_time()
+            network = train_network(ARCHITECTURE, [part], CONFIG, executor=_on_one_core)
+            seconds['ours'].append(time.process_time() - start)
+    theirs = _extrapolated(sizes, seconds['mdp'])
+    ours = _extrapolated([8 * size for size in sizes], seconds['ours'])
+    speedup = float(theirs @ [1, PAPER_PICTURES] / (ours @ [1, PAPER_PICTURES]))
+    return {
+        'train_speedup_vs_mdp': speedup,
+        'train_speedup_vs_mdp_per_picture': float(theirs[1] / ours[1]),
+        'train_mdp_s_per_picture': float(theirs[1]),
+        'train_s_per_picture': float(ours[1]),
+        'train_mdp_paper_size_hours': float(theirs @ [1, PAPER_PICTURES]) / 3600,
+        **_execution(flow, network, drive.panoramas.read(0, 1)),
+    }
+
+
+def _on_one_core(work, shards, on_shard):
+    cores = hierarchy._cores
+    hierarchy._cores = lambda: 1
+    try:
+        return in_this_process(work, shards, on_shard)
+    finally:
+        hierarchy._cores = cores
+
+
+def _first(drive: Drive, count: int) -> Drive:
+    part = PanoramaArray(drive.panoramas.stamps_ns[:count], drive.panoramas.images[:count])
+    return Drive(part, drive.scale[: count - 1])
+
+
+def _extrapolated(sizes: list[int] | tuple[int, ...], seconds: list[float]) -> np.ndarray:
+    """(a, b) of a + b pictures."""
+    slope = (seconds[1] - seconds[0]) / (sizes[1] - sizes[0])
+    return np.array([max(seconds[0] - slope * sizes[0], 0.0), slope])
+
+
+def _execution(flow, network, image: np.ndarray) -> dict[str, float]:
+    """MDP's execution of a prepared frame over all that locate does with the picture."""
+    model = made_up_model(network)
+    flat = prepare(image, ARCHITECTURE).reshape(1, -1).astype(float)
+    with one_core():
+        theirs, ours = in_turns([lambda: flow.execute(flat), lambda: model.locate(image[0])], 30)
+    return {'locate_speedup_vs_mdp': float(np.median(theirs) / np.median(ours))}
+
+
+def in_turns(functions: list[Callable[[], object]], rounds: int) -> np.ndarray:
+    """Seconds (functions, rounds) of each function, called in turns."""
+    taken = np.zeros((len(functions), rounds))
+    for function in functions:
+        function()
+    for at in range(rounds):
+        for row, function in zip(taken, functions, strict=True):
+            start = time.perf_counter()
+            function()
+            row[at] = time.perf_counter() - start
+    return taken
+
+
+def made_up_model(network) -> PlaceModel:
+    """A model of the default sizes whose map and compass mean nothing; their cost is real."""
+    rng = np.random.default_rng(0)
+    metric, heading = MetricConfig(), HeadingConfig()
+    count = metric.inducing_points
+    points = rng.normal(size=(count, 16))
+    basis = Process.at(points * 0.3, np.full(16, 0.3), 0.01)
+    expanded = basis.expand(points)
+    posterior = linalg.inv(expanded.T @ expanded + np.diag(basis.ridge) + 1e-9 * np.eye(count + 1))
+    spread = linalg.cholesky(0.05**2 * posterior, lower=True)
+    sway = 1e-3 * rng.normal(size=(count + 1, 12, 2))
+    map_ = MetricMap(basis, rng.normal(size=(count + 1, 2)), spread, sway, 0.05, 1.0)
+    images = rng.integers(0, 256, (40, *SIZE, 3), np.uint8)
+    maps = network.maps(images)
+    layers = tuple(layer - 1 for layer in heading.heading_layers)
+    width = heading_input([m[:1] for m in maps], layers).shape[1]
+    with one_core():
+        compass = _compass(rng, heading.heading_inducing_points, heading.heading_features, width)
+    return PlaceModel(
+        network,
+        map_,
+        PanoramaConfig(),
+        Novelty.fit([describe(m) for m in maps]),
+        agreement=Agreement(1.0, 1.0, 1.0),
+        compass=compass,
+        yaw_agreement=Agreement(1.0, 1.0, 1.0),
+        heading_layers=layers,
+    )
+
+
+def _compass(rng: np.random.Generator, count: int, features: int, width: int) -> Compass:
+    """A compass of random inducing pictures."""
+    s = rng.normal(size=(count, features))
+    f = rng.normal(size=(count, width, 2)) @ np.array([1, 1j])
+    f /= np.linalg.norm(f, axis=1, keepdims=True)
+    kernel = _kernel(s, f, s, f, 2.0)
+    moment = kernel.conj().T @ np.exp(1j * rng.uniform(-3, 3, count))
+    solution = _solve(kernel.conj().T @ kernel, moment, kernel, 0.1)
+    scales = np.ones(features), np.ones(width)
+    return Compass(s, f, *scales, *solution, 2.0, 0.1, -1.0, np.array([1.0, 1e-3]))
+
+
+def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
+    """Locating one picture against the matrix products of its equations, on one core."""
+    height, width = model.network.architecture.size
+    image = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
+    blind = replace(model, compass=None, yaw_agreement=None, heading_layers=())
+    products, network_only = bare_products(model, image), bare_network(model)
+    with one_core():
+        whole, bare, without, maps, bare_maps = in_turns(
+            [
+                lambda: model.locate(image),
+                lambda: [product() for product in products],
+                lambda: blind.locate(image),
+                lambda: model.network.maps(image[None]),
+                lambda: [product() for product in network_only],
+            ],
+            rounds,
+        )
+        grown = _growth(lambda: model.locate(image), 10_000 if rounds >= 1000 else 1000)
+    median = float(np.median(bare))
+    return {
+        'locate_over_matmul': float(np.median(whole)) / median,
+        'locate_p99_over_matmul_p99': float(np.percentile(whole, 99) / np.percentile(bare, 99)),
+        'locate_ms': float(np.median(whole)) * 1e3,
+        'locate_p99_ms': float(np.percentile(whole, 99)) * 1e3,
+        'matmul_ms': median * 1e3,
+        'network_over_matmul': float(np.median(maps) / np.median(bare_maps)),
+        'locate_heading_cost': float(np.median(whole) / np.median(without)) - 1,
+        'locate_growth_mib': grown,
+    }
+
+
+def _growth(function: Callable[[], object], calls: int) -> float:
+    """MiB by which the process's peak memory grows over many calls."""
+    for _ in range(100):
+        function()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for _ in range(calls):
+        function()
+    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+
+
+def bare_network(model: PlaceModel) -> list[Callable[[], object]]:
+    """The two products of every layer, on inputs that are ready."""
+    made = []
+    network = model.network
+    for depth, node in enumerate(network.nodes):
+        nodes = network.architecture.map_rows[depth + 1] * network.architecture.rotations
+        for weights in (node.linear, node.slow):
+            made.append(_product(np.ones((nodes, len(weights)), np.float32), weights))
+    return made
+
+
+def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], object]]:
+    """All products of a model's equations, on inputs that are ready."""
+    made = bare_network(model)
+    maps = model.network.maps(image[None])
+    for layer, m in zip(model.novelty.layers, maps, strict=True):
+        description = describe(m) - layer.mean
+        made += [_product(description, layer.directions), _product(description, layer.axes)]
+    fast = model._predictor()
+    assert isinstance(fast, FastProcess)
+    features = top_features(maps)[:, : len(fast.scale)] * fast.scale
+    kernel = np.ones((1, len(fast.points)))
+    made += [_product(features, fast.points.T.copy()), _product(kernel, fast.linear)]
+    made.append(_triangular(fast.factor))
+    if model.compass is not None:
+        compass = model.compass
+        for layer in model.heading_layers:
+            wave = np.ones(maps[layer].shape[2], np.complex64)
+            made.append(_product(wave, maps[layer].astype(np.complex64)))
+        f = np.concatenate([harmonics(maps[layer]) for layer in model.heading_layers], axis=1)
+        made.append(_product(f.astype(np.complex64), compass._fast.adjoint))
+        made.append(_triangular(compass._fast.factor))
+        made.append(_product(np.ones((1, len(compass.weights)), complex), compass.weights))
+    return made
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> Callable[[], object]:
+    return lambda: a @ b
+
+
+def _triangular(factor: np.ndarray) -> Callable[[], object]:
+    product = linalg.get_blas_funcs('trmv', (factor,))
+    vector = np.ones(len(factor), factor.dtype)
+    return lambda: product(factor, vector, lower=1, trans=1)
+
+
+def bench_memory(folder: Path, quick: bool = False) -> dict[str, float]:
+    """Peak memory of training on 4 and 16 times the pictures over that of 1 times."""
+    least = 128
+    panoramas(folder / 'memory.u8', least * (4 if quick else 16))
+    peaks = {}
+    for times in (1, 4) if quick else (1, 4, 16):
+        command = [
+            sys.executable,
+            __file__,
+            '--peak',
+            str(folder / 'memory.u8'),
+            str(least * times),
+        ]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        peaks[times] = float(done.stdout)
+    ratios = {f'train_memory_{n}x_over_1x': peaks[n] / peaks[1] for n in peaks if n > 1}
+    return {**ratios, 'train_memory_mib': peaks[1]}
+
+
+def peak(path: Path, count: int) -> float:
+    """Peak memory (MiB) of this process after training on a file's first pictures."""
+    images = np.memmap(path, np.uint8, 'r', shape=(count, *SIZE, 3))
+    drive = Drive(PanoramaArray(np.arange(count), images), np.ones(count - 1, np.float32))
+    config = replace(
+        CONFIG,
+        layers='custom',
+        linear_dimensions=(16, 16, 16),
+        output_dimensions=(16, 16, 16),
+    )
+    train_network(architecture_of(config, SIZE), [drive], config)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def bench_sklearn_sfa(rounds: int = 3) -> dict[str, float]:
+    """Our solver against sklearn-sfa's on one node's signal; nothing where it is not installed."""
+    if importlib.util.find_spec('sksfa') is None:
+        return {}
+    from sksfa import SFA
+
+    rng = np.random.default_rng(0)
+    signal = rng.normal(size=(20_000, 300)).cumsum(0) @ rng.normal(size=(300, 300))
+    theirs, ours = in_turns(
+        [
+            lambda: SFA(n_components=32).fit(signal),
+            lambda: StreamingSFA(32).partial_fit(signal).fit(),
+        ],
+        rounds,
+    )
+    return {'sfa_speedup_vs_sklearn_sfa': float(np.median(theirs) / np.median(ours))}
+
+
+def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> dict[str, float]:
+    """All figures, by name."""
+    if model is None:
+        drive = panoramas(folder / 'locate.u8', 96)
+        located = made_up_model(train_network(ARCHITECTURE, [drive], CONFIG))
+    else:
+        located = PlaceModel.load(model)
+    figures = bench_locate(located, 300 if quick else 2000)
+    figures |= bench_sklearn_sfa()
+    figures |= bench_memory(folder, quick)
+    figures |= bench_training(folder, quick)
+    try:
+        figures |= bench_engines(folder, quick)
+    except ConfigError as error:
+        sys.stderr.write(f'no comparison with MDP: {error}\n')
+    return figures
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--quick', action='store_true', help='fewer pictures')
+    parser.add_argument('--model', type=Path, help='trained model to locate with')
+    parser.add_argument('--peak', nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.peak:
+        sys.stdout.write(f'{peak(Path(options.peak[0]), int(options.peak[1]))}\n')
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        figures = bench_sfa(Path(folder), options.quick, options.model)
+    sys.stdout.write(json.dumps(figures, indent=2) + '\n')
+
+
+if __name__ == '__main__':
+    main()
