@@ -25,8 +25,6 @@ from sfa_localization.place_model import PlaceModel
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r'<!-- run: (\w+) -->\s*```(\w+)\n(.*?)```', re.DOTALL)
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
-# The demo's drive, in the garden of the sample.
-DRIVE = 'simulate demo/test --trajectory test --seed 2 --area 10x10 --length 40 --compressed'
 pytestmark = pytest.mark.slow
 
 
@@ -38,6 +36,14 @@ def blocks(kind: str, language: str) -> list[str]:
 def commands(kind: str) -> list[list[str]]:
     lines = '\n'.join(blocks(kind, 'bash')).splitlines()
     return [shlex.split(line) for line in lines if line.strip()]
+
+
+def raw_drive() -> list[str]:
+    """Return the command that made the sample's second drive, but with the mirror's pictures."""
+    text = (ROOT / 'bags/README.md').read_text('utf-8').replace('\\\n', ' ')
+    (line,) = (line for line in text.splitlines() if 'simulate bags/sample_test' in line)
+    words = shlex.split(line.partition('-m sfa_localization ')[2])
+    return [{'bags/sample_test': 'demo/test', 'panorama': 'raw'}.get(w, w) for w in words]
 
 
 def program(words: list[str]) -> list[str]:
@@ -94,7 +100,7 @@ def test_nodes_run_as_told(folder, monkeypatch):
 
     monkeypatch.chdir(folder)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
-    complete(shlex.split(DRIVE), folder)
+    complete(raw_drive(), folder)
     os.link(folder / 'model.npz', folder / 'demo/model.npz')
     size = PlaceModel.load(folder / 'model.npz').panorama
     extra = {
