@@ -37,10 +37,10 @@ from sfa_localization.run import Image, Panoramas
 from sfa_localization.sfa import Solution, Statistics, solve
 from sfa_localization.threads import one_core
 
-# Pictures read at once, in a shard, and multiplied at once.
+# Pictures read at once, and in a shard; signals of a node multiplied at once, which fit a cache.
 BATCH = 16
 SHARD = 64
-_TOGETHER = 4
+_TOGETHER = 1440
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,13 +189,16 @@ def stage_sums(partial: Partial, shard: Shard) -> Sums:
     network = partial.network()
     sums = _sums(partial)
     signals = _signals(partial)
+    architecture = partial.architecture
+    nodes = architecture.map_rows[partial.depth + 1] * architecture.rotations
+    together = max(1, _TOGETHER // nodes)
     lead = shard.lead()
     if lead is not None:
         sums.lead(signals(_below(network, lead)))
     for images, scale in shard.batches():
         maps = _below(network, images)
-        for start in range(0, len(maps), _TOGETHER):
-            part = slice(start, start + _TOGETHER)
+        for start in range(0, len(maps), together):
+            part = slice(start, start + together)
             sums.add(signals(maps[part]), scale[part])
     return sums
 

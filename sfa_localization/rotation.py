@@ -195,9 +195,9 @@ def _between_images(columns: Map, last: Map | None, scale: Map) -> Map:
     return np.asarray(difference)
 
 
-def _product(a: Map, b: Map) -> Array:
-    """a^T b over all leading axes, in float32, returned in float64."""
-    return np.asarray(a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1]), np.float64)
+def _product(a: Map, b: Map) -> Map:
+    """a^T b over all leading axes."""
+    return np.asarray(a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1]))
 
 
 class SampleStatistics:
@@ -205,33 +205,37 @@ class SampleStatistics:
 
     def __init__(self, rotations: int, dimensions: int) -> None:
         self.rotations = rotations
-        self.sums = Statistics.empty(dimensions)
+        self.samples = self.pairs = 0
+        self.total = np.zeros(dimensions)
+        self.second, self.within, self.between = np.zeros((3, dimensions, dimensions))
         self._last: Map | None = None
 
     def lead(self, maps: Map) -> None:
         self._last = maps[:, -1]
 
     def add(self, maps: Map, scale: Map) -> None:
-        r, s = self.rotations, self.sums
-        nodes = maps.shape[1] * maps.shape[2]
-        s.weight += nodes * r
-        s.total += maps.sum((1, 2, 3), dtype=np.float64)
-        s.second += _square(maps)
-        s.difference += _square(_turned(maps)) * ((r - 1) / r)
-        s.steps += nodes * (r - 1)
+        self.samples += maps.shape[1] * maps.shape[2]
+        self.total += maps.sum((1, 2, 3), dtype=np.float64)
+        self.second += _square(maps)
+        self.within += _square(_turned(maps))
         self._add_pairs(maps, scale)
         self._last = maps[:, -1].copy()
 
     def merge(self, other: SampleStatistics) -> None:
-        s, o = self.sums, other.sums
-        s.weight += o.weight
-        s.steps += o.steps
-        s.total += o.total
-        s.second += o.second
-        s.difference += o.difference
+        self.samples += other.samples
+        self.pairs += other.pairs
+        self.total += other.total
+        self.second += other.second
+        self.within += other.within
+        self.between += other.between
 
     def result(self) -> Statistics:
-        return self.sums
+        r = self.rotations
+        difference = self.within * ((r - 1) / r) + self.between / r
+        steps = self.samples * (r - 1) + self.pairs
+        return Statistics(
+            float(self.samples * r), self.total, self.second, float(steps), difference
+        )
 
     def _add_pairs(self, maps: Map, scale: Map) -> None:
         joined = np.flatnonzero(scale > 0)
@@ -241,8 +245,8 @@ class SampleStatistics:
         for at, t in enumerate(joined.tolist()):
             _difference_into(maps[:, t], self._before(maps, t), float(scale[t]), pairs[:, at])
         if len(joined):
-            self.sums.difference += _square(pairs) / self.rotations
-            self.sums.steps += pairs.shape[1] * pairs.shape[2]
+            self.between += _square(pairs)
+            self.pairs += pairs.shape[1] * pairs.shape[2]
 
     def _before(self, maps: Map, t: int) -> Map:
         if t > 0:
@@ -267,6 +271,6 @@ def _turned(signals: Map) -> Map:
     return out
 
 
-def _square(signals: Map) -> Array:
+def _square(signals: Map) -> Map:
     flat = signals.reshape(len(signals), -1)
-    return np.asarray(flat @ flat.T, np.float64)
+    return np.asarray(flat @ flat.T)
