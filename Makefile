@@ -26,10 +26,8 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)
 
-bench: $(READY)  ## compare speeds side by side; the chain of nodes with the model of the demo
-	set -e; for bench in $(filter-out %/bench_chain.py,$(wildcard test/benchmarks/bench_*.py)); do \
-	    echo "== $$bench"; PYTHONPATH=. $(PY) $$bench; done
-	if [ -f demo/model.npz ]; then PYTHONPATH=. $(PY) test/benchmarks/bench_chain.py demo/model.npz; fi
+bench: $(READY)  ## compare speeds side by side, to bench.json (ARGS=--quick); the nodes after a demo
+	PYTHONPATH=. $(PY) test/benchmarks/bench_all.py $(addprefix --model ,$(wildcard demo/model.npz)) $(ARGS)
 
 lint: $(READY)  ## ruff, ruff format, mypy
 	$(VENV)/bin/ruff check .

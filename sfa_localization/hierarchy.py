@@ -322,7 +322,8 @@ def train_network(
     shards = shards_of(drives, config)
     while not partial.finished:
         total = executor(_Stage(partial), shards, on_shard)
-        partial = partial.advanced(total.result(), config.relative_cut)
+        with one_core():
+            partial = partial.advanced(total.result(), config.relative_cut)
         on_stage(partial)
     return partial.network()
 

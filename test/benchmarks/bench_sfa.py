@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import resource
+import re
 import subprocess
 import sys
 import tempfile
@@ -22,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 from scipy import linalg
 
 from sfa_localization import hierarchy, mdp_engine
@@ -233,13 +234,13 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
 
 
 def _growth(function: Callable[[], object], calls: int) -> float:
-    """MiB by which the process's peak memory grows over many calls."""
+    """MiB by which the process's memory grows over many calls."""
     for _ in range(100):
         function()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = psutil.Process().memory_info().rss
     for _ in range(calls):
         function()
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return (psutil.Process().memory_info().rss - before) / 2**20
 
 
 def bare_network(model: PlaceModel) -> list[Callable[[], object]]:
@@ -318,7 +319,9 @@ def peak(path: Path, count: int) -> float:
         output_dimensions=(16, 16, 16),
     )
     train_network(architecture_of(config, SIZE), [drive], config)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    # Not ru_maxrss: a process inherits it from the one that started it.
+    status = Path('/proc/self/status').read_text()
+    return float(re.search(r'VmHWM:\s+(\d+) kB', status).group(1)) / 1024
 
 
 def bench_sklearn_sfa(rounds: int = 3) -> dict[str, float]:
