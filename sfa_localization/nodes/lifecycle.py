@@ -247,12 +247,18 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     node = None
     try:
         rclpy.init(args=args)
+        # Made first: after a signal it could not be made any more.
+        executor = SingleThreadedExecutor()
         node = make()
         if not node.start():
             return 1
         with one_core():
-            _spin(node)
+            _spin(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except rclpy_implementation.RCLError:
+        if rclpy.ok():
+            raise
         return 0
     except LocalizationError as error:
         rclpy.logging.get_logger('sfa_localization').fatal(str(error))
@@ -262,8 +268,7 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     return 0
 
 
-def _spin(node: LocalizationNode) -> None:
-    executor = SingleThreadedExecutor()
+def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
     executor.add_node(node)
     while rclpy.ok():
         try:
