@@ -135,8 +135,10 @@ class StampFilter:
 
 
 class Stream:
-    """One topic being read: `select` picks the part of a message that matters, or None, and
-    `convert` turns that into a value. Of an opaque one messages are not decoded: they are None.
+    """One topic being read.
+
+    `select` picks the part of a message that matters, or None, and `convert` turns that into a
+    value. Of an opaque one messages are not decoded: they are None.
     """
 
     def __init__(

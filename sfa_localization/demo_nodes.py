@@ -219,7 +219,8 @@ def _require_speech(recorder: Recorder, processes: Processes, longest_s: float) 
     """Raise NodeError for the first node of the chain that is silent."""
     for name in NODES:
         if recorder.count(name) == 0 or recorder.silence_s(name) > longest_s:
+            since = f' in the last {longest_s:g} s' if np.isfinite(longest_s) else ''
             raise NodeError(
                 f'{name} is silent: {recorder.count(name)} messages on {OUTPUTS[name]}, '
-                f'none for {longest_s:g} s; see {processes.log(name)}'
+                f'none{since}; see {processes.log(name)}'
             )

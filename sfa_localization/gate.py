@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Do measurements agree with each other under the odometry's motion, and where do they put us?
+"""Whether measurements agree under the odometry's motion, and where they put the robot.
 
 A measurement that the filter refuses may be wrong, or the filter may be. What decides is whether
 the refused ones agree among themselves: laid along the odometry's path, turned and shifted as a

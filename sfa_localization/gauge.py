@@ -39,8 +39,10 @@ def gauge(fit: Fit, segments: Segments, stack: Stack, config: MetricConfig) -> R
 
 
 def _odometry(segments: Segments, fit: Fit) -> tuple[Array, Array]:
-    """Poses (n, 3) of the first segments' frames in the odometry frame, free of the bias, and
-    the variance (n,) of their places; up to the first break of the odometry."""
+    """Poses (n, 3) of the first segments' frames in the odometry frame, and variances (n,).
+
+    Free of the bias; the variances are those of the places; up to the odometry's first break.
+    """
     bias = float(fit.solution.bias[0])
     poses, variances = [np.asarray(segments[0].start, float)], [0.0]
     yaw_variance = place_variance = 0.0

@@ -85,8 +85,10 @@ class MetricResult:
 
     @property
     def left_out_error_m(self) -> float:
-        """Mean distance between the predictions of a map learnt without a stretch of the drive
-        and where the whole drive, certified, puts that stretch. Needs no ground truth."""
+        """Mean error of a map at stretches of the drive that it was learnt without.
+
+        The distance to where the whole drive, certified, puts the stretch; needs no ground truth.
+        """
         return float(np.hypot(*self.left_out.T).mean())
 
 
@@ -186,8 +188,10 @@ def _plane(values: Complex) -> Array:
 
 
 def _inflation(left: LeftOut) -> float:
-    """Factor on the predicted variances that makes half of the left-out errors fall inside the
-    50 % ellipse, and 95 % inside the 95 % ellipse: the larger of the two, at least 1."""
+    """Factor, at least 1, on the predicted variances, by the left-out errors.
+
+    Half of these then fall inside the 50 % ellipse, and 95 % inside the 95 % ellipse.
+    """
     ratio = np.abs(left.errors) ** 2 / left.variances
     # The squared distance of two normal axes is exponential: quantile q at -2 log(1 - q).
     factors = [np.quantile(ratio, q) / (-2.0 * np.log(1.0 - q)) for q in (0.5, 0.95)]

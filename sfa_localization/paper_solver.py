@@ -35,7 +35,7 @@ class Parameters:
     weights: Array
 
     def flat(self) -> Array:
-        """(N + 2N + 2J,)"""
+        """All in one vector (N + 2N + 2J,)."""
         return np.concatenate([self.alpha, self.origins.ravel(), self.weights.ravel()])
 
     @classmethod

@@ -13,6 +13,7 @@ import time
 import tty
 from collections.abc import Callable
 from types import TracebackType
+from typing import Any
 
 PAUSE, STEP, FASTER, SLOWER = 'pause', 'step', 'faster', 'slower'
 KEYS = {
@@ -67,7 +68,7 @@ class Keyboard:
 
     def __init__(self, descriptor: int | None = None) -> None:
         self._descriptor = descriptor
-        self._saved: list[object] | None = None
+        self._saved: list[Any] | None = None
 
     def __enter__(self) -> Keyboard:
         if self._descriptor is None:
@@ -84,7 +85,7 @@ class Keyboard:
         trace: TracebackType | None,
     ) -> None:
         if self._descriptor is not None and self._saved is not None:
-            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._saved)  # type: ignore[arg-type]
+            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._saved)
 
     @property
     def attached(self) -> bool:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""For all tests: ROS stays on this machine, checks messages, logs to a temporary folder; one core."""
+"""For all tests: ROS stays on this machine, checks messages, logs elsewhere; one core is used."""
 
 import os
 import tempfile

@@ -66,6 +66,7 @@ class EkfNode(LocalizationNode):
         self._config = self.settings(EkfNodeConfig)
         self._filter = PoseFilter(self.settings(FilterConfig))
         self._paused = False
+        self._jumps: Any = None
         self._path: deque[PoseStamped] = deque(maxlen=self._config.path_length)
         self._path_ns = 0
         self._frames = self._config.odom_frame, self._config.base_frame
@@ -115,9 +116,8 @@ class EkfNode(LocalizationNode):
         self._tell_state()
 
     def teardown(self) -> None:
-        jumps = getattr(self, '_jumps', None)
-        if jumps is not None:
-            jumps.unregister()
+        if self._jumps is not None:
+            self._jumps.unregister()
             self._jumps = None
 
     def settings_changed(self, settings: Settings) -> None:

@@ -64,7 +64,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._settings: dict[type[Settings], Settings] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        for kind in (NodeConfig, *kinds):
+        everything: list[type[Settings]] = [NodeConfig, *kinds]
+        for kind in everything:
             self._declare(kind)
 
     def _declare(self, kind: type[Settings]) -> None:
@@ -246,7 +247,7 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start."""
     node = None
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=None if args is None else list(args))
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
