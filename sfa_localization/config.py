@@ -464,6 +464,13 @@ class SimulationConfig(Settings):
     odometry_rate: float = setting(
         50.0, 'odometry, gyroscope, truth', unit='Hz', low=5.0, high=500.0
     )
+    test_drift: float = setting(
+        0.31,
+        "mean odometry error of a test drive, the paper's robot's; 0: as the errors are drawn",
+        unit='m',
+        low=0.0,
+        high=10.0,
+    )
     scale_error: float = setting(
         0.005, "deviation of a run's factor of wheel radius and of gyroscope", low=0.0, high=0.2
     )

@@ -12,7 +12,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +37,11 @@ LIGHT_TIME_S = 30.0
 
 Entry = tuple[int, Callable[[], None]]
 
+# The errors that make odometry drift, and how they are scaled to a wanted drift.
+_DRIFT_ERRORS = ('scale_error', 'slip', 'gyro_bias')
+_DRIFT_ITERATIONS = 3
+_DRIFT_FACTOR_MAX = 5.0
+_NO_DRIFT_M = 0.01
 ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM = range(4)
 
 
@@ -68,6 +73,8 @@ def drive(garden: Garden, config: SimulationConfig) -> Drive:
     route = plan(lawn, garden.dock, random_stream(config, ROUTE_STREAM), config.length)
     stamps, twists, pictures = _motion(route, config)
     truth = Trajectory(stamps, integrate(stamps, twists, garden.dock))
+    if config.trajectory == 'test' and config.test_drift > 0:
+        config = _drifting(truth, twists, config)
     measured, variances = _measured(twists, config, random_stream(config, SENSOR_STREAM))
     odometry = Odometry(stamps, integrate(stamps, measured), measured, variances)
     gyro = YawRate(stamps, measured[:, 1], variances[:, 1])
@@ -112,6 +119,23 @@ def _profile(distance: float, speed: float, acceleration: float, dt: float) -> A
     steady = np.clip(t - ramp, 0, total - 2 * ramp)
     gone = acceleration * rising**2 / 2 + speed * steady + speed * falling
     return np.asarray(gone - acceleration * falling**2 / 2)
+
+
+def _drifting(truth: Trajectory, twists: Array, config: SimulationConfig) -> SimulationConfig:
+    """The same errors of wheels and gyroscope, scaled to drift by `config.test_drift` on average.
+
+    What is drawn makes some test drives nearly perfect and others useless; so all compare.
+    """
+    for _ in range(_DRIFT_ITERATIONS):
+        measured, _ = _measured(twists, config, random_stream(config, SENSOR_STREAM))
+        path = integrate(truth.stamps_ns, measured, truth.poses[0])
+        drift = float(np.hypot(*(path - truth.poses)[:, :2].T).mean())
+        if drift < _NO_DRIFT_M:
+            break
+        factor = min(config.test_drift / drift, _DRIFT_FACTOR_MAX)
+        errors = {name: factor * getattr(config, name) for name in _DRIFT_ERRORS}
+        config = replace(config, **errors)
+    return config
 
 
 def _measured(
