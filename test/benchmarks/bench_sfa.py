@@ -89,24 +89,24 @@ def bench_training(folder: Path, quick: bool = False) -> dict[str, float]:
 def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
     """Seconds of one core per picture and in all, by MDP on the explicit sequence and by ours.
 
-    Both are measured at two sizes, in turns; time is a + b pictures.
+    Each is measured at two sizes, in turns; time is a + b pictures.
     """
-    sizes = (2, 4) if quick else (4, 8)
-    drive = panoramas(folder / 'engines.u8', sizes[1] * 8)
+    sizes, our_sizes = ((2, 4) if quick else (4, 8)), (64, 320)
+    drive = panoramas(folder / 'engines.u8', our_sizes[1])
     seconds: dict[str, list[float]] = {'mdp': [], 'ours': []}
     flow = None
-    for size in sizes:
+    for size, our_size in zip(sizes, our_sizes, strict=True):
         part = _first(drive, size)
         with one_core():
             start = time.process_time()
             flow, _ = mdp_engine.train_flow(ARCHITECTURE, [part], CONFIG)
             seconds['mdp'].append(time.process_time() - start)
-            part = _first(drive, size * 8)
+            part = _first(drive, our_size)
             start = time.process_time()
             network = train_network(ARCHITECTURE, [part], CONFIG, executor=_on_one_core)
             seconds['ours'].append(time.process_time() - start)
     theirs = _extrapolated(sizes, seconds['mdp'])
-    ours = _extrapolated([8 * size for size in sizes], seconds['ours'])
+    ours = _extrapolated(our_sizes, seconds['ours'])
     speedup = float(theirs @ [1, PAPER_PICTURES] / (ours @ [1, PAPER_PICTURES]))
     return {
         'train_speedup_vs_mdp': speedup,
@@ -132,7 +132,7 @@ def _first(drive: Drive, count: int) -> Drive:
     return Drive(part, drive.scale[: count - 1])
 
 
-def _extrapolated(sizes: list[int] | tuple[int, ...], seconds: list[float]) -> np.ndarray:
+def _extrapolated(sizes: tuple[int, ...], seconds: list[float]) -> np.ndarray:
     """(a, b) of a + b pictures."""
     slope = (seconds[1] - seconds[0]) / (sizes[1] - sizes[0])
     return np.array([max(seconds[0] - slope * sizes[0], 0.0), slope])
