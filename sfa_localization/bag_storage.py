@@ -23,7 +23,7 @@ else:
 try:
     from yaml import CSafeLoader as YamlLoader
 except ImportError:  # PyYAML was built without libyaml
-    from yaml import SafeLoader as YamlLoader
+    from yaml import SafeLoader as YamlLoader  # type: ignore[assignment]
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 PIECE = 1 << 20
