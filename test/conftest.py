@@ -5,6 +5,9 @@
 import os
 import tempfile
 
+import pytest
+from robustness import robustness_table
+
 # Before rclpy is imported by any test; a user's own choice stands.
 _LOGS = tempfile.TemporaryDirectory(prefix='sfa_localization_ros_log_')
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -12,3 +15,11 @@ os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 os.environ.setdefault('ROS_LOG_DIR', _LOGS.name)
 # Small products on many cores of a busy machine wait for each other.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that README.md names."""
+    named = {test for tests in robustness_table().values() for test in tests}
+    for item in items:
+        if (item.path.name, getattr(item, 'originalname', item.name)) in named:
+            item.add_marker(pytest.mark.robustness)
