@@ -10,7 +10,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test bench lint format colcon matrix clean
+.PHONY: help env demo test robustness fuzz soak bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -25,6 +25,15 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)
+
+robustness: $(READY)  ## run the tests named in test/README.md: bad input, time, loss, overload
+	$(PY) -m pytest -m robustness $(ARGS)
+
+fuzz: $(READY)  ## read thousands of damaged bags (ARGS='-k messages' for some kinds)
+	FUZZ_EXAMPLES=300 $(PY) -m pytest test/test_bag_fuzz.py $(ARGS)
+
+soak: $(READY)  ## drive the three nodes for an hour at 20x; memory must not grow (ARGS='--seconds 800')
+	PYTHONPATH=. $(PY) test/benchmarks/soak.py $(ARGS)
 
 bench: $(READY)  ## compare speeds side by side, to bench.json (ARGS=--quick); the nodes after a demo
 	PYTHONPATH=. $(PY) test/benchmarks/bench_all.py $(addprefix --model ,$(wildcard demo/model.npz)) $(ARGS)

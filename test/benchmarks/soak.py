@@ -1,0 +1,289 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""An hour of driving through the three nodes at 20 times its pace: `soak.py [--seconds 3600]`.
+
+The nodes are processes of their own, with a place learnt from a small simulated world. Odometry
+at 50 Hz and pictures at 5 Hz follow a robot that goes round in that place. Fails when a node ends,
+does not answer, is lost at the end, or holds more memory than after the warm-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe
+
+from sfa_localization.nodes.conversions import read_stamp, to_image, to_odometry
+from sfa_localization.nodes.lifecycle import latched_qos
+
+DOMAIN = 69
+START_NS = 1_700_000_000_000_000_000
+ODOMETRY_HZ, EVERY = 50, 10
+SPEED, RADIUS = 0.8, 0.9
+VIEWS = 997
+"""Pictures of one lap; the robot passes others of them in each lap."""
+WARM_UP = 1 / 3
+GROWTH = 0.1
+PATIENCE_S = 1.0
+IN_FLIGHT = 3
+SPREAD = np.diag([1e-6, 1e-6])
+
+
+def lap(steps: np.ndarray) -> np.ndarray:
+    """Poses (N, 3) of a circle about the place's origin, after so many odometry messages."""
+    angle = steps * (SPEED / RADIUS / ODOMETRY_HZ)
+    yaw = np.angle(np.exp(1j * (angle + np.pi / 2)))
+    return np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), yaw], -1)
+
+
+class Robot:
+    """Sends odometry and pictures, and hears the poses that come back."""
+
+    def __init__(self) -> None:
+        angles = np.arange(VIEWS) * (2 * np.pi / VIEWS)
+        poses = lap(angles * RADIUS * ODOMETRY_HZ / SPEED)
+        self.views = Spheres.about(1).panoramas(poses, recipe().panorama)
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.node = rclpy.create_node('robot', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.pictures = self.node.create_publisher(Image, 'image_raw', 10)
+        self.odometry = self.node.create_publisher(Odometry, 'odom', 1000)
+        self.state, self.pose = '', np.zeros(2)
+        self.used, self.share = 0, 0.0
+        self.waiting: set[int] = set()
+        self.answered = self.unanswered = 0
+        self.heard = threading.Condition()
+        listen = self.node.create_subscription
+        listen(PoseWithCovarianceStamped, 'ekf/pose', self.hear, 100)
+        listen(String, 'ekf/state', self.hear_state, latched_qos())
+        listen(DiagnosticArray, '/diagnostics', self.hear_health, 10)
+        self.thread = threading.Thread(target=self.spin, daemon=True)
+        self.thread.start()
+
+    def spin(self) -> None:
+        """Run the executor until the end."""
+        with contextlib.suppress(ExternalShutdownException):
+            self.executor.spin()
+
+    def hear(self, message: PoseWithCovarianceStamped) -> None:
+        """Note the answer to a picture."""
+        position = message.pose.pose.position
+        with self.heard:
+            self.pose = np.array([position.x, position.y])
+            self.waiting.discard(read_stamp(message.header.stamp))
+            self.answered += 1
+            self.heard.notify()
+
+    def hear_state(self, message: String) -> None:
+        """Note what the filter says of itself."""
+        self.state = message.data
+
+    def hear_health(self, message: DiagnosticArray) -> None:
+        """Note how much odometry the filter has used."""
+        for status in message.status:
+            if status.name.startswith('ekf_node'):
+                told = {item.key: item.value for item in status.values}
+                self.used = int(told.get('odometry: used', 0))
+
+    def step(self, number: int) -> None:
+        """The odometry of one moment, and its picture where there is one."""
+        stamp_ns = START_NS + number * (10**9 // ODOMETRY_HZ)
+        pose = lap(np.array(float(number)))
+        twist = np.array([SPEED, SPEED / RADIUS])
+        frames = ('odom', 'base_link')
+        self.odometry.publish(to_odometry(pose, np.eye(3), twist, SPREAD, stamp_ns, frames))
+        if number % EVERY == 0:
+            turn = number * SPEED / RADIUS / ODOMETRY_HZ / (2 * math.pi)
+            view = self.views[round(turn * VIEWS) % VIEWS]
+            with self.heard:
+                self.waiting.add(stamp_ns)
+            self.pictures.publish(to_image(view, stamp_ns, 'omnicam'))
+
+    def wait(self) -> None:
+        """Until few pictures are unanswered: what is faster than the nodes says nothing of them."""
+        with self.heard:
+            if not self.heard.wait_for(lambda: len(self.waiting) < IN_FLIGHT, PATIENCE_S):
+                self.unanswered += len(self.waiting)
+                self.waiting.clear()
+
+    def close(self) -> None:
+        """End the node and its thread."""
+        self.executor.shutdown()
+        self.thread.join(5.0)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+@contextlib.contextmanager
+def nodes(folder: Path):
+    """The three nodes as processes, by name; all have ended afterwards."""
+    place().model.save(folder / 'model.npz')
+    size = [f'height:={PLACE_SIZE[0]}', f'width:={PLACE_SIZE[1]}']
+    parameters = {
+        'omnicam_node': ['camera_model:=panorama', 'image_width:=0', 'image_height:=0', *size],
+        'sfa_node': [f'model:={folder / "model.npz"}'],
+        'ekf_node': [],
+    }
+    environment = {
+        **os.environ,
+        'ROS_DOMAIN_ID': str(DOMAIN),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_LOG_DIR': str(folder),
+        'OMP_NUM_THREADS': '1',
+    }
+    code = 'import sys; from sfa_localization.nodes.{} import main; sys.exit(main())'
+    started = {
+        name: subprocess.Popen(
+            [
+                *(sys.executable, '-c', code.format(name), '--ros-args'),
+                *(word for value in values for word in ('-p', value)),
+            ],
+            env=environment,
+        )
+        for name, values in parameters.items()
+    }
+    try:
+        yield started
+    finally:
+        for process in started.values():
+            process.terminate()
+        for process in started.values():
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def memory_mib(processes: dict[str, subprocess.Popen]) -> dict[str, float]:
+    """Resident memory of each process, MiB; RuntimeError for one that has ended."""
+    for name, process in processes.items():
+        if process.poll() is not None:
+            raise RuntimeError(f'{name} ended with exit code {process.returncode}')
+    return {
+        name: psutil.Process(process.pid).memory_info().rss / 2**20
+        for name, process in processes.items()
+    }
+
+
+def awake(robot: Robot, processes: dict[str, subprocess.Popen]) -> int:
+    """Drive at a robot's own pace until all three answer; how many steps that took."""
+    number, end = 0, time.monotonic() + 30.0
+    while robot.answered < 3:
+        if time.monotonic() > end:
+            raise RuntimeError('the nodes do not answer')
+        memory_mib(processes)
+        robot.step(number)
+        number += 1
+        time.sleep(1 / ODOMETRY_HZ)
+    robot.waiting.clear()
+    return number
+
+
+def drive(robot: Robot, processes: dict[str, subprocess.Popen], seconds: float, pace: float):
+    """Drive so many simulated seconds; (time s, memory by node) forty times on the way."""
+    first = awake(robot, processes)
+    steps = round(seconds * ODOMETRY_HZ)
+    often = max(steps // 40, 1)
+    found, start = [], time.perf_counter()
+    robot.answered = robot.unanswered = 0
+    for step in range(1, steps + 1):
+        ahead = step / (ODOMETRY_HZ * pace) - (time.perf_counter() - start)
+        if ahead > 0.002:
+            time.sleep(ahead)
+        robot.step(first + step)
+        if step % EVERY == 0:
+            robot.wait()
+        if step % often == 0:
+            found.append((step / ODOMETRY_HZ, memory_mib(processes)))
+            tell(*found[-1])
+    wall_s = time.perf_counter() - start
+    time.sleep(2.5)  # the nodes tell their health every second
+    robot.share = robot.used / (first + steps)
+    return found, wall_s, float(np.hypot(*(robot.pose - lap(np.array(float(first + steps)))[:2])))
+
+
+def tell(seconds: float, memory: dict[str, float]) -> None:
+    """One line of progress."""
+    shown = '  '.join(f'{name} {value:.1f} MiB' for name, value in memory.items())
+    sys.stderr.write(f'{seconds:6.0f} s  {shown}\n')
+
+
+def growth(found: list[tuple[float, dict[str, float]]]) -> dict[str, float]:
+    """Share by which the last tenth of the drive holds more than what follows the warm-up."""
+    count = len(found)
+    early = found[round(count * WARM_UP) :][: max(count // 10, 1)]
+    late = found[-max(count // 10, 1) :]
+    means = [{n: np.mean([m[n] for _, m in part]) for n in part[0][1]} for part in (early, late)]
+    return {name: float(means[1][name] / means[0][name] - 1) for name in means[0]}
+
+
+def soak(seconds: float, pace: float) -> tuple[dict[str, object], list[str]]:
+    """Figures of the drive, and what is wrong with them."""
+    with tempfile.TemporaryDirectory() as folder, nodes(Path(folder)) as processes:
+        robot = Robot()
+        try:
+            found, wall_s, error_m = drive(robot, processes, seconds, pace)
+        finally:
+            robot.close()
+    grown = growth(found)
+    total = robot.answered + robot.unanswered
+    wrong = [f'{name} grew by {g:.0%}' for name, g in grown.items() if g > GROWTH]
+    if not robot.state.startswith(('LOCALISED', 'DEGRADED')):
+        wrong.append(f'the filter ended {robot.state!r}')
+    if robot.answered < 0.5 * total:
+        wrong.append(f'{robot.unanswered} of {total} pictures were not answered')
+    if robot.share < 0.5:
+        wrong.append(f'only {robot.share:.0%} of the odometry was used')
+    figures = {
+        'soak_simulated_s': seconds,
+        'soak_pace': round(seconds / wall_s, 1),
+        'soak_answered': round(robot.answered / total, 4),
+        'soak_odometry_used': round(robot.share, 4),
+        'soak_state': robot.state,
+        'soak_last_error_m': round(error_m, 3),
+        'soak_memory_mib': {name: round(value, 1) for name, value in found[-1][1].items()},
+        'soak_growth': {name: round(value, 4) for name, value in grown.items()},
+    }
+    return figures, wrong
+
+
+def main() -> int:
+    """Print the figures; 1 where something is wrong with them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seconds', type=float, default=3600.0, help='simulated time')
+    parser.add_argument('--pace', type=float, default=20.0, help='at most so many times real time')
+    options = parser.parse_args()
+    figures, wrong = soak(options.seconds, options.pace)
+    sys.stdout.write(json.dumps(figures, indent=2) + '\n')
+    for reason in wrong:
+        sys.stderr.write(f'soak: {reason}\n')
+    return 1 if wrong else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
