@@ -964,7 +964,7 @@ class NetworkConfig(Settings):
         2.0, 'pictures farther apart are no neighbors', unit='m', low=0.01, high=1e4
     )
     photometric_std: float = setting(
-        0.0, 'random light of each training picture, logarithmic', low=0.0, high=2.0
+        0.3, 'random light of each training picture, logarithmic', low=0.0, high=2.0
     )
     photometric_seed: int = setting(0, 'seed of the random light', low=0)
     binning: int = setting(2, 'custom: pixels averaged per side', low=1, high=64)

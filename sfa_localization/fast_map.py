@@ -25,7 +25,7 @@ from sfa_localization.geometry import Array
 from sfa_localization.regression import MetricMap, Process, matern
 
 # Error of the variance, over the variance of a point, that float32 may make.
-_TOLERANCE = 1e-2
+_TOLERANCE = 2e-3
 
 
 class Predictor(Protocol):
@@ -38,7 +38,7 @@ def fast_map(metric: MetricMap) -> Predictor:
     """The quickest form of a map; the map itself where there is no quicker one."""
     if not isinstance(metric.basis, Process):
         return metric
-    return FastProcess.of(metric, metric.basis) or metric
+    return FastProcess.of(metric, metric.basis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +60,13 @@ class FastProcess:
     inflation: float
 
     @classmethod
-    def of(cls, metric: MetricMap, basis: Process) -> FastProcess | None:
-        """Compile a map; None where rounding would spoil the variance."""
+    def of(cls, metric: MetricMap, basis: Process) -> FastProcess:
+        """Compile a map."""
         prior = metric.noise_m**2 / basis.noise
         q = metric.spread @ metric.spread.T
         inner = prior * np.eye(len(q) - 1) - q[:-1, :-1]
-        try:
-            quadratic = basis.whiten.T @ inner @ basis.whiten
-            factor = linalg.cholesky((quadratic + quadratic.T) / 2, lower=True)
-        except linalg.LinAlgError:
-            return None
+        quadratic = basis.whiten.T @ inner @ basis.whiten
+        factor = _root((quadratic + quadratic.T) / 2)
         rows = np.column_stack([metric.weights, 2 * q[:, -1], metric.sway.reshape(len(q), -1)])
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + metric.noise_m**2 + prior
@@ -91,6 +88,16 @@ class FastProcess:
         sway = told[:, 3:].reshape(len(told), -1, 2)
         joint = sway.transpose(0, 2, 1) @ sway
         return told[:, :2], np.asarray(self.inflation * (joint + own[:, None, None] * np.eye(2)))
+
+
+def _root(symmetric: Array) -> Array:
+    """Lower triangular C with C C^T = a matrix, its negative part (rounding) left out."""
+    try:
+        return np.asarray(linalg.cholesky(symmetric, lower=True))
+    except linalg.LinAlgError:
+        values, axes = linalg.eigh(symmetric)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(linalg.qr(root.T, mode='r')[0].T)
 
 
 def _rounded(

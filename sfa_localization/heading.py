@@ -86,7 +86,7 @@ class Compass:
             'feature_scale': self.feature_scale,
             'harmonic_scale': self.harmonic_scale,
             'weights': self.weights,
-            'uncertainty': self.uncertainty.astype(np.complex64),
+            'uncertainty': self.uncertainty,
             'scalars': np.array([self.length, self.noise, self.sign]),
             'calibration': self.calibration,
         }
@@ -272,8 +272,9 @@ class _Problem:
         return g, variance
 
     def compass(self, sign: float, length: float, noise: float, calibration: Array) -> Compass:
-        """The compass of all labels."""
-        s, f = self.s[self.chosen], self.f[self.chosen]
+        """The compass of all labels, solved for the inducing pictures as they will be saved."""
+        s = self.s[self.chosen].astype(np.float32).astype(np.float64)
+        f = self.f[self.chosen].astype(np.complex64).astype(np.complex128)
         kernel = _kernel(self.s, self.f, s, f, length)
         moment = kernel.conj().T @ np.exp(1j * sign * self.yaw)
         weights, uncertainty = _solve(

@@ -21,7 +21,7 @@ from sfa_localization.run import PanoramaArray
 
 distributed = pytest.importorskip('distributed', reason='the extra distributed is not installed')
 
-CONFIG = NetworkConfig(relative_cut=1e-7)
+CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from sfa_localization.network import LAYERS, Network, Node, expand, prepare
 from sfa_localization.run import PanoramaArray
 from sfa_localization.sfa import solve
 
-CONFIG = NetworkConfig(relative_cut=1e-7)
+CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
 
 
 def trained(*drives: Drive, config: NetworkConfig = CONFIG, **options) -> Network:

@@ -18,7 +18,7 @@ from sfa_localization.errors import ConfigError, DataError
 from sfa_localization.network import prepare
 from sfa_localization.rotation import unfold
 
-CONFIG = NetworkConfig(relative_cut=1e-7)
+CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
 
 try:
     mdp = mdp_shim.import_mdp()
