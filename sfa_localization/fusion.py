@@ -156,9 +156,10 @@ class _Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
     ) -> tuple[Array, Array, float]:
         """Mean, covariance (Joseph form) and squared Mahalanobis distance of the innovation."""
         self.x, self.P = mean, covariance
-        self.update(z, lambda _: jacobian, lambda x: jacobian @ x, noise, residual=_residual)
+        # Array.dot throughout: on arrays this small, @ takes twice as long.
+        self.update(z, lambda _: jacobian, jacobian.dot, noise, residual=_residual)
         self.x[YAW] = motion.wrap(float(self.x[YAW]))
-        return self.x, symmetric(self.P), float(self.y @ self.SI @ self.y)
+        return self.x, symmetric(self.P), float(self.y.dot(self.SI).dot(self.y))
 
 
 class Fusion:
@@ -168,6 +169,7 @@ class Fusion:
         self.config = config
         self._kalman = _Kalman()
         self._many = _LASTING * config.recovery_pictures
+        self._root_share = math.sqrt(config.correlated_share)
         self._thresholds = {n: float(chi2.ppf(config.gate_probability, n)) for n in (2, 3)}
 
     def measurement(
@@ -176,7 +178,7 @@ class Fusion:
         """Split the noise into what neighbouring pictures share and what is each one's own."""
         size, share = len(value), self.config.correlated_share
         jacobian = _OBSERVE[:size].copy()
-        jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
+        jacobian[:, ERROR : ERROR + size] = lower_root(covariance, self._root_share)
         return MeasurementEvent(
             stamp_ns, value, covariance, novelty, jacobian, (1 - share) * covariance
         )
@@ -525,15 +527,15 @@ class Fusion:
     def _remembered(
         self, belief: Belief, event: MeasurementEvent, covariance: Array, agreed: bool
     ) -> tuple[Evidence, ...]:
-        variance = float(covariance[0, 0] + covariance[1, 1]) / 2
-        knows = event.value.size == 3
+        variances, (x, y, *yaw) = covariance.diagonal().tolist(), event.value.tolist()
+        variance = (variances[0] + variances[1]) / 2
         item = Evidence(
             belief.reckoned,
             belief.travelled_m,
-            (float(event.value[0]), float(event.value[1])),
-            float(event.value[2]) if knows else math.nan,
+            (x, y),
+            yaw[0] if yaw else math.nan,
             variance,
-            float(covariance[2, 2]) if knows else math.inf,
+            variances[2] if yaw else math.inf,
             agreed,
         )
         reach = max(3 * self.config.recovery_distance, 30 * math.sqrt(variance))

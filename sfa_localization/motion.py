@@ -152,7 +152,7 @@ def drive(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
     jacobian[:, SCALE] += twist.v * gain[:, 0]
     jacobian[:, BIAS] -= gain[:, 1]
     variances = np.array([twist.v_variance, twist.omega_variance])
-    noise = (gain * variances) @ gain.T
+    noise = (gain * variances).dot(gain.T)
     _add_lasting_noise(noise, gain, variances, dt, config)
     _add_drift(noise, abs(v) * dt, abs(omega) * dt, dt, fade, config)
     return Step(after, jacobian, noise)
@@ -244,7 +244,7 @@ def _add_lasting_noise(
     if dt <= 0:
         return
     part = gain[:3]
-    noise[:3, :3] += (part * (variances * (config.odometry_correlation / dt))) @ part.T
+    noise[:3, :3] += (part * (variances * (config.odometry_correlation / dt))).dot(part.T)
 
 
 def _add_drift(

@@ -104,17 +104,16 @@ def _is_positive(rows: list[list[float]]) -> bool:
 
 def _conditioned(rows: list[list[float]], config: FilterConfig) -> Array:
     """Symmetric, with the factor applied, then what is below the floor raised to it."""
-    made = np.array(rows)
-    made += made.T.copy()
-    made *= config.measurement_factor / 2
+    half = config.measurement_factor / 2
     floor, yaw_floor = config.position_std_floor**2, config.yaw_std_floor**2
-    if made[0, 0] < floor:
-        made[0, 0] = floor
-    if made[1, 1] < floor:
-        made[1, 1] = floor
-    if len(rows) == 3 and made[2, 2] < yaw_floor:
-        made[2, 2] = yaw_floor
-    return made
+    xx = max((rows[0][0] + rows[0][0]) * half, floor)
+    xy = (rows[0][1] + rows[1][0]) * half
+    yy = max((rows[1][1] + rows[1][1]) * half, floor)
+    if len(rows) == 2:
+        return np.array([[xx, xy], [xy, yy]])
+    xt, yt = (rows[0][2] + rows[2][0]) * half, (rows[1][2] + rows[2][1]) * half
+    tt = max((rows[2][2] + rows[2][2]) * half, yaw_floor)
+    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 
 def lower_root(covariance: Array, factor: float) -> list[list[float]]:
@@ -159,4 +158,6 @@ def is_covariance(matrix: Array) -> bool:
 
 def symmetric(matrix: Array) -> Array:
     """The symmetric part."""
-    return np.asarray((matrix + matrix.T) * 0.5)
+    total: Array = matrix + matrix.T
+    total *= 0.5
+    return total
