@@ -3,6 +3,7 @@
 """For all tests: ROS stays on this machine, checks messages, logs elsewhere; one core is used."""
 
 import os
+import signal
 import tempfile
 
 import pytest
@@ -15,6 +16,9 @@ os.environ.setdefault('ROS_PYTHON_CHECK_FIELDS', '1')
 os.environ.setdefault('ROS_LOG_DIR', _LOGS.name)
 # Small products on many cores of a busy machine wait for each other.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
+# A background job of a shell ignores Ctrl-C, and so would every process that the tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items):
