@@ -18,6 +18,7 @@ from sfa_localization.calibration_files import read_calibration
 from sfa_localization.cameras import make_camera
 from sfa_localization.config import CalibrationConfig, CameraConfig, PanoramaConfig
 from sfa_localization.errors import CameraError
+from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array
 from sfa_localization.panorama import Unwrapper
 from sfa_localization.pictures import decode_compressed, encode_png
@@ -378,14 +379,8 @@ def _labelled(strip: Image, panorama: PanoramaConfig) -> Image:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file that is there whole or not at all. Raises CameraError naming it."""
-    partial = path.with_name(path.name + '.partial')
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise CameraError(f'{path} cannot be written: {error.strerror or error}') from None
+    with whole_file(path, CameraError, make_folder=True) as file:
+        file.write(data)
 
 
 def write_check(path: Path, picture: Image) -> None:

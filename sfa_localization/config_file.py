@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import os
-import tempfile
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +16,7 @@ import yaml
 from sfa_localization import config
 from sfa_localization.config import Settings
 from sfa_localization.errors import ConfigError
+from sfa_localization.files import whole_file
 
 S = TypeVar('S', bound=Settings)
 SECTIONS: dict[str, tuple[type[Settings], ...]] = {
@@ -137,15 +136,8 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
 
 def write_config(path: Path | str, changes: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Write `render(changes)` to a file, at once or not at all. Raises ConfigError."""
-    path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix='.part')
-        with os.fdopen(handle, 'w', encoding='utf-8') as file:
-            file.write(render(changes))
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be written: {error}') from None
+    with whole_file(Path(path), ConfigError) as file:
+        file.write(render(changes).encode())
 
 
 def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:

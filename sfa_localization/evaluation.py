@@ -9,7 +9,6 @@ drive and applied unchanged to the drive that is judged; the error is the Euclid
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,8 @@ from scipy import linalg
 from tqdm import tqdm
 
 from sfa_localization.config import FilterConfig
-from sfa_localization.errors import DataError, LocalizationError
+from sfa_localization.errors import DataError
+from sfa_localization.files import whole_file
 from sfa_localization.geometry import (
     Array,
     RigidTransform,
@@ -231,14 +231,7 @@ def _supervised(model: PlaceModel, weights: Array, drive: _Drive) -> Trajectory:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON under a temporary name, then rename it. Raises LocalizationError."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp('.json', f'.{path.name}-', path.parent)
-        with os.fdopen(handle, 'w') as file:
-            json.dump(content, file, indent=2)
-            file.write('\n')
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise LocalizationError(f'{path}: cannot be written: {error.strerror}') from None
+    """Write JSON, at once or not at all. Raises LocalizationError."""
+    text = json.dumps(content, indent=2) + '\n'
+    with whole_file(path, make_folder=True) as file:
+        file.write(text.encode())

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import csv
 import math
-import os
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +17,7 @@ from tqdm import tqdm
 
 from sfa_localization.config import FilterConfig
 from sfa_localization.errors import DataError
+from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array, align
 from sfa_localization.pose_filter import PoseFilter, Status
 from sfa_localization.run import Stamps, Trajectory, integrate
@@ -183,17 +182,10 @@ def _told_variance(positions: Table) -> float:
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:
     """Write `stamp x y z qx qy qz qw` lines, at once or not at all. Raises DataError."""
-    path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix='.part')
-        with os.fdopen(handle, 'w', encoding='ascii') as file:
-            for stamp_ns, (x, y, yaw) in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
-                turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
-                file.write(f'{_seconds(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n')
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except OSError as error:
-        raise DataError(f'{path}: cannot be written: {error}') from None
+    with whole_file(Path(path), DataError) as file:
+        for stamp_ns, (x, y, yaw) in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
+            turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
+            file.write(f'{_seconds(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n'.encode())
 
 
 def _seconds(stamp_ns: int) -> str:

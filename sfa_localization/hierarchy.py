@@ -27,8 +27,8 @@ from sfa_localization.network import (
     Layer,
     Network,
     Node,
-    Weights,
     expand_into,
+    folded,
     linear_stage,
     prepare,
 )
@@ -223,7 +223,7 @@ def _signals(partial: Partial) -> Callable[[Map], Map]:
     if partial.linear is None:
         return lambda maps: maps
     receptive = partial.architecture.fields[partial.depth]
-    linear, offset = _folded_linear(partial.linear)
+    linear, offset = folded(partial.linear)
 
     def expanded(maps: Map) -> Map:
         dimensions = partial.architecture.layers[partial.depth].expanded
@@ -234,11 +234,6 @@ def _signals(partial: Partial) -> Callable[[Map], Map]:
         return out
 
     return expanded
-
-
-def _folded_linear(linear: Solution) -> tuple[Weights, Weights]:
-    weights = linear.weights.astype(np.float32)
-    return weights, (linear.mean @ linear.weights).astype(np.float32)
 
 
 def _below(network: Network, images: Image) -> Map:

@@ -182,10 +182,11 @@ class Node:
 
     @classmethod
     def from_solutions(cls, linear: Solution, slow: Solution) -> Node:
-        return cls(*_folded(linear), *_folded(slow))
+        return cls(*folded(linear), *folded(slow))
 
 
-def _folded(solution: Solution) -> tuple[Weights, Weights]:
+def folded(solution: Solution) -> tuple[Weights, Weights]:
+    """Weights (D, K) of a solution, and its mean as an offset (K,): x weights - offset."""
     weights = solution.weights.astype(np.float32)
     return weights, (solution.mean @ solution.weights).astype(np.float32)
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,6 +19,7 @@ from sfa_localization.agreement import Agreement, disagreement
 from sfa_localization.config import PanoramaConfig
 from sfa_localization.errors import ConfigError, ModelError
 from sfa_localization.fast_map import Predictor, fast_map
+from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array
 from sfa_localization.heading import UNKNOWN_YAW_VARIANCE, Compass, harmonics
 from sfa_localization.network import Architecture, Layer, Network, Node
@@ -220,23 +219,10 @@ def _under(arrays: Arrays, prefix: str) -> Arrays:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays (N, ...) as .npz: a temporary name, then a rename. ModelError."""
-    path = Path(path)
+    """Write named arrays (N, ...) as .npz, at once or not at all. Raises ModelError."""
     plain: dict[str, Any] = dict(arrays)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp('.npz', f'.{path.name}-', path.parent)
-    except OSError as error:
-        raise ModelError(f'{path}: cannot be written: {error.strerror}') from None
-    try:
-        with os.fdopen(handle, 'wb') as file:
-            np.savez(file, **plain)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ModelError(f'{path}: cannot be written: {error.strerror}') from None
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with whole_file(Path(path), ModelError, make_folder=True) as file:
+        np.savez(file, **plain)
 
 
 def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
