@@ -464,6 +464,12 @@ class SimulationConfig(Settings):
     odometry_rate: float = setting(
         50.0, 'odometry, gyroscope, truth', unit='Hz', low=5.0, high=500.0
     )
+    odometry_frame: str = setting(
+        'random',
+        'where the odometry frame lies: anywhere, as of a robot that was switched on earlier, or '
+        'at the start of the recording',
+        choices=('random', 'start'),
+    )
     test_drift: float = setting(
         0.31,
         "mean odometry error of a test drive, the paper's robot's; 0: as the errors are drawn",

@@ -25,8 +25,7 @@ def winding(seconds, rate_hz=50.0, speed=1.0, turn=0.5):
 
 def true_path(stamps_ns, twists, start=(0.0, 0.0, 0.0)):
     """Poses (N, 3): each twist has been held since the stamp before."""
-    held = np.vstack([twists[1:], twists[-1:]])
-    return integrate(stamps_ns, held, np.array(start, float))
+    return integrate(stamps_ns, twists, np.array(start, float))
 
 
 @dataclass
