@@ -24,6 +24,7 @@ from sfa_localization import mdp_engine
 from sfa_localization import metric as metric_learning
 from sfa_localization.agreement import Agreement, disagreement
 from sfa_localization.bag import load_run
+from sfa_localization.camera_clock import CameraClock, camera_clock
 from sfa_localization.config import (
     BagConfig,
     CameraConfig,
@@ -69,6 +70,7 @@ CHECKPOINT_VERSION = 1
 _BATCH = 16
 # Pictures whose maps are kept for the compass and for novelty, however long the drives.
 _SAMPLES = 3000
+_DELAY_MAX_NS, _DELAY_SHOWN_S = 500_000_000, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,8 +273,12 @@ def learn_place(
     layers = _heading_layers(network, recipe.heading)
     views = _view(network, runs, layers, progress)
     offsets = np.cumsum([0, *(len(run.panoramas) for run in runs)])
+    clocks = [_clock_of(run) for run in runs]
     segments = join(
-        [cut(r.odometry, r.panoramas.stamps_ns, recipe.segments, r.yaw_rate) for r in runs],
+        [
+            cut(r.odometry, r.panoramas.stamps_ns - c.delay_ns, recipe.segments, r.yaw_rate)
+            for r, c in zip(runs, clocks, strict=True)
+        ],
         [int(offset) for offset in offsets[:-1]],
     )
     result = metric_learning.learn(views.features, segments, recipe.metric)
@@ -283,6 +289,8 @@ def learn_place(
         axes=2,
     )
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
+    # Of each run, s; None where the drive does not show it.
+    delays = [c.delay_s if c.known else None for c in clocks]
     yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled])
     model = PlaceModel(
         network,
@@ -293,9 +301,26 @@ def learn_place(
         heading.compass if heading else None,
         yaw_agreement,
         layers if heading else (),
-        _quality(network, views, segments, result, agreement, heading, yaw_agreement, labelled),
+        {
+            **_quality(
+                network, views, segments, result, agreement, heading, yaw_agreement, labelled
+            ),
+            'camera_delay_s': delays,
+        },
     )
     return Trained(model, tuple(runs), views.features, segments, result, heading, labelled)
+
+
+def _clock_of(run: Run) -> CameraClock:
+    """The camera's clock beside the odometry's; what no filter can make up for is warned of."""
+    clock = camera_clock(run)
+    if abs(clock.delay_ns) > _DELAY_MAX_NS:
+        logger.warning(
+            '%s: images are stamped %.2f s later than odometry: taken into account here, but the '
+            'filter makes up for half a second only; bring both to one clock', run.name,
+            clock.delay_s,
+        )  # fmt: skip
+    return clock
 
 
 def _panorama_of(runs: Sequence[Run], recipe: Recipe) -> PanoramaConfig:
@@ -470,6 +495,9 @@ def summary(trained: Trained) -> str:
             f'heading, likewise: {quality["left_out_yaw_deg"]:.1f} degrees mean error, '
             f'{100 * quality["left_out_yaw_within_95"]:.0f} % inside the 95 % interval'
         )
+    for run, delay in zip(trained.runs, quality['camera_delay_s'], strict=True):
+        if delay is not None and abs(delay) > _DELAY_SHOWN_S:
+            lines.append(f'{run.name}: images are stamped {delay:.2f} s late: taken into account')
     for name, count in _counts(trained).items():
         lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
     return '\n'.join(lines)
