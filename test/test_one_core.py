@@ -22,9 +22,8 @@ from geometry_msgs.msg import PoseStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from ros_bench import Bench, until  # noqa: E402
 
+from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
-    read_stamp,
-    read_yaw,
     to_image,
     to_odometry,
 )

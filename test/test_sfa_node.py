@@ -32,10 +32,9 @@ from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,
-    read_stamp,
-    read_yaw,
     to_compressed,
     to_image,
 )

@@ -20,9 +20,8 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from sfa_localization.config import Settings, SfaNodeConfig, WatchConfig
-from sfa_localization.errors import ConfigError, LocalizationError
+from sfa_localization.errors import ConfigError, LocalizationError, MessageError
 from sfa_localization.nodes.conversions import (
-    MessageError,
     read_image,
     to_array,
     to_pose,
