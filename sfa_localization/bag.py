@@ -21,7 +21,8 @@ from sfa_localization.bag_stream import Stream
 from sfa_localization.bag_values import Values, to_trajectory, to_yaw_rate
 from sfa_localization.bag_writer import BagWriter
 from sfa_localization.config import BagConfig, TopicNames
-from sfa_localization.errors import BagError
+from sfa_localization.decoding import read_yaw_rate
+from sfa_localization.errors import BagError, MessageError
 from sfa_localization.panorama import looks_like_panorama
 from sfa_localization.run import Count, Image, Odometry, PanoramaArray, Run, Stamps
 
@@ -89,11 +90,11 @@ class PanoramaFile:
         return np.array(self._stamps, np.int64)
 
     def fitting(self, image: Image) -> Image:
-        """The picture itself. Raises Unusable when its size is not that of the first."""
+        """The picture itself. Raises MessageError when its size is not that of the first."""
         self._shape = self._shape or image.shape
         if image.shape != self._shape:
             height, width = self._shape[:2]
-            raise messages.Unusable(f'size is not {width}x{height} like the first picture')
+            raise MessageError(f'size is not {width}x{height} like the first picture')
         return image
 
     def add(self, stamp_ns: int, image: Image) -> None:
@@ -131,7 +132,7 @@ class _Loader:
             logger.warning('%s: no message on %s: going on without gyroscope', bag.path, names)
             found = []
         if topics.imu or found:
-            imu = bag.stream(bag.find('imu', topics.imu), messages.yaw_rate_of)
+            imu = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
             imu.required = bool(topics.imu)
             self._streams['imu'] = imu
         if want_truth:
@@ -194,7 +195,7 @@ class _Loader:
 
 
 def _prepared(message: Any, unwrap: Unwrap | None) -> Image:
-    """The message's picture as a panorama. Raises CameraError."""
+    """The message's picture as a panorama. Raises LocalizationError."""
     image = messages.image_of(message)
     if unwrap is None or looks_like_panorama(*image.shape[:2]):
         return image

@@ -22,7 +22,8 @@ from sfa_localization.bag_storage import Channel, Record, inflate_message
 from sfa_localization.bag_stream import StampFilter, Stream, Tally
 from sfa_localization.bag_values import Values, to_odometry, to_trajectory, to_yaw_rate
 from sfa_localization.config import BagConfig
-from sfa_localization.errors import BagError
+from sfa_localization.decoding import read_yaw_rate
+from sfa_localization.errors import BagError, MessageError
 from sfa_localization.run import Count, Image, Odometry, Trajectory, YawRate
 
 SERIALIZATIONS = ('cdr', 'ros1')
@@ -196,7 +197,7 @@ class Bag:
 
     def yaw_rate(self, topic: str = '') -> YawRate:
         """All yaw rates of an Imu."""
-        stream = self.stream(self.find('imu', topic), messages.yaw_rate_of)
+        stream = self.stream(self.find('imu', topic), read_yaw_rate)
         return to_yaw_rate([(stamp, value) for _, stamp, value in self.read([stream])])
 
     def trajectory(self, topic: str = '') -> Trajectory:
@@ -268,13 +269,13 @@ class Bag:
             return stream.push(receive_ns, receive_ns, None)
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
-        except messages.Unusable as error:
+            if part is None:
+                stream.tally.leave('tells of other frames')
+                return []
+            stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
+        except MessageError as error:
             stream.tally.skip(str(error))
             return []
-        if part is None:
-            stream.tally.leave('tells of other frames')
-            return []
-        stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
         return stream.push(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part)
 
     def _check_complete(self, stream: Stream) -> None:

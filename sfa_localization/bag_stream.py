@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from sfa_localization.decoding import NO_STAMP
 from sfa_localization.errors import BagError, LocalizationError
 from sfa_localization.run import Count
 
@@ -79,7 +80,7 @@ class StampFilter:
 
     def _judge(self, item: Item) -> list[Item]:
         if item.stamp_ns <= 0:
-            self._tally.skip('zero stamp')
+            self._tally.skip(NO_STAMP)
             return []
         suspect, self._suspect = self._suspect, None
         if self._follows(self._last, item):

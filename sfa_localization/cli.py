@@ -29,6 +29,7 @@ from sfa_localization.config import (
     SimulationConfig,
     TopicNames,
     TuneConfig,
+    WatchConfig,
 )
 from sfa_localization.config_file import load_changes, load_settings, render, write_config
 from sfa_localization.errors import ConfigError, DataError, LocalizationError
@@ -356,6 +357,10 @@ def _filter_config(path: Path | None) -> FilterConfig:
     return load_settings(path, 'ekf_node', FilterConfig) if path else FilterConfig()
 
 
+def _watch_config(path: Path | None) -> WatchConfig:
+    return load_settings(path, 'sfa_node', WatchConfig) if path else WatchConfig()
+
+
 FILTER = Command(
     'filter',
     'Fuse a log of odometry and positions, without ROS: what the live filter would have told.',
@@ -392,7 +397,8 @@ def _tune(arguments: argparse.Namespace) -> int:
     )
     config = _filter_config(arguments.config)
     progress = sys.stderr.isatty()
-    tours = tuning.read_tours(arguments.bags, model, recipe, how.method == 'grid', progress)
+    watch = _watch_config(arguments.config)
+    tours = tuning.read_tours(arguments.bags, model, recipe, how.method == 'grid', progress, watch)
     best = tuning.tune(tours, config, how, progress)
     changes = load_changes(arguments.config) if arguments.config else {}
     found = {
@@ -533,10 +539,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         align_bag=arguments.align,
         recipe=_recipe(arguments),
         config=_filter_config(arguments.config),
+        watch=_watch_config(arguments.config),
         progress=sys.stderr.isatty(),
     )
     print(report.table(judged.scores), report.heading_table(judged.scores), sep='\n\n')
-    for stream in ('images', 'odometry'):
+    for stream in ('images', 'odometry', 'observations'):
         count = judged.counts[stream]
         reasons = ''.join(f'; {n} skipped: {why}' for why, n in sorted(count['skipped'].items()))
         print(f'{stream}: {count["used"]} used{reasons}')

@@ -129,6 +129,17 @@ class PanoramaConfig(Settings):
     )
     clockwise: bool = setting(True, 'columns grow clockwise seen from above')
 
+    def differences(self, other: PanoramaConfig, *, geometry_only: bool = False) -> str:
+        """What is other in `other`, as 'height 30 instead of 60'; '' when they are the same.
+
+        `geometry_only` leaves out the size, which a picture shows by itself.
+        """
+        names = [item.name for item in dataclasses.fields(self)]
+        if geometry_only:
+            names = [name for name in names if name not in ('width', 'height')]
+        found = [(name, getattr(other, name), getattr(self, name)) for name in names]
+        return ', '.join(f'{name} {a} instead of {b}' for name, a, b in found if a != b)
+
 
 @dataclass(frozen=True, slots=True)
 class CameraConfig(Settings):
@@ -791,13 +802,9 @@ class FilterConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class SfaNodeConfig(Settings):
-    """sfa_node: panorama in, slow features and pose out."""
+class WatchConfig(Settings):
+    """Which panoramas are not believed, live and offline."""
 
-    model: str = setting('', 'file of the trained model', live=True)
-    map_frame: str = setting('map', 'frame of the positions')
-    feature_frame: str = setting('slow_feature_space', 'frame of the slow features')
-    compressed: bool = setting(False, 'listen to panorama/compressed')
     dark_level: float = setting(
         8.0, 'a picture of lower mean is dark', unit='grey levels', low=0.0, high=255.0, live=True
     )
@@ -812,11 +819,21 @@ class SfaNodeConfig(Settings):
     frozen_pictures: int = setting(
         5, 'equal pictures in a row that mean a frozen camera', low=2, high=10_000, live=True
     )
+    novelty_unusable: float = setting(
+        3.0, 'pictures of more novelty are not used', low=1.0, high=1e6, live=True
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SfaNodeConfig(Settings):
+    """sfa_node: panorama in, slow features and pose out."""
+
+    model: str = setting('', 'file of the trained model', live=True)
+    map_frame: str = setting('map', 'frame of the positions')
+    feature_frame: str = setting('slow_feature_space', 'frame of the slow features')
+    compressed: bool = setting(False, 'listen to panorama/compressed')
     novelty_warning: float = setting(
         1.5, 'novelty from which on a warning is given', low=1.0, high=1e6, live=True
-    )
-    novelty_unusable: float = setting(
-        3.0, 'novelty from which on a picture is told to know nothing', low=1.0, high=1e6, live=True
     )
     camera_timeout: float = setting(
         2.0,

@@ -26,7 +26,7 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
         config.CameraConfig,
         config.PanoramaConfig,
     ),
-    'sfa_node': (config.NodeConfig, config.SfaNodeConfig),
+    'sfa_node': (config.NodeConfig, config.SfaNodeConfig, config.WatchConfig),
     'ekf_node': (config.NodeConfig, config.EkfNodeConfig, config.FilterConfig),
     'training': (
         config.TopicNames,

@@ -26,9 +26,10 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from sfa_localization.config import DemoConfig
+from sfa_localization.decoding import read_stamp
 from sfa_localization.errors import LocalizationError, NodeError
 from sfa_localization.geometry import Array
-from sfa_localization.nodes.conversions import read_odometry, read_pose, read_stamp
+from sfa_localization.nodes.conversions import read_odometry, read_pose
 from sfa_localization.processes import Processes
 from sfa_localization.run import Trajectory
 

@@ -27,5 +27,9 @@ class CameraError(LocalizationError):
     """A camera model or picture is unusable."""
 
 
+class MessageError(LocalizationError):
+    """A message cannot be used; the text is the reason it is counted under."""
+
+
 class NodeError(LocalizationError):
     """A node process ended, or stays silent."""

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 from scipy import linalg
 from tqdm import tqdm
 
-from sfa_localization.config import FilterConfig
+from sfa_localization.config import FilterConfig, WatchConfig
 from sfa_localization.errors import DataError
 from sfa_localization.files import whole_file
 from sfa_localization.geometry import (
@@ -31,9 +32,10 @@ from sfa_localization.geometry import (
     wrap_angle,
 )
 from sfa_localization.localizer import Localizer
+from sfa_localization.observation import Observation
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.run import Run, Stamps, Trajectory
-from sfa_localization.training import Recipe, read_drive
+from sfa_localization.run import Count, Run, Stamps, Trajectory
+from sfa_localization.training import Recipe, as_live, read_drive
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
@@ -41,8 +43,9 @@ _TRUTH_TOLERANCE_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """A judged drive. `estimates` are in the truth's frame; `features` (N, K) of the pictures.
+    """A judged drive. `estimates` are in the truth's frame.
 
+    `features` (N, K) are those of the usable pictures, of which `estimates['sfa']` is.
     `aligned_on` names the drive on which the transform was fitted.
     """
 
@@ -60,12 +63,13 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """A drive as the model sees it: map poses (N, 3) of its pictures, features (N, K)."""
+    """A drive as the model sees it: map poses (N, 3) of its usable pictures, features (N, K)."""
 
     run: Run
     truth: Trajectory
     sfa: Trajectory
     features: Array
+    observations: Count
 
 
 def evaluate(
@@ -75,23 +79,26 @@ def evaluate(
     align_bag: Path | None = None,
     recipe: Recipe | None = None,
     config: FilterConfig | None = None,
+    watch: WatchConfig | None = None,
     progress: bool = False,
 ) -> Evaluation:
-    """Judge a model on a drive with ground truth.
+    """Judge a model on a drive with ground truth, by what sfa_node and ekf_node would publish.
 
     The transform to the truth is fitted on `align_bag`, a training drive; without one, on the
-    drive itself. Raises BagError or DataError, also when there is no ground truth.
+    drive itself. Pictures that cannot be believed count as skipped observations. Raises
+    BagError or DataError, also when there is no ground truth.
     """
-    recipe = replace(recipe or Recipe(), panorama=model.panorama)
+    recipe = as_live(recipe or Recipe(), model)
     transform, supervised = None, None
     if align_bag is not None:
         with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
-            trained = _seen(model, align_bag, Path(cache), recipe, progress)
+            run = _read(align_bag, Path(cache), recipe, progress)
+            trained, _ = _replayed(Localizer(model, config, watch), run, progress)
             transform = fit_transform(trained.truth, trained.sfa)
             supervised = _supervised_weights(model, trained)
     with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
         run = _read(bag, Path(cache), recipe, progress)
-        localizer = Localizer(model, config)
+        localizer = Localizer(model, config, watch)
         drive, ekf = _replayed(localizer, run, progress)
     transform = transform or fit_transform(drive.truth, drive.sfa)
     estimates = {'odometry': odometry_from_start(drive.truth, run)}
@@ -101,6 +108,7 @@ def evaluate(
         estimates['supervised'] = _supervised(model, supervised, drive)
     scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
     counts = {name: count.as_dict() for name, count in run.counts.items()}
+    counts['observations'] = drive.observations.as_dict()
     counts['fusion'] = dict(localizer.filter.counts)
     aligned_on = str(align_bag or bag)
     return Evaluation(drive.truth, estimates, scores, counts, drive.features, aligned_on)
@@ -113,25 +121,15 @@ def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
     return run
 
 
-def _seen(model: PlaceModel, bag: Path, cache: Path, recipe: Recipe, progress: bool) -> _Drive:
-    """What the model alone makes of a drive."""
-    run = _read(bag, cache, recipe, progress)
-    localizer = Localizer(model)
-    with _bar(run, progress) as bar:
-        seen = []
-        for told in localizer.locate_run(run):
-            seen.append(told)
-            bar.update()
-    return _drive(run, seen)
-
-
 def _replayed(localizer: Localizer, run: Run, progress: bool) -> tuple[_Drive, Trajectory]:
     """What the model makes of a drive, and the filter at every odometry message."""
-    seen, stamps, poses = [], [], []
-    with _bar(run, progress) as bar:
-        for stamp_ns, estimate, state in localizer.replay(run):
-            if estimate is not None:
-                seen.append((stamp_ns, estimate))
+    seen: list[Observation] = []
+    stamps, poses = [], []
+    title = f'locating {run.name}'
+    with tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress) as bar:
+        for stamp_ns, observation, state in localizer.replay(run):
+            if observation is not None:
+                seen.append(observation)
                 bar.update()
             elif state is not None:
                 stamps.append(stamp_ns)
@@ -140,17 +138,18 @@ def _replayed(localizer: Localizer, run: Run, progress: bool) -> tuple[_Drive, T
     return _drive(run, seen), path
 
 
-def _bar(run: Run, progress: bool) -> Any:
-    title = f'locating {run.name}'
-    return tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress)
-
-
-def _drive(run: Run, seen: list[tuple[int, Any]]) -> _Drive:
+def _drive(run: Run, seen: list[Observation]) -> _Drive:
     assert run.ground_truth is not None
-    stamps = np.array([stamp_ns for stamp_ns, _ in seen], np.int64)
-    poses = np.array([np.append(e.position, e.yaw) for _, e in seen]).reshape(-1, 3)
-    features = np.array([e.slow_features for _, e in seen])
-    return _Drive(run, run.ground_truth, Trajectory(stamps, poses), features)
+    usable = [one for one in seen if not one.problem]
+    if not usable:
+        raise DataError(f'{run.name}: no picture can be used: {seen[0].problem}')
+    estimates = [one.estimate for one in usable]
+    stamps = np.array([one.stamp_ns for one in usable], np.int64)
+    poses = np.array([np.append(e.position, e.yaw) for e in estimates])
+    features = np.array([e.slow_features for e in estimates])
+    skipped = Counter(one.problem for one in seen if one.problem)
+    count = Count(len(usable), dict(skipped))
+    return _Drive(run, run.ground_truth, Trajectory(stamps, poses), features, count)
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from sfa_localization.config import FilterConfig
 from sfa_localization.errors import DataError
+from sfa_localization.events import PICTURE, in_order
 from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array, align
 from sfa_localization.pose_filter import PoseFilter, Status
@@ -196,15 +197,12 @@ def _seconds(stamp_ns: int) -> str:
 
 def _feed(fused: PoseFilter, odometry: Table, positions: Table, shift: int) -> Iterator[int]:
     """Give both tables to the filter in the order of time; yields each odometry stamp, done."""
-    events = [(int(s) + shift, 0, i) for i, s in enumerate(odometry.stamps_ns)]
-    events += [(int(s) + shift, 1, i) for i, s in enumerate(positions.stamps_ns)]
-    events.sort()
     pending: int | None = None
-    for stamp_ns, kind, i in events:
+    for stamp_ns, kind, i in in_order(odometry.stamps_ns + shift, positions.stamps_ns + shift):
         if pending is not None and stamp_ns > pending:
             yield pending
             pending = None
-        if kind == 1:
+        if kind == PICTURE:
             fused.add_measurement(stamp_ns, *_measurement(positions.columns, i))
         elif not fused.add_odometry(stamp_ns, *_twist(odometry.columns, i)):
             pending = stamp_ns

@@ -5,15 +5,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.config import MetricConfig
 from sfa_localization.elimination import Stack
 from sfa_localization.fitting import Fit, targets
-from sfa_localization.geometry import Array, RigidTransform, compose, invert
+from sfa_localization.geometry import Array, RigidTransform, align_complex, compose, invert
 from sfa_localization.segments import Segments
-
-Complex = NDArray[np.complex128]
 
 
 def gauge(fit: Fit, segments: Segments, stack: Stack, config: MetricConfig) -> RigidTransform:
@@ -29,7 +26,8 @@ def gauge(fit: Fit, segments: Segments, stack: Stack, config: MetricConfig) -> R
     path = stack.corrected(fit.solution.bias)[rows]
     driven = poses[owner, 0] + 1j * poses[owner, 1] + np.exp(1j * poses[owner, 2]) * path
     weights = 1.0 / (variances[owner] + fit.variance)
-    frame = _align(targets(fit.solution, stack)[rows], driven, weights)
+    turn, shift = align_complex(targets(fit.solution, stack)[rows], driven, weights)
+    frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
     if not config.use_anchor:
         return frame
     start = np.array([config.anchor_x, config.anchor_y, config.anchor_yaw])
@@ -56,12 +54,3 @@ def _odometry(segments: Segments, fit: Fit) -> tuple[Array, Array]:
         yaw_variance += segment.turn_variance
         variances.append(place_variance)
     return np.array(poses), np.array(variances)
-
-
-def _align(source: Complex, target: Complex, weights: Array) -> RigidTransform:
-    """Weighted least-squares rotation and translation of complex points (M,)."""
-    share = weights / weights.sum()
-    a, b = share @ source, share @ target
-    yaw = float(np.angle(np.sum(share * np.conj(source - a) * (target - b))))
-    shift = b - np.exp(1j * yaw) * a
-    return RigidTransform(float(shift.real), float(shift.imag), yaw)

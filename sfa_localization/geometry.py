@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sfa_localization.errors import DataError
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 
 def wrap_angle(angle_rad: Array | float) -> Array:
@@ -76,8 +77,24 @@ def align(source: Array, target: Array) -> RigidTransform:
     source, target = np.asarray(source, float), np.asarray(target, float)
     if source.shape != target.shape or source.ndim != 2 or len(source) < 2:
         raise DataError(f'cannot align points of shapes {source.shape} and {target.shape}')
-    a, b = source - source.mean(0), target - target.mean(0)
-    za, zb = a[:, 0] + 1j * a[:, 1], b[:, 0] + 1j * b[:, 1]
-    yaw = float(np.angle(np.vdot(za, zb)))
-    x, y = target.mean(0) - rotation(yaw) @ source.mean(0)
-    return RigidTransform(float(x), float(y), yaw)
+    turn, shift = align_complex(_complex(source), _complex(target))
+    return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
+
+
+def _complex(points: Array) -> Complex:
+    return np.asarray(points[:, 0] + 1j * points[:, 1])
+
+
+def align_complex(
+    source: Complex, target: Complex, weights: Array | None = None
+) -> tuple[complex, complex]:
+    """Least-squares unit turn and shift, turn * source + shift = target, of points x + iy (N,).
+
+    `weights` (N,) of the squared distances, all equal by default. Points that show no direction
+    are not turned.
+    """
+    a, b = np.average(source, weights=weights), np.average(target, weights=weights)
+    products = np.conj(source - a) * (target - b)
+    product = complex(np.sum(products if weights is None else weights * products))
+    turn = product / abs(product) if product != 0 else 1.0 + 0.0j
+    return turn, complex(b - turn * a)

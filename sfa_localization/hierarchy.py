@@ -33,12 +33,11 @@ from sfa_localization.network import (
     prepare,
 )
 from sfa_localization.rotation import FieldStatistics, Map, SampleStatistics, Sums
-from sfa_localization.run import Image, Panoramas
+from sfa_localization.run import BATCH, Image, Panoramas
 from sfa_localization.sfa import Solution, Statistics, solve
 from sfa_localization.threads import one_core
 
-# Pictures read at once, and in a shard; signals of a node multiplied at once, which fit a cache.
-BATCH = 16
+# Pictures of a shard; signals of a node multiplied at once, which fit a cache.
 SHARD = 64
 _TOGETHER = 1440
 

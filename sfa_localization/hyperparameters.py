@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sfa_localization.config import MetricConfig
 from sfa_localization.elimination import Links, Problem, Stack, eliminate, schur
 from sfa_localization.fitting import Fit, fit, targets
-from sfa_localization.geometry import Array
+from sfa_localization.geometry import Array, align_complex
 from sfa_localization.phases import phase_cost, refine
 from sfa_localization.regression import Basis, Monomials, Process, spread
 
@@ -81,18 +81,11 @@ def leave_out(whole: Fit, stack: Stack, config: MetricConfig) -> LeftOut:
         solution = problem.solve(whole.solution.z, whole.solution.bias)
         coefficients = elimination.weights(solution.coefficients(stack.run))
         left = whole.expanded[rows]
-        turn, shift = _onto(targets(solution, stack), truth, weights > 0)
+        used = weights > 0
+        turn, shift = align_complex(targets(solution, stack)[used], truth[used])
         errors[rows] = truth[rows] - (turn * (left @ coefficients) + shift)
         variances[rows] = whole.variance * (missing[rows] + elimination.leverage(left))
     return LeftOut(errors, variances)
-
-
-def _onto(source: Complex, target: Complex, used: NDArray[np.bool_]) -> tuple[complex, complex]:
-    """Turn and shift that put the source (M,) on the target, over the used rows."""
-    a, b = source[used].mean(), target[used].mean()
-    product = complex(np.vdot(source[used] - a, target[used] - b))
-    turn = product / abs(product) if product != 0 else 1.0
-    return turn, complex(b - turn * a)
 
 
 def evidence(basis: Basis, features: Array, stack: Stack, links: Links, now: Fit) -> float:

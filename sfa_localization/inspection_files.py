@@ -11,6 +11,7 @@ from typing import Any
 
 from sfa_localization.config import InspectionConfig, TopicNames
 from sfa_localization.errors import BagError
+from sfa_localization.files import whole_file
 from sfa_localization.inspection import BagReport, inspect
 from sfa_localization.report_bag import write_contact_sheet, write_path
 
@@ -50,10 +51,8 @@ def _inspected(path: Path, **options: Any) -> BagReport:
 
 def _write_json(reports: Sequence[BagReport], path: Path) -> None:
     text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f'.{path.name}')
-    partial.write_text(text + '\n', encoding='utf-8')
-    partial.replace(path)
+    with whole_file(path, BagError, make_folder=True) as file:
+        file.write(f'{text}\n'.encode())
 
 
 def _write_pictures(report: BagReport, folder: Path, prefix: str) -> None:

@@ -1,24 +1,23 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper in one file: a panorama tells where the robot is, odometry how it moves, an EKF fuses.
+"""The paper in one file: a panorama shows where the robot is, odometry how it moves, an EKF fuses.
 
-The three nodes do the same in three processes; this is for programs without ROS, and for the
-evaluation of bags.
+The nodes do the same in two processes: sfa_node holds the `Observer`, ekf_node the `PoseFilter`,
+and a pose with its covariance is all that passes between them. This is for programs without ROS,
+and for the evaluation of bags.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
-from sfa_localization.config import FilterConfig
+from sfa_localization.config import FilterConfig, WatchConfig
+from sfa_localization.events import ODOMETRY, in_order
 from sfa_localization.geometry import Array
-from sfa_localization.place_model import Estimate, PlaceModel
+from sfa_localization.observation import Observation, Observer
+from sfa_localization.place_model import PlaceModel
 from sfa_localization.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.run import Image, Run
-
-_BATCH = 16
 
 
 class Localizer:
@@ -30,26 +29,36 @@ class Localizer:
     >>> localizer.state.pose, localizer.status
     """
 
-    def __init__(self, model: PlaceModel, config: FilterConfig | None = None) -> None:
-        self.model = model
+    def __init__(
+        self,
+        model: PlaceModel,
+        config: FilterConfig | None = None,
+        watch: WatchConfig | None = None,
+    ) -> None:
+        self.observer = Observer(model, watch)
         self.filter = PoseFilter(config)
 
     def add_odometry(
         self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)
-    ) -> None:
-        """Take speed m/s and yaw rate rad/s at a stamp, with their variances (0: unknown)."""
-        self.filter.add_odometry(stamp_ns, v, omega, variances)
+    ) -> State | None:
+        """Take speed m/s and yaw rate rad/s at a stamp, with their variances (0: unknown).
 
-    def add_panorama(self, stamp_ns: int, panorama: Image) -> Estimate:
+        Returns the estimate at that stamp; None before the start, and for what cannot be used.
+        """
+        if self.filter.add_odometry(stamp_ns, v, omega, variances):
+            return None
+        return self.filter.at(stamp_ns)
+
+    def add_panorama(self, stamp_ns: int, panorama: Image) -> Observation:
         """Locate a panorama (H, W, 3) uint8 BGR and fuse it. Raises ModelError for a wrong size."""
-        estimate = self.model.locate(panorama)
-        self.add_estimate(stamp_ns, estimate)
-        return estimate
+        observation = self.observer.observe(stamp_ns, panorama)
+        self.add_observation(observation)
+        return observation
 
-    def add_estimate(self, stamp_ns: int, estimate: Estimate) -> Update:
-        """Fuse what a picture told."""
-        pose = np.append(estimate.position, estimate.yaw)
-        return self.filter.add_measurement(stamp_ns, pose, estimate.covariance, estimate.novelty)
+    def add_observation(self, observation: Observation) -> Update:
+        """Fuse what a picture shows."""
+        seen = observation
+        return self.filter.add_measurement(seen.stamp_ns, seen.pose, seen.covariance)
 
     @property
     def state(self) -> State | None:
@@ -61,31 +70,18 @@ class Localizer:
         """Whether the robot is lost, and why."""
         return self.filter.status
 
-    def replay(self, run: Run) -> Iterator[tuple[int, Estimate | None, State | None]]:
-        """Feed a recorded run in the order of its stamps, telling (stamp, estimate, state).
+    def replay(self, run: Run) -> Iterator[tuple[int, Observation | None, State | None]]:
+        """Feed a recorded run in the order of its stamps: (stamp, observation, state at it).
 
-        The estimate is None at odometry messages.
+        The observation is None at odometry messages. The state is what the nodes would have
+        published then: it knows nothing of what came later.
         """
-        odometry, at = run.odometry, 0
-        for stamp_ns, estimate in self.locate_run(run):
-            while at < len(odometry.stamps_ns) and odometry.stamps_ns[at] <= stamp_ns:
-                yield self._replay_odometry(run, at)
-                at += 1
-            self.add_estimate(stamp_ns, estimate)
-            yield stamp_ns, estimate, self.state
-        for rest in range(at, len(odometry.stamps_ns)):
-            yield self._replay_odometry(run, rest)
-
-    def _replay_odometry(self, run: Run, at: int) -> tuple[int, None, State | None]:
-        odometry = run.odometry
-        stamp_ns, (v, omega) = int(odometry.stamps_ns[at]), odometry.twists[at]
-        self.add_odometry(stamp_ns, float(v), float(omega), odometry.variances[at])
-        return stamp_ns, None, self.state
-
-    def locate_run(self, run: Run) -> Iterator[tuple[int, Estimate]]:
-        """Stamp and estimate of each picture of a run."""
-        at = 0
-        for batch in run.panoramas.batches(_BATCH):
-            for estimate in self.model.locate_all(batch):
-                yield int(run.panoramas.stamps_ns[at]), estimate
-                at += 1
+        odometry, observations = run.odometry, self.observer.observe_run(run)
+        for stamp_ns, kind, i in in_order(odometry.stamps_ns, run.panoramas.stamps_ns):
+            if kind == ODOMETRY:
+                v, omega = odometry.twists[i].tolist()
+                yield stamp_ns, None, self.add_odometry(stamp_ns, v, omega, odometry.variances[i])
+                continue
+            observation = next(observations)
+            self.add_observation(observation)
+            yield stamp_ns, observation, self.filter.at(stamp_ns)

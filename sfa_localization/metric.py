@@ -20,7 +20,7 @@ from sfa_localization.elimination import Links, Stack, schur
 from sfa_localization.errors import DataError
 from sfa_localization.fitting import Fit, problem_of, targets
 from sfa_localization.gauge import gauge
-from sfa_localization.geometry import Array, RigidTransform, wrap_angle
+from sfa_localization.geometry import Array, RigidTransform, align_complex, wrap_angle
 from sfa_localization.hyperparameters import LeftOut, choose, leave_out
 from sfa_localization.phases import Certificate, certify, refine
 from sfa_localization.regression import MetricMap
@@ -211,10 +211,8 @@ def _rigid_error(left: LeftOut, whole: Fit, stack: Stack) -> float:
     remaining = np.zeros(len(path))
     for n in range(stack.segments):
         rows = stack.owner == n
-        a, b = path[rows] - path[rows].mean(), predicted[rows] - predicted[rows].mean()
-        product = np.vdot(a, b)
-        turn = product / abs(product) if abs(product) > 0 else 1.0
-        remaining[rows] = np.abs(b - turn * a)
+        turn, shift = align_complex(path[rows], predicted[rows])
+        remaining[rows] = np.abs(turn * path[rows] + shift - predicted[rows])
     return float(remaining.mean())
 
 

@@ -8,8 +8,7 @@ file; nothing here opens a window. Colours are Okabe and Ito's, told apart by co
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure, SubFigure
 
+from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array, wrap_angle
 from sfa_localization.run import Stamps, Trajectory
 
@@ -307,22 +307,11 @@ def _number(value: float | None, column: str) -> str:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, at once or not at all."""
-    with _whole(path) as partial:
-        figure.savefig(partial, dpi=DOTS_PER_INCH, format='png')
+    with whole_file(path) as file:
+        figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, at once or not at all."""
-    with _whole(path) as partial:
-        partial.write_text(text, encoding='utf-8')
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A temporary name to write to; it becomes `path` in the end, or vanishes after an error."""
-    partial = path.with_name(f'.{path.name}.partial')
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        file.write(text.encode())

@@ -15,6 +15,8 @@ from sfa_localization.geometry import Array, compose, relative, wrap_angle
 
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
+BATCH = 16
+"""Pictures that are read and looked at together."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ from sfa_localization.place_model import (
     write_arrays,
 )
 from sfa_localization.rotation import Map
-from sfa_localization.run import Run
+from sfa_localization.run import BATCH, Run
 from sfa_localization.segments import Segments, assignment, cut, join
 from sfa_localization.sfa import Solution
 from sfa_localization.threads import one_core
@@ -67,7 +67,6 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT = 'sfa_localization training checkpoint'
 CHECKPOINT_VERSION = 1
-_BATCH = 16
 # Pictures whose maps are kept for the compass and for novelty, however long the drives.
 _SAMPLES = 3000
 _DELAY_MAX_NS, _DELAY_SHOWN_S = 500_000_000, 0.02
@@ -190,6 +189,14 @@ def read_drive(
             strict=strict,
             config=recipe.bag,
         )
+
+
+def as_live(recipe: Recipe, model: PlaceModel) -> Recipe:
+    """The recipe to read a drive as the nodes get it: the model's panorama, no picture left out.
+
+    Training leaves out pictures far from any odometry; the filter fuses them too.
+    """
+    return replace(recipe, panorama=model.panorama, bag=replace(recipe.bag, odometry_tolerance=0.0))
 
 
 def drive_of(run: Run, config: NetworkConfig) -> Drive:
@@ -371,7 +378,7 @@ def _all_maps(
         desc='features of all pictures', total=total, unit='img', disable=not progress
     ) as bar:
         for run in runs:
-            for images in run.panoramas.batches(_BATCH):
+            for images in run.panoramas.batches(BATCH):
                 yield start, network.maps(images)
                 start += len(images)
                 bar.update(len(images))

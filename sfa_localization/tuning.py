@@ -23,13 +23,15 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from sfa_localization.config import FilterConfig, TuneConfig
+from sfa_localization.config import FilterConfig, TuneConfig, WatchConfig
 from sfa_localization.errors import DataError
+from sfa_localization.events import ODOMETRY, in_order
 from sfa_localization.geometry import Array, align
+from sfa_localization.observation import Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.pose_filter import PoseFilter, Update
 from sfa_localization.run import Odometry, Run, Stamps, Trajectory
-from sfa_localization.training import Recipe, read_drive
+from sfa_localization.training import Recipe, as_live, read_drive
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The grid: factors on the variances of pictures and of odometry."""
@@ -43,21 +45,19 @@ TUNED = (
 """What the likelihood decides, each on a logarithmic scale."""
 _SPREAD = 0.7
 _ENOUGH = 20
-_BATCH = 16
 _TAIL = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What the pictures of a drive told: stamps (N,), poses (N, 3), yaw NaN where unknown.
+    """What the usable pictures of a drive show: stamps (N,), poses (N, 3), covariances (N, 3, 3).
 
-    `covariances` (N, 3, 3), `novelty` (N,).
+    An unusable picture changes nothing in the filter.
     """
 
     stamps_ns: Stamps
     poses: Array
     covariances: Array
-    novelty: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,31 +78,36 @@ class Outcome:
 
 
 def read_tours(
-    bags: Sequence[Path], model: PlaceModel, recipe: Recipe, want_truth: bool, progress: bool
+    bags: Sequence[Path],
+    model: PlaceModel,
+    recipe: Recipe,
+    want_truth: bool,
+    progress: bool,
+    watch: WatchConfig | None = None,
 ) -> list[Tour]:
     """What the model sees in the pictures of each bag, and the bag's odometry. Raises BagError."""
     tours = []
     for bag in bags:
         with TemporaryDirectory(prefix='sfa_localization_tune_') as cache:
-            run = read_drive(bag, Path(cache), recipe, progress, want_truth=want_truth)
-            tours.append(Tour(run.odometry, _sight(run, model, progress), run.ground_truth))
+            run = read_drive(
+                bag, Path(cache), as_live(recipe, model), progress, want_truth=want_truth
+            )
+            sight = _sight(run, Observer(model, watch), progress)
+            tours.append(Tour(run.odometry, sight, run.ground_truth))
     return tours
 
 
-def _sight(run: Run, model: PlaceModel, progress: bool) -> Sight:
-    poses, covariances, novelty = [], [], []
+def _sight(run: Run, observer: Observer, progress: bool) -> Sight:
     with tqdm(total=len(run.panoramas), desc='locating', unit='img', disable=not progress) as bar:
-        for batch in run.panoramas.batches(_BATCH):
-            for estimate in model.locate_all(batch):
-                poses.append([*estimate.position, estimate.yaw])
-                covariances.append(estimate.covariance)
-                novelty.append(estimate.novelty)
-            bar.update(len(batch))
+        seen = []
+        for observation in observer.observe_run(run):
+            bar.update()
+            if not observation.problem:
+                seen.append(observation)
     return Sight(
-        run.panoramas.stamps_ns,
-        np.reshape(poses, (-1, 3)),
-        np.reshape(covariances, (-1, 3, 3)),
-        np.array(novelty),
+        np.array([one.stamp_ns for one in seen], np.int64),
+        np.reshape([one.pose for one in seen], (-1, 3)),
+        np.reshape([one.covariance for one in seen], (-1, 3, 3)),
     )
 
 
@@ -194,16 +199,12 @@ def error_cost(tours: Iterable[Tour], config: FilterConfig) -> float:
 def _fuse(fused: PoseFilter, tour: Tour) -> Iterator[Update]:
     """Feed a tour in the order of time; yields the updates."""
     odometry, sight = tour.odometry, tour.sight
-    events = [(int(s), 0, i) for i, s in enumerate(odometry.stamps_ns)]
-    events += [(int(s), 1, i) for i, s in enumerate(sight.stamps_ns)]
-    for stamp_ns, kind, i in sorted(events):
-        if kind == 0:
+    for stamp_ns, kind, i in in_order(odometry.stamps_ns, sight.stamps_ns):
+        if kind == ODOMETRY:
             v, omega = odometry.twists[i]
             fused.add_odometry(stamp_ns, v, omega, odometry.variances[i])
         else:
-            yield fused.add_measurement(
-                stamp_ns, sight.poses[i], sight.covariances[i], sight.novelty[i]
-            )
+            yield fused.add_measurement(stamp_ns, sight.poses[i], sight.covariances[i])
 
 
 def _with_logs(config: FilterConfig, logs: NDArray[np.float64]) -> FilterConfig:

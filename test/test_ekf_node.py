@@ -27,11 +27,10 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
+from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes import ekf_node  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,
-    read_stamp,
-    read_yaw,
     to_odometry,
     to_pose_with_covariance,
 )
@@ -253,7 +252,7 @@ def malformed():
         (odom, lambda m: setattr(m.pose.pose.orientation, 'w', nan)),
         (odom, lambda m: (setattr(m.pose.pose.orientation, 'w', 0.0),
                           setattr(m.pose.pose.orientation, 'z', 0.0))),
-        (odom, lambda m: setattr(m.pose.pose.orientation, 'z', 5.0)),
+        (odom, lambda m: setattr(m.pose.pose.orientation, 'z', 1e200)),
         (odom, lambda m: setattr(m.header.stamp, 'sec', 0)
          or setattr(m.header.stamp, 'nanosec', 0)),
         (odom, lambda m: setattr(m.header.stamp, 'nanosec', 2_000_000_000)),

@@ -141,7 +141,7 @@ def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
             bag.odometry('/odom', 0 if index == 3 else at, (0, 0, 0), (0, 0), (0, 0))
     problems = {topic.name: topic.problems for topic in inspect(tmp_path / 'bag').topics}
     assert problems['/panorama'] == ['pause of 10.2 s', 'pictures of several sizes: 80x8, 60x8']
-    assert problems['/odom'] == ['1 of 20 messages: zero stamp', 'pause of 10.2 s']
+    assert problems['/odom'] == ['1 of 20 messages: zero or negative stamp', 'pause of 10.2 s']
 
 
 # The numbers.
@@ -247,3 +247,13 @@ def test_the_command_takes_topics_and_limits(
     options = ['--image-topic', '/nothing', '--min-pictures', '5']
     assert main(['inspect', str(path), *options]) == 0
     assert 'has no topic /nothing' in capsys.readouterr().out
+
+
+def test_json_that_cannot_be_written_leaves_nothing_behind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / 'out'
+    (folder / 'taken').mkdir(parents=True)
+    assert main(['inspect', str(tmp_path / 'missing'), '--json', str(folder / 'taken')]) == 1
+    assert f'{folder / "taken"}: cannot be written' in capsys.readouterr().err
+    assert [path.name for path in folder.iterdir()] == ['taken']

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sfa_localization import report
+from sfa_localization.errors import LocalizationError
 from sfa_localization.run import Trajectory
 
 SECOND = 1_000_000_000
@@ -103,11 +104,11 @@ def test_path_is_drawn_in_its_colour_and_to_scale(tmp_path, truth):
 
 
 def test_failed_picture_leaves_nothing(tmp_path: Path, truth, monkeypatch):
-    def full_disk(_figure, path, **_options):
-        path.write_bytes(b'half a picture')
+    def full_disk(_figure, file, **_options):
+        file.write(b'half a picture')
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(report.Figure, 'savefig', full_disk)
-    with pytest.raises(OSError, match='No space'):
+    with pytest.raises(LocalizationError, match=r'errors\.png: cannot be written: No space'):
         report.errors_figure(tmp_path / 'errors.png', truth, {})
     assert list(tmp_path.iterdir()) == []

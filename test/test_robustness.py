@@ -42,8 +42,8 @@ from ros_bench import Bench, until  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Empty, String  # noqa: E402
 
+from sfa_localization.decoding import read_stamp  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
-    read_stamp,
     to_image,
     to_odometry,
     to_pose_with_covariance,

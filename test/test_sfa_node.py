@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from sfa_localization.config import PanoramaConfig, SfaNodeConfig
+from sfa_localization.config import PanoramaConfig
 from sfa_localization.errors import ModelError
-from sfa_localization.picture_watch import UNKNOWN_VARIANCE, PictureWatch, unusable_covariance
+from sfa_localization.observation import UNKNOWN_VARIANCE
 from sfa_localization.place_model import Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
@@ -20,40 +20,6 @@ def panorama(seed=0, level=120, spread=40):
     rng = np.random.default_rng(seed)
     noise = rng.normal(level, spread, (SIZE.height, SIZE.width, 3))
     return np.clip(noise, 0, 255).astype(np.uint8)
-
-
-# The judge of pictures needs no ROS.
-
-
-def test_a_good_picture_is_believed():
-    watch = PictureWatch(SfaNodeConfig())
-    assert [watch.judge(panorama(seed)) for seed in range(20)] == [''] * 20
-
-
-@pytest.mark.parametrize(('level', 'spread', 'reason'), [
-    (2, 2, 'dark'), (0, 0, 'dark'), (120, 0, 'covered'), (250, 1, 'covered'),
-])  # fmt: skip
-def test_dark_and_covered_pictures_are_told_apart(level, spread, reason):
-    assert reason in PictureWatch(SfaNodeConfig()).judge(panorama(level=level, spread=spread))
-
-
-def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
-    watch = PictureWatch(SfaNodeConfig(frozen_pictures=3))
-    told = [watch.judge(panorama(seed)) for seed in (1, 1, 1, 1, 2, 2, 1)]
-    assert ['frozen' in text for text in told] == [False, False, True, True, False, False, False]
-
-
-@pytest.mark.parametrize(('novelty', 'fine'), [(0.5, True), (3.0, True), (3.1, False),
-                                              (math.nan, False)])  # fmt: skip
-def test_foreign_pictures_are_not_believed(novelty, fine):
-    assert (PictureWatch(SfaNodeConfig()).judge_novelty(novelty) == '') == fine
-
-
-def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():
-    from sfa_localization.pose_filter import PoseFilter
-
-    update = PoseFilter().add_measurement(10**9, [0, 0, 0], unusable_covariance())
-    assert not update.accepted and update.reason == 'covariance tells that nothing is known'
 
 
 pytest.importorskip('rclpy')
@@ -66,10 +32,9 @@ from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,
-    read_stamp,
-    read_yaw,
     to_compressed,
     to_image,
 )
@@ -245,7 +210,10 @@ def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
     models['a.npz'].shift = math.nan
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     bench.publish('panorama', message())
-    assert until(lambda: node.monitor('panorama').refused) and not heard
+    assert until(lambda: node.monitor('panorama').refused and heard)
+    _, pose, covariance = read_pose(heard[0])
+    assert np.array_equal(pose, np.zeros(3)) and covariance[0, 0] == UNKNOWN_VARIANCE
+    assert 'no finite estimate' in next(iter(node.monitor('panorama').refused))
 
 
 def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models):

@@ -22,8 +22,7 @@ def tour(told=0.2, true=0.2, seed=0, truth=True, seconds=40):
     spread = np.diag([told**2, told**2, 0.05**2])
     return Tour(
         Odometry(drive.stamps_ns, drive.poses, drive.read, variances),
-        Sight(drive.stamps_ns[drive.pictures], drive.seen, np.tile(spread, (count, 1, 1)),
-              np.zeros(count)),
+        Sight(drive.stamps_ns[drive.pictures], drive.seen, np.tile(spread, (count, 1, 1))),
         Trajectory(drive.stamps_ns, drive.poses) if truth else None,
     )  # fmt: skip
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS messages to and from plain values; what is malformed raises MessageError with the reason.
 
-Nothing else in the package reads or fills a message. Stamps are integer nanoseconds, poses are
-(x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
+Messages are filled here and nowhere else; what their fields mean stands in `decoding`. Stamps are
+integer nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
 """
 
 from __future__ import annotations
@@ -27,20 +27,23 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
-from sfa_localization.errors import CameraError, LocalizationError
+from sfa_localization.decoding import (
+    NANOSECONDS,
+    read_compressed,
+    read_planar,
+    read_raw,
+    read_stamp,
+    read_twist,
+    require_sane,
+)
+from sfa_localization.errors import MessageError
 from sfa_localization.geometry import Array
-from sfa_localization.pictures import decode_compressed, decode_image, encode_jpeg
+from sfa_localization.pictures import encode_jpeg
 from sfa_localization.run import Image
 
-UNKNOWN_VARIANCE = 1e6
-"""Variance of what a planar estimate does not know: z, roll and pitch are fixed, not unknown."""
 _FIXED_VARIANCE = 1e-6
+"""Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-_NANOSECONDS = 1_000_000_000
-
-
-class MessageError(LocalizationError):
-    """A message cannot be used; the text is the reason, in short words that can be counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,30 +58,10 @@ class Motion:
     child_frame: str
 
 
-def read_stamp(stamp: Time) -> int:
-    """Nanoseconds; raises MessageError for the zero stamp and for impossible nanoseconds."""
-    if not 0 <= stamp.nanosec < _NANOSECONDS:
-        raise MessageError('impossible stamp')
-    total = stamp.sec * _NANOSECONDS + stamp.nanosec
-    if total <= 0:
-        raise MessageError('zero or negative stamp')
-    return int(total)
-
-
 def to_stamp(stamp_ns: int) -> Time:
     """A message's stamp from nanoseconds >= 0."""
-    seconds, rest = divmod(int(stamp_ns), _NANOSECONDS)
+    seconds, rest = divmod(int(stamp_ns), NANOSECONDS)
     return Time(sec=seconds, nanosec=rest)
-
-
-def read_yaw(q: Quaternion) -> float:
-    """Heading of a quaternion; raises MessageError when it is not finite or not of unit length."""
-    norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-    if not math.isfinite(norm):
-        raise MessageError('quaternion is not finite')
-    if abs(norm - 1.0) > 0.01:
-        raise MessageError('quaternion is not of unit length')
-    return math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
 
 
 def to_quaternion(yaw_rad: float) -> Quaternion:
@@ -88,20 +71,8 @@ def to_quaternion(yaw_rad: float) -> Quaternion:
 
 def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
     """Stamp and picture (H, W, 3) uint8 BGR of either image message."""
-    stamp_ns = read_stamp(message.header.stamp)
-    try:
-        if isinstance(message, CompressedImage):
-            return stamp_ns, decode_compressed(message.data, message.format)
-        return stamp_ns, decode_image(
-            message.data,
-            message.height,
-            message.width,
-            message.step,
-            message.encoding,
-            bool(message.is_bigendian),
-        )
-    except CameraError as error:
-        raise MessageError(str(error)) from None
+    read = read_compressed if isinstance(message, CompressedImage) else read_raw
+    return read_stamp(message.header.stamp), read(message)
 
 
 def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
@@ -124,35 +95,29 @@ def to_compressed(image: Image, stamp_ns: int, frame: str, quality: int) -> Comp
 
 
 def read_odometry(message: Odometry) -> Motion:
-    """The planar motion told by an odometry message; variances of 0 mean that it tells none."""
-    twist, covariance = message.twist.twist, message.twist.covariance
-    v, omega = float(twist.linear.x), float(twist.angular.z)
-    _require_finite('twist', [v, omega])
-    position = message.pose.pose.position
-    _require_finite('pose', [position.x, position.y])
-    yaw = read_yaw(message.pose.pose.orientation)
+    """The planar motion of an odometry message; variances of 0 mean that they are unknown."""
+    v, omega, *variances = read_twist(message)
+    pose = message.pose.pose
     return Motion(
         stamp_ns=read_stamp(message.header.stamp),
-        pose=np.array([position.x, position.y, yaw]),
+        pose=np.array(read_planar(pose.position, pose.orientation)),
         twist=(v, omega),
-        variances=(_variance(covariance[0]), _variance(covariance[35])),
+        variances=(variances[0], variances[1]),
         frame=message.header.frame_id,
         child_frame=message.child_frame_id,
     )
 
 
 def read_pose(message: PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
-    """Stamp, pose (3,) and covariance (3, 3) of [x, y, yaw]; all zeros where it tells none."""
-    position = message.pose.pose.position
-    _require_finite('position', [position.x, position.y])
-    yaw = read_yaw(message.pose.pose.orientation)
+    """Stamp, pose (3,) and covariance (3, 3) of [x, y, yaw]; all zeros where it is unknown."""
+    pose = np.array(read_planar(message.pose.pose.position, message.pose.pose.orientation))
     covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[_PLANAR]
-    _require_finite('covariance', covariance)
+    require_sane('covariance', *covariance.ravel().tolist())
     if np.any(np.diag(covariance) < 0):
         raise MessageError('negative variance')
     if np.abs(covariance - covariance.T).max() > 1e-6 * (1 + np.abs(covariance).max()):
         raise MessageError('covariance is not symmetric')
-    return read_stamp(message.header.stamp), np.array([position.x, position.y, yaw]), covariance
+    return read_stamp(message.header.stamp), pose, covariance
 
 
 def to_pose(pose: ArrayLike, stamp_ns: int, frame: str) -> PoseStamped:
@@ -198,7 +163,7 @@ def to_odometry(
 def to_transform(pose: ArrayLike, stamp_ns: int, frames: tuple[str, str]) -> TransformStamped:
     """Pose (3,) of frames[1] in frames[0] as a transform from the one to the other."""
     value = np.asarray(pose, float)
-    _require_finite('output', value)
+    require_sane('output', *value.tolist())
     message = TransformStamped(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frames[0]
     message.transform.translation.x = float(value[0])
@@ -223,19 +188,6 @@ def to_covariance(covariance: Array) -> NDArray[np.float64]:
 
 
 def _fill(message: Any, pose: Array) -> None:
-    _require_finite('output', pose[:2])
+    require_sane('output', *pose[:2].tolist())
     message.position.x, message.position.y = float(pose[0]), float(pose[1])
     message.orientation = to_quaternion(float(pose[2]) if math.isfinite(pose[2]) else 0.0)
-
-
-def _variance(value: float) -> float:
-    """A variance, or 0 (unknown) where the message holds something that is none."""
-    return float(value) if math.isfinite(value) and 0 < value < UNKNOWN_VARIANCE else 0.0
-
-
-def _require_finite(name: str, values: ArrayLike) -> None:
-    numbers = np.asarray(values, float)
-    if not np.all(np.isfinite(numbers)):
-        raise MessageError(f'{name} is not finite')
-    if np.any(np.abs(numbers) > 1e9):
-        raise MessageError(f'{name} is absurdly large')

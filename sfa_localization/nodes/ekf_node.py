@@ -20,9 +20,9 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.config import EkfNodeConfig, FilterConfig, Settings
+from sfa_localization.errors import MessageError
 from sfa_localization.geometry import compose, invert
 from sfa_localization.nodes.conversions import (
-    MessageError,
     Motion,
     read_odometry,
     read_pose,

@@ -21,8 +21,8 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 
 from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig, Settings
-from sfa_localization.errors import LocalizationError
-from sfa_localization.nodes.conversions import MessageError, read_image, to_compressed, to_image
+from sfa_localization.errors import LocalizationError, MessageError
+from sfa_localization.nodes.conversions import read_image, to_compressed, to_image
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
     reliable_qos,

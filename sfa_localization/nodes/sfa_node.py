@@ -19,10 +19,9 @@ from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
-from sfa_localization.config import Settings, SfaNodeConfig
-from sfa_localization.errors import ConfigError, LocalizationError
+from sfa_localization.config import Settings, SfaNodeConfig, WatchConfig
+from sfa_localization.errors import ConfigError, LocalizationError, MessageError
 from sfa_localization.nodes.conversions import (
-    MessageError,
     read_image,
     to_array,
     to_pose,
@@ -33,8 +32,8 @@ from sfa_localization.nodes.lifecycle import (
     run_node,
     sensor_qos,
 )
-from sfa_localization.picture_watch import PictureWatch, unusable_covariance
-from sfa_localization.place_model import Estimate, PlaceModel
+from sfa_localization.observation import Observation, Observer
+from sfa_localization.place_model import PlaceModel
 
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -43,19 +42,17 @@ class SfaNode(LocalizationNode):
     """Locates each panorama with the trained model; the `model` parameter may change live."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('sfa_node', [SfaNodeConfig], **options)
+        super().__init__('sfa_node', [SfaNodeConfig, WatchConfig], **options)
         self._config = self.settings(SfaNodeConfig)
-        self._watch = PictureWatch(self._config)
-        self._model: PlaceModel | None = None
+        self._observer: Observer | None = None
         self._loaded: tuple[str, PlaceModel] | None = None
-        self._novelty = 0.0
-        self._unusable = ''
+        self._seen: Observation | None = None
         self.add_on_set_parameters_callback(self._check_model)
 
     def setup(self) -> None:
         self._config = self.settings(SfaNodeConfig)
-        self._watch = PictureWatch(self._config)
-        self._model = self._load(self._config.model)
+        self._observer = Observer(self._load(self._config.model), self.settings(WatchConfig))
+        self._seen = None
         self._features = self.publisher(Float64MultiArray, 'sfa/slow_features')
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
@@ -67,7 +64,7 @@ class SfaNode(LocalizationNode):
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
 
     def teardown(self) -> None:
-        self._model = None
+        self._observer = None
 
     # The model.
 
@@ -86,9 +83,9 @@ class SfaNode(LocalizationNode):
         return model
 
     def _check_model(self, changes: list[Parameter]) -> SetParametersResult:
-        """Refuse a model that cannot be loaded before anything changes."""
+        """Refuse a model that cannot be loaded before anything changes, in any state."""
         for change in changes:
-            if change.name == 'model' and self.active:
+            if change.name == 'model':
                 try:
                     self._loaded = str(change.value), self._load(str(change.value))
                 except LocalizationError as error:
@@ -96,55 +93,51 @@ class SfaNode(LocalizationNode):
         return SetParametersResult(successful=True)
 
     def settings_changed(self, settings: Settings) -> None:
+        if isinstance(settings, WatchConfig) and self._observer is not None:
+            self._observer.watch.config = settings
         if not isinstance(settings, SfaNodeConfig):
             return
-        self._config = self._watch.config = settings
+        self._config = settings
         if self._loaded is not None and self._loaded[0] == settings.model:
-            self._model = self._loaded[1]
+            self._use(self._loaded[1])
         self._loaded = None
 
+    def _use(self, model: PlaceModel) -> None:
+        """Go on with another model; an unconfigured node reads its own when it is configured."""
+        if self._observer is not None:
+            self._observer.model = model
+
     def _reload(self, _: Any, response: Any) -> Any:
-        self._model = self._load(self._config.model)
+        self._use(self._load(self._config.model))
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
 
     # Pictures.
 
     def _receive(self, message: ImageMessage | CompressedImage) -> None:
-        assert self._model is not None
-        stamp_ns, panorama = read_image(message)
-        size = self._model.panorama
-        if panorama.shape[:2] != (size.height, size.width):
-            height, width = panorama.shape[:2]
-            raise MessageError(
-                f'panorama is {width}x{height}, but the model was trained on '
-                f'{size.width}x{size.height}: set width and height of omnicam_node'
-            )
-        problem = self._watch.judge(panorama)
-        estimate = self._model.locate(panorama)
-        _require_finite(estimate)
-        self._novelty = estimate.novelty
-        self._unusable = problem or self._watch.judge_novelty(estimate.novelty)
-        self._publish(estimate, stamp_ns)
-        if self._unusable:
-            raise MessageError(self._unusable)
+        assert self._observer is not None
+        self._seen = seen = self._observer.observe(*read_image(message))
+        self._publish(seen)
+        if seen.problem:
+            raise MessageError(seen.problem)
 
-    def _publish(self, estimate: Estimate, stamp_ns: int) -> None:
+    def _publish(self, seen: Observation) -> None:
         """A pose without covariance cannot say that it is worthless, so then there is none."""
-        config = self._config
-        slow = estimate.slow_features
-        self._features.publish(to_array(slow, 'slow features'))
-        self._feature_pose.publish(_feature_pose(slow, stamp_ns, config.feature_frame))
-        pose = [estimate.position[0], estimate.position[1], estimate.yaw]
-        if not self._unusable:
-            self._pose.publish(to_pose(pose, stamp_ns, config.map_frame))
-        covariance = unusable_covariance() if self._unusable else estimate.covariance
+        frame, slow = self._config.map_frame, seen.estimate.slow_features
+        if np.all(np.isfinite(slow)):
+            self._features.publish(to_array(slow, 'slow features'))
+            feature_pose = _feature_pose(slow, seen.stamp_ns, self._config.feature_frame)
+            self._feature_pose.publish(feature_pose)
+        if not seen.problem:
+            self._pose.publish(to_pose(seen.pose, seen.stamp_ns, frame))
         self._uncertain.publish(
-            to_pose_with_covariance(pose, covariance, stamp_ns, config.map_frame)
+            to_pose_with_covariance(seen.pose, seen.covariance, seen.stamp_ns, frame)
         )
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        values = {'model': self._config.model, 'novelty': f'{self._novelty:.2f}'}
+        problem = self._seen.problem if self._seen is not None else ''
+        novelty = self._seen.estimate.novelty if self._seen is not None else 0.0
+        values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
         silent = self.monitor(self._topic).silent_for_s()
         if math.isinf(silent):
             return _WARN, f'waiting for pictures on {self._topic}', values
@@ -152,9 +145,9 @@ class SfaNode(LocalizationNode):
             return _ERROR, f'no picture on {self._topic} for {silent:.0f} s', values
         if self.monitor(self._topic).used == 0:
             return _ERROR, 'no picture has been usable', values
-        if self._unusable:
-            return _ERROR, self._unusable, values
-        if self._novelty > self._config.novelty_warning:
+        if problem:
+            return _ERROR, problem, values
+        if novelty > self._config.novelty_warning:
             return _WARN, 'pictures are unlike those of training', values
         return _OK, 'locating', values
 
@@ -165,12 +158,6 @@ def _feature_pose(slow: Any, stamp_ns: int, frame: str) -> PoseStamped:
     message = to_pose([first[0], first[1], 0.0], stamp_ns, frame)
     message.pose.position.z = first[2]
     return message
-
-
-def _require_finite(estimate: Estimate) -> None:
-    known = np.concatenate([estimate.slow_features, estimate.position, estimate.covariance.ravel()])
-    if not np.all(np.isfinite(known)):
-        raise MessageError('the model gives no finite estimate for this picture')
 
 
 def main(args: Sequence[str] | None = None) -> int:

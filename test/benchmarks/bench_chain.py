@@ -30,8 +30,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
+from sfa_localization.decoding import read_stamp
 from sfa_localization.nodes.conversions import (
-    read_stamp,
     to_image,
     to_odometry,
     to_pose_with_covariance,

@@ -37,7 +37,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe
 
-from sfa_localization.nodes.conversions import read_stamp, to_image, to_odometry
+from sfa_localization.decoding import read_stamp
+from sfa_localization.nodes.conversions import to_image, to_odometry
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.threads import one_core
 

@@ -1,0 +1,112 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages mean the same whether they come from a bag or from a topic."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sfa_localization.bag import Bag, BagWriter
+from sfa_localization.decoding import read_planar, read_stamp, read_twist, read_yaw, read_yaw_rate
+from sfa_localization.errors import MessageError
+
+
+def quaternion(yaw, length=1.0, roll=0.0):
+    half = np.array([math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2)])
+    turn = math.cos(yaw / 2), math.sin(yaw / 2)
+    x, y, z, w = turn[0] * half[0], turn[1] * half[0], turn[1] * half[3], turn[0] * half[3]
+    return SimpleNamespace(x=length * x, y=length * y, z=length * z, w=length * w)
+
+
+@pytest.mark.parametrize('length', [0.01, 0.98, 1.0, 1.5, 1e4])
+@pytest.mark.parametrize('roll', [0.0, 0.1])
+def test_the_length_of_a_quaternion_changes_nothing(length, roll):
+    for yaw in np.linspace(-3.1, 3.1, 13):
+        assert read_yaw(quaternion(yaw, length, roll)) == pytest.approx(yaw, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('length', 'reason'), [(0.0, 'zero'), (1e-5, 'zero'), (math.nan, 'finite'), (1e200, 'large')]
+)
+def test_a_quaternion_without_direction_is_refused(length, reason):
+    with pytest.raises(MessageError, match=reason):
+        read_yaw(quaternion(1.0, length))
+
+
+@pytest.mark.parametrize(('sec', 'nanosec', 'reason'), [
+    (0, 0, 'zero'), (-5, 7, 'zero or negative'), (5, 10**9, 'impossible'),
+])  # fmt: skip
+def test_impossible_stamps_are_refused(sec, nanosec, reason):
+    with pytest.raises(MessageError, match=reason):
+        read_stamp(SimpleNamespace(sec=sec, nanosec=nanosec))
+    assert read_stamp(SimpleNamespace(sec=5, nanosec=7)) == 5_000_000_007
+
+
+def test_numbers_that_no_robot_reaches_are_refused():
+    far = SimpleNamespace(x=1e10, y=0.0)
+    with pytest.raises(MessageError, match='pose is absurdly large'):
+        read_planar(far, quaternion(0.0))
+
+
+def test_unknown_variances_are_zero():
+    twist = SimpleNamespace(linear=SimpleNamespace(x=1.0), angular=SimpleNamespace(z=0.5))
+    for unknown in (0.0, -1.0, math.nan, math.inf, 1e6):
+        covariance = np.zeros(36)
+        covariance[0], covariance[35] = unknown, 0.01
+        part = SimpleNamespace(twist=twist, covariance=covariance)
+        assert read_twist(SimpleNamespace(twist=part)) == (1.0, 0.5, 0.0, 0.01)
+    imu = SimpleNamespace(
+        angular_velocity=SimpleNamespace(z=0.2), angular_velocity_covariance=np.zeros(9)
+    )
+    assert read_yaw_rate(imu) == (0.2, 0.0)
+    imu.angular_velocity_covariance[0] = -1.0
+    with pytest.raises(MessageError, match='unknown'):
+        read_yaw_rate(imu)
+
+
+LENGTHS = (1.0, 0.5, 3.0, 0.0, 1.0, 1.001, math.nan)
+"""Of the quaternions of a drive; two of them have no direction."""
+
+
+def scaled(message, length):
+    message.pose.pose.orientation.z *= length
+    message.pose.pose.orientation.w *= length
+    return message
+
+
+def bag_poses(path):
+    """Return the poses of a bag with such quaternions, by stamp."""
+
+    class Writer(BagWriter):
+        def message(self, topic, stamp_ns, message):
+            super().message(topic, stamp_ns, scaled(message, LENGTHS[stamp_ns // 10**9 - 1]))
+
+    with Writer(path) as bag:
+        for k in range(len(LENGTHS)):
+            bag.odometry('/odom', (k + 1) * 10**9, [k, 0.0, 0.3 * k], [1.0, 0.3], [0.01, 0.01])
+    with Bag(path) as bag:
+        odometry = bag.odometry()
+        assert bag.counts['/odom'].skipped == {
+            'quaternion is zero': 1, 'quaternion is not finite': 1,
+        }  # fmt: skip
+    return dict(zip(odometry.stamps_ns.tolist(), odometry.poses, strict=True))
+
+
+def test_bags_and_topics_take_and_refuse_the_same_quaternions(tmp_path):
+    pytest.importorskip('rclpy')
+    from sfa_localization.nodes.conversions import read_odometry, to_odometry
+
+    recorded, live = bag_poses(tmp_path / 'bag'), {}
+    for k, length in enumerate(LENGTHS):
+        stamp_ns, pose = (k + 1) * 10**9, [k, 0.0, 0.3 * k]
+        frames = ('odom', 'base_link')
+        message = to_odometry(pose, np.eye(3), [1.0, 0.3], np.eye(2), stamp_ns, frames)
+        try:
+            live[stamp_ns] = read_odometry(scaled(message, length)).pose
+        except MessageError:
+            continue
+    assert sorted(live) == sorted(recorded) and len(live) == 5
+    for stamp_ns, pose in live.items():
+        assert np.allclose(pose, recorded[stamp_ns], atol=1e-12)

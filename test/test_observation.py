@@ -1,0 +1,121 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which pictures are believed, and what the filter gets of those that are not."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from picture_readers import PictureReader, panorama
+
+from sfa_localization.config import WatchConfig
+from sfa_localization.errors import ModelError
+from sfa_localization.events import ODOMETRY, PICTURE, in_order
+from sfa_localization.observation import Observer, PictureWatch, unusable_covariance
+from sfa_localization.pose_filter import PoseFilter
+from sfa_localization.run import BATCH, Odometry, PanoramaArray, Run
+
+
+def test_a_good_picture_is_believed():
+    watch = PictureWatch()
+    assert [watch.judge(panorama(seed=seed)) for seed in range(20)] == [''] * 20
+
+
+@pytest.mark.parametrize(('level', 'spread', 'reason'), [
+    (2, 2, 'dark'), (0, 0, 'dark'), (120, 0, 'covered'), (250, 1, 'covered'),
+])  # fmt: skip
+def test_dark_and_covered_pictures_are_distinguished(level, spread, reason):
+    picture = panorama(level=level, spread=spread)
+    picture[0] = picture[1]
+    assert reason in PictureWatch().judge(picture)
+
+
+def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
+    watch = PictureWatch(WatchConfig(frozen_pictures=3))
+    found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 2, 2, 1)]
+    assert ['frozen' in text for text in found] == [False, False, True, True, False, False, False]
+
+
+@pytest.mark.parametrize(('novelty', 'fine'), [(0.5, True), (3.0, True), (3.1, False),
+                                              (math.nan, False)])  # fmt: skip
+def test_foreign_pictures_are_not_believed(novelty, fine):
+    assert (PictureWatch().judge_novelty(novelty) == '') == fine
+
+
+def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():
+    update = PoseFilter().add_measurement(10**9, [0, 0, 0], unusable_covariance())
+    assert not update.accepted and update.reason == 'covariance tells that nothing is known'
+
+
+def test_a_believed_picture_gives_the_models_pose_and_covariance():
+    seen = Observer(PictureReader()).observe(7, panorama((3.0, 40.0, 1.0)))
+    assert seen.stamp_ns == 7 and seen.problem == ''
+    assert seen.pose == pytest.approx([3.0, 40.0, 1.0], abs=1e-4)
+    assert np.array_equal(seen.covariance, np.diag([0.02, 0.03, 0.002]))
+
+
+def test_without_a_compass_the_yaw_is_zero_as_on_the_topic():
+    reader = PictureReader(has_heading=False)
+    reader.locate = lambda image: dataclasses.replace(PictureReader().locate(image), yaw=math.nan)
+    assert Observer(reader).observe(7, panorama((3.0, 4.0, 1.0))).pose.tolist() == [3.0, 4.0, 0.0]
+
+
+def test_an_estimate_that_is_not_finite_says_that_nothing_is_known():
+    reader = PictureReader()
+    reader.locate = lambda image: dataclasses.replace(
+        PictureReader().locate(image), position=np.array([math.nan, 1.0])
+    )
+    seen = Observer(reader).observe(7, panorama())
+    assert 'no finite estimate' in seen.problem
+    assert np.array_equal(seen.pose, np.zeros(3))
+    assert np.array_equal(seen.covariance, unusable_covariance())
+
+
+def test_another_size_is_refused_with_the_remedy():
+    for look in (
+        lambda image: Observer(PictureReader()).observe(7, image),
+        lambda image: Observer(PictureReader()).observe_all(np.array([7]), image[None]),
+    ):
+        with pytest.raises(ModelError, match=r'100x20.*64x16.*omnicam_node'):
+            look(np.zeros((20, 100, 3), np.uint8))
+
+
+def mixed_run(count=3 * BATCH + 5):
+    """A run with all kinds of bad pictures, also across the borders of batches."""
+    pictures = [panorama((0.1 * k, 2.0, 0.02 * k), seed=k) for k in range(count)]
+    pictures[3] = np.zeros_like(pictures[3])
+    pictures[BATCH - 3 : BATCH + 6] = [pictures[5]] * 9
+    pictures[30] = panorama((1.0, 2.0, 3.0), seed=30, novelty=9.0)
+    pictures[31] = np.full_like(pictures[3], 90)
+    stamps = np.arange(1, count + 1, dtype=np.int64) * 10**8
+    still = Odometry(stamps, np.zeros((count, 3)), np.zeros((count, 2)), np.zeros((count, 2)))
+    return Run('mixed', PanoramaArray(stamps, np.array(pictures)), still)
+
+
+def test_in_batches_and_one_by_one_pictures_are_judged_alike():
+    run = mixed_run()
+    batched = list(Observer(PictureReader()).observe_run(run))
+    single = Observer(PictureReader())
+    assert len(batched) == len(run.panoramas)
+    for stamp_ns, image, seen in zip(
+        run.panoramas.stamps_ns.tolist(), run.panoramas.images, batched, strict=True
+    ):
+        alone = single.observe(stamp_ns, image)
+        assert (alone.stamp_ns, alone.problem) == (seen.stamp_ns, seen.problem)
+        assert np.array_equal(alone.pose, seen.pose)
+        assert np.array_equal(alone.covariance, seen.covariance)
+    found = [seen.problem for seen in batched if seen.problem]
+    assert len(found) == 1 + 5 + 1 + 1
+    assert {text.split()[2].rstrip(':') for text in found} == {
+        'dark', 'covered', 'frozen', 'unlike'
+    }  # fmt: skip
+
+
+def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp():
+    odometry, pictures = np.array([5, 10, 20]), np.array([1, 10, 15, 30])
+    assert list(in_order(odometry, pictures)) == [
+        (1, PICTURE, 0), (5, ODOMETRY, 0), (10, ODOMETRY, 1), (10, PICTURE, 1),
+        (15, PICTURE, 2), (20, ODOMETRY, 2), (30, PICTURE, 3),
+    ]  # fmt: skip
+    assert [event[1] for event in in_order(odometry, pictures[:0])] == [ODOMETRY] * 3

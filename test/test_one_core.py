@@ -1,0 +1,176 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Live nodes, `Localizer` and `evaluate` give the same poses, whatever the pictures are like."""
+
+import numpy as np
+import pytest
+from filter_drives import Drive
+from picture_readers import SIZE, PictureReader, panorama
+
+from sfa_localization.bag import BagWriter
+from sfa_localization.config import FilterConfig, WatchConfig
+from sfa_localization.evaluation import evaluate, fit_transform, moved
+from sfa_localization.events import ODOMETRY, in_order
+from sfa_localization.localizer import Localizer
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.run import Trajectory
+
+pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+from geometry_msgs.msg import PoseStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
+
+from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
+from sfa_localization.nodes.conversions import (  # noqa: E402
+    to_image,
+    to_odometry,
+)
+from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
+from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
+
+SEEN = 'sfa/pose_with_covariance'
+# Settings of sfa_node and ekf_node that are not the defaults, and matter here.
+WATCH = {'frozen_pictures': 3, 'novelty_unusable': 2.5}
+FILTER = {'measurement_factor': 2.0}
+
+
+class Recording:
+    """A drive with dark, covered, frozen, foreign and misshapen pictures, and an odometry gap."""
+
+    def __init__(self):
+        drive = Drive(
+            seconds=24, rate_hz=20, every=4, start=(5.0, 60.0, 0.3),
+            v_std=0.02, omega_std=0.01, position_std=0.1, yaw_std=0.03,
+        )  # fmt: skip
+        t = np.arange(len(drive.stamps_ns)) / 20
+        self.drive, self.kept = drive, np.flatnonzero((t < 16) | (t > 18.5))
+        # Between two odometry messages, as pictures are.
+        self.pictures_ns = drive.stamps_ns[drive.pictures] + 7_000_000
+        self.pictures = [self._picture(k) for k in range(len(drive.pictures))]
+
+    def _picture(self, k):
+        if k < 2 or k in (60, 61):
+            return panorama(self.drive.seen[k], k, novelty=9.0)
+        if k in (20, 21):
+            return np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
+        if k == 30:
+            return np.full((SIZE.height, SIZE.width, 3), 90, np.uint8)
+        if 40 <= k < 50:
+            return panorama(self.drive.seen[40], 40)
+        if k == 55:
+            return np.zeros((SIZE.height, SIZE.width + 2, 3), np.uint8)
+        return panorama(self.drive.seen[k], k, novelty=2.0 if 63 <= k < 66 else 0.5)
+
+    def events(self):
+        yield from in_order(self.drive.stamps_ns[self.kept], self.pictures_ns)
+
+    def write(self, path):
+        drive = self.drive
+        with BagWriter(path) as bag:
+            for stamp_ns, kind, index in self.events():
+                if kind == ODOMETRY:
+                    i = self.kept[index]
+                    told = drive.poses[i], drive.read[i], drive.variances()
+                    bag.odometry('/odom', stamp_ns, *told)
+                    bag.pose('/truth', stamp_ns, drive.poses[i])
+                else:
+                    bag.image('/panorama', stamp_ns, self.pictures[index], 'omnicam')
+        return path
+
+    def message(self, stamp_ns, kind, index):
+        """Return topic and message of an event, as a robot sends it."""
+        if kind != ODOMETRY:
+            return 'panorama', to_image(self.pictures[index], stamp_ns, 'omnicam')
+        drive, i = self.drive, self.kept[index]
+        spread, frames = np.diag(drive.variances()), ('odom', 'base_link')
+        return 'odom', to_odometry(
+            drive.poses[i], np.eye(3), drive.read[i], spread, stamp_ns, frames
+        )
+
+
+def trajectory(messages):
+    """Return the poses of Odometry or PoseStamped messages."""
+    poses = [m.pose.pose if isinstance(m, Odometry) else m.pose for m in messages]
+    return Trajectory(
+        np.array([read_stamp(m.header.stamp) for m in messages], np.int64),
+        np.array([[p.position.x, p.position.y, read_yaw(p.orientation)] for p in poses]),
+    )
+
+
+def live(recording, monkeypatch):
+    """Return what sfa_node and ekf_node publish: poses of pictures, and of the filter."""
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    bench = Bench(69)
+    try:
+        sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
+        ekf = bench.run(EkfNode, **FILTER)
+        seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
+        sent = 0
+        for event in recording.events():
+            topic, message = recording.message(*event)
+            before = ekf.monitor(SEEN).received, ekf.monitor('odom').received
+            bench.publish(topic, message)
+            sent += topic == 'panorama'
+            misshapen = topic == 'panorama' and message.width != SIZE.width
+            done = (
+                before[0] + (topic == 'panorama' and not misshapen),
+                before[1] + (topic == 'odom'),
+            )
+            assert until(
+                lambda d=done, n=sent: (
+                    sfa.monitor('panorama').received == n
+                    and (ekf.monitor(SEEN).received, ekf.monitor('odom').received) == d
+                )
+            )
+        last = int(recording.drive.stamps_ns[-1])
+        assert until(lambda: fused and read_stamp(fused[-1].header.stamp) == last)
+        return trajectory(seen), trajectory(fused)
+    finally:
+        bench.close()
+
+
+def same(one, other):
+    assert np.array_equal(one.stamps_ns, other.stamps_ns)
+    assert np.allclose(one.poses[:, :2], other.poses[:, :2], rtol=0, atol=1e-9)
+    assert np.allclose(np.exp(1j * one.poses[:, 2]), np.exp(1j * other.poses[:, 2]), atol=1e-9)
+
+
+def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeypatch):
+    recording = Recording()
+    seen, fused = live(recording, monkeypatch)
+    config, watch = FilterConfig(**FILTER), WatchConfig(**WATCH)
+
+    # Without ROS, message by message.
+    localizer = Localizer(PictureReader(), config, watch)
+    stamps, poses = [], []
+    for stamp_ns, kind, index in recording.events():
+        if kind == ODOMETRY:
+            i = recording.kept[index]
+            state = localizer.add_odometry(
+                stamp_ns, *recording.drive.read[i], recording.drive.variances()
+            )
+            if state is not None:
+                stamps.append(stamp_ns)
+                poses.append(state.pose)
+        elif recording.pictures[index].shape[1] == SIZE.width:
+            localizer.add_panorama(stamp_ns, recording.pictures[index])
+    same(fused, Trajectory(np.array(stamps), np.array(poses)))
+
+    # From the bag, in batches; the map is laid on the truth.
+    judged = evaluate(
+        PictureReader(), recording.write(tmp_path / 'drive'), config=config, watch=watch
+    )
+    to_truth = fit_transform(judged.truth, seen)
+    same(moved(seen, to_truth), judged.estimates['sfa'])
+    same(moved(fused, to_truth), judged.estimates['ekf'])
+
+    # The pictures were what they are meant to be, and the filter knew where it was.
+    assert judged.counts['observations']['skipped'] == {
+        'picture is unlike any of training': 4,
+        'picture is dark': 2,
+        'picture is covered: it shows nothing': 1,
+        'camera is frozen: it repeats its picture': 8,
+    }
+    assert judged.scores['ekf']['p95'] < 0.3
