@@ -24,7 +24,6 @@ from sfa_localization import mdp_engine
 from sfa_localization import metric as metric_learning
 from sfa_localization.agreement import Agreement, disagreement
 from sfa_localization.bag import load_run
-from sfa_localization.camera_clock import CameraClock, camera_clock
 from sfa_localization.config import (
     BagConfig,
     CameraConfig,
@@ -62,6 +61,7 @@ from sfa_localization.run import BATCH, Run
 from sfa_localization.segments import Segments, assignment, cut, join
 from sfa_localization.sfa import Solution
 from sfa_localization.threads import one_core
+from sfa_localization.visual_turns import CameraClock, camera_clock
 
 logger = logging.getLogger(__name__)
 

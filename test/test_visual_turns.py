@@ -10,8 +10,8 @@ import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
 from sfa_localization.bag import load_run
-from sfa_localization.camera_clock import camera_clock, visual_turns
 from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.visual_turns import camera_clock, visual_turns
 
 BAGS = Path(__file__).parents[1] / 'bags'
 SIZE = (20, 120)
