@@ -707,9 +707,6 @@ class FilterConfig(Settings):
     decorrelation: float = setting(
         1.0, 'way over which the picture error changes', unit='m', low=1e-3, high=1e3
     )
-    novelty_limit: float = setting(
-        3.0, 'pictures more unlike training than this are not used', low=1.0, high=1e6, live=True
-    )
     gate_probability: float = setting(
         0.999,
         'share of right measurements that the gate lets in',

@@ -81,7 +81,6 @@ class MeasurementEvent(NamedTuple):
     stamp_ns: int
     value: Array
     covariance: Array
-    novelty: float
     jacobian: Array
     white: Array
 
@@ -94,7 +93,6 @@ class Memory(NamedTuple):
 
     support: int = 0
     refused: int = 0
-    novel: int = 0
     excess: float = 0.0
     accepted_ns: int | None = None
     accepted_m: float = 0.0
@@ -172,16 +170,12 @@ class Fusion:
         self._root_share = math.sqrt(config.correlated_share)
         self._thresholds = {n: float(chi2.ppf(config.gate_probability, n)) for n in (2, 3)}
 
-    def measurement(
-        self, stamp_ns: int, value: Array, covariance: Array, novelty: float
-    ) -> MeasurementEvent:
+    def measurement(self, stamp_ns: int, value: Array, covariance: Array) -> MeasurementEvent:
         """Split the noise into what neighbouring pictures share and what is each one's own."""
         size, share = len(value), self.config.correlated_share
         jacobian = _OBSERVE[:size].copy()
         jacobian[:, ERROR : ERROR + size] = lower_root(covariance, self._root_share)
-        return MeasurementEvent(
-            stamp_ns, value, covariance, novelty, jacobian, (1 - share) * covariance
-        )
+        return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
 
     def blank(self, stamp_ns: int) -> Belief:
         """What is believed before anything is known."""
@@ -295,12 +289,6 @@ class Fusion:
         return covariance
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
-        if event.novelty > self.config.novelty_limit:
-            memory = belief.memory._replace(
-                novel=belief.memory.novel + 1,
-                update=_refused(event, 'unlike any picture of training'),
-            )
-            return belief._replace(memory=memory)
         covariance = event.covariance
         blind = event.value.size == 2 and belief.covariance[YAW, YAW] > self.config.lost_yaw_std**2
         if not belief.located or blind:
@@ -311,10 +299,9 @@ class Fusion:
         """Start from one picture with heading, or from the way that several lie along."""
         evidence = self._remembered(belief, event, covariance, False)
         found = None
-        if event.novelty > 1.0:
-            found = None
-        elif event.value.size == 3:
-            found = event.value, covariance
+        if event.value.size == 3:
+            if self._sure(covariance):
+                found = event.value, covariance
         else:
             fit = relocate(evidence, self.config)
             if fit is not None and self._sure_of_heading(fit) and self._fair(fit, evidence):
@@ -322,7 +309,7 @@ class Fusion:
         if found is None and belief.located:
             return self._followed(belief, event, covariance, evidence)
         if found is None:
-            reason = 'heading unknown yet' if event.value.size == 2 else 'too novel to start from'
+            reason = 'heading unknown yet' if event.value.size == 2 else 'too unsure to start from'
             memory = belief.memory._replace(evidence=evidence, update=_refused(event, reason))
             return belief._replace(memory=memory)
         return self._restarted(belief, event, found, 'started')
@@ -355,6 +342,12 @@ class Fusion:
         posterior[:2, :2] = rest @ own @ rest.T + gain @ covariance[:2, :2] @ gain.T
         memory = memory._replace(accepted_ns=event.stamp_ns, accepted_m=belief.travelled_m)
         return belief._replace(mean=mean, covariance=symmetric(posterior), memory=memory)
+
+    def _sure(self, covariance: Array) -> bool:
+        """Whether one picture's pose is a place to start from: not one that would be LOST."""
+        config = self.config
+        x, y, yaw = covariance.diagonal().tolist()
+        return bool(max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2)
 
     def _sure_of_heading(self, fit: Fit) -> bool:
         return bool(fit.covariance[2, 2] < self.config.start_yaw_std**2) and fit.pictures >= 3
@@ -450,7 +443,7 @@ class Fusion:
         """Refuse a picture, unless those refused outweigh the estimate; then start anew there."""
         evidence = self._remembered(belief, event, covariance, False)
         fit = relocate(evidence, self.config) if len(evidence) > 1 else None
-        if fit is not None and event.novelty <= 1.0 and self._overruled(belief, fit):
+        if fit is not None and self._overruled(belief, fit):
             return self._restarted(belief, event, (fit.pose, fit.covariance), 're-initialised')
         outside = update.d2 > update.threshold
         refused = belief.memory.refused + int(outside)

@@ -49,7 +49,7 @@ class Localizer:
     def add_estimate(self, stamp_ns: int, estimate: Estimate) -> Update:
         """Fuse what a picture told."""
         pose = np.append(estimate.position, estimate.yaw)
-        return self.filter.add_measurement(stamp_ns, pose, estimate.covariance, estimate.novelty)
+        return self.filter.add_measurement(stamp_ns, pose, estimate.covariance)
 
     @property
     def state(self) -> State | None:

@@ -143,25 +143,20 @@ class PoseFilter:
         self._history.add((stamp_ns, _ODOMETRY), OdometryEvent(stamp_ns, twist))
         return ''
 
-    def add_measurement(
-        self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike, novelty: float = 0.0
-    ) -> Update:
+    def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
         """Fuse a position (2,) or pose (3,) seen at a stamp, with its covariance.
 
         A heading that is NaN or less sure than `yaw_std_limit` is left out. Zero covariance means
-        unknown. `novelty` above 1 says how unlike training the picture is: the covariance should
-        have grown with it already, and the filter does not start from such a picture.
+        unknown. The filter does not start from a pose so unsure that it would be lost at once.
         """
         stamp_ns = int(stamp_ns)
         try:
             fused, spread = read_measurement(value, covariance, self.config)
-            if math.isnan(novelty):
-                raise DataError('novelty is not a number')
             self._place(stamp_ns, _MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        event = self._fusion.measurement(stamp_ns, fused, spread, float(novelty))
+        event = self._fusion.measurement(stamp_ns, fused, spread)
         update = self._history.add((stamp_ns, _MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
@@ -283,8 +278,6 @@ def _degraded(belief: Belief, state: State, config: FilterConfig) -> list[str]:
         found.append(f'position known to {state.position_std:.1f} m only')
     if memory.refused >= DISTRUST_AFTER:
         found.append(f'{memory.refused} pictures in a row did not fit')
-    if memory.novel >= DISTRUST_AFTER:
-        found.append(f'{memory.novel} pictures in a row are unlike any of training')
     return [*found, *_silences(belief, config)]
 
 

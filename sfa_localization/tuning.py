@@ -201,9 +201,7 @@ def _fuse(fused: PoseFilter, tour: Tour) -> Iterator[Update]:
             v, omega = odometry.twists[i]
             fused.add_odometry(stamp_ns, v, omega, odometry.variances[i])
         else:
-            yield fused.add_measurement(
-                stamp_ns, sight.poses[i], sight.covariances[i], sight.novelty[i]
-            )
+            yield fused.add_measurement(stamp_ns, sight.poses[i], sight.covariances[i])
 
 
 def _with_logs(config: FilterConfig, logs: NDArray[np.float64]) -> FilterConfig:
