@@ -19,7 +19,7 @@ from sfa_localization import motion
 from sfa_localization.config import FilterConfig
 from sfa_localization.gate import Evidence, Fit, consistent, relocate, remember
 from sfa_localization.geometry import Array
-from sfa_localization.motion import ERROR, SCALE, SIZE, YAW, State, Step, V
+from sfa_localization.motion import ERROR, SCALE, SIZE, YAW, State, Step, V, X, Y
 from sfa_localization.readings import lower_root, symmetric
 
 DISTRUST_AFTER = 3
@@ -35,6 +35,9 @@ _PLAIN_TURN = 0.5
 _BRIDGED_S = 10.0
 _NO_DOUBT = (0.0, 0.0, 0.0)
 _OBSERVE = np.eye(3, SIZE)
+_PLACE = (X, Y, ERROR, ERROR + 1, ERROR + 2)
+_REST = tuple(sorted({*range(SIZE)} - {*_PLACE}))
+"""A position alone tells of these, and not of those, while the heading is lost."""
 
 
 class Update(NamedTuple):
@@ -307,7 +310,7 @@ class Fusion:
             if fit is not None and self._sure_of_heading(fit) and self._fair(fit, evidence):
                 found = fit.pose, fit.covariance
         if found is None and belief.located:
-            return self._followed(belief, event, covariance, evidence)
+            return self._followed(belief, event, evidence)
         if found is None:
             reason = 'heading unknown yet' if event.value.size == 2 else 'too unsure to start from'
             memory = belief.memory._replace(evidence=evidence, update=_refused(event, reason))
@@ -315,33 +318,26 @@ class Fusion:
         return self._restarted(belief, event, found, 'started')
 
     def _followed(
-        self,
-        belief: Belief,
-        event: MeasurementEvent,
-        covariance: Array,
-        evidence: tuple[Evidence, ...],
+        self, belief: Belief, event: MeasurementEvent, evidence: tuple[Evidence, ...]
     ) -> Belief:
         """The heading is lost: follow positions, and draw no conclusion from them on the heading.
 
         What the heading has to do with the position is linear only for small errors.
         """
-        own, miss = belief.covariance[:2, :2], event.value[:2] - belief.mean[:2]
-        total = own + covariance[:2, :2]
-        d2, threshold = float(miss @ np.linalg.solve(total, miss)), self._thresholds[2]
+        apart = belief.covariance.copy()
+        apart[np.ix_(_PLACE, _REST)] = apart[np.ix_(_REST, _PLACE)] = 0.0
+        mean, posterior, d2 = self._kalman.correct(
+            belief.mean, apart, event.value, event.jacobian, event.white
+        )
+        threshold = self._thresholds[2]
         near = d2 <= threshold
         reason = 'position only: heading unknown' if near else 'outside the gate'
         update = Update(event.stamp_ns, near, d2, threshold, reason)
         memory = belief.memory._replace(evidence=evidence, update=update)
         if not near:
             return belief._replace(memory=memory)
-        gain = own @ np.linalg.inv(total)
-        mean, posterior = belief.mean.copy(), belief.covariance.copy()
-        mean[:2] += gain @ miss
-        posterior[:2, :], posterior[:, :2] = 0.0, 0.0
-        rest = np.eye(2) - gain
-        posterior[:2, :2] = rest @ own @ rest.T + gain @ covariance[:2, :2] @ gain.T
         memory = memory._replace(accepted_ns=event.stamp_ns, accepted_m=belief.travelled_m)
-        return belief._replace(mean=mean, covariance=symmetric(posterior), memory=memory)
+        return belief._replace(mean=mean, covariance=posterior, memory=memory)
 
     def _sure(self, covariance: Array) -> bool:
         """Whether one picture's pose is a place to start from: not one that would be LOST."""

@@ -563,6 +563,22 @@ def test_after_a_long_gap_positions_are_followed_and_the_heading_is_found_again(
     assert fused.status.level is Level.LOCALISED
 
 
+def test_a_standing_robot_with_lost_heading_does_not_average_its_pictures_away():
+    fused = PoseFilter()
+    fused.initialise(START_NS, (0.0, 0.0, 0.0), np.diag([1.0, 1.0, 4.0]))
+    rng = np.random.default_rng(1)
+    for k in range(1, 2000):
+        stamp = START_NS + k * SECOND // 10
+        fused.add_odometry(stamp, 0.0, 0.0)
+        seen = [0.2, -0.1] + 0.05 * rng.standard_normal(2)
+        update = fused.add_measurement(stamp + 1, seen, 0.09 * np.eye(2))
+        assert update.reason == 'position only: heading unknown'
+    # Pictures of one place err alike by 0.7 of their variance: sqrt(0.7) * 0.3 m remains.
+    assert 0.2 < fused.state.position_std < 0.3
+    assert fused.state.pose[:2] == pytest.approx([0.2, -0.1], abs=0.05)
+    assert np.linalg.eigvalsh(fused.state.covariance)[0] > 0
+
+
 @pytest.mark.parametrize('gap', [0.3, 1.5])
 def test_dropouts_of_the_odometry_are_bridged(gap):
     drive = Drive(seconds=30, **NOISY)
