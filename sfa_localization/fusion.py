@@ -181,7 +181,10 @@ class _Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
 
 
 class Fusion:
-    """The rules by which a belief follows from the one before and an event."""
+    """The rules by which a belief follows from the one before and an event.
+
+    `config` must say how picture errors correlate: see correlation.resolved.
+    """
 
     def __init__(self, config: FilterConfig) -> None:
         self.config = config

@@ -32,7 +32,7 @@ class Localizer:
 
     def __init__(self, model: PlaceModel, config: FilterConfig | None = None) -> None:
         self.model = model
-        self.filter = PoseFilter(config)
+        self.filter = PoseFilter(config, model.error_correlation)
 
     def add_odometry(
         self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from sfa_localization.camera_clock import DELAY_LIMIT
 from sfa_localization.config import FilterConfig
+from sfa_localization.correlation import ErrorCorrelation, resolved
 from sfa_localization.errors import DataError
 from sfa_localization.fusion import (
     DISTRUST_AFTER,
@@ -65,13 +66,17 @@ class Status:
 class PoseFilter:
     """Fuses odometry with positions (2,) or poses (3,) in the map; see FilterConfig.
 
+    `correlation` is what is known of the pictures' errors where the settings leave it open.
     `counts` tells what became of all that came in. No message raises; what is unusable is counted.
     """
 
-    def __init__(self, config: FilterConfig | None = None) -> None:
+    def __init__(
+        self, config: FilterConfig | None = None, correlation: ErrorCorrelation | None = None
+    ) -> None:
         self.config = config or FilterConfig()
         self.counts: Counter[str] = Counter()
-        self._fusion = Fusion(self.config)
+        self._correlation = correlation
+        self._fusion = Fusion(resolved(self.config, correlation))
         self._history = self._fresh(self._fusion.blank(0))
         self._forget()
 
@@ -83,8 +88,14 @@ class PoseFilter:
     def reconfigure(self, config: FilterConfig) -> None:
         """Go on with other parameters, from what is believed now."""
         belief, newest_ns = self._history.newest, self._history.newest_ns
-        self.config, self._fusion = config, Fusion(config)
+        self.config, self._fusion = config, Fusion(resolved(config, self._correlation))
         self._history = self._fresh(belief, newest_ns)
+
+    def correlate(self, correlation: ErrorCorrelation) -> None:
+        """Go on with what a model knows of how its errors hang together."""
+        if correlation != self._correlation:
+            self._correlation = correlation
+            self.reconfigure(self.config)
 
     def _forget(self) -> None:
         self._history = self._fresh(self._fusion.blank(0))

@@ -27,7 +27,8 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
-from sfa_localization.errors import CameraError, LocalizationError
+from sfa_localization.correlation import ErrorCorrelation
+from sfa_localization.errors import CameraError, DataError, LocalizationError
 from sfa_localization.geometry import Array
 from sfa_localization.pictures import decode_compressed, decode_image, encode_jpeg
 from sfa_localization.run import Image
@@ -37,6 +38,7 @@ UNKNOWN_VARIANCE = 1e6
 _FIXED_VARIANCE = 1e-6
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 _NANOSECONDS = 1_000_000_000
+_CORRELATION = 'share, distance_m'
 
 
 class MessageError(LocalizationError):
@@ -213,6 +215,21 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
     message = Float64MultiArray(data=array.array('d', numbers))
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message
+
+
+def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:
+    """How pictures' errors hang together: the share that is common, and over which way."""
+    return to_array([correlation.share, correlation.distance_m], _CORRELATION)
+
+
+def read_error_correlation(message: Float64MultiArray) -> ErrorCorrelation:
+    """Raises MessageError for numbers that cannot be."""
+    if len(message.data) != 2:
+        raise MessageError(f'{len(message.data)} numbers where {_CORRELATION} are expected')
+    try:
+        return ErrorCorrelation(*message.data)
+    except DataError as error:
+        raise MessageError(str(error)) from None
 
 
 def to_covariance(covariance: Array) -> NDArray[np.float64]:

@@ -25,11 +25,13 @@ from sfa_localization.nodes.conversions import (
     MessageError,
     read_image,
     to_array,
+    to_error_correlation,
     to_pose,
     to_pose_with_covariance,
 )
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
+    latched_qos,
     run_node,
     sensor_qos,
 )
@@ -60,11 +62,17 @@ class SfaNode(LocalizationNode):
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+        self._correlation = self.publisher(
+            Float64MultiArray, 'sfa/error_correlation', latched_qos()
+        )
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
         self._topic = 'panorama/compressed' if self._config.compressed else 'panorama'
         # Depth 1: when pictures come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
+
+    def started(self) -> None:
+        self._tell_correlation()
 
     def teardown(self) -> None:
         self._model = None
@@ -101,12 +109,19 @@ class SfaNode(LocalizationNode):
         self._config = self._watch.config = settings
         if self._loaded is not None and self._loaded[0] == settings.model:
             self._model = self._loaded[1]
+            self._tell_correlation()
         self._loaded = None
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._model = self._load(self._config.model)
+        self._tell_correlation()
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
+
+    def _tell_correlation(self) -> None:
+        """The filter weighs pictures by what the model knows of its own errors."""
+        if self._model is not None:
+            self._correlation.publish(to_error_correlation(self._model.error_correlation))
 
     # Pictures.
 
