@@ -27,6 +27,7 @@ from sfa_localization.bag import load_run
 from sfa_localization.config import (
     BagConfig,
     CameraConfig,
+    FilterConfig,
     HeadingConfig,
     MetricConfig,
     NetworkConfig,
@@ -34,6 +35,7 @@ from sfa_localization.config import (
     SegmentConfig,
     TopicNames,
 )
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.errors import DataError, ModelError
 from sfa_localization.geometry import Array
 from sfa_localization.heading import HeadingFit, fit_compass
@@ -295,6 +297,7 @@ def learn_place(
         result.left_out_variance,
         axes=2,
     )
+    correlation = _error_correlation(segments, result)
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
     # Of each run, s; None where the drive does not show it.
     delays = [c.delay_s if c.known else None for c in clocks]
@@ -314,6 +317,7 @@ def learn_place(
             ),
             'camera_delay_s': delays,
         },
+        correlation,
     )
     return Trained(model, tuple(runs), views.features, segments, result, heading, labelled)
 
@@ -436,6 +440,20 @@ def _learn_heading(
         logger.warning('no heading is learnt: %s', error)
         return None, labelled[:0]
     return fit, known
+
+
+def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrelation:
+    """How the errors of pictures that the map had not seen hang together along the drive."""
+    turn_radius = FilterConfig().turn_radius
+    ways = [
+        np.cumsum(np.abs(np.diff(s.path, prepend=s.path[0])))
+        + turn_radius * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
+        for s in segments
+    ]
+    owner = np.repeat(np.arange(len(ways)), [len(way) for way in ways])
+    return ErrorCorrelation.fit(
+        result.left_out, result.left_out_variance, np.concatenate(ways), owner
+    )
 
 
 def _yaw_agreement(heading: HeadingFit | None, spread: Array) -> Agreement | None:

@@ -117,13 +117,22 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return made
 
     def subscribe(
-        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile | None = None
+        self,
+        kind: Any,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile | None = None,
+        *,
+        while_inactive: bool = False,
     ) -> None:
-        """A subscription whose refused messages are counted under `topic` and end nothing."""
+        """A subscription whose refused messages are counted under `topic` and end nothing.
+
+        An inactive node drops messages; not `while_inactive` those that come but once, latched.
+        """
         made = self.create_subscription(
             kind,
             topic,
-            self._guarded(topic, callback),
+            self._guarded(topic, callback, while_inactive),
             qos or sensor_qos(),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
@@ -152,11 +161,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         if count == 1 or count % 1000 == 0:
             self.get_logger().warning(f'{topic}: {reason} ({count} so far)')
 
-    def _guarded(self, topic: str, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _guarded(
+        self, topic: str, callback: Callable[[Any], None], while_inactive: bool = False
+    ) -> Callable[[Any], None]:
         monitor = self.monitor(topic)
 
         def receive(message: Any) -> None:
-            if not self.active:
+            if not (self.active or while_inactive):
                 return
             received_s = monitor.receive()
             try:
