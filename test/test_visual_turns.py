@@ -10,8 +10,9 @@ import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
 from sfa_localization.bag import load_run
+from sfa_localization.geometry import wrap_angle
 from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
-from sfa_localization.visual_turns import camera_clock, visual_turns
+from sfa_localization.visual_turns import camera_clock, headings
 
 BAGS = Path(__file__).parents[1] / 'bags'
 SIZE = (20, 120)
@@ -34,7 +35,7 @@ def late(run, seconds):
 def test_the_columns_shift_as_the_robot_turns(clockwise):
     run = run_of(wander(60, 1, hz=20.0), every=1, clockwise=clockwise)
     turned = np.diff(np.unwrap(run.odometry.poses[:, 2]))
-    seen = visual_turns(run.panoramas) * (1 if clockwise else -1)
+    seen = wrap_angle(np.diff(list(headings(run.panoramas, clockwise))))
     assert np.median(np.abs(seen - turned)) < 0.02
     assert np.corrcoef(seen, turned)[0, 1] > 0.9
 
