@@ -126,7 +126,12 @@ class _Loader:
         self._bag = bag
         self._image_topic = bag.find('image', topics.image)
         self._streams = {'odometry': bag.odometry_stream(topics.odometry)}
-        if topics.imu or any(topic.kind == messages.IMU for topic in bag.topics.values()):
+        found = [topic for topic in bag.topics.values() if topic.kind == messages.IMU]
+        if found and not topics.imu and not any(topic.count for topic in found):
+            names = ', '.join(topic.name for topic in found)
+            logger.warning('%s: no message on %s: going on without gyroscope', bag.path, names)
+            found = []
+        if topics.imu or found:
             imu = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
             imu.required = bool(topics.imu)
             self._streams['imu'] = imu

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sfa_localization.geometry import Array, compose, invert, relative
-from sfa_localization.run import Odometry, Stamps, Trajectory, YawRate, integrate
+from sfa_localization.run import Odometry, Stamps, Trajectory, YawRate, differences, integrate
 
 Values = list[tuple[int, Any]]
 """Stamps in ns, each with what its message tells."""
@@ -39,22 +39,11 @@ def to_odometry(values: Values, jump_m: float) -> tuple[Odometry, int]:
     stamps = _stamps(values)
     poses = np.array([pose for _, (pose, _) in values], float).reshape(-1, 3)
     if not values or values[0][1][1] is None:
-        twists = _differences(stamps, poses)
+        twists = differences(stamps, poses)
         return Odometry(stamps, poses, twists, np.zeros_like(twists)), 0
     motion = np.array([twist for _, (_, twist) in values], float).reshape(-1, 4)
     poses, resets = _rejoined(stamps, poses, motion[:, :2], jump_m)
     return Odometry(stamps, poses, motion[:, :2], motion[:, 2:]), resets
-
-
-def _differences(stamps: Stamps, poses: Array) -> Array:
-    """Twists (N, 2) that lead from each pose to the next; the last is repeated."""
-    if len(poses) < 2:
-        return np.zeros((len(poses), 2))
-    step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps) * 1e-9
-    arc = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / 2 / np.pi)
-    bearing = np.arctan2(step[:, 1], step[:, 0]) - step[:, 2] / 2
-    twists = np.stack([arc * np.sign(np.cos(bearing)), step[:, 2]], -1) / seconds[:, None]
-    return np.concatenate([twists, twists[-1:]])
 
 
 def _rejoined(stamps: Stamps, poses: Array, twists: Array, jump_m: float) -> tuple[Array, int]:

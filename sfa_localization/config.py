@@ -470,6 +470,12 @@ class SimulationConfig(Settings):
     odometry_rate: float = setting(
         50.0, 'odometry, gyroscope, truth', unit='Hz', low=5.0, high=500.0
     )
+    odometry_frame: str = setting(
+        'random',
+        'where the odometry frame lies: anywhere, as of a robot that was switched on earlier, or '
+        'at the start of the recording',
+        choices=('random', 'start'),
+    )
     test_drift: float = setting(
         0.31,
         "mean odometry error of a test drive, the paper's robot's; 0: as the errors are drawn",
@@ -594,6 +600,13 @@ class FilterConfig(Settings):
     scale_walk: float = setting(
         1e-3, 'random walk of the scale', unit='1/sqrt(m)', low=0.0, high=1.0, live=True
     )
+    camera_delay_std: float = setting(
+        0.1,
+        "deviation of the camera clock's delay before any is learnt; 0: its stamps are right",
+        unit='s',
+        low=0.0,
+        high=0.5,
+    )
     odometry_factor: float = setting(
         1.0, "factor on the odometry's own variances", low=1e-3, high=1e4, live=True
     )
@@ -704,17 +717,19 @@ class FilterConfig(Settings):
         1.0, 'a heading less sure than this is not used', unit='rad', low=0.01, high=3.2, live=True
     )
     correlated_share: float = setting(
-        0.7,
-        'share of the picture error that neighbouring places have in common (variance)',
-        low=0.0,
+        -1.0,
+        'share of the picture error that neighbouring places have in common (variance); '
+        '-1: as learnt with the model, else 0.7',
+        low=-1.0,
         high=0.99,
         live=True,
     )
     decorrelation: float = setting(
-        1.0, 'way over which the picture error changes', unit='m', low=1e-3, high=1e3
-    )
-    novelty_limit: float = setting(
-        3.0, 'pictures more unlike training than this are not used', low=1.0, high=1e6, live=True
+        0.0,
+        'way over which the picture error changes; 0: as learnt with the model, else 1',
+        unit='m',
+        low=0.0,
+        high=1e3,
     )
     gate_probability: float = setting(
         0.999,

@@ -36,7 +36,7 @@ class Localizer:
         watch: WatchConfig | None = None,
     ) -> None:
         self.observer = Observer(model, watch)
-        self.filter = PoseFilter(config)
+        self.filter = PoseFilter(config, model.error_correlation)
 
     def add_odometry(
         self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)

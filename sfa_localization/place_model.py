@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.agreement import Agreement, disagreement
 from sfa_localization.config import PanoramaConfig
-from sfa_localization.errors import ConfigError, ModelError
+from sfa_localization.correlation import ErrorCorrelation
+from sfa_localization.errors import ConfigError, DataError, ModelError
 from sfa_localization.fast_map import Predictor, fast_map
 from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array
@@ -30,7 +31,7 @@ from sfa_localization.run import Image
 from sfa_localization.threads import one_core
 
 FORMAT = 'sfa_localization place model'
-VERSION = 1
+VERSION = 2
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -56,6 +57,7 @@ class PlaceModel:
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `slow_features` and `places` are kept out of it.
+    `error_correlation` says how the errors of neighbouring pictures hang together.
     """
 
     network: Network
@@ -67,6 +69,7 @@ class PlaceModel:
     yaw_agreement: Agreement | None = None
     heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
+    error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -124,7 +127,7 @@ class PlaceModel:
         arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
         try:
             model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
-        except (KeyError, ValueError, TypeError, IndexError, ConfigError) as error:
+        except (KeyError, ValueError, TypeError, IndexError, ConfigError, DataError) as error:
             raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
         except ModelError as error:
             raise ModelError(f'{path}: {error}') from None
@@ -141,6 +144,7 @@ class PlaceModel:
             'panorama': dataclasses.asdict(self.panorama),
             'heading_layers': self.heading_layers,
             'quality': self.quality,
+            'error_correlation': dataclasses.asdict(self.error_correlation),
         }
 
     def _arrays(self) -> Arrays:
@@ -170,6 +174,7 @@ class PlaceModel:
             Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,
             tuple(header['heading_layers']),
             header['quality'],
+            ErrorCorrelation(**header['error_correlation']),
         )
 
 

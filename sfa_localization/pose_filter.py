@@ -18,7 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sfa_localization.camera_clock import DELAY_LIMIT
 from sfa_localization.config import FilterConfig
+from sfa_localization.correlation import ErrorCorrelation, resolved
 from sfa_localization.errors import DataError
 from sfa_localization.fusion import (
     DISTRUST_AFTER,
@@ -41,6 +43,7 @@ _BACKWARD = 5
 _AHEAD = 3
 _FAR_OUTSIDE = 4.0
 _MOVED_ON = 0.5
+_DELAY_WARNED = 0.95 * DELAY_LIMIT
 
 
 class Level(enum.Enum):
@@ -63,13 +66,17 @@ class Status:
 class PoseFilter:
     """Fuses odometry with positions (2,) or poses (3,) in the map; see FilterConfig.
 
+    `correlation` is what is known of the pictures' errors where the settings leave it open.
     `counts` tells what became of all that came in. No message raises; what is unusable is counted.
     """
 
-    def __init__(self, config: FilterConfig | None = None) -> None:
+    def __init__(
+        self, config: FilterConfig | None = None, correlation: ErrorCorrelation | None = None
+    ) -> None:
         self.config = config or FilterConfig()
         self.counts: Counter[str] = Counter()
-        self._fusion = Fusion(self.config)
+        self._correlation = correlation
+        self._fusion = Fusion(resolved(self.config, correlation))
         self._history = self._fresh(self._fusion.blank(0))
         self._forget()
 
@@ -81,8 +88,14 @@ class PoseFilter:
     def reconfigure(self, config: FilterConfig) -> None:
         """Go on with other parameters, from what is believed now."""
         belief, newest_ns = self._history.newest, self._history.newest_ns
-        self.config, self._fusion = config, Fusion(config)
+        self.config, self._fusion = config, Fusion(resolved(config, self._correlation))
         self._history = self._fresh(belief, newest_ns)
+
+    def correlate(self, correlation: ErrorCorrelation) -> None:
+        """Go on with what a model knows of how its errors hang together."""
+        if correlation != self._correlation:
+            self._correlation = correlation
+            self.reconfigure(self.config)
 
     def _forget(self) -> None:
         self._history = self._fresh(self._fusion.blank(0))
@@ -143,25 +156,20 @@ class PoseFilter:
         self._history.add((stamp_ns, _ODOMETRY), OdometryEvent(stamp_ns, twist))
         return ''
 
-    def add_measurement(
-        self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike, novelty: float = 0.0
-    ) -> Update:
+    def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
         """Fuse a position (2,) or pose (3,) seen at a stamp, with its covariance.
 
         A heading that is NaN or less sure than `yaw_std_limit` is left out. Zero covariance means
-        unknown. `novelty` above 1 says how unlike training the picture is: the covariance should
-        have grown with it already, and the filter does not start from such a picture.
+        unknown. The filter does not start from a pose so unsure that it would be lost at once.
         """
         stamp_ns = int(stamp_ns)
         try:
             fused, spread = read_measurement(value, covariance, self.config)
-            if math.isnan(novelty):
-                raise DataError('novelty is not a number')
             self._place(stamp_ns, _MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        event = self._fusion.measurement(stamp_ns, fused, spread, float(novelty))
+        event = self._fusion.measurement(stamp_ns, fused, spread)
         update = self._history.add((stamp_ns, _MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
@@ -283,8 +291,8 @@ def _degraded(belief: Belief, state: State, config: FilterConfig) -> list[str]:
         found.append(f'position known to {state.position_std:.1f} m only')
     if memory.refused >= DISTRUST_AFTER:
         found.append(f'{memory.refused} pictures in a row did not fit')
-    if memory.novel >= DISTRUST_AFTER:
-        found.append(f'{memory.novel} pictures in a row are unlike any of training')
+    if abs(state.camera_delay_s) > _DELAY_WARNED:
+        found.append(f"the camera's stamps are off by {DELAY_LIMIT} s, or more")
     return [*found, *_silences(belief, config)]
 
 

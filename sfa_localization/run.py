@@ -73,7 +73,11 @@ class Odometry:
     """Wheel odometry: poses in the odom frame and the twist that moved them.
 
     `stamps_ns` (N,), `poses` (N, 3), `twists` (N, 2) as v m/s, omega rad/s; `variances` (N, 2) of
-    v and omega as the messages tell them, 0 where they tell nothing.
+    v and omega as in the messages, 0 where unknown. The odometry frame may start anywhere.
+
+    Everywhere in this package a twist is the mean over the time since the message before: what
+    drivers of wheel encoders publish, whose pose has moved by just this twist. The first message's
+    twist moves nothing.
     """
 
     stamps_ns: Stamps
@@ -171,14 +175,26 @@ class Run:
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:
-    """Dead reckoning: poses (N, 3) from twists (N, 2) held from each stamp to the next."""
+    """Dead reckoning: poses (N, 3) from twists (N, 2), each held since the stamp before."""
     poses = np.zeros((len(stamps_ns), 3))
     poses[0] = 0.0 if start is None else start
     dt = np.diff(stamps_ns) * 1e-9
-    yaw = poses[0, 2] + np.concatenate([[0.0], np.cumsum(twists[:-1, 1] * dt)])
-    chord = twists[:-1, 0] * dt * np.sinc(twists[:-1, 1] * dt / 2 / np.pi)
-    middle = yaw[:-1] + twists[:-1, 1] * dt / 2
+    v, omega = twists[1:].T
+    yaw = poses[0, 2] + np.concatenate([[0.0], np.cumsum(omega * dt)])
+    chord = v * dt * np.sinc(omega * dt / 2 / np.pi)
+    middle = (yaw[:-1] + yaw[1:]) / 2
     poses[1:, 0] = poses[0, 0] + np.cumsum(chord * np.cos(middle))
     poses[1:, 1] = poses[0, 1] + np.cumsum(chord * np.sin(middle))
     poses[:, 2] = wrap_angle(yaw)
     return poses
+
+
+def differences(stamps_ns: Stamps, poses: Array) -> Array:
+    """Twists (N, 2) that lead to each pose (N, 3) from the one before; the first is repeated."""
+    if len(poses) < 2:
+        return np.zeros((len(poses), 2))
+    step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps_ns) * 1e-9
+    arc = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / 2 / np.pi)
+    bearing = np.arctan2(step[:, 1], step[:, 0]) - step[:, 2] / 2
+    twists = np.stack([arc * np.sign(np.cos(bearing)), step[:, 2]], -1) / seconds[:, None]
+    return np.concatenate([twists[:1], twists])

@@ -8,6 +8,7 @@ segment n lies at o_n + z_n q_nm for an unknown origin o_n and an unknown direct
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,11 +18,17 @@ from numpy.typing import NDArray
 from sfa_localization.config import SegmentConfig
 from sfa_localization.errors import DataError
 from sfa_localization.geometry import Array, relative, wrap_angle
-from sfa_localization.run import Count, Odometry, Stamps, Trajectory, YawRate
+from sfa_localization.run import Count, Odometry, Stamps, Trajectory, YawRate, differences
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
+logger = logging.getLogger(__name__)
+
+# A gyroscope is compared with wheels that have turned this much, rad^2 in steps of a second, and
+# must then agree within this factor: skidding wheels are off by two, degrees by 57.
+_TURNS_TO_JUDGE = 1.0
+_GYRO_RATIO = 5.0
 # Jumps of yaw between two odometry messages, beyond what the twist explains: a reset.
 _YAW_JUMP_RAD = 0.5
 # Yaw rates are averaged over this long before they are compared with a threshold.
@@ -202,8 +209,10 @@ def _track(odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None) 
     breaks = _breaks(stamps, poses, twists, config, skipped)
     variances = np.where(odometry.variances[kept, 1] > 0, odometry.variances[kept, 1], 0.0)
     yaw = np.unwrap(poses[:, 2])
-    if yaw_rate is not None and config.yaw_source != 'odometry' and len(yaw_rate.stamps_ns) > 1:
-        measured, variances = _gyro_yaw(stamps, yaw_rate)
+    gyro = None if config.yaw_source == 'odometry' else _usable_gyro(yaw_rate)
+    if gyro is not None:
+        turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, config, skipped)
+        measured = yaw[0] + np.concatenate([[0.0], np.cumsum(turns)])
         poses, yaw = _turned(poses, yaw, measured), measured
         twists = np.column_stack([twists[:, 0], np.gradient(yaw, _seconds(stamps))])
     elif config.yaw_source == 'gyro':
@@ -232,14 +241,8 @@ def _sound(odometry: Odometry) -> tuple[NDArray[np.bool_], dict[str, int]]:
 
 
 def _twists(stamps: Stamps, poses: Array, twists: Array) -> Array:
-    """The messages' twists, or the poses' own where no message tells any."""
-    if np.any(twists):
-        return twists
-    step = relative(poses[:-1], poses[1:])
-    dt = np.diff(stamps) * 1e-9
-    own = np.column_stack([np.copysign(np.hypot(step[:, 0], step[:, 1]), step[:, 0]), step[:, 2]])
-    own /= dt[:, None]
-    return np.vstack([own, own[-1:]])
+    """The messages' twists, or the poses' own where no message has any."""
+    return twists if np.any(twists) else differences(stamps, poses)
 
 
 def _breaks(
@@ -259,23 +262,88 @@ def _breaks(
     return np.asarray(gap | reset)
 
 
-def _gyro_yaw(stamps: Stamps, gyro: YawRate) -> tuple[Array, Array]:
-    """The gyroscope's integrated yaw (N,) at the stamps, and its rate's variance (N,)."""
-    sound = np.isfinite(gyro.omega)
-    sound[1:] &= np.diff(gyro.stamps_ns) > 0
-    seconds = (gyro.stamps_ns[sound] - stamps[0]) * 1e-9
-    omega = gyro.omega[sound]
-    yaw = np.concatenate([[0.0], np.cumsum((omega[1:] + omega[:-1]) / 2 * np.diff(seconds))])
-    at = _seconds(stamps)
-    variance = np.interp(at, seconds, np.maximum(np.nan_to_num(gyro.variance[sound]), 0.0))
-    return np.interp(at, seconds, yaw), variance
+def _usable_gyro(yaw_rate: YawRate | None) -> YawRate | None:
+    """The finite readings with increasing stamps; None where they are fewer than two."""
+    if yaw_rate is None:
+        return None
+    omega = np.where(np.isfinite(yaw_rate.omega), yaw_rate.omega, np.nan)
+    stamps = np.where(np.isfinite(omega), yaw_rate.stamps_ns, np.iinfo(np.int64).min)
+    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
+    kept = stamps > before
+    if kept.sum() < 2:
+        return None
+    return YawRate(stamps[kept], omega[kept], np.nan_to_num(yaw_rate.variance[kept]))
+
+
+def _gyro_turns(
+    stamps: Stamps,
+    yaw: Array,
+    variances: Array,
+    whole: NDArray[np.bool_],
+    gyro: YawRate,
+    config: SegmentConfig,
+    skipped: dict[str, int],
+) -> tuple[Array, Array]:
+    """Turns (N - 1,) between the odometry's stamps, and the variances (N,) of their rate.
+
+    The gyroscope's where it has readings all along a step, else the odometry's: less exact, but
+    a gyroscope that pauses or ends says nothing of the turns since. The odometry's are then given
+    the gyroscope's mean offset, so that one bias is left for the whole drive.
+    """
+    seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, _seconds(stamps)
+    areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
+    turns = np.diff(np.interp(at, seconds, np.concatenate([[0.0], np.cumsum(areas)])))
+    wheels, dt = np.diff(yaw), np.diff(at)
+    seen = _bridged(stamps, gyro.stamps_ns, round(config.odometry_gap_max * 1e9))
+    both = seen & whole
+    sign = _gyro_sign(turns[both], wheels[both], at[:-1][both], config)
+    if sign == 0.0 or not both.any():
+        _tally(skipped, 'without a usable gyroscope', whole)
+        return wheels, variances
+    _tally(skipped, 'in a gap of the gyroscope', whole & ~seen)
+    turns *= sign
+    offset = float((turns - wheels)[both].sum() / dt[both].sum())
+    own = np.interp(at, seconds, np.maximum(gyro.variance, 0.0))
+    own = np.where(np.append(seen, seen[-1]), own, variances)
+    return np.where(seen, turns, wheels + offset * dt), own
+
+
+def _bridged(stamps: Stamps, readings: Stamps, gap_ns: int) -> NDArray[np.bool_]:
+    """Mask (N - 1,) of the steps between stamps (N,) along which readings (M,) never pause."""
+    before = np.searchsorted(readings, stamps[:-1], 'right') - 1
+    after = np.searchsorted(readings, stamps[1:], 'left')
+    inside = (before >= 0) & (after < len(readings))
+    pauses = np.concatenate([[0], np.cumsum(np.diff(readings) > gap_ns)])
+    before, after = np.clip([before, after], 0, len(readings) - 1)
+    return np.asarray(inside & (pauses[before] == pauses[after]))
+
+
+def _gyro_sign(turns: Array, wheels: Array, at_s: Array, config: SegmentConfig) -> float:
+    """1, or -1 for a gyroscope mounted upside down, or 0 for one that measures something else.
+
+    Compared over whole seconds with the turns of the wheels, where these turn at all.
+    """
+    second = np.unique(np.floor(at_s), return_inverse=True)[1]
+    ours, theirs = (np.bincount(second, values) for values in (turns, wheels))
+    power = float(theirs @ theirs)
+    if config.yaw_source == 'gyro' or power < _TURNS_TO_JUDGE:
+        return 1.0
+    slope = float(ours @ theirs) / power
+    if not 1 / _GYRO_RATIO < abs(slope) < _GYRO_RATIO:
+        logger.warning(
+            'the gyroscope turns %.2g times as far as the odometry: it is not used; check its '
+            'axis and unit (rad/s), or trust it with yaw_source: gyro', slope
+        )  # fmt: skip
+        return 0.0
+    if slope < 0:
+        logger.warning('the gyroscope turns opposite to the odometry: taken as upside down')
+    return float(np.sign(slope))
 
 
 def _turned(poses: Array, yaw: Array, measured: Array) -> Array:
     """The same wheel steps driven with another yaw (N,)."""
     step = np.diff(poses[:, 0] + 1j * poses[:, 1])
     middle = (yaw[:-1] + yaw[1:]) / 2
-    measured = measured - measured[0] + yaw[0]
     step = step * np.exp(1j * ((measured[:-1] + measured[1:]) / 2 - middle))
     place = poses[0, 0] + 1j * poses[0, 1] + np.concatenate([[0.0], np.cumsum(step)])
     return np.column_stack([place.real, place.imag, wrap_angle(measured)])

@@ -42,7 +42,9 @@ _DRIFT_ERRORS = ('scale_error', 'slip', 'gyro_bias')
 _DRIFT_ITERATIONS = 3
 _DRIFT_FACTOR_MAX = 5.0
 _NO_DRIFT_M = 0.01
-ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM = range(4)
+ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM = range(5)
+# The robot may have been switched on this far from where the recording starts.
+_FRAME_REACH_M = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +78,30 @@ def drive(garden: Garden, config: SimulationConfig) -> Drive:
     if config.trajectory == 'test' and config.test_drift > 0:
         config = _drifting(truth, twists, config)
     measured, variances = _measured(twists, config, random_stream(config, SENSOR_STREAM))
-    odometry = Odometry(stamps, integrate(stamps, measured), measured, variances)
+    poses = integrate(stamps, measured, _odometry_start(config))
+    odometry = Odometry(stamps, poses, measured, variances)
     gyro = YawRate(stamps, measured[:, 1], variances[:, 1])
     return Drive(truth, odometry, gyro, _image_stamps(stamps, twists, pictures, config))
 
 
+def _odometry_start(config: SimulationConfig) -> Array:
+    """Pose (3,) of the robot in the odometry frame when the recording starts."""
+    if config.odometry_frame == 'start':
+        return np.zeros(3)
+    rng = random_stream(config, FRAME_STREAM)
+    return np.array([*rng.uniform(-_FRAME_REACH_M, _FRAME_REACH_M, 2), rng.uniform(-np.pi, np.pi)])
+
+
 def _motion(route: Route, config: SimulationConfig) -> tuple[Stamps, Array, Array]:
-    """Stamps (N,), true twists (N, 2) held until the next stamp, pictures wanted (N,)."""
+    """Stamps (N,), true twists (N, 2) held since the stamp before, pictures wanted (N,)."""
     dt_ns = round(1e9 / config.odometry_rate)
     rest = Motion(np.zeros((1, 2)), pictures=False)
     parts = [_increments(motion, config, dt_ns * 1e-9) for motion in [rest, *route, rest]]
-    increments = np.concatenate([*parts, np.zeros((1, 2))])
+    increments = np.concatenate([np.zeros((1, 2)), *parts])
     wanted = [
         part[:, 0] * 0 + motion.pictures for part, motion in zip(parts[1:-1], route, strict=True)
     ]
-    pictures = np.concatenate([parts[0][:, 0], *wanted, parts[-1][:, 0], [0]])
+    pictures = np.concatenate([[0], parts[0][:, 0], *wanted, parts[-1][:, 0]])
     stamps = START_NS + np.arange(len(increments), dtype=np.int64) * dt_ns
     return stamps, increments / (dt_ns * 1e-9), pictures
 
@@ -177,7 +188,7 @@ def _image_stamps(
     turning = (twists[:, 0] == 0) / np.radians(config.images_every_turn)
     rate = np.abs(twists[:, 0]) / config.images_every + np.abs(twists[:, 1]) * turning
     dt = np.diff(stamps) * 1e-9
-    progress = np.concatenate([[0], np.cumsum((rate * pictures)[:-1] * dt)])
+    progress = np.concatenate([[0], np.cumsum((rate * pictures)[1:] * dt)])
     marks = np.arange(0.5, progress[-1])
     after = np.searchsorted(progress, marks)
     part = (marks - progress[after - 1]) / (progress[after] - progress[after - 1])

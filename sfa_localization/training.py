@@ -27,6 +27,7 @@ from sfa_localization.bag import load_run
 from sfa_localization.config import (
     BagConfig,
     CameraConfig,
+    FilterConfig,
     HeadingConfig,
     MetricConfig,
     NetworkConfig,
@@ -34,6 +35,7 @@ from sfa_localization.config import (
     SegmentConfig,
     TopicNames,
 )
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.errors import DataError, ModelError
 from sfa_localization.geometry import Array
 from sfa_localization.heading import HeadingFit, fit_compass
@@ -61,6 +63,7 @@ from sfa_localization.run import BATCH, Run
 from sfa_localization.segments import Segments, assignment, cut, join
 from sfa_localization.sfa import Solution
 from sfa_localization.threads import one_core
+from sfa_localization.visual_turns import CameraClock, camera_clock
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +71,7 @@ CHECKPOINT = 'sfa_localization training checkpoint'
 CHECKPOINT_VERSION = 1
 # Pictures whose maps are kept for the compass and for novelty, however long the drives.
 _SAMPLES = 3000
+_DELAY_MAX_NS, _DELAY_SHOWN_S = 500_000_000, 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,8 +282,12 @@ def learn_place(
     layers = _heading_layers(network, recipe.heading)
     views = _view(network, runs, layers, progress)
     offsets = np.cumsum([0, *(len(run.panoramas) for run in runs)])
+    clocks = [_clock_of(run) for run in runs]
     segments = join(
-        [cut(r.odometry, r.panoramas.stamps_ns, recipe.segments, r.yaw_rate) for r in runs],
+        [
+            cut(r.odometry, r.panoramas.stamps_ns - c.delay_ns, recipe.segments, r.yaw_rate)
+            for r, c in zip(runs, clocks, strict=True)
+        ],
         [int(offset) for offset in offsets[:-1]],
     )
     result = metric_learning.learn(views.features, segments, recipe.metric)
@@ -289,7 +297,10 @@ def learn_place(
         result.left_out_variance,
         axes=2,
     )
+    correlation = _error_correlation(segments, result)
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
+    # Of each run, s; None where the drive does not show it.
+    delays = [c.delay_s if c.known else None for c in clocks]
     yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled])
     model = PlaceModel(
         network,
@@ -300,9 +311,27 @@ def learn_place(
         heading.compass if heading else None,
         yaw_agreement,
         layers if heading else (),
-        _quality(network, views, segments, result, agreement, heading, yaw_agreement, labelled),
+        {
+            **_quality(
+                network, views, segments, result, agreement, heading, yaw_agreement, labelled
+            ),
+            'camera_delay_s': delays,
+        },
+        correlation,
     )
     return Trained(model, tuple(runs), views.features, segments, result, heading, labelled)
+
+
+def _clock_of(run: Run) -> CameraClock:
+    """The camera's clock beside the odometry's; what no filter can make up for is warned of."""
+    clock = camera_clock(run)
+    if abs(clock.delay_ns) > _DELAY_MAX_NS:
+        logger.warning(
+            '%s: images are stamped %.2f s later than odometry: taken into account here, but the '
+            'filter makes up for half a second only; bring both to one clock', run.name,
+            clock.delay_s,
+        )  # fmt: skip
+    return clock
 
 
 def _panorama_of(runs: Sequence[Run], recipe: Recipe) -> PanoramaConfig:
@@ -413,6 +442,20 @@ def _learn_heading(
     return fit, known
 
 
+def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrelation:
+    """How the errors of pictures that the map had not seen hang together along the drive."""
+    turn_radius = FilterConfig().turn_radius
+    ways = [
+        np.cumsum(np.abs(np.diff(s.path, prepend=s.path[0])))
+        + turn_radius * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
+        for s in segments
+    ]
+    owner = np.repeat(np.arange(len(ways)), [len(way) for way in ways])
+    return ErrorCorrelation.fit(
+        result.left_out, result.left_out_variance, np.concatenate(ways), owner
+    )
+
+
 def _yaw_agreement(heading: HeadingFit | None, spread: Array) -> Agreement | None:
     if heading is None:
         return None
@@ -477,6 +520,9 @@ def summary(trained: Trained) -> str:
             f'heading, likewise: {quality["left_out_yaw_deg"]:.1f} degrees mean error, '
             f'{100 * quality["left_out_yaw_within_95"]:.0f} % inside the 95 % interval'
         )
+    for run, delay in zip(trained.runs, quality['camera_delay_s'], strict=True):
+        if delay is not None and abs(delay) > _DELAY_SHOWN_S:
+            lines.append(f'{run.name}: images are stamped {delay:.2f} s late: taken into account')
     for name, count in _counts(trained).items():
         lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
     return '\n'.join(lines)

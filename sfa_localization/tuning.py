@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from sfa_localization.config import FilterConfig, TuneConfig, WatchConfig
+from sfa_localization.correlation import resolved
 from sfa_localization.errors import DataError
 from sfa_localization.events import ODOMETRY, in_order
 from sfa_localization.geometry import Array, align
@@ -128,6 +129,7 @@ def tune_by_likelihood(
     Nelder-Mead over the logarithms of TUNED: the cost is not smooth where the gate decides.
     """
     _require_data(tours)
+    config = resolved(config)
     start = np.log([getattr(config, name) for name in TUNED])
 
     def cost(logs: NDArray[np.float64]) -> float:

@@ -92,7 +92,8 @@ def wander(count: int, seed: int, hz: float = 10.0) -> Odometry:
         omega += 0.1 * (rng.normal(0, 3) + 2.0 * pull - omega)
         twists[at, 1] = np.clip(omega, -2.0, 2.0)
         pose = integrate(np.array([0, int(1e9 / hz)]), twists[[at, at]], pose)[1]
-    return Odometry(stamps, np.array(poses), twists, np.tile([1e-4, 1e-4], (count, 1)))
+    held_since = np.vstack([twists[:1], twists[:-1]])
+    return Odometry(stamps, np.array(poses), held_since, np.tile([1e-4, 1e-4], (count, 1)))
 
 
 def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str = 'run') -> Run:

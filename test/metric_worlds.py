@@ -29,14 +29,14 @@ def drive(twists, *, start=(0.0, 0.0, 0.0), bias=0.0, yaw_noise=0.0, speed_noise
     rng = np.random.default_rng(seed)
     twists = np.asarray(twists, float)
     stamps = 1_000_000_000 + STEP_NS * np.arange(len(twists) + 1)
-    held = np.vstack([twists, np.zeros((1, 2))])
+    held = np.vstack([np.zeros((1, 2)), twists])
     truth = integrate(stamps, held, np.array(start))
     measured = held * (1 + speed_noise * rng.standard_normal((len(held), 1)) * [1, 0])
     measured[:, 1] += bias + yaw_noise * rng.standard_normal(len(held))
     poses = integrate(stamps, measured)
     odometry = Odometry(stamps, poses, measured, np.zeros((len(stamps), 2)))
     # The rate between two stamps, as the trapezoid of the rates at both would have it.
-    omega = np.interp(np.arange(len(held)), np.arange(len(held) - 1) + 0.5, measured[:-1, 1])
+    omega = np.interp(np.arange(len(held)), np.arange(len(held) - 1) + 0.5, measured[1:, 1])
     gyro = YawRate(stamps, omega, np.zeros(len(stamps)))
     pictures = stamps[::10]
     return Drive(odometry, pictures, Trajectory(stamps, truth).at(pictures), gyro)

@@ -8,10 +8,12 @@ import math
 import numpy as np
 
 from sfa_localization.config import PanoramaConfig
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.place_model import Estimate
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05
+UNLIKE_DEFAULT = ErrorCorrelation(0.5, 2.0)
 
 
 def panorama(pose=(0.0, 0.0, 0.0), seed=0, novelty=0.5, level=120, spread=40):
@@ -32,6 +34,7 @@ class PictureReader:
 
     panorama: PanoramaConfig = SIZE
     has_heading: bool = True
+    error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
 
     def locate(self, image):
         a, b, novelty = image[0, :3].astype(int)

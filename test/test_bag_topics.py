@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_formats import PERIOD, pose, stamp
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from sfa_localization.bag import Bag, BagWriter, load_run
@@ -378,6 +378,29 @@ def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
         bag.trajectory()
     with Bag(path, stamp_source='receive') as bag:
         np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
+
+
+def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with BagWriter(tmp_path / 'heard') as bag:
+        for k in range(4):
+            bag.imu('/imu', stamp(k), 0.0, 0.0)
+            bag.image('/image', stamp(k), np.full((8, 32, 3), k, np.uint8), 'camera')
+            bag.odometry('/odom', stamp(k), np.zeros(3), np.zeros(2), np.zeros(2))
+    with Reader(tmp_path / 'heard') as heard, Writer(tmp_path / 'bag', version=9) as silent:
+        connections = {
+            c.topic: silent.add_connection(c.topic, c.msgtype, typestore=STORE)
+            for c in heard.connections
+        }
+        for connection, at, raw in heard.messages():
+            if connection.topic != '/imu':
+                silent.write(connections[connection.topic], at, raw)
+    run = load_run(tmp_path / 'bag', cache=tmp_path / 'cache')
+    assert run.yaw_rate is None and len(run.panoramas) == 4
+    assert 'no message on /imu: going on without gyroscope' in caplog.text
+    with pytest.raises(BagError, match='/imu'):
+        load_run(tmp_path / 'bag', cache=tmp_path / 'cache', topics=TopicNames(imu='/imu'))
 
 
 # The writer.

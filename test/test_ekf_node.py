@@ -9,6 +9,7 @@ import pytest
 from filter_drives import START_NS, Drive
 
 from sfa_localization.config import FilterConfig
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.geometry import compose
 from sfa_localization.pose_filter import PoseFilter
 
@@ -24,13 +25,14 @@ from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.time import Time  # noqa: E402
 from ros_bench import Bench, until  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
 from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes import ekf_node  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,
+    to_error_correlation,
     to_odometry,
     to_pose_with_covariance,
 )
@@ -437,3 +439,35 @@ def test_measurements_without_heading_are_taken_as_positions(bench):
     message.pose.pose.orientation.z, message.pose.pose.orientation.w = 1.0, 0.0  # 180 deg off
     bench.publish(SEEN, message)
     assert until(lambda: node._filter.counts['measurement: accepted'] == 1)
+
+
+def test_the_models_knowledge_of_its_errors_is_what_an_offline_filter_uses(bench):
+    drive = Drive(seconds=4, **NOISY)
+    known = ErrorCorrelation(0.1, 3.0)
+    node = bench.run(EkfNode, start=False)
+    node.trigger_configure()
+    heard = node.monitor('sfa/error_correlation')
+    bench.publish('sfa/error_correlation', to_error_correlation(known), latched_qos())
+    # It is published once, perhaps before the node is active.
+    assert until(lambda: heard.received == 1)
+    node.trigger_activate()
+    play(bench, node, drive)
+    told = {}
+    for name, fused in (('knows', PoseFilter(correlation=known)), ('ignores', PoseFilter())):
+        for event in drive.events():
+            if event[1]:
+                fused.add_measurement(event[0], drive.seen[event[2]], SPREAD)
+            else:
+                drive.give(fused, event)
+        told[name] = fused.state.position_std
+    assert node._filter.state.position_std == pytest.approx(told['knows'], rel=1e-3)
+    assert told['knows'] < 0.9 * told['ignores']
+
+
+@pytest.mark.parametrize('numbers', [[], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]])
+def test_knowledge_that_cannot_be_is_refused(bench, numbers):
+    node = bench.run(EkfNode)
+    message = Float64MultiArray(data=numbers)
+    bench.publish('sfa/error_correlation', message, latched_qos())
+    assert until(lambda: node.monitor('sfa/error_correlation').received == 1)
+    assert node._filter._fusion.config.correlated_share == 0.7

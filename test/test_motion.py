@@ -4,18 +4,20 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sfa_localization import motion
 from sfa_localization.config import FilterConfig
+from sfa_localization.correlation import resolved
 from sfa_localization.geometry import wrap_angle
 from sfa_localization.motion import BIAS, ERROR, OMEGA, SCALE, SIZE, YAW, State, Twist, V
 
-CONFIG = FilterConfig()
-QUIET = FilterConfig(slip_per_metre=0.0, yaw_per_metre=0.0, yaw_per_radian=0.0, bias_walk=0.0,
-                     scale_walk=0.0, odometry_correlation=0.0)  # fmt: skip
+CONFIG = resolved(FilterConfig())
+QUIET = replace(CONFIG, slip_per_metre=0.0, yaw_per_metre=0.0, yaw_per_radian=0.0, bias_walk=0.0,
+                scale_walk=0.0, odometry_correlation=0.0)  # fmt: skip
 
 
 def random_mean(rng):
@@ -130,7 +132,7 @@ def test_white_noise_of_the_readings_adds_up_by_hand():
 
 
 def test_lasting_noise_does_not_average_out_with_the_rate():
-    lasting = FilterConfig(slip_per_metre=0.0, yaw_per_metre=0.0, odometry_correlation=0.5)
+    lasting = replace(CONFIG, slip_per_metre=0.0, yaw_per_metre=0.0, odometry_correlation=0.5)
     spread = []
     for rate in (10, 100):
         total = sum(
@@ -152,10 +154,11 @@ def test_picture_error_fades_over_the_way_and_keeps_unit_variance():
 
 
 def test_a_state_names_its_parts():
-    mean = np.arange(10.0)
-    covariance = np.diag([4.0, 1.0, 0.25, 1, 1, 1, 1, 1, 1, 1])
+    mean = np.arange(11.0)
+    covariance = np.diag([4.0, 1.0, 0.25, 1, 1, 1, 1, 1, 1, 1, 1])
     covariance[0, 1] = covariance[1, 0] = 1.5
     state = State(5, mean, covariance)
     assert list(state.pose) == [0, 1, 2] and list(state.twist) == [3, 4]
     assert (state.yaw_rate_bias, state.wheel_scale, state.yaw_std) == (5.0, 7.0, 0.5)
+    assert state.camera_delay_s == 7.0
     assert state.position_std == pytest.approx(math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))

@@ -107,6 +107,8 @@ def live(recording, monkeypatch):
         sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
         ekf = bench.run(EkfNode, **FILTER)
         seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
+        # The latched correlation of errors is there before the first picture.
+        assert until(lambda: ekf.monitor('sfa/error_correlation').used == 1)
         sent = 0
         for event in recording.events():
             topic, message = recording.message(*event)

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
 
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.errors import ModelError
 from sfa_localization.fast_map import FastProcess, fast_map
 from sfa_localization.geometry import wrap_angle
 from sfa_localization.heading import UNKNOWN_YAW_VARIANCE
+from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, read_arrays
 
 
@@ -252,3 +254,16 @@ def refused(path: Path, told: str) -> None:
         PlaceModel.load(path)
     assert str(path) in str(error.value)
     assert 'train' in str(error.value) and '\n' not in str(error.value)
+
+
+def test_what_is_known_of_the_errors_travels_with_the_model(model, tmp_path):
+    known = replace(model, error_correlation=ErrorCorrelation(0.35, 2.5))
+    known.save(tmp_path / 'known.npz')
+    assert PlaceModel.load(tmp_path / 'known.npz').error_correlation == ErrorCorrelation(0.35, 2.5)
+
+
+def test_the_trainer_fills_it_in_from_what_it_left_out(model):
+    assert model.error_correlation != ErrorCorrelation()
+    assert Localizer(model).filter._fusion.config.correlated_share == pytest.approx(
+        model.error_correlation.share
+    )

@@ -10,8 +10,8 @@ from metric_worlds import criss_cross, drive, meander, stand, straight, turn
 
 from sfa_localization.config import SegmentConfig
 from sfa_localization.errors import DataError
-from sfa_localization.geometry import relative, wrap_angle
-from sfa_localization.run import Odometry
+from sfa_localization.geometry import compose, relative, wrap_angle
+from sfa_localization.run import Odometry, Trajectory, YawRate
 from sfa_localization.segments import assignment, cut, join
 
 ANY = SegmentConfig()
@@ -227,3 +227,74 @@ def test_joined_runs_keep_their_pictures_apart():
 def test_a_drive_without_segments_says_what_to_do(parts, config, remedy):
     with pytest.raises(DataError, match=remedy):
         cut(*drive_of(*parts), config)
+
+
+def turned_frame(run, yaw, shift=(0.0, 0.0)):
+    """The same recording of a robot that was switched on elsewhere."""
+    poses = compose(np.array([*shift, yaw]), run.odometry.poses)
+    return dataclasses.replace(run.odometry, poses=poses)
+
+
+@pytest.mark.parametrize('config', [ANY, STRAIGHT])
+@pytest.mark.parametrize('gyro', [True, False])
+def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyro):
+    twists, start = criss_cross(6)
+    run = drive(twists, start=start)
+    rate = run.gyro if gyro else None
+    one = cut(run.odometry, run.stamps_ns, config, rate)
+    other = cut(turned_frame(run, 2.5, (30.0, -7.0)), run.stamps_ns, config, rate)
+    assert len(one) == len(other)
+    for a, b in zip(one, other, strict=True):
+        moved = compose(np.array([30.0, -7.0, 2.5]), a.start)
+        assert np.allclose(relative(moved, b.start), 0, atol=1e-9)
+        assert np.allclose(a.path, b.path) and np.allclose(a.headings, b.headings)
+        if a.linked:
+            assert a.turn_rad == pytest.approx(b.turn_rad)
+            assert a.displacement == pytest.approx(b.displacement)
+
+
+def test_the_start_of_a_segment_is_its_pose_in_the_odometry_frame_with_a_gyro_too():
+    run = drive(SQUARE)
+    poses = turned_frame(run, 1.0)
+    for s in cut(poses, run.stamps_ns, ANY, run.gyro):
+        at = Trajectory(poses.stamps_ns, poses.poses).at(run.stamps_ns[s.images[:1]])[0]
+        assert np.allclose(relative(at, s.start), 0, atol=0.02)
+
+
+def pieces_of_gyro(gyro, keep):
+    return YawRate(gyro.stamps_ns[keep], gyro.omega[keep], gyro.variance[keep])
+
+
+@pytest.mark.parametrize('gap', [(2.0, 10.0), (15.0, 1e9), (-1.0, 12.0)])
+@pytest.mark.parametrize('bias', [0.0, 0.02])
+def test_where_the_gyro_pauses_the_wheels_go_on(gap, bias):
+    run = drive(np.vstack([SQUARE, SQUARE]))
+    seconds = (run.gyro.stamps_ns - run.gyro.stamps_ns[0]) * 1e-9
+    biased = dataclasses.replace(run.gyro, omega=run.gyro.omega + bias)
+    kept = pieces_of_gyro(biased, (seconds < gap[0]) | (seconds > gap[1]))
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT, kept)
+    assert segments.odometry.skipped['in a gap of the gyroscope'] > 0
+    turns = [s.turn_rad - bias * s.turn_time_s for s in segments.items[:-1]]
+    assert turns == pytest.approx([np.pi / 2] * 7, abs=0.01)
+
+
+def test_a_gyro_mounted_upside_down_is_turned_and_one_in_degrees_left_out(caplog):
+    run = drive(SQUARE)
+    for factor, warning in ((-1.0, 'upside down'), (57.3, 'unit')):
+        other = dataclasses.replace(run.gyro, omega=factor * run.gyro.omega)
+        segments = cut(run.odometry, run.stamps_ns, STRAIGHT, other)
+        assert [s.turn_rad for s in segments.items[:-1]] == pytest.approx([np.pi / 2] * 3, abs=0.01)
+        assert warning in caplog.text
+    trusted = dataclasses.replace(STRAIGHT, yaw_source='gyro')
+    other = dataclasses.replace(run.gyro, omega=0.1 * run.gyro.omega)
+    turned = cut(run.odometry, run.stamps_ns, trusted, other)
+    assert turned[0].headings[-1] == pytest.approx(0.0, abs=0.01)
+    assert turned.items[0].turn_rad < 0.5
+
+
+def test_a_gyro_on_another_clock_is_as_good_as_none():
+    run = drive(SQUARE)
+    other = dataclasses.replace(run.gyro, stamps_ns=run.gyro.stamps_ns + 10**15)
+    segments = cut(run.odometry, run.stamps_ns, STRAIGHT, other)
+    assert segments.odometry.skipped['without a usable gyroscope'] > 0
+    check_segments(segments, run.poses)

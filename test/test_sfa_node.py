@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from sfa_localization.config import PanoramaConfig
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.errors import ModelError
 from sfa_localization.observation import UNKNOWN_VARIANCE
 from sfa_localization.place_model import Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
+KNOWN = ErrorCorrelation(0.25, 1.5)
 
 
 def panorama(seed=0, level=120, spread=40):
@@ -34,6 +36,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 
 from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
+    read_error_correlation,
     read_pose,
     to_compressed,
     to_image,
@@ -53,6 +56,7 @@ class FakeModel:
     novelty: float = 0.5
     shift: float = 0.0
     panorama: PanoramaConfig = SIZE
+    error_correlation: ErrorCorrelation = KNOWN
 
     @property
     def has_heading(self):
@@ -88,6 +92,18 @@ def bench():
 
 def message(seed=1, stamp_ns=5_000_000_001, image=None):
     return to_image(panorama(seed) if image is None else image, stamp_ns, 'omnicam')
+
+
+def test_what_the_model_knows_of_its_errors_reaches_those_who_come_later(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+    heard = bench.listen(Float64MultiArray, 'sfa/error_correlation', latched_qos())
+    assert until(lambda: heard)
+    assert heard[0].layout.dim[0].label == 'share, distance_m'
+    assert read_error_correlation(heard[0]) == KNOWN
+    models['b.npz'].error_correlation = ErrorCorrelation(0.5, 3.0)
+    node.set_parameters([Parameter('model', value='b.npz')])
+    assert until(lambda: len(heard) == 2)
+    assert read_error_correlation(heard[1]) == ErrorCorrelation(0.5, 3.0)
 
 
 def test_all_outputs_carry_the_pictures_stamp(bench, models):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,11 +19,13 @@ from sfa_localization.cli import main
 from sfa_localization.config import CameraConfig, PanoramaConfig, SimulationConfig
 from sfa_localization.errors import BagError, CameraError, ConfigError
 from sfa_localization.garden import Garden, panel
-from sfa_localization.geometry import compose, wrap_angle
+from sfa_localization.geometry import compose, relative, wrap_angle
 from sfa_localization.panorama import Unwrapper
 from sfa_localization.pictures import decode_compressed
+from sfa_localization.pose_filter import PoseFilter
 from sfa_localization.rendering import Dome, Light, Scene
 from sfa_localization.routes import CLEARANCE_M, ROUTES, Lawn
+from sfa_localization.run import differences, integrate
 from sfa_localization.simulation import (
     START_NS,
     drive,
@@ -60,8 +63,9 @@ def psnr(one, other):
 
 
 def world_odometry(garden, recorded):
-    start = np.broadcast_to(garden.dock, recorded.odometry.poses.shape)
-    return compose(start, recorded.odometry.poses)
+    """The odometry from the true start on, wherever its own frame lies."""
+    poses = recorded.odometry.poses
+    return compose(garden.dock, relative(poses[0], poses))
 
 
 # Pictures
@@ -245,8 +249,38 @@ def test_every_drive_starts_at_the_dock(garden):
     for trajectory in TRAJECTORIES:
         recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=1))
         assert np.allclose(recorded.truth.poses[0], garden.dock)
-        assert np.allclose(recorded.odometry.poses[0], 0)
         assert recorded.truth.stamps_ns[0] == START_NS
+
+
+def test_the_odometry_frame_lies_anywhere_or_at_the_start(garden):
+    """Frames differ from drive to drive; nothing else of the drive changes with them."""
+    starts = []
+    for seed in range(8):
+        config = SimulationConfig(trajectory='test', seed=seed)
+        recorded = drive(garden, config)
+        same = drive(garden, replace(config, odometry_frame='start'))
+        assert np.allclose(same.odometry.poses[0], 0)
+        assert np.array_equal(same.odometry.twists, recorded.odometry.twists)
+        poses = relative(recorded.odometry.poses[0], recorded.odometry.poses)
+        assert np.allclose(relative(poses, same.odometry.poses), 0, atol=1e-9)
+        starts.append(recorded.odometry.poses[0])
+    assert np.ptp(np.array(starts), axis=0).min() > 1.0
+
+
+@pytest.mark.parametrize('rate', [5.0, 50.0])
+def test_exact_twists_lead_to_the_truth_through_the_filter_and_by_sums(garden, rate):
+    """One convention: a twist is held since the message before, at any rate."""
+    config = SimulationConfig(trajectory='test', seed=3, odometry_rate=rate, **EXACT)
+    recorded = drive(garden, config)
+    odometry, truth = recorded.odometry, recorded.truth.poses
+    summed = integrate(odometry.stamps_ns, odometry.twists, truth[0])
+    assert np.abs(relative(truth, summed)).max() < 1e-3
+    assert np.allclose(differences(odometry.stamps_ns, truth)[1:], odometry.twists[1:], atol=1e-6)
+    fused = PoseFilter()
+    fused.initialise(int(odometry.stamps_ns[0]), truth[0])
+    for stamp_ns, twist, pose in zip(odometry.stamps_ns, odometry.twists, truth, strict=True):
+        fused.add_odometry(int(stamp_ns), *twist)
+        assert np.abs(relative(pose, fused.state.pose)).max() < 1e-3
 
 
 # Sensors

@@ -30,6 +30,7 @@ from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from sfa_localization.config import PanoramaConfig
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.decoding import (
     NANOSECONDS,
     read_compressed,
@@ -39,7 +40,7 @@ from sfa_localization.decoding import (
     read_twist,
     require_sane,
 )
-from sfa_localization.errors import ConfigError, MessageError
+from sfa_localization.errors import ConfigError, DataError, MessageError
 from sfa_localization.geometry import Array
 from sfa_localization.pictures import encode_jpeg
 from sfa_localization.run import Image
@@ -47,6 +48,7 @@ from sfa_localization.run import Image
 _FIXED_VARIANCE = 1e-6
 """Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_CORRELATION = 'share, distance_m'
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +202,21 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
     message = Float64MultiArray(data=array.array('d', numbers))
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message
+
+
+def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:
+    """How pictures' errors hang together: the share that is common, and over which way."""
+    return to_array([correlation.share, correlation.distance_m], _CORRELATION)
+
+
+def read_error_correlation(message: Float64MultiArray) -> ErrorCorrelation:
+    """Raises MessageError for numbers that cannot be."""
+    if len(message.data) != 2:
+        raise MessageError(f'{len(message.data)} numbers where {_CORRELATION} are expected')
+    try:
+        return ErrorCorrelation(*message.data)
+    except DataError as error:
+        raise MessageError(str(error)) from None
 
 
 def to_covariance(covariance: Array) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
-from std_msgs.msg import String
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.config import EkfNodeConfig, FilterConfig, Settings
@@ -24,6 +24,7 @@ from sfa_localization.errors import MessageError
 from sfa_localization.geometry import compose, invert
 from sfa_localization.nodes.conversions import (
     Motion,
+    read_error_correlation,
     read_odometry,
     read_pose,
     to_odometry,
@@ -56,6 +57,7 @@ _WATCH_PERIOD_S = 0.2
 _REPEAT_STATE_S = 1.0
 _BACKWARD_JUMP_NS = -500_000_000
 _ODOM, _SEEN = 'odom', 'sfa/pose_with_covariance'
+_CORRELATION = 'sfa/error_correlation'
 
 
 class EkfNode(LocalizationNode):
@@ -83,6 +85,13 @@ class EkfNode(LocalizationNode):
         self._make_publishers()
         self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
         self.subscribe(PoseWithCovarianceStamped, _SEEN, self._receive_pose, sensor_qos(20))
+        self.subscribe(
+            Float64MultiArray,
+            _CORRELATION,
+            self._receive_correlation,
+            latched_qos(),
+            while_inactive=True,
+        )
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(PoseWithCovarianceStamped, topic, self._set_pose, reliable_qos(1))
         self.service(Trigger, '~/reset', self._reset)
@@ -160,6 +169,9 @@ class EkfNode(LocalizationNode):
             )
         if not update.accepted:
             raise MessageError(update.reason)
+
+    def _receive_correlation(self, message: Float64MultiArray) -> None:
+        self._filter.correlate(read_error_correlation(message))
 
     def _set_pose(self, message: PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
@@ -277,6 +289,7 @@ class EkfNode(LocalizationNode):
             values['heading deviation [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
+            values['camera delay [s]'] = f'{state.camera_delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or 'localised', values
 
 

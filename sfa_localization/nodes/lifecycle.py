@@ -123,16 +123,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         topic: str,
         callback: Callable[[Any], None],
         qos: QoSProfile | None = None,
-        always: bool = False,
+        *,
+        while_inactive: bool = False,
     ) -> None:
         """A subscription whose refused messages are counted under `topic` and end nothing.
 
-        Messages are dropped while the node is inactive, unless they are wanted `always`.
+        An inactive node drops messages; not `while_inactive` those that come but once, latched.
         """
         made = self.create_subscription(
             kind,
             topic,
-            self._guarded(topic, callback, always),
+            self._guarded(topic, callback, while_inactive),
             qos or sensor_qos(),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
@@ -185,12 +186,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return reason
 
     def _guarded(
-        self, topic: str, callback: Callable[[Any], None], always: bool = False
+        self, topic: str, callback: Callable[[Any], None], while_inactive: bool = False
     ) -> Callable[[Any], None]:
         monitor = self.monitor(topic)
 
         def receive(message: Any) -> None:
-            if not (self.active or always):
+            if not (self.active or while_inactive):
                 return
             received_s = monitor.receive()
             if self._attempt(topic, lambda: callback(message)):

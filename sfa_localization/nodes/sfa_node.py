@@ -25,6 +25,7 @@ from sfa_localization.nodes.conversions import (
     read_image,
     read_info,
     to_array,
+    to_error_correlation,
     to_pose,
     to_pose_with_covariance,
 )
@@ -62,13 +63,19 @@ class SfaNode(LocalizationNode):
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+        self._correlation = self.publisher(
+            Float64MultiArray, 'sfa/error_correlation', latched_qos()
+        )
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
         self._topic = 'panorama/compressed' if self._config.compressed else 'panorama'
         self._declared, self._undeclared_said = None, False
-        self.subscribe(String, _INFO, self._receive_info, latched_qos(), always=True)
+        self.subscribe(String, _INFO, self._receive_info, latched_qos(), while_inactive=True)
         # Depth 1: when pictures come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
+
+    def started(self) -> None:
+        self._publish_correlation()
 
     def teardown(self) -> None:
         self._observer = None
@@ -116,11 +123,18 @@ class SfaNode(LocalizationNode):
         """Go on with another model; an unconfigured node reads its own when it is configured."""
         if self._observer is not None:
             self._observer.model = model
+            self._publish_correlation()
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._use(self._load(self._config.model))
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
+
+    def _publish_correlation(self) -> None:
+        """The filter weighs images by what the model knows of its own errors."""
+        assert self._observer is not None
+        correlation = self._observer.model.error_correlation
+        self._correlation.publish(to_error_correlation(correlation))
 
     # Pictures.
 

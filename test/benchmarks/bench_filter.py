@@ -20,6 +20,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from sfa_localization import motion
 from sfa_localization.config import FilterConfig
+from sfa_localization.correlation import resolved
 from sfa_localization.motion import ERROR, SIZE, YAW, Twist
 from sfa_localization.pose_filter import PoseFilter
 
@@ -45,7 +46,7 @@ def wrapped(z: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
 def bare_steps(poses: np.ndarray) -> float:
     """Seconds that filterpy alone takes for one predict and update per pose."""
-    config, twist = FilterConfig(), Twist(*READING)
+    config, twist = resolved(FilterConfig()), Twist(*READING)
     ekf = Bare(SIZE, 3)
     ekf.x, ekf.P = np.zeros(SIZE), PoseFilter(config)._fusion.blank(0).covariance
     share = config.correlated_share
@@ -78,7 +79,7 @@ def our_steps(poses: np.ndarray) -> float:
 
 def circle(steps: int) -> np.ndarray:
     """Where the reading leads, with errors as large as told (steps, 3)."""
-    mean, config = np.zeros(SIZE), FilterConfig()
+    mean, config = np.zeros(SIZE), resolved(FilterConfig())
     rng = np.random.default_rng(1)
     poses = np.empty((steps, 3))
     for k in range(steps):

@@ -1,0 +1,85 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How pictures' errors hang together: found again in errors that are made so."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sfa_localization.config import FilterConfig
+from sfa_localization.correlation import ErrorCorrelation, resolved
+from sfa_localization.errors import DataError
+
+
+def made(share, distance, seed=0, step=0.1, stretches=60, length=80):
+    """Errors (M, 2) of 0.2 m with variances (M,), way (M,) and stretch (M,)."""
+    rng = np.random.default_rng(seed)
+    fade = math.exp(-step / distance)
+    errors = []
+    for _ in range(stretches):
+        lasting = rng.standard_normal(2)
+        for _ in range(length):
+            lasting = fade * lasting + math.sqrt(1 - fade**2) * rng.standard_normal(2)
+            white = math.sqrt(1 - share) * rng.standard_normal(2)
+            errors.append(math.sqrt(share) * lasting + white)
+    count = len(errors)
+    std = rng.uniform(0.1, 0.3, count)
+    owner = np.repeat(np.arange(stretches), length)
+    return np.array(errors) * std[:, None], std**2, np.arange(count) * step, owner
+
+
+@pytest.mark.parametrize('share', [0.3, 0.7, 0.9])
+@pytest.mark.parametrize('distance', [0.3, 1.0, 2.0])
+def test_share_and_distance_are_found_again(share, distance):
+    found = [ErrorCorrelation.fit(*made(share, distance, seed)) for seed in range(5)]
+    assert np.mean([f.share for f in found]) == pytest.approx(share, abs=0.06)
+    assert np.median([f.distance_m for f in found]) == pytest.approx(distance, rel=0.3)
+
+
+def test_white_errors_have_nothing_in_common():
+    assert ErrorCorrelation.fit(*made(0.0, 1.0)).share < 0.05
+
+
+def test_variances_claimed_too_small_or_too_large_change_nothing():
+    errors, variances, way, owner = made(0.6, 1.0)
+    assert ErrorCorrelation.fit(errors, variances, way, owner) == ErrorCorrelation.fit(
+        errors, variances * 4, way, owner
+    )
+
+
+def test_outliers_do_not_rule():
+    errors, variances, way, owner = made(0.7, 1.0)
+    errors[::25] += np.random.default_rng(1).uniform(-20, 20, (len(errors[::25]), 2))
+    assert ErrorCorrelation.fit(errors, variances, way, owner).share == pytest.approx(0.7, abs=0.15)
+
+
+def test_errors_of_different_stretches_are_not_compared():
+    errors, variances, way, owner = made(0.8, 0.5, stretches=400, length=4)
+    apart = ErrorCorrelation.fit(errors, variances, way, owner)
+    mixed = ErrorCorrelation.fit(errors, variances, way, np.zeros_like(owner))
+    assert apart.share == pytest.approx(0.8, abs=0.1) and mixed.distance_m < apart.distance_m
+
+
+def test_too_few_pictures_say_nothing():
+    errors, variances, way, owner = made(0.2, 1.0, stretches=3, length=5)
+    assert ErrorCorrelation.fit(errors, variances, way, owner) == ErrorCorrelation()
+
+
+@pytest.mark.parametrize(('share', 'distance'), [
+    (1.0, 1.0), (-0.1, 1.0), (math.nan, 1.0), (0.5, 0.0), (0.5, math.inf), (0.5, math.nan),
+])  # fmt: skip
+def test_numbers_that_cannot_be_are_refused(share, distance):
+    with pytest.raises(DataError, match='share'):
+        ErrorCorrelation(share, distance)
+
+
+def test_the_users_value_wins_over_what_is_known_over_the_default():
+    known = ErrorCorrelation(0.4, 2.0)
+    open_ = resolved(FilterConfig())
+    assert (open_.correlated_share, open_.decorrelation) == (0.7, 1.0)
+    learnt = resolved(FilterConfig(), known)
+    assert (learnt.correlated_share, learnt.decorrelation) == (0.4, 2.0)
+    given = resolved(FilterConfig(correlated_share=0.0, decorrelation=3.0), known)
+    assert (given.correlated_share, given.decorrelation) == (0.0, 3.0)
+    assert resolved(learnt) == learnt

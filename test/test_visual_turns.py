@@ -1,0 +1,97 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The camera's clock beside the odometry's, in worlds of spheres and on the sample."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres, panorama_config, wander
+
+from sfa_localization.bag import load_run
+from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.visual_turns import camera_clock, visual_turns
+
+BAGS = Path(__file__).parents[1] / 'bags'
+SIZE = (20, 120)
+
+
+def run_of(odometry, seed=0, every=3, clockwise=True):
+    """A run whose images, one of every few odometry messages, show spheres."""
+    world = Spheres.about(seed)
+    images = world.panoramas(odometry.poses[::every], panorama_config(SIZE, clockwise))
+    return Run('run', PanoramaArray(odometry.stamps_ns[::every], images), odometry)
+
+
+def late(run, seconds):
+    """The same run of a camera that stamps its images so late."""
+    shifted = run.panoramas.stamps_ns + round(seconds * 1e9)
+    return replace(run, panoramas=PanoramaArray(shifted, run.panoramas.images))
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+def test_the_columns_shift_as_the_robot_turns(clockwise):
+    run = run_of(wander(60, 1, hz=20.0), every=1, clockwise=clockwise)
+    turned = np.diff(np.unwrap(run.odometry.poses[:, 2]))
+    seen = visual_turns(run.panoramas) * (1 if clockwise else -1)
+    assert np.median(np.abs(seen - turned)) < 0.02
+    assert np.corrcoef(seen, turned)[0, 1] > 0.9
+
+
+@pytest.mark.parametrize('delay', [-2.0, -0.3, -0.05, 0.0, 0.15, 0.5, 1.7])
+def test_a_delay_is_found_within_what_is_claimed(delay):
+    for seed in range(4):
+        run = late(run_of(wander(400, seed, hz=20.0), seed, clockwise=seed % 2 == 0), delay)
+        clock = camera_clock(run)
+        assert clock.known and clock.std_s < 0.02
+        assert abs(clock.delay_s - delay) < 3 * clock.std_s + 1e-3
+
+
+def test_the_frame_and_the_rate_of_the_odometry_do_not_matter():
+    run = late(run_of(wander(400, 3, hz=20.0), 3), 0.1)
+    odometry = run.odometry
+    turned = integrate(odometry.stamps_ns, odometry.twists, np.array([40.0, -3.0, 2.9]))
+    slow = slice(None, None, 4)
+    for other in (
+        replace(odometry, poses=turned),
+        Odometry(*(getattr(odometry, n)[slow] for n in Odometry.__slots__)),
+    ):
+        assert camera_clock(replace(run, odometry=other)).delay_s == pytest.approx(0.1, abs=0.02)
+
+
+def test_what_the_robot_carries_in_every_image_does_not_count():
+    run = late(run_of(wander(400, 2, hz=20.0), 2), 0.2)
+    images = run.panoramas.images.copy()
+    images[:, :, 20:35], images[:, -6:, 60:100] = 0, 255
+    masked = replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images))
+    assert camera_clock(masked).delay_s == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize('kind', ['straight', 'even', 'noise', 'dark', 'few'])
+def test_where_nothing_shows_the_delay_none_is_claimed(kind):
+    omega = {'straight': 0.0, 'even': 0.5}.get(kind)
+    odometry = wander(300, 5, hz=20.0)
+    if omega is not None:
+        twists = np.tile([0.2, omega], (300, 1))
+        poses = integrate(odometry.stamps_ns, twists)
+        odometry = replace(odometry, poses=poses, twists=twists)
+    run = run_of(odometry, 5)
+    images = run.panoramas.images
+    if kind == 'noise':
+        images = np.random.default_rng(0).integers(0, 255, images.shape, np.uint8)
+    if kind == 'dark':
+        images = np.zeros_like(images)
+    if kind == 'few':
+        images = images[:5]
+    run = replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns[: len(images)], images))
+    clock = camera_clock(run)
+    assert not clock.known and clock.delay_ns == 0
+
+
+@pytest.mark.parametrize('name', ['sample', 'sample_test'])
+def test_the_sample_is_on_one_clock(name, tmp_path):
+    run = load_run(BAGS / name, cache=tmp_path)
+    for delay in (0.0, 0.15):
+        clock = camera_clock(late(run, delay))
+        assert clock.known and abs(clock.delay_s - delay) < 3 * clock.std_s
