@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from sfa_localization.decoding import NO_STAMP
 from sfa_localization.errors import BagError, LocalizationError
+from sfa_localization.reasons import ReasonCounter
 from sfa_localization.run import Count
 
 
@@ -19,7 +19,7 @@ class Tally:
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
         self._used = 0
-        self._skipped: Counter[str] = Counter()
+        self._skipped = ReasonCounter()
 
     def use(self, number: int = 1) -> None:
         self._used += number
@@ -28,12 +28,12 @@ class Tally:
         """Count messages left out because they are faulty."""
         if self._strict:
             raise BagError(f'{self._where}: {reason}; read without --strict to skip such messages')
-        self._skipped[reason] += number
+        self._skipped.add(reason, number)
 
     def leave(self, reason: str, number: int = 1) -> None:
         """Count messages left out though nothing is wrong with them."""
         if number:
-            self._skipped[reason] += number
+            self._skipped.add(reason, number)
 
     def unuse(self, reason: str, number: int) -> None:
         """Count messages, used so far, as left out."""

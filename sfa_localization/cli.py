@@ -361,6 +361,20 @@ def _watch_config(path: Path | None) -> WatchConfig:
     return load_settings(path, 'sfa_node', WatchConfig) if path else WatchConfig()
 
 
+def _require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:
+    """Refuse a parameter file with which sfa_node would refuse omnicam_node's panoramas."""
+    if path is None:
+        return
+    declared = load_settings(path, 'omnicam_node', PanoramaConfig)
+    # The size is the pictures' own where they are panoramas already.
+    declared = dataclasses.replace(declared, width=trained.width, height=trained.height)
+    differences = trained.differences(declared)
+    if differences:
+        raise ConfigError(
+            f'{path}: omnicam_node: panoramas would be unlike those of training: {differences}'
+        )
+
+
 FILTER = Command(
     'filter',
     'Fuse a log of odometry and positions, without ROS: what the live filter would have told.',
@@ -390,6 +404,7 @@ def _tune(arguments: argparse.Namespace) -> int:
     from sfa_localization.place_model import PlaceModel
 
     how, model = _settings(TuneConfig, arguments), PlaceModel.load(arguments.model)
+    _require_same_panorama(arguments.config, model.panorama)
     camera = CameraConfig()
     if arguments.config:
         camera = load_settings(arguments.config, 'omnicam_node', CameraConfig)
@@ -535,8 +550,10 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from sfa_localization import evaluation, report
     from sfa_localization.place_model import PlaceModel
 
+    model = PlaceModel.load(arguments.model)
+    _require_same_panorama(arguments.config, model.panorama)
     judged = evaluation.evaluate(
-        PlaceModel.load(arguments.model),
+        model,
         arguments.bag,
         align_bag=arguments.align,
         recipe=_recipe(arguments),

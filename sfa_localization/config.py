@@ -129,14 +129,9 @@ class PanoramaConfig(Settings):
     )
     clockwise: bool = setting(True, 'columns grow clockwise seen from above')
 
-    def differences(self, other: PanoramaConfig, *, geometry_only: bool = False) -> str:
-        """What is other in `other`, as 'height 30 instead of 60'; '' when they are the same.
-
-        `geometry_only` leaves out the size, which a picture shows by itself.
-        """
+    def differences(self, other: PanoramaConfig) -> str:
+        """What is other in `other`, as 'height 30 instead of 60'; '' when they are the same."""
         names = [item.name for item in dataclasses.fields(self)]
-        if geometry_only:
-            names = [name for name in names if name not in ('width', 'height')]
         found = [(name, getattr(other, name), getattr(self, name)) for name in names]
         return ', '.join(f'{name} {a} instead of {b}' for name, a, b in found if a != b)
 

@@ -8,6 +8,7 @@ with pauses that double. Knows nothing of ROS; time is the steady clock's.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -22,6 +23,8 @@ from sfa_localization.config import OmnicamNodeConfig
 from sfa_localization.errors import CameraError
 from sfa_localization.pictures import decode_compressed
 from sfa_localization.run import Image
+
+logger = logging.getLogger(__name__)
 
 _SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.ppm', '.pgm', '.tif', '.tiff', '.webp')
 _USUAL_RATE = 10.0
@@ -233,6 +236,7 @@ class Feed:
         self._stopped = threading.Event()
         self._generation = 0
         self._status = FeedStatus()
+        self._defect = ''
         self._pause_s = config.reopen_min
         self._deadline_s = np.inf  # when a read or an opening in progress counts as hanging
         self._frozen = FrozenWatch()
@@ -287,11 +291,22 @@ class Feed:
             try:
                 self._read_all(generation)
                 return
-            except (CameraError, cv2.error, OSError) as error:
+            except Exception as error:  # whatever it is, the camera is to be opened again
                 if not self._is_current(generation):
                     return
-                self._lose(str(error))
+                self._lose(self._problem(error))
             self._back_off()
+
+    def _problem(self, error: Exception) -> str:
+        """What went wrong; what is no trouble of a camera is a defect, and is shown as one."""
+        if isinstance(error, (CameraError, cv2.error, OSError)):
+            return str(error)
+        text = f'internal error: {type(error).__name__}'
+        self._refuse(text)
+        if text != self._defect:
+            self._defect = text
+            logger.error('%s', text, exc_info=error)
+        return text
 
     def _back_off(self) -> None:
         self._deadline_s = np.inf

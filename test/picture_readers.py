@@ -1,17 +1,22 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A stand-in for a trained model that reads pose and novelty off the picture's first row."""
+"""A stand-in for a trained model that reads pose and novelty off the picture; a drive for it."""
 
 import dataclasses
 import math
 
 import numpy as np
+from filter_drives import Drive
 
+from sfa_localization.bag import BagWriter
 from sfa_localization.config import PanoramaConfig
+from sfa_localization.correlation import ErrorCorrelation
+from sfa_localization.events import ODOMETRY, in_order
 from sfa_localization.place_model import Estimate
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05
+UNLIKE_DEFAULT = ErrorCorrelation(0.5, 2.0)
 
 
 def panorama(pose=(0.0, 0.0, 0.0), seed=0, novelty=0.5, level=120, spread=40):
@@ -32,6 +37,7 @@ class PictureReader:
 
     panorama: PanoramaConfig = SIZE
     has_heading: bool = True
+    error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
 
     def locate(self, image):
         a, b, novelty = image[0, :3].astype(int)
@@ -44,3 +50,48 @@ class PictureReader:
 
     def locate_all(self, images):
         return [self.locate(image) for image in images]
+
+
+class Recording:
+    """A drive with dark, covered, frozen, foreign and misshapen pictures, and an odometry gap."""
+
+    def __init__(self):
+        drive = Drive(
+            seconds=24, rate_hz=20, every=4, start=(5.0, 60.0, 0.3),
+            v_std=0.02, omega_std=0.01, position_std=0.1, yaw_std=0.03,
+        )  # fmt: skip
+        t = np.arange(len(drive.stamps_ns)) / 20
+        self.drive, self.kept = drive, np.flatnonzero((t < 16) | (t > 18.5))
+        # Between two odometry messages, as pictures are.
+        self.pictures_ns = drive.stamps_ns[drive.pictures] + 7_000_000
+        self.pictures = [self._picture(k) for k in range(len(drive.pictures))]
+
+    def _picture(self, k):
+        if k < 2 or k in (60, 61):
+            return panorama(self.drive.seen[k], k, novelty=9.0)
+        if k in (20, 21):
+            return np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
+        if k == 30:
+            return np.full((SIZE.height, SIZE.width, 3), 90, np.uint8)
+        if 40 <= k < 50:
+            return panorama(self.drive.seen[40], 40)
+        if k == 55:
+            return np.zeros((SIZE.height, SIZE.width + 2, 3), np.uint8)
+        return panorama(self.drive.seen[k], k, novelty=2.0 if 63 <= k < 66 else 0.5)
+
+    def events(self):
+        yield from in_order(self.drive.stamps_ns[self.kept], self.pictures_ns)
+
+    def write(self, path):
+        drive = self.drive
+        with BagWriter(path) as bag:
+            for stamp_ns, kind, index in self.events():
+                if kind == ODOMETRY:
+                    i = self.kept[index]
+                    told = drive.poses[i], drive.read[i], drive.variances()
+                    bag.odometry('/odom', stamp_ns, *told)
+                else:
+                    bag.image('/panorama', stamp_ns, self.pictures[index], 'omnicam')
+            for stamp_ns, pose in zip(drive.stamps_ns.tolist(), drive.poses, strict=True):
+                bag.pose('/truth', stamp_ns, pose)
+        return path

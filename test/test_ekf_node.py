@@ -224,6 +224,53 @@ def test_reset_and_pause(bench):
     assert until(lambda: node._status().level.name == 'LOCALISED')
 
 
+def set_state(bench, transition):
+    request = ChangeState.Request(transition=Transition(id=transition))
+    assert bench.call(ChangeState, 'ekf_node/change_state', request).success
+
+
+def test_a_pause_ends_with_the_configuration(bench):
+    drive = Drive(seconds=1, **NOISY)
+    node = bench.run(EkfNode)
+    assert bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=True)).success
+    for transition in (
+        Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP,
+        Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE,
+    ):  # fmt: skip
+        set_state(bench, transition)
+    assert 'paused' not in ' '.join(node._status().reasons)
+    bench._publishers.clear()
+    play(bench, node, drive)
+    assert until(lambda: node._filter.counts['measurement: accepted'] > 0)
+
+
+def test_a_refused_pose_is_not_used_too(bench):
+    drive = Drive(seconds=2, **NOISY)
+    drive.seen[10, :2] += 9.0
+    node = bench.run(EkfNode, set_initial_pose=True)
+    heard = bench.listen(DiagnosticArray, 'ekf/measurement_status')
+    play(bench, node, drive)
+    count = len(drive.pictures)
+    assert until(lambda: len(heard) == count)
+    monitor = node.monitor(SEEN)
+    assert until(lambda: monitor.used + sum(monitor.refused.values()) == count)
+    assert monitor.refused == {'outside the gate': 1}
+
+
+def test_what_senders_write_does_not_fill_the_diagnostics(bench):
+    node = bench.run(EkfNode, diagnostics_period=0.1)
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    for number in range(200):
+        message = to_pose_with_covariance([1, 1, 0], SPREAD, 5, f'frame_{number}' + 'x' * 2000)
+        bench.publish(SEEN, message)
+        assert until(lambda n=number: node.monitor(SEEN).received > n)
+    assert until(lambda: sum(node.monitor(SEEN).refused.values()) == 200)
+    told.clear()
+    assert until(lambda: told)
+    values = told[-1].status[0].values
+    assert len(values) < 60 and max(len(value.key) for value in values) < 320
+
+
 def malformed():
     """Broken messages, each a change of a good one, with the topic it goes to."""
     drive = Drive(seconds=1)

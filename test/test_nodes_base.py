@@ -9,18 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sfa_localization.config import NodeConfig, Settings, setting
+from sfa_localization.config import NodeConfig, PanoramaConfig, Settings, setting
 from sfa_localization.decoding import read_stamp, read_yaw
-from sfa_localization.errors import ConfigError, MessageError
+from sfa_localization.errors import ConfigError, LocalizationError, MessageError
 
 rclpy = pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 from sfa_localization.nodes import conversions as convert  # noqa: E402
 from sfa_localization.nodes.lifecycle import LocalizationNode  # noqa: E402
@@ -154,6 +157,62 @@ def test_refused_messages_and_defects_are_counted_and_end_nothing(make):
     assert monitor.refused == {'negative': 1, 'internal error: ZeroDivisionError': 1}
 
 
+class Timed(LocalizationNode):
+    """A node whose timer, health and service fail at first."""
+
+    def __init__(self, **options):
+        super().__init__('timed', [], **options)
+        self.calls = 0
+
+    def setup(self):
+        self.every(0.01, self._tick)
+        self.service(Trigger, '~/fail', self._fail)
+
+    def _tick(self):
+        self.calls += 1
+        if self.calls == 1:
+            raise LocalizationError('not ready')
+        if self.calls == 2:
+            raise ZeroDivisionError
+
+    def _fail(self, request, response):
+        raise KeyError('a defect')
+
+    def health(self):
+        raise ZeroDivisionError
+
+
+def test_a_timer_goes_on_after_an_error_which_is_counted():
+    bench = Bench(61)
+    try:
+        node = bench.run(Timed, diagnostics_period=0.1)
+        told = bench.listen(DiagnosticArray, '/diagnostics')
+        assert until(lambda: node.calls > 5)
+        assert node.monitor('timer tick').refused == {
+            'not ready': 1, 'internal error: ZeroDivisionError': 1,
+        }  # fmt: skip
+        # What the node cannot say of itself is an error, with the counts beside it.
+        assert until(lambda: told)
+        status = told[-1].status[0]
+        assert status.level == DiagnosticStatus.ERROR and 'cannot be found out' in status.message
+        keys = {value.key for value in status.values}
+        assert 'timer tick: refused: internal error: ZeroDivisionError' in keys
+        assert until(lambda: len(told) > 2)
+    finally:
+        bench.close()
+
+
+def test_a_defect_in_a_service_is_its_answer_and_ends_nothing():
+    bench = Bench(61)
+    try:
+        bench.run(Timed)
+        for _ in range(2):
+            answer = bench.call(Trigger, 'timed/fail', Trigger.Request())
+            assert not answer.success and answer.message == 'internal error: KeyError'
+    finally:
+        bench.close()
+
+
 def test_a_node_survives_its_whole_life_cycle_twice(make):
     node = make(Echo)
     node.start()
@@ -265,6 +324,14 @@ def test_a_malformed_covariance_is_named(index, value, reason):
     message.pose.covariance[index] = value
     with pytest.raises(MessageError, match=reason):
         convert.read_pose(message)
+
+
+def test_the_declaration_of_a_panorama_survives_the_round_trip_and_bad_ones_are_named():
+    panorama = PanoramaConfig(width=300, elevation_min=-7.25, clockwise=False)
+    assert convert.read_info(convert.to_info(panorama)) == panorama
+    for text in ('', 'no JSON', '[1]', '"x"', '[' * 100_000, '{"width": "wide"}', '{"colour": 1}'):
+        with pytest.raises(MessageError):
+            convert.read_info(String(data=text))
 
 
 def test_nothing_that_is_not_finite_gets_out():

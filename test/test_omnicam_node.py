@@ -3,6 +3,7 @@
 """The omnicam node on real messages: panoramas, demand, bad pictures, live parameters, sources."""
 
 import array
+import dataclasses
 import threading
 import time
 
@@ -28,7 +29,10 @@ from omnicam_bench import (  # noqa: E402
     send_until,
 )
 from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 
+from sfa_localization.nodes.conversions import read_info  # noqa: E402
+from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
 from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
 
 PANORAMA = PanoramaConfig(width=120, height=12)
@@ -66,6 +70,17 @@ def test_the_panorama_has_the_stamp_and_frame_of_the_picture(bench):
     assert message.encoding == 'bgr8'
     expected = Unwrapper(CameraConfig(), PANORAMA)(raw_picture())
     np.testing.assert_array_equal(pixels(message), expected)
+
+
+def test_what_the_panorama_shows_is_declared_for_those_who_come_late_and_after_a_change(bench):
+    run = bench().start()
+    heard = []
+    run.peer.create_subscription(String, 'panorama/info', heard.append, latched_qos())
+    run.wait(lambda: heard)
+    assert read_info(heard[0]) == PANORAMA
+    assert run.set(elevation_max=30.0).successful
+    run.wait(lambda: len(heard) == 2)
+    assert read_info(heard[1]) == dataclasses.replace(PANORAMA, elevation_max=30.0)
 
 
 def test_frame_and_quality_of_service_by_parameter(bench):

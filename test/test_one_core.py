@@ -4,13 +4,11 @@
 
 import numpy as np
 import pytest
-from filter_drives import Drive
-from picture_readers import SIZE, PictureReader, panorama
+from picture_readers import SIZE, PictureReader, Recording
 
-from sfa_localization.bag import BagWriter
 from sfa_localization.config import FilterConfig, WatchConfig
 from sfa_localization.evaluation import evaluate, fit_transform, moved
-from sfa_localization.events import ODOMETRY, in_order
+from sfa_localization.events import ODOMETRY
 from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.run import Trajectory
@@ -36,58 +34,13 @@ WATCH = {'frozen_pictures': 3, 'novelty_unusable': 2.5}
 FILTER = {'measurement_factor': 2.0}
 
 
-class Recording:
-    """A drive with dark, covered, frozen, foreign and misshapen pictures, and an odometry gap."""
-
-    def __init__(self):
-        drive = Drive(
-            seconds=24, rate_hz=20, every=4, start=(5.0, 60.0, 0.3),
-            v_std=0.02, omega_std=0.01, position_std=0.1, yaw_std=0.03,
-        )  # fmt: skip
-        t = np.arange(len(drive.stamps_ns)) / 20
-        self.drive, self.kept = drive, np.flatnonzero((t < 16) | (t > 18.5))
-        # Between two odometry messages, as pictures are.
-        self.pictures_ns = drive.stamps_ns[drive.pictures] + 7_000_000
-        self.pictures = [self._picture(k) for k in range(len(drive.pictures))]
-
-    def _picture(self, k):
-        if k < 2 or k in (60, 61):
-            return panorama(self.drive.seen[k], k, novelty=9.0)
-        if k in (20, 21):
-            return np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
-        if k == 30:
-            return np.full((SIZE.height, SIZE.width, 3), 90, np.uint8)
-        if 40 <= k < 50:
-            return panorama(self.drive.seen[40], 40)
-        if k == 55:
-            return np.zeros((SIZE.height, SIZE.width + 2, 3), np.uint8)
-        return panorama(self.drive.seen[k], k, novelty=2.0 if 63 <= k < 66 else 0.5)
-
-    def events(self):
-        yield from in_order(self.drive.stamps_ns[self.kept], self.pictures_ns)
-
-    def write(self, path):
-        drive = self.drive
-        with BagWriter(path) as bag:
-            for stamp_ns, kind, index in self.events():
-                if kind == ODOMETRY:
-                    i = self.kept[index]
-                    told = drive.poses[i], drive.read[i], drive.variances()
-                    bag.odometry('/odom', stamp_ns, *told)
-                    bag.pose('/truth', stamp_ns, drive.poses[i])
-                else:
-                    bag.image('/panorama', stamp_ns, self.pictures[index], 'omnicam')
-        return path
-
-    def message(self, stamp_ns, kind, index):
-        """Return topic and message of an event, as a robot sends it."""
-        if kind != ODOMETRY:
-            return 'panorama', to_image(self.pictures[index], stamp_ns, 'omnicam')
-        drive, i = self.drive, self.kept[index]
-        spread, frames = np.diag(drive.variances()), ('odom', 'base_link')
-        return 'odom', to_odometry(
-            drive.poses[i], np.eye(3), drive.read[i], spread, stamp_ns, frames
-        )
+def message_of(recording, stamp_ns, kind, index):
+    """Return topic and message of an event, as a robot sends it."""
+    if kind != ODOMETRY:
+        return 'panorama', to_image(recording.pictures[index], stamp_ns, 'omnicam')
+    drive, i = recording.drive, recording.kept[index]
+    spread, frames = np.diag(drive.variances()), ('odom', 'base_link')
+    return 'odom', to_odometry(drive.poses[i], np.eye(3), drive.read[i], spread, stamp_ns, frames)
 
 
 def trajectory(messages):
@@ -107,9 +60,11 @@ def live(recording, monkeypatch):
         sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
         ekf = bench.run(EkfNode, **FILTER)
         seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
+        # The latched correlation of errors is there before the first picture.
+        assert until(lambda: ekf.monitor('sfa/error_correlation').used == 1)
         sent = 0
         for event in recording.events():
-            topic, message = recording.message(*event)
+            topic, message = message_of(recording, *event)
             before = ekf.monitor(SEEN).received, ekf.monitor('odom').received
             bench.publish(topic, message)
             sent += topic == 'panorama'

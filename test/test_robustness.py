@@ -16,6 +16,7 @@ import pytest
 from robustness import TABLE, robustness_table
 
 from sfa_localization.config import FilterConfig, PanoramaConfig
+from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.place_model import Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
@@ -71,6 +72,7 @@ class ReadsPixels:
 
     panorama: PanoramaConfig = SIZE
     has_heading: bool = True
+    error_correlation: ErrorCorrelation = dataclasses.field(default_factory=ErrorCorrelation)
     free: threading.Event = dataclasses.field(default_factory=threading.Event)
     entered: threading.Event = dataclasses.field(default_factory=threading.Event)
 

@@ -26,12 +26,12 @@ def panorama(seed=0, level=120, spread=40):
 
 pytest.importorskip('rclpy')
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from ros_bench import Bench, until  # noqa: E402
 from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
-from std_msgs.msg import Float64MultiArray  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
@@ -40,6 +40,7 @@ from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,
     to_compressed,
     to_image,
+    to_info,
 )
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
 from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
@@ -266,3 +267,103 @@ def test_waiting_for_pictures_is_told(bench, models):
     assert until(lambda: told and 'waiting for pictures' in told[-1].status[0].message)
     bench.publish('panorama', message())
     assert until(lambda: 'no picture on panorama for' in told[-1].status[0].message)
+
+
+# What the node says is what it does, in any state.
+
+
+@pytest.mark.parametrize('state', ['unconfigured', 'inactive', 'active'])
+def test_a_model_is_checked_in_every_state_and_the_one_reported_is_in_use(bench, models, state):
+    node = bench.run(SfaNode, start=False, model='a.npz', diagnostics_period=0.1)
+    if state != 'unconfigured':
+        node.trigger_configure()
+    if state == 'active':
+        node.trigger_activate()
+    refused = node.set_parameters([Parameter('model', value='none.npz')])[0]
+    assert not refused.successful and 'none.npz' in refused.reason
+    assert node.get_parameter('model').value == 'a.npz'
+    assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
+    if state == 'unconfigured':
+        node.trigger_configure()
+    if state != 'active':
+        node.trigger_activate()
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    bench.publish('panorama', message())
+    assert until(lambda: heard) and heard[0].pose.position.x >= 100
+    assert until(lambda: told)
+    assert {v.key: v.value for v in told[-1].status[0].values}['model'] == 'b.npz'
+
+
+def test_a_model_whose_arrays_do_not_fit_is_refused_live(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+
+    def broken(image):
+        raise ValueError('shapes do not match')
+
+    models['b.npz'].locate = broken
+    refused = node.set_parameters([Parameter('model', value='b.npz')])[0]
+    assert not refused.successful and 'b.npz: the model is damaged' in refused.reason
+
+
+def declare(bench, **changes):
+    info = to_info(dataclasses.replace(SIZE, **changes))
+    bench.publish('panorama/info', info, latched_qos())
+
+
+@pytest.mark.parametrize('changes', [
+    {'elevation_min': -20.0}, {'elevation_max': 30.0}, {'clockwise': False},
+])  # fmt: skip
+def test_panoramas_declared_to_show_something_else_are_refused(bench, models, changes):
+    node = bench.run(SfaNode, model='a.npz', diagnostics_period=0.1)
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    declare(bench, **changes)
+    assert until(lambda: node.monitor('panorama/info').used == 1)
+    bench.publish('panorama', message())
+    assert until(lambda: node.monitor('panorama').refused)
+    ((name, value),) = changes.items()
+    reason = next(iter(node.monitor('panorama').refused))
+    assert f'{name} {value} instead of {getattr(SIZE, name)}' in reason and 'omnicam' in reason
+    assert until(
+        lambda: any(
+            m.status[0].level == DiagnosticStatus.ERROR and name in m.status[0].message
+            for m in told
+        )
+    )
+    assert not heard
+    declare(bench)
+    assert until(lambda: node.monitor('panorama/info').used == 2)
+    bench.publish('panorama', message())
+    assert until(lambda: heard)
+
+
+def test_a_declaration_made_before_activation_counts(bench, models):
+    node = bench.run(SfaNode, start=False, model='a.npz')
+    node.trigger_configure()
+    declare(bench, clockwise=False)
+    assert until(lambda: node.monitor('panorama/info').used == 1)
+    node.trigger_activate()
+    bench.publish('panorama', message())
+    assert until(lambda: node.monitor('panorama').refused)
+
+
+def test_that_nobody_declares_the_panorama_is_said_once(bench, models, monkeypatch):
+    bench.run(SfaNode, model='a.npz')
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    said = []
+    logger = type('Logger', (), {'info': lambda _, text, **k: said.append(text)})()
+    monkeypatch.setattr(SfaNode, 'get_logger', lambda _: logger)
+    for count in (1, 2, 3):
+        bench.publish('panorama', message(seed=count))
+        assert until(lambda n=count: len(heard) == n)
+    assert len(said) == 1 and 'nobody declares' in said[0] and '-12 to 24 deg' in said[0]
+
+
+def test_a_declaration_that_cannot_be_read_is_counted(bench, models):
+    node = bench.run(SfaNode, model='a.npz')
+    bench.publish('panorama/info', String(data='{"widht": 5}'), latched_qos())
+    assert until(lambda: node.monitor('panorama/info').refused)
+    heard = bench.listen(PoseStamped, 'sfa/pose')
+    bench.publish('panorama', message())
+    assert until(lambda: heard)

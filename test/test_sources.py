@@ -167,6 +167,33 @@ def test_equal_pictures_of_a_file_are_no_fault(run_feed):
     assert feed.status().lost == 0
 
 
+def test_a_defect_in_the_thread_is_shown_and_the_source_opened_again(run_feed):
+    refused = []
+    script = Script([1, ZeroDivisionError()], [2, ZeroDivisionError()], [3, None], live=False)
+    feed, received = run_feed(script, refused.append)
+    assert [received.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 2, 3]
+    wait_for(lambda: feed.status().state == 'ended')
+    assert feed.status().lost == 2
+    assert refused == ['internal error: ZeroDivisionError'] * 2
+
+
+def test_what_takes_the_pictures_may_fail_too():
+    script, lost = Script([1, 2, None], live=False), []
+
+    def deliver(image):
+        if not lost:
+            lost.append(1)
+            raise KeyError('a defect')
+
+    feed = Feed(script, deliver, config())
+    feed.start()
+    try:
+        wait_for(lambda: feed.status().state == 'ended')
+        assert feed.status().lost == 1 and script.opened == 2
+    finally:
+        feed.stop()
+
+
 def test_files_wait_until_they_are_wanted():
     wanted, received = threading.Event(), queue.Queue()
     script = Script([1, 2, None], live=False)

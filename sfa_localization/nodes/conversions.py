@@ -9,6 +9,8 @@ integer nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3,
 from __future__ import annotations
 
 import array
+import dataclasses
+import json
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -25,8 +27,9 @@ from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
+from sfa_localization.config import PanoramaConfig
 from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.decoding import (
     NANOSECONDS,
@@ -37,7 +40,7 @@ from sfa_localization.decoding import (
     read_twist,
     require_sane,
 )
-from sfa_localization.errors import DataError, MessageError
+from sfa_localization.errors import ConfigError, DataError, MessageError
 from sfa_localization.geometry import Array
 from sfa_localization.pictures import encode_jpeg
 from sfa_localization.run import Image
@@ -94,6 +97,25 @@ def to_compressed(image: Image, stamp_ns: int, frame: str, quality: int) -> Comp
     message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
     message.data = array.array('B', encode_jpeg(image, quality))
     return message
+
+
+def to_info(panorama: PanoramaConfig) -> String:
+    """What a panorama shows, for panorama/info: the settings as a JSON object."""
+    return String(data=json.dumps(dataclasses.asdict(panorama)))
+
+
+def read_info(message: String) -> PanoramaConfig:
+    """What a panorama shows, by panorama/info."""
+    try:
+        values = json.loads(message.data)
+    except (ValueError, RecursionError):
+        values = None
+    if not isinstance(values, dict):
+        raise MessageError('is no JSON object')
+    try:
+        return PanoramaConfig.from_mapping(values, 'is no panorama')
+    except ConfigError as error:
+        raise MessageError(str(error)) from None
 
 
 def read_odometry(message: Odometry) -> Motion:

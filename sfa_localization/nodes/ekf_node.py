@@ -79,6 +79,7 @@ class EkfNode(LocalizationNode):
     def setup(self) -> None:
         self._config = self.settings(EkfNodeConfig)
         self._filter = PoseFilter(self.settings(FilterConfig))
+        self._paused = False
         self._path.clear()
         self._told_level = None
         self._make_publishers()
@@ -167,7 +168,7 @@ class EkfNode(LocalizationNode):
                 )
             )
         if not update.accepted:
-            self.monitor(_SEEN).refuse(update.reason)
+            raise MessageError(update.reason)
 
     def _receive_correlation(self, message: Float64MultiArray) -> None:
         self._filter.correlate(read_error_correlation(message))
@@ -191,8 +192,7 @@ class EkfNode(LocalizationNode):
         return state.stamp_ns if state is not None else int(self.get_clock().now().nanoseconds)
 
     def _reset(self, _: Any, response: Any) -> Any:
-        self._filter.reset()
-        self._path.clear()
+        self._forget()
         self._tell_state()
         response.success, response.message = True, self._status().level.name
         return response
@@ -208,6 +208,9 @@ class EkfNode(LocalizationNode):
         self.get_logger().warning(
             f'the clock went back by {-jump.delta.nanoseconds * 1e-9:.1f} s: starting anew'
         )
+        self._attempt('clock', self._forget)
+
+    def _forget(self) -> None:
         self._filter.reset()
         self._path.clear()
 

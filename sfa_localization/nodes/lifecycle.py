@@ -26,6 +26,7 @@ from sfa_localization.config import NodeConfig, Settings
 from sfa_localization.errors import LocalizationError
 from sfa_localization.nodes import parameters
 from sfa_localization.nodes.monitor import Monitor
+from sfa_localization.reasons import bounded
 from sfa_localization.threads import one_core
 
 S = TypeVar('S', bound=Settings)
@@ -146,20 +147,43 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                 return callback(request, response)
             except LocalizationError as error:
                 response.success, response.message = False, str(error)
-                return response
+            except InvalidHandle:
+                raise
+            except Exception as error:
+                response.success, response.message = False, self._defect(name, error)
+            return response
 
         self._entities.append((self.destroy_service, self.create_service(kind, name, answer)))
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call at a steady period: simulated time may stop, and wall time may step back."""
-        made = self.create_timer(period_s, callback, clock=self._steady)
+        """Call at a steady period: simulated time may stop, and wall time may step back.
+
+        What the callback raises is counted under its name; the timer goes on.
+        """
+        name = f'timer {callback.__name__.strip("_")}'
+
+        def call() -> None:
+            self._attempt(name, callback)
+
+        made = self.create_timer(period_s, call, clock=self._steady)
         self._entities.append((self.destroy_timer, made))
 
-    def refuse(self, topic: str, reason: str) -> None:
-        """Count a refused message; log the first of a reason, then each thousandth."""
+    def refuse(self, topic: str, reason: str) -> int:
+        """Count a refused message; log the first of a reason, then each thousandth.
+
+        Returns how many of this reason there have been.
+        """
         count = self.monitor(topic).refuse(reason)
         if count == 1 or count % 1000 == 0:
-            self.get_logger().warning(f'{topic}: {reason} ({count} so far)')
+            self.get_logger().warning(f'{topic}: {bounded(reason)} ({count} so far)')
+        return count
+
+    def _defect(self, name: str, error: Exception) -> str:
+        """Count an error that nobody can have meant, and show where it came from."""
+        reason = f'internal error: {type(error).__name__}'
+        if self.refuse(name, reason) == 1:
+            self.get_logger().error(traceback.format_exc())
+        return reason
 
     def _guarded(
         self, topic: str, callback: Callable[[Any], None], while_inactive: bool = False
@@ -170,20 +194,24 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             if not (self.active or while_inactive):
                 return
             received_s = monitor.receive()
-            try:
-                callback(message)
-            except LocalizationError as error:
-                self.refuse(topic, str(error))
-            except InvalidHandle:
-                raise
-            except Exception as error:
-                # A node must outlive any message; what got here is a defect, and is shown as one.
-                self.refuse(topic, f'internal error: {type(error).__name__}')
-                self.get_logger().error(traceback.format_exc(), once=True)
-            else:
+            if self._attempt(topic, lambda: callback(message)):
                 monitor.use(received_s)
 
         return receive
+
+    def _attempt(self, name: str, callback: Callable[[], None]) -> bool:
+        """Call; what is raised is counted and logged under `name`. Whether nothing was."""
+        try:
+            callback()
+        except LocalizationError as error:
+            self.refuse(name, str(error))
+        except InvalidHandle:
+            raise
+        except Exception as error:
+            self._defect(name, error)  # a node must outlive any message
+        else:
+            return True
+        return False
 
     # Life cycle.
 
@@ -241,7 +269,10 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def _tell_health(self) -> None:
         if not self.active:
             return
-        level, text, values = self.health()
+        found: list[tuple[int, str, dict[str, str]]] = []
+        if not self._attempt('health', lambda: found.append(self.health())):
+            found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be found out', {}))
+        level, text, values = found[0]
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{topic}: '))
         status = DiagnosticStatus(

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import deque
 
 import numpy as np
+
+from sfa_localization.reasons import ReasonCounter
 
 _WINDOW = 500
 
@@ -23,7 +25,7 @@ class Monitor:
     def __init__(self) -> None:
         self.received = 0
         self.used = 0
-        self.refused: Counter[str] = Counter()
+        self.refused = ReasonCounter()
         self.last_received_s: float | None = None
         self._arrivals: deque[float] = deque(maxlen=_WINDOW)
         self._latencies: deque[float] = deque(maxlen=_WINDOW)
@@ -44,8 +46,7 @@ class Monitor:
 
     def refuse(self, reason: str) -> int:
         """Count a refusal; returns how many of this reason there have been."""
-        self.refused[reason] += 1
-        return self.refused[reason]
+        return self.refused.add(reason)
 
     def silent_for_s(self) -> float:
         """Seconds since the last arrival; infinite before the first."""
@@ -75,5 +76,7 @@ class Monitor:
             f'{prefix}latency p50 [ms]': f'{self.latency_ms(50):.2f}',
             f'{prefix}latency p99 [ms]': f'{self.latency_ms(99):.2f}',
         }
-        told.update({f'{prefix}refused: {why}': str(n) for why, n in sorted(self.refused.items())})
+        # Copied, for the thread of a feed may add to it meanwhile.
+        refused = sorted(dict(self.refused).items())
+        told.update({f'{prefix}refused: {why}': str(n) for why, n in refused})
         return told

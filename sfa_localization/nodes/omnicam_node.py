@@ -19,12 +19,14 @@ from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
+from std_msgs.msg import String
 
 from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig, Settings
 from sfa_localization.errors import LocalizationError, MessageError
-from sfa_localization.nodes.conversions import read_image, to_compressed, to_image
+from sfa_localization.nodes.conversions import read_image, to_compressed, to_image, to_info
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
+    latched_qos,
     reliable_qos,
     run_node,
     sensor_qos,
@@ -41,7 +43,10 @@ _TOPICS = {'raw': 'image_raw', 'compressed': 'image_raw/compressed'}
 
 
 class OmnicamNode(LocalizationNode):
-    """Unwraps each picture and publishes it as `panorama` and `panorama/compressed`."""
+    """Unwraps each picture and publishes it as `panorama` and `panorama/compressed`.
+
+    `panorama/info`, latched, says which elevations the rows are, and which way the columns go.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(
@@ -67,6 +72,7 @@ class OmnicamNode(LocalizationNode):
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', reliable_qos(2))
         self._compressed = self.publisher(CompressedImage, 'panorama/compressed', reliable_qos(2))
+        self._info = self.publisher(String, 'panorama/info', latched_qos())
         self._input = _TOPICS[self._config.image_transport]
         if self._config.source != 'topic':
             self._input = self._config.source_path
@@ -74,6 +80,7 @@ class OmnicamNode(LocalizationNode):
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
 
     def started(self) -> None:
+        self._info.publish(to_info(self.settings(PanoramaConfig)))
         self._follow_demand()
         if self._feed is not None and self._feed.status().state == 'new':
             self._feed.start()
@@ -174,6 +181,8 @@ class OmnicamNode(LocalizationNode):
                 self._feed.config = settings
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
             self._unwrapper = self._new_unwrapper()
+            if self.active:
+                self._info.publish(to_info(self.settings(PanoramaConfig)))
 
     def _new_unwrapper(self) -> Unwrapper:
         return Unwrapper(self.settings(CameraConfig), self.settings(PanoramaConfig))

@@ -16,13 +16,14 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from sfa_localization.config import Settings, SfaNodeConfig, WatchConfig
-from sfa_localization.errors import ConfigError, LocalizationError, MessageError
+from sfa_localization.config import PanoramaConfig, Settings, SfaNodeConfig, WatchConfig
+from sfa_localization.errors import ConfigError, LocalizationError, MessageError, ModelError
 from sfa_localization.nodes.conversions import (
     read_image,
+    read_info,
     to_array,
     to_error_correlation,
     to_pose,
@@ -37,6 +38,7 @@ from sfa_localization.nodes.lifecycle import (
 from sfa_localization.observation import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 
+_INFO = 'panorama/info'
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -49,6 +51,8 @@ class SfaNode(LocalizationNode):
         self._observer: Observer | None = None
         self._loaded: tuple[str, PlaceModel] | None = None
         self._seen: Observation | None = None
+        self._declared: PanoramaConfig | None = None
+        self._undeclared_said = False
         self.add_on_set_parameters_callback(self._check_model)
 
     def setup(self) -> None:
@@ -65,6 +69,8 @@ class SfaNode(LocalizationNode):
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
         self._topic = 'panorama/compressed' if self._config.compressed else 'panorama'
+        self._declared, self._undeclared_said = None, False
+        self.subscribe(String, _INFO, self._receive_info, latched_qos(), while_inactive=True)
         # Depth 1: when pictures come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
 
@@ -85,7 +91,10 @@ class SfaNode(LocalizationNode):
             )
         model = PlaceModel.load(Path(path))
         size = model.panorama
-        model.locate(np.zeros((size.height, size.width, 3), np.uint8))
+        try:
+            model.locate(np.zeros((size.height, size.width, 3), np.uint8))
+        except Exception as error:  # arrays that do not fit each other fail in many ways
+            raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
         heading = 'with heading' if model.has_heading else 'without heading'
         self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}, {heading}')
         return model
@@ -129,8 +138,38 @@ class SfaNode(LocalizationNode):
 
     # Pictures.
 
+    def _receive_info(self, message: String) -> None:
+        self._declared = read_info(message)
+
+    def _declared_problem(self, model: PlaceModel) -> str:
+        """How the panoramas are declared to differ from those of training; '' when they do not."""
+        if self._declared is None:
+            self._say_undeclared(model.panorama)
+            return ''
+        differences = model.panorama.differences(self._declared)
+        if not differences:
+            return ''
+        return (
+            f'panorama is declared to be unlike those of training: {differences}; '
+            'set these parameters of omnicam_node'
+        )
+
+    def _say_undeclared(self, expected: PanoramaConfig) -> None:
+        """Say once that elevations and direction of a foreign source's panoramas are believed."""
+        if self._undeclared_said or self.count_publishers(self.resolve_topic_name(_INFO)):
+            return
+        self._undeclared_said = True
+        self.get_logger().info(
+            f'nobody declares on {_INFO} what the panoramas show: they are taken to be from '
+            f'{expected.elevation_min:g} to {expected.elevation_max:g} deg, '
+            f'{"clockwise" if expected.clockwise else "counter-clockwise"}, as in training'
+        )
+
     def _receive(self, message: ImageMessage | CompressedImage) -> None:
         assert self._observer is not None
+        problem = self._declared_problem(self._observer.model)
+        if problem:
+            raise MessageError(problem)
         self._seen = seen = self._observer.observe(*read_image(message))
         self._publish(seen)
         if seen.problem:
@@ -158,6 +197,9 @@ class SfaNode(LocalizationNode):
             return _WARN, f'waiting for pictures on {self._topic}', values
         if silent > self._config.camera_timeout:
             return _ERROR, f'no picture on {self._topic} for {silent:.0f} s', values
+        declared = self._declared_problem(self._observer.model) if self._observer else ''
+        if declared:
+            return _ERROR, declared, values
         if self.monitor(self._topic).used == 0:
             return _ERROR, 'no picture has been usable', values
         if problem:

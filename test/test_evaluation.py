@@ -1,0 +1,79 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""evaluate and tune look at a drive as the nodes do, by the same parameter file."""
+
+import json
+
+import pytest
+from picture_readers import PictureReader, Recording
+
+from sfa_localization import tuning
+from sfa_localization.cli import main
+from sfa_localization.config import WatchConfig
+from sfa_localization.config_file import write_config
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.training import Recipe
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return Recording().write(tmp_path_factory.mktemp('bags') / 'drive')
+
+
+@pytest.fixture(autouse=True)
+def model(monkeypatch):
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+
+
+def evaluated(bag, tmp_path, **sections):
+    """Return what evaluate counts with a parameter file of these sections."""
+    write_config(tmp_path / 'own.yaml', sections)
+    figures = tmp_path / 'figures.json'
+    arguments = ['--config', str(tmp_path / 'own.yaml'), '--json', str(figures)]
+    assert main(['evaluate', 'reader.npz', str(bag), *arguments]) == 0
+    return json.loads(figures.read_text())
+
+
+def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, capsys):
+    plain = evaluated(bag, tmp_path)['counts']['observations']
+    assert plain == {
+        'used': 119 - 1 - 2 - 1 - 6 - 4,
+        'skipped': {
+            'picture is unlike any of training': 4,
+            'picture is dark': 2,
+            'picture is covered: it shows nothing': 1,
+            'camera is frozen: it repeats its picture': 6,
+        },
+    }
+    assert '; 2 skipped: picture is dark' in capsys.readouterr().out
+    watch = {'frozen_pictures': 2, 'novelty_unusable': 1.5}
+    found = evaluated(bag, tmp_path, sfa_node=watch)['counts']['observations']['skipped']
+    assert found['camera is frozen: it repeats its picture'] == 9
+    assert found['picture is unlike any of training'] == 4 + 3
+
+
+def test_unusable_pictures_are_not_scored(bag, tmp_path):
+    figures = evaluated(bag, tmp_path)
+    assert figures['sfa']['n'] == figures['counts']['observations']['used']
+    # Frozen pictures were kept until they were many enough to be known as such.
+    assert figures['sfa']['p95'] < 0.6
+
+
+def test_tune_leaves_out_the_same_pictures(bag):
+    counts = [
+        len(tuning.read_tours([bag], PictureReader(), Recipe(), False, False, watch)[0].sight.poses)
+        for watch in (None, WatchConfig(frozen_pictures=2, novelty_unusable=1.5))
+    ]
+    assert counts == [105, 105 - 3 - 3]
+
+
+@pytest.mark.parametrize('command', ['evaluate', 'tune'])
+def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path, capsys):
+    write_config(tmp_path / 'own.yaml', {'omnicam_node': {'elevation_max': 30.0}})
+    arguments = {
+        'evaluate': ['evaluate', 'reader.npz', str(bag)],
+        'tune': ['tune', str(bag), '--model', 'reader.npz', '--output', str(tmp_path / 'new.yaml')],
+    }
+    assert main([*arguments[command], '--config', str(tmp_path / 'own.yaml')]) == 1
+    assert 'elevation_max 30.0 instead of 24.0' in capsys.readouterr().err
+    assert not (tmp_path / 'new.yaml').exists()
