@@ -11,6 +11,7 @@ from typing import Any
 
 from sfa_localization.config import InspectionConfig, TopicNames
 from sfa_localization.errors import BagError
+from sfa_localization.files import whole_file
 from sfa_localization.inspection import BagReport, inspect
 from sfa_localization.report_bag import write_contact_sheet, write_path
 
@@ -26,18 +27,15 @@ def inspect_bags(
 ) -> list[BagReport]:
     """Inspect each bag; one that cannot be read has its `error` set and stops no other.
 
-    `json_file` receives all reports, `folder` the pictures. Raises BagError when those cannot be
-    written.
+    `json_file` receives all reports, `folder` the pictures. Raises LocalizationError when those
+    cannot be written.
     """
     reports = [_inspected(path, topics=topics, config=config, strict=strict) for path in paths]
-    try:
-        if json_file is not None:
-            _write_json(reports, json_file)
-        if folder is not None:
-            for number, report in enumerate(reports):
-                _write_pictures(report, folder, f'{number}_' if len(reports) > 1 else '')
-    except OSError as error:
-        raise BagError(f'{error.filename}: cannot be written: {error.strerror}') from None
+    if json_file is not None:
+        _write_json(reports, json_file)
+    if folder is not None:
+        for number, report in enumerate(reports):
+            _write_pictures(report, folder, f'{number}_' if len(reports) > 1 else '')
     return reports
 
 
@@ -50,10 +48,8 @@ def _inspected(path: Path, **options: Any) -> BagReport:
 
 def _write_json(reports: Sequence[BagReport], path: Path) -> None:
     text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f'.{path.name}')
-    partial.write_text(text + '\n', encoding='utf-8')
-    partial.replace(path)
+    with whole_file(path, make_folder=True) as file:
+        file.write(f'{text}\n'.encode())
 
 
 def _write_pictures(report: BagReport, folder: Path, prefix: str) -> None:

@@ -8,8 +8,7 @@ file; nothing here opens a window. Colours are Okabe and Ito's, told apart by co
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure, SubFigure
 
+from sfa_localization.files import whole_file
 from sfa_localization.geometry import Array, wrap_angle
 from sfa_localization.run import Stamps, Trajectory
 
@@ -183,8 +183,8 @@ def write_report(
     """Write every picture and ``report.md`` into `folder`, made when missing.
 
     Estimates are in the truth's frame; `positions` (N, 2) m and `features` (N, K) belong together.
+    Raises LocalizationError when a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     trajectories_figure(folder / 'trajectories.png', truth, estimates, scores)
     errors_figure(folder / 'errors.png', truth, estimates)
     firing_maps_figure(folder / 'firing_maps.png', positions, features)
@@ -195,7 +195,7 @@ def write_report(
         pictures.append('heading')
     images = [f'![{name}]({name}.png)' for name in pictures]
     parts = ['# Evaluation', table(scores), heading_table(scores), *images]
-    write_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
+    save_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
 
 
 def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Scores) -> None:
@@ -306,23 +306,12 @@ def _number(value: float | None, column: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, at once or not at all."""
-    with _whole(path) as partial:
-        figure.savefig(partial, dpi=DOTS_PER_INCH, format='png')
+    """Write a figure as PNG, at once or not at all. Raises LocalizationError."""
+    with whole_file(path, make_folder=True) as file:
+        figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, at once or not at all."""
-    with _whole(path) as partial:
-        partial.write_text(text, encoding='utf-8')
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A temporary name to write to; it becomes `path` in the end, or vanishes after an error."""
-    partial = path.with_name(f'.{path.name}.partial')
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, at once or not at all. Raises LocalizationError."""
+    with whole_file(path, make_folder=True) as file:
+        file.write(text.encode())

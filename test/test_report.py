@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report: errors by hand, and pictures that are whole, of the promised size, and not blank."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -100,14 +98,3 @@ def test_path_is_drawn_in_its_colour_and_to_scale(tmp_path, truth):
     upper = rows < 0.85 * blue.shape[0]  # without the legend
     assert np.ptp(columns[upper]) == pytest.approx(np.ptp(rows[upper]), rel=0.02)
     assert np.ptp(rows[upper]) > 100
-
-
-def test_failed_picture_leaves_nothing(tmp_path: Path, truth, monkeypatch):
-    def full_disk(_figure, path, **_options):
-        path.write_bytes(b'half a picture')
-        raise OSError(28, 'No space left on device')
-
-    monkeypatch.setattr(report.Figure, 'savefig', full_disk)
-    with pytest.raises(OSError, match='No space'):
-        report.errors_figure(tmp_path / 'errors.png', truth, {})
-    assert list(tmp_path.iterdir()) == []
