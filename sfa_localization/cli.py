@@ -48,6 +48,8 @@ OPTIONAL = {
     'embreex': 'trimesh embreex',
     'mdp': 'MDP==3.6',
     'distributed': 'distributed',
+    'lz4': 'lz4',
+    'zstandard': 'backports.zstd',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }
 """What some commands need beyond the rest, and how it is installed."""
