@@ -299,7 +299,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     pictures = calibration.read_pictures(arguments.images)
     circles = None
     if arguments.center or arguments.radii:
-        circles = calibration.given_circles(arguments.center or (), arguments.radii or ())
+        circles = calibration.given_circles(arguments.center, arguments.radii, pictures)
     config, known = _settings(CalibrationConfig, arguments), _given(CameraConfig, arguments)
     camera = calibration.calibrate(pictures, arguments.calibration, circles, config, known)
     print(calibration.parameters_text(camera), end='')
@@ -399,7 +399,7 @@ def _configure_tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, help='parameter file to start from')
     parser.add_argument('--output', type=Path, required=True, help='parameter file to write')
     _add_settings(parser, TuneConfig)
-    _add_settings(parser, TopicNames)
+    _add_topics(parser, *_TOPIC_FLAGS)
 
 
 def _tune(arguments: argparse.Namespace) -> int:
