@@ -51,7 +51,10 @@ setup(
         'scipy>=1.11',
         'opencv-python-headless>=4.6',
         'filterpy>=1.4.5',
-        'rosbags>=0.10',
+        'rosbags>=0.10.9',
+        # Compressed bags are read by these, not through rosbags; its versions bring different ones.
+        'backports.zstd>=1.0; python_version < "3.14"',
+        'lz4>=4.0',
         'PyYAML>=5.4',
         'threadpoolctl>=3.1',
         'tqdm>=4.60',

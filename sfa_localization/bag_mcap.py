@@ -21,7 +21,8 @@ from typing import NamedTuple
 
 from lz4.frame import LZ4FrameDecompressor
 
-from sfa_localization.bag_storage import Channel, Record, make_channel, zstd
+from sfa_localization.bag_storage import Channel, Record, make_channel
+from sfa_localization.bag_zstd import ZstdError, decompressor
 from sfa_localization.errors import BagError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -308,13 +309,13 @@ def _inflated(packed: bytes, compression: str, cut_off: bool) -> bytes:
         return packed
     if compression not in ('zstd', 'lz4'):
         raise Damage(f'unknown compression {compression!r}')
-    decompressor = zstd.ZstdDecompressor() if compression == 'zstd' else LZ4FrameDecompressor()
+    inflater = decompressor() if compression == 'zstd' else LZ4FrameDecompressor()
     plain: list[bytes] = []
     step = PIECE if cut_off else max(len(packed), 1)
     try:
         for start in range(0, len(packed), step):
-            plain.append(decompressor.decompress(packed[start : start + step]))
-    except (zstd.ZstdError, RuntimeError, EOFError, MemoryError):
+            plain.append(inflater.decompress(packed[start : start + step]))
+    except (ZstdError, RuntimeError, EOFError, MemoryError):
         if not cut_off:
             raise Damage(f'{compression} cannot decompress it') from None
     return b''.join(plain)

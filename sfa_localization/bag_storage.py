@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol
@@ -13,12 +12,8 @@ import yaml
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
+from sfa_localization.bag_zstd import ZstdError, decompressor
 from sfa_localization.errors import BagError
-
-if sys.version_info >= (3, 14):
-    from compression import zstd as zstd
-else:
-    from backports import zstd as zstd
 
 try:
     from yaml import CSafeLoader as YamlLoader
@@ -96,27 +91,31 @@ def inflate_message(data: bytes) -> bytes:
     """Undo the recorder's compression of single messages. Raises BagError."""
     if data[:4] != ZSTD_MAGIC:
         return data
+    inflater = decompressor()
     try:
-        return bytes(zstd.decompress(data))
-    except zstd.ZstdError:
+        plain = bytes(inflater.decompress(data))
+    except ZstdError:
         raise BagError('a compressed message is damaged') from None
+    if not inflater.eof:
+        raise BagError('a compressed message is cut off')
+    return plain
 
 
 def inflate_file(source: Path, target: Path) -> str:
     """Decompress a file; return what is wrong with it ('' when whole). Raises OSError."""
-    decompressor = zstd.ZstdDecompressor()
     with source.open('rb') as packed, target.open('wb') as plain:
-        return _inflate(packed, plain, decompressor)
+        return _inflate(packed, plain)
 
 
-def _inflate(packed: IO[bytes], plain: IO[bytes], decompressor: Any) -> str:
+def _inflate(packed: IO[bytes], plain: IO[bytes]) -> str:
+    inflater = decompressor()
     while piece := packed.read(PIECE):
         while piece:
+            if inflater.eof:
+                inflater = decompressor()
             try:
-                plain.write(decompressor.decompress(piece))
-            except zstd.ZstdError:
+                plain.write(inflater.decompress(piece))
+            except ZstdError:
                 return 'damaged zstd data; read up to the damage'
-            piece = decompressor.unused_data
-            if decompressor.eof and piece:
-                decompressor = zstd.ZstdDecompressor()
-    return '' if decompressor.eof else 'cut-off zstd data; read up to the cut'
+            piece = inflater.unused_data
+    return '' if inflater.eof else 'cut-off zstd data; read up to the cut'

@@ -67,8 +67,14 @@ class BagWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = Path(tempfile.mkdtemp(prefix='.bag-', dir=self.path.parent))
         except OSError as error:
-            raise BagError(f'{self.path}: cannot be written: {error.strerror}') from None
-        self._writer = _open_writer(self._folder / self.path.name, self._storage)
+            raise self._unwritable(error) from None
+        try:
+            self._writer = _open_writer(self._folder / self.path.name, self._storage)
+        except BaseException as error:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            if isinstance(error, Exception):
+                raise self._unwritable(error) from None
+            raise
         return self
 
     def __exit__(
@@ -81,10 +87,17 @@ class BagWriter:
             self._writer.__exit__(kind, error, trace)
             if kind is None:
                 (self._folder / self.path.name).rename(self.path)
-        except OSError as failure:
-            raise BagError(f'{self.path}: cannot be written: {failure.strerror}') from None
+        except Exception as failure:
+            # What ended the block is the cause; that the rest could not be written follows.
+            if kind is None:
+                raise self._unwritable(failure) from None
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _unwritable(self, error: Exception) -> BagError:
+        """The error to raise instead of one of the file system's, or of a database's many."""
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        return BagError(f'{self.path}: cannot be written: {why or type(error).__name__}')
 
     def image(
         self,
@@ -184,10 +197,11 @@ class BagWriter:
             self._connections[topic] = connection
         if connection.msgtype != kind:
             raise BagError(f'{self.path}: topic {topic} is {connection.msgtype}, not {kind}')
+        data = self._types.serialize_cdr(message, kind)
         try:
-            self._writer.write(connection, stamp_ns, self._types.serialize_cdr(message, kind))
-        except OSError as error:
-            raise BagError(f'{self.path}: cannot be written: {error.strerror}') from None
+            self._writer.write(connection, stamp_ns, data)
+        except Exception as error:
+            raise self._unwritable(error) from None
 
     def _make(self, kind: str, **fields: Any) -> Any:
         return self._types.types[kind](**fields)

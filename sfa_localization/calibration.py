@@ -251,8 +251,19 @@ def _limits(circles: MirrorCircles) -> dict[str, float]:
     return {'radius_min': hole, 'radius_max': circles.rim.radius}
 
 
-def given_circles(center: Sequence[float], radii: Sequence[float]) -> MirrorCircles:
-    """Circles told by the user: center as column, row, and radii as hole, rim, in pixels."""
+def given_circles(
+    center: Sequence[float] | None, radii: Sequence[float] | None, pictures: Sequence[Image] = ()
+) -> MirrorCircles:
+    """Circles told by the user: center as column, row, and radii as hole, rim, in pixels.
+
+    What is not told is found in the pictures (H, W, 3). Raises CameraError.
+    """
+    if center is None or radii is None:
+        if not pictures:
+            raise CameraError('without pictures, give both --center and --radii')
+        found = find_circles(pictures)
+        center = center or (found.rim.column, found.rim.row)
+        radii = radii or (found.hole.radius if found.hole else 0.0, found.rim.radius)
     if len(center) != 2 or len(radii) != 2 or not 0 <= radii[0] < radii[1]:
         raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
     column, row = center

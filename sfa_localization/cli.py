@@ -31,7 +31,13 @@ from sfa_localization.config import (
     TuneConfig,
     WatchConfig,
 )
-from sfa_localization.config_file import load_changes, load_settings, render, write_config
+from sfa_localization.config_file import (
+    SECTIONS,
+    load_changes,
+    load_settings,
+    render,
+    write_config,
+)
 from sfa_localization.errors import ConfigError, DataError, LocalizationError
 
 if TYPE_CHECKING:
@@ -43,6 +49,8 @@ OPTIONAL = {
     'embreex': 'trimesh embreex',
     'mdp': 'MDP==3.6',
     'distributed': 'distributed',
+    'lz4': 'lz4',
+    'zstandard': 'backports.zstd',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }
 """What some commands need beyond the rest, and how it is installed."""
@@ -69,6 +77,8 @@ def _add_settings(
         unit = f' ({item.metadata["unit"]})' if item.metadata['unit'] else ''
         parser.add_argument(
             f'--{item.name.replace("_", "-")}',
+            dest=_dest(group, item.name),
+            metavar=None if item.metadata['choices'] else item.name.upper(),
             type=_by_x if isinstance(item.default, tuple) else type(item.default),
             choices=item.metadata['choices'] or None,
             default=argparse.SUPPRESS,
@@ -88,11 +98,23 @@ def _shown(default: object) -> str:
     return 'x'.join(f'{part:g}' for part in default) if isinstance(default, tuple) else str(default)
 
 
-def _settings(group: type[S], arguments: argparse.Namespace) -> S:
-    """The group with the settings that were given on the command line."""
-    names = {item.name for item in dataclasses.fields(group)}
-    given = {name: value for name, value in vars(arguments).items() if name in names}
-    return group.from_mapping(given, 'command line')
+def _dest(group: type[Settings], name: str) -> str:
+    """Where the parser keeps a setting: under its group, as two groups may share a name."""
+    return f'{group.__name__}.{name}'
+
+
+def _given(group: type[Settings], arguments: argparse.Namespace) -> dict[str, Any]:
+    """The settings of the group that were given on the command line."""
+    places = {_dest(group, item.name): item.name for item in dataclasses.fields(group)}
+    return {places[at]: value for at, value in vars(arguments).items() if at in places}
+
+
+def _settings(group: type[S], arguments: argparse.Namespace, path: Path | None = None) -> S:
+    """The group as the parameter file at `path`, if any, and then the command line say."""
+    section = next((name for name, kinds in SECTIONS.items() if group in kinds), '')
+    settings = load_settings(path, section, group) if path else group()
+    told = {item.name: getattr(settings, item.name) for item in dataclasses.fields(group)}
+    return group.from_mapping({**told, **_given(group, arguments)}, 'command line')
 
 
 def _configure_simulate(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +123,7 @@ def _configure_simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--compressed',
         action='store_const',
-        dest='compression',
+        dest=_dest(SimulationConfig, 'compression'),
         const='jpeg',
         default=argparse.SUPPRESS,
         help='short for --compression jpeg',
@@ -197,18 +219,24 @@ def _configure_inspect(parser: argparse.ArgumentParser) -> None:
     _add_settings(parser, InspectionConfig)
 
 
+_TOPIC_FLAGS = {
+    'image': '--image-topic',
+    'odometry': '--odom-topic',
+    'imu': '--imu-topic',
+    'ground_truth': '--ground-truth-topic',
+}
+
+
 def _add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
     """Add the flags that choose topics (none named: for pictures and odometry)."""
-    flags = {
-        'image': '--image-topic',
-        'odometry': '--odom-topic',
-        'imu': '--imu-topic',
-        'ground_truth': '--ground-truth-topic',
-    }
     docs = {item.name: item.metadata['doc'] for item in dataclasses.fields(TopicNames)}
     for name in names or ('image', 'odometry'):
         parser.add_argument(
-            flags[name], dest=name, metavar='T', default=argparse.SUPPRESS, help=docs[name]
+            _TOPIC_FLAGS[name],
+            dest=_dest(TopicNames, name),
+            metavar='T',
+            default=argparse.SUPPRESS,
+            help=docs[name],
         )
 
 
@@ -272,9 +300,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     pictures = calibration.read_pictures(arguments.images)
     circles = None
     if arguments.center or arguments.radii:
-        circles = calibration.given_circles(arguments.center or (), arguments.radii or ())
-    known = {name: value for name, value in vars(arguments).items() if name in _MOUNT}
-    config = _settings(CalibrationConfig, arguments)
+        circles = calibration.given_circles(arguments.center, arguments.radii, pictures)
+    config, known = _settings(CalibrationConfig, arguments), _given(CameraConfig, arguments)
     camera = calibration.calibrate(pictures, arguments.calibration, circles, config, known)
     print(calibration.parameters_text(camera), end='')
     if arguments.check:
@@ -329,7 +356,7 @@ def _filter(arguments: argparse.Namespace) -> int:
 
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
-    config = _filter_config(arguments.config)
+    config = _settings(FilterConfig, arguments, arguments.config)
     config, text = filtering.fitting_config(odometry, positions, config)
     if text:
         print(text)
@@ -351,14 +378,6 @@ def _filter(arguments: argparse.Namespace) -> int:
     waited = f', {done.before_start} rows before the start' if done.before_start else ''
     print(f'{arguments.output}: {len(done.poses)} poses{waited}')
     return 0
-
-
-def _filter_config(path: Path | None) -> FilterConfig:
-    return load_settings(path, 'ekf_node', FilterConfig) if path else FilterConfig()
-
-
-def _watch_config(path: Path | None) -> WatchConfig:
-    return load_settings(path, 'sfa_node', WatchConfig) if path else WatchConfig()
 
 
 def _require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:
@@ -395,25 +414,20 @@ def _configure_tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, help='parameter file to start from')
     parser.add_argument('--output', type=Path, required=True, help='parameter file to write')
     _add_settings(parser, TuneConfig)
-    _add_settings(parser, TopicNames)
+    _add_topics(parser, *_TOPIC_FLAGS)
 
 
 def _tune(arguments: argparse.Namespace) -> int:
-    from sfa_localization import training, tuning
+    from sfa_localization import tuning
     from sfa_localization.correlation import resolved
     from sfa_localization.place_model import PlaceModel
 
     how, model = _settings(TuneConfig, arguments), PlaceModel.load(arguments.model)
     _require_same_panorama(arguments.config, model.panorama)
-    camera = CameraConfig()
-    if arguments.config:
-        camera = load_settings(arguments.config, 'omnicam_node', CameraConfig)
-    recipe = training.Recipe(
-        topics=_settings(TopicNames, arguments), camera=camera, panorama=model.panorama
-    )
-    config = _filter_config(arguments.config)
+    recipe = dataclasses.replace(_recipe(arguments), panorama=model.panorama)
+    config = _settings(FilterConfig, arguments, arguments.config)
+    watch = _settings(WatchConfig, arguments, arguments.config)
     progress = sys.stderr.isatty()
-    watch = _watch_config(arguments.config)
     start = resolved(config, model.error_correlation)
     tours = tuning.read_tours(arguments.bags, model, recipe, how.method == 'grid', progress, watch)
     best = tuning.tune(tours, start, how, progress)
@@ -468,20 +482,10 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
     """The recipe of --config, with the topics and settings that the command line names."""
     from sfa_localization.training import Recipe
 
-    topics = {name: vars(arguments)[name] for name in _TOPICS if name in arguments}
-    values = {}
-    for item in dataclasses.fields(Recipe):
-        group = type(getattr(Recipe(), item.name))
-        section = 'omnicam_node' if group in (CameraConfig, PanoramaConfig) else 'training'
-        settings = load_settings(arguments.config, section, group) if arguments.config else group()
-        known = {field.name for field in dataclasses.fields(group)}
-        told = {name: value for name, value in vars(arguments).items() if name in known}
-        values[item.name] = dataclasses.replace(settings, **told) if told else settings
-    values['topics'] = dataclasses.replace(values['topics'], **topics)
-    return Recipe(**values)
-
-
-_TOPICS = ('image', 'odometry', 'imu', 'ground_truth')
+    groups = {item.name: type(getattr(Recipe(), item.name)) for item in dataclasses.fields(Recipe)}
+    return Recipe(
+        **{name: _settings(group, arguments, arguments.config) for name, group in groups.items()}
+    )
 
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
@@ -543,7 +547,7 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, help='parameter file')
     parser.add_argument('--report', type=Path, metavar='DIR', help='write pictures and the table')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the figures')
-    _add_topics(parser, *_TOPICS)
+    _add_topics(parser, *_TOPIC_FLAGS)
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -557,8 +561,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         arguments.bag,
         align_bag=arguments.align,
         recipe=_recipe(arguments),
-        config=_filter_config(arguments.config),
-        watch=_watch_config(arguments.config),
+        config=_settings(FilterConfig, arguments, arguments.config),
+        watch=_settings(WatchConfig, arguments, arguments.config),
         progress=sys.stderr.isatty(),
     )
     print(report.table(judged.scores), report.heading_table(judged.scores), sep='\n\n')

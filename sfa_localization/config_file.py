@@ -41,6 +41,7 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
 _EVERY_NODE = '/**'
 _KEY = 'ros__parameters'
 _OF_ROS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+"""Parameters that rclpy declares for every node; they are none of the settings."""
 _WIDTH = 100
 _HEAD = """\
 # Every parameter of sfa_localization, with its default; all may be left out.
@@ -55,23 +56,36 @@ def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
     Raises ConfigError naming file, section and parameter for whatever cannot be used.
     """
     values = load_section(Path(path), section)
-    names = {item.name: item for item in dataclasses.fields(kind)}
-    given = {name: _number(names[name], value) for name, value in values.items() if name in names}
+    names = {item.name for item in dataclasses.fields(kind)}
+    given = {name: value for name, value in values.items() if name in names}
     return kind.from_mapping(given, f'{path}: {section}')
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:
-    """Names and values of one section, those of `/**` below them. Raises ConfigError."""
+    """Names and values that one section sets, or `/**` where the section has the name.
+
+    ROS's own parameters are among them, such as `use_sim_time`: no settings, but the user's will.
+    Raises ConfigError.
+    """
     document = _read(path)
-    known = {item.name for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
+    known = {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
     anywhere = {item.name for kinds in SECTIONS.values() for kind in kinds
                 for item in dataclasses.fields(kind)}  # fmt: skip
     shared = _parameters(document, _EVERY_NODE, path)
     own = {name: value for given in (section, f'/{section}')
            for name, value in _parameters(document, given, path).items()}  # fmt: skip
     _require_known(shared, anywhere, f'{path}: {_EVERY_NODE}')
-    _require_known(own, known, f'{path}: {section}')
-    return {**shared, **own}
+    _require_known(own, set(known), f'{path}: {section}')
+    return {
+        name: _number(known[name], value) if name in known else value
+        for name, value in {**shared, **own}.items()
+        if name in known or _of_ros(name)
+    }
+
+
+def _of_ros(name: str) -> bool:
+    """Whether ROS has the parameter, given as a tree or by its full name with dots."""
+    return name.partition('.')[0] in _OF_ROS
 
 
 def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
@@ -103,20 +117,20 @@ def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[s
     values = part.get(_KEY) or {}
     if not isinstance(values, dict):
         raise ConfigError(f'{path}: {section}.{_KEY} must hold names and values')
-    return {str(name): value for name, value in values.items() if name not in _OF_ROS}
+    return {str(name): value for name, value in values.items()}
 
 
 def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
     for name in values:
-        if name not in known:
+        if name not in known and not _of_ros(name):
             close = difflib.get_close_matches(name, sorted(known), n=1)
             hint = f'; did you mean {close[0]!r}?' if close else ''
             raise ConfigError(f'{where}: unknown parameter {name!r}{hint}')
 
 
 def _number(item: dataclasses.Field[Any], value: Any) -> Any:
-    """YAML 1.1 takes 1e-3 for a text; ROS does not, and neither do people."""
-    if isinstance(item.default, float) and isinstance(value, str):
+    """YAML 1.1 takes 1e-3 for a text; ROS does not, and neither do people. 3 is as good as 3.0."""
+    if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)
         except ValueError:
@@ -131,6 +145,7 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
         parts.append(f'{section}:\n  {_KEY}:\n')
         changed = (changes or {}).get(section, {})
         parts += [_group(kind, changed) for kind in kinds]
+        parts.append(_ros_group({n: value for n, value in changed.items() if _of_ros(n)}))
     return ''.join(parts)
 
 
@@ -149,6 +164,13 @@ def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:
         )
         lines.append(f'    {item.name}: {_text(changes.get(item.name, item.default))}')
     return '\n'.join(lines) + '\n'
+
+
+def _ros_group(values: Mapping[str, Any]) -> str:
+    if not values:
+        return ''
+    text = yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
+    return textwrap.indent(f'# --- Of ROS itself.\n{text}', '    ')
 
 
 def _described(item: dataclasses.Field[Any]) -> str:

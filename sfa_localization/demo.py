@@ -27,6 +27,7 @@ from sfa_localization.evaluation import (
     score,
     write_json,
 )
+from sfa_localization.files import whole_file
 from sfa_localization.report import write_report
 from sfa_localization.run import Trajectory
 from sfa_localization.simulation import simulate
@@ -75,20 +76,30 @@ class _Steps:
 
 def _prepare(out: Path, config: DemoConfig) -> None:
     """Make the folder, or clear what a demonstration with other settings left in it."""
-    settings = json.dumps({'version': __version__, 'world': config.world, 'seed': config.seed})
     marker = out / MARKER
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()) and not marker.exists():
             raise LocalizationError(f'{out}: not a folder of the demo: name another one with --out')
-        if marker.exists() and marker.read_text(encoding='utf-8') != settings:
+        if marker.exists() and marker.read_text(encoding='utf-8') != _settings_of(config):
             for name in ('coverage', 'test', 'logs', 'report'):
                 shutil.rmtree(out / name, ignore_errors=True)
         for name in ('model.npz', 'results.json'):
             (out / name).unlink(missing_ok=True)
-        marker.write_text(settings, encoding='utf-8')
     except OSError as error:
         raise LocalizationError(f'{out}: cannot be written: {error.strerror}') from None
+    _mark(marker, config)
+
+
+def _mark(marker: Path, config: DemoConfig) -> None:
+    """Note what the folder was made with."""
+    with whole_file(marker) as file:
+        file.write(_settings_of(config).encode())
+
+
+def _settings_of(config: DemoConfig) -> str:
+    """What another demonstration must share to use the bags again."""
+    return json.dumps({'version': __version__, 'world': config.world, 'seed': config.seed})
 
 
 def _simulate(drive: str, bag: Path, config: DemoConfig, progress: bool) -> None:

@@ -27,18 +27,15 @@ def inspect_bags(
 ) -> list[BagReport]:
     """Inspect each bag; one that cannot be read has its `error` set and stops no other.
 
-    `json_file` receives all reports, `folder` the pictures. Raises BagError when those cannot be
-    written.
+    `json_file` receives all reports, `folder` the pictures. Raises LocalizationError when those
+    cannot be written.
     """
     reports = [_inspected(path, topics=topics, config=config, strict=strict) for path in paths]
-    try:
-        if json_file is not None:
-            _write_json(reports, json_file)
-        if folder is not None:
-            for number, report in enumerate(reports):
-                _write_pictures(report, folder, f'{number}_' if len(reports) > 1 else '')
-    except OSError as error:
-        raise BagError(f'{error.filename}: cannot be written: {error.strerror}') from None
+    if json_file is not None:
+        _write_json(reports, json_file)
+    if folder is not None:
+        for number, report in enumerate(reports):
+            _write_pictures(report, folder, f'{number}_' if len(reports) > 1 else '')
     return reports
 
 

@@ -166,13 +166,17 @@ def _fixed_point(pixels: Array, wraps: bool, seen: Mask) -> _Tables:
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
-    """Mask (H, W) of the rays whose azimuth lies in one of the sectors (start, end in degrees)."""
+    """Mask (H, W) of the rays whose azimuth lies in one of the sectors (start, end in degrees).
+
+    A sector that comes around to where it starts, as from -180 to 180, is the whole circle.
+    """
     if len(sectors) % 2:
         raise CameraError('blind_sectors must hold a start and an end for each sector')
     azimuth = np.degrees(np.arctan2(rays[..., 1], rays[..., 0]))
     hidden = np.zeros(azimuth.shape, bool)
     for start, end in zip(sectors[::2], sectors[1::2], strict=True):
-        hidden |= (azimuth - start) % 360.0 <= (end - start) % 360.0
+        whole = end - start >= 360.0 or (end != start and (end - start) % 360.0 == 0.0)
+        hidden |= (azimuth - start) % 360.0 <= (360.0 if whole else (end - start) % 360.0)
     return hidden
 
 

@@ -183,8 +183,8 @@ def write_report(
     """Write every picture and ``report.md`` into `folder`, made when missing.
 
     Estimates are in the truth's frame; `positions` (N, 2) m and `features` (N, K) belong together.
+    Raises LocalizationError when a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     trajectories_figure(folder / 'trajectories.png', truth, estimates, scores)
     errors_figure(folder / 'errors.png', truth, estimates)
     firing_maps_figure(folder / 'firing_maps.png', positions, features)
@@ -195,7 +195,7 @@ def write_report(
         pictures.append('heading')
     images = [f'![{name}]({name}.png)' for name in pictures]
     parts = ['# Evaluation', table(scores), heading_table(scores), *images]
-    write_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
+    save_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
 
 
 def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Scores) -> None:
@@ -306,12 +306,12 @@ def _number(value: float | None, column: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, at once or not at all."""
-    with whole_file(path) as file:
+    """Write a figure as PNG, at once or not at all. Raises LocalizationError."""
+    with whole_file(path, make_folder=True) as file:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, at once or not at all."""
-    with whole_file(path) as file:
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, at once or not at all. Raises LocalizationError."""
+    with whole_file(path, make_folder=True) as file:
         file.write(text.encode())

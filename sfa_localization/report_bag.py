@@ -8,17 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sfa_localization.geometry import Array
+from sfa_localization.report import save
 from sfa_localization.run import Image
-
-DOTS_PER_INCH = 130
 
 
 def write_contact_sheet(samples: Sequence[Image], title: str, path: Path) -> None:
-    """Write BGR pictures (H, W, 3) as a PNG, in reading order."""
+    """Write BGR pictures (H, W, 3) as a PNG, in reading order. Raises LocalizationError."""
     height, width = samples[0].shape[:2]
     columns = max(1, round(np.sqrt(len(samples) * height / width)))
     rows = -(-len(samples) // columns)
@@ -30,11 +28,14 @@ def write_contact_sheet(samples: Sequence[Image], title: str, path: Path) -> Non
         axis.set_axis_off()
     for axis, sample in zip(axes, samples, strict=False):
         axis.imshow(sample[..., ::-1], interpolation='lanczos')
-    _save(figure, path)
+    save(figure, path)
 
 
 def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
-    """Write the odometry's path (N, 3) and the places (M, 3) of the pictures as a PNG."""
+    """Write the odometry's path (N, 3) and the places (M, 3) of the pictures as a PNG.
+
+    Raises LocalizationError.
+    """
     figure = Figure((6.5, 6), layout='constrained')
     axes = figure.add_subplot()
     axes.plot(poses[:, 0], poses[:, 1], color='0.8', linewidth=1, zorder=1)
@@ -46,13 +47,4 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     axes.title.set_fontsize(10)
     axes.legend(loc='upper right')
     figure.colorbar(dots, label='pictures, % of the drive', shrink=0.7)
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    """Write to another name first, so that no half picture is ever seen."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f'.{path.name}')
-    FigureCanvasAgg(figure)
-    figure.savefig(partial, dpi=DOTS_PER_INCH, format='png')
-    partial.replace(path)
+    save(figure, path)

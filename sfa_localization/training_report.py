@@ -18,8 +18,10 @@ _SIZE = (7.0, 6.0)
 
 
 def write_training_report(folder: Path, trained: Trained) -> None:
-    """Write coverage, line fits, firing maps and, where there are any, headings and descent."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write coverage, line fits, firing maps and, where there are any, headings and descent.
+
+    Makes the folder. Raises LocalizationError when a file cannot be written.
+    """
     images, places = metric.positions(trained.metric, trained.segments)
     names = ['coverage', 'line_fits', 'firing_maps']
     coverage_figure(folder / 'coverage.png', trained, places)
@@ -33,7 +35,7 @@ def write_training_report(folder: Path, trained: Trained) -> None:
         convergence_figure(folder / 'convergence.png', trained.metric.history)
     shown = [f'![{name}]({name}.png)' for name in names]
     text = '\n\n'.join(['# Training', f'```\n{summary(trained)}\n```', *shown]) + '\n'
-    report.write_text(folder / 'training.md', text)
+    report.save_text(folder / 'training.md', text)
 
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:

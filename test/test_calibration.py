@@ -147,7 +147,7 @@ def test_from_a_calibration_file(tmp_path):
         (['missing.png'], 'missing.png'),
         (['notes.txt'], 'notes.txt'),
         (['raw.png', 'small.png'], 'differ in size'),
-        (['raw.png', '--center', '3x4'], '--radii'),
+        (['raw.png', '--center', '3'], '--radii'),
         (['--calibration', 'missing.yaml'], 'missing.yaml'),
         (['filled.png'], 'inner circle'),
     ],
@@ -181,3 +181,16 @@ def test_given_circles_are_checked():
     with pytest.raises(CameraError, match='--radii'):
         given_circles((1.0, 2.0), (5.0, 4.0))
     assert given_circles((1.0, 2.0), (0.0, 4.0)).hole is None
+
+
+def test_of_center_and_radii_what_is_not_given_is_found():
+    picture = scene(1)
+    found = find_circles([picture])
+    center = given_circles((300.0, 200.0), None, [picture])
+    assert (center.rim.column, center.rim.row) == (300.0, 200.0)
+    assert (center.rim.radius, center.hole.radius) == (found.rim.radius, found.hole.radius)
+    radii = given_circles(None, (50.0, 180.0), [picture])
+    assert (radii.rim.column, radii.rim.row) == (found.rim.column, found.rim.row)
+    assert (radii.hole.radius, radii.rim.radius) == (50.0, 180.0)
+    with pytest.raises(CameraError, match='both --center and --radii'):
+        given_circles((300.0, 200.0), None)

@@ -75,6 +75,30 @@ def test_what_is_not_named_is_default_and_ros_names_are_left_alone(tmp_path):
     assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig()
 
 
+def test_what_is_of_ros_is_written_again(tmp_path):
+    """A file that is read, changed and written anew keeps what only ROS knows, and all values."""
+    path = saved(tmp_path, '/**:\n  ros__parameters:\n    use_sim_time: true\n    width: 300\n'
+                           'ekf_node:\n  ros__parameters:\n    history: 3\n'
+                           '    slip_per_metre: 1e-3\n'
+                           '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n'
+                           'omnicam_node:\n  ros__parameters:\n'
+                           '    qos_overrides./panorama.publisher.depth: 7\n'
+                           'training:\n  ros__parameters:\n    photometric_seed: 7\n')  # fmt: skip
+    changes = config_file.load_changes(path)
+    write_config(tmp_path / 'new.yaml', changes)
+    sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
+    ekf, omnicam, sfa, training = (
+        sections[name]['ros__parameters']
+        for name in ('ekf_node', 'omnicam_node', 'sfa_node', 'training')
+    )
+    assert ekf['use_sim_time'] is omnicam['use_sim_time'] is sfa['use_sim_time'] is True
+    assert ekf['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
+    assert omnicam['qos_overrides./panorama.publisher.depth'] == 7
+    assert (ekf['slip_per_metre'], type(ekf['history'])) == (1e-3, float), 'as ROS reads them'
+    assert (omnicam['width'], training['photometric_seed']) == (300, 7)
+    assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
+
+
 def test_numbers_as_people_write_them(tmp_path):
     path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    slip_per_metre: 1e-3\n')
     assert load_settings(path, 'ekf_node', FilterConfig).slip_per_metre == 1e-3

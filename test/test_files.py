@@ -1,11 +1,82 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A file is there whole or not at all, whatever happens while it is written."""
+"""A file is there whole or not at all, whatever happens while it is written, and whoever writes."""
 
+import ast
+import errno
+import io
+from pathlib import Path
+
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from sfa_localization.errors import DataError
+import sfa_localization
+from sfa_localization import (
+    bag_writer,
+    calibration,
+    config_file,
+    evaluation,
+    files,
+    filtering,
+    inspection_files,
+    place_model,
+    report,
+    report_bag,
+)
+from sfa_localization.bag_writer import BagWriter
+from sfa_localization.config import DemoConfig
+from sfa_localization.errors import BagError, DataError, LocalizationError
 from sfa_localization.files import whole_file
+from sfa_localization.inspection import BagReport
+
+FULL = OSError(errno.ENOSPC, 'No space left on device')
+PICTURE = np.zeros((8, 16, 3), np.uint8)
+PLACES = np.zeros((5, 3))
+
+
+def mark_a_demo(path: Path) -> None:
+    pytest.importorskip('rclpy')
+    from sfa_localization import demo
+
+    demo._mark(path, DemoConfig())
+
+
+WRITERS = {
+    'arrays of a model or checkpoint': lambda p: place_model.write_arrays(p, {'a': PLACES}),
+    'calibration': lambda p: calibration.write_whole(p, b'camera'),
+    'check picture': lambda p: calibration.write_check(p, PICTURE),
+    'parameter file': config_file.write_config,
+    'figures of an evaluation': lambda p: evaluation.write_json(p, {'ekf': 1}),
+    'path of the filter': lambda p: filtering.write_tum(p, np.arange(5), PLACES),
+    'what was inspected': lambda p: inspection_files._write_json([BagReport('bag')], p),
+    'figure': lambda p: report.save(Figure(), p),
+    'text of a report': lambda p: report.save_text(p, 'text'),
+    'contact sheet': lambda p: report_bag.write_contact_sheet([PICTURE], 'bag', p),
+    'path of a bag': lambda p: report_bag.write_path(PLACES, PLACES, 'bag', p),
+    'marker of the demo': mark_a_demo,
+}
+# Who writes otherwise, and why it may.
+OTHERS = {
+    'bag': 'decoded pictures, in a folder that its caller removes',
+    'bag_storage': 'a decompressed copy, in a temporary folder',
+    'bag_writer': 'a folder, which is renamed when whole',
+    'files': 'the one writer',
+    'processes': 'what a program prints, while it prints it',
+    'training': 'the folder of decoded pictures, which it removes',
+}
+
+
+class Failing(io.FileIO):
+    """A file whose bytes cannot be written, for whatever reason."""
+
+    def __init__(self, handle: int, error: BaseException) -> None:
+        super().__init__(handle, 'wb')
+        self.error = error
+
+    def write(self, data) -> int:
+        super().write(bytes(data)[:1])
+        raise self.error
 
 
 def test_the_file_is_there_only_in_the_end(tmp_path):
@@ -35,3 +106,68 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         whole_file(tmp_path / 'missing' / 'a.txt', DataError),
     ):
         raise AssertionError
+
+
+@pytest.mark.parametrize('name', WRITERS)
+@pytest.mark.parametrize('error', [FULL, KeyboardInterrupt(), ValueError()], ids=repr)
+def test_every_writer_leaves_the_old_file_and_no_part_of_the_new(
+    tmp_path, monkeypatch, name, error
+):
+    path = tmp_path / 'file'
+    WRITERS[name](path)
+    assert path.stat().st_size > 0, 'without an error it is written'
+    path.write_bytes(b'old')
+    monkeypatch.setattr(files.os, 'fdopen', lambda handle, mode: Failing(handle, error))
+    expected = LocalizationError if error is FULL else type(error)
+    with pytest.raises(expected) as raised:
+        WRITERS[name](path)
+    assert path.read_bytes() == b'old'
+    assert list(tmp_path.iterdir()) == [path]
+    if error is FULL:
+        assert str(raised.value) == f'{path}: cannot be written: No space left on device'
+
+
+def test_whoever_writes_files_does_so_through_the_one_writer():
+    writers = {'write_text', 'write_bytes', 'imwrite', 'tofile', 'savetxt', 'mkstemp', 'mkdtemp',
+               'rename', 'NamedTemporaryFile', 'truncate', 'fdopen'}  # fmt: skip
+    found = set()
+    for path in Path(sfa_localization.__file__).parent.rglob('*.py'):
+        for call in ast.walk(ast.parse(path.read_text('utf-8'))):
+            if not isinstance(call, ast.Call):
+                continue
+            name = getattr(call.func, 'attr', getattr(call.func, 'id', ''))
+            modes = [a.value for a in call.args if isinstance(a, ast.Constant)]
+            opens = name == 'open' and any(m in ('w', 'wb', 'x', 'xb', 'a', 'ab') for m in modes)
+            if name in writers or opens:
+                found.add(path.stem)
+    assert found == set(OTHERS)
+
+
+# Bags are folders.
+
+
+@pytest.mark.parametrize('storage', bag_writer.STORAGES)
+@pytest.mark.parametrize('step', ['opening', 'writing', 'closing'])
+@pytest.mark.parametrize('error', [FULL, KeyboardInterrupt(), RuntimeError('database is full')])
+def test_no_part_of_a_bag_is_left(tmp_path, monkeypatch, storage, step, error):
+    def fail(*_args, **_named):
+        raise error
+
+    method = {'opening': 'open', 'writing': 'write', 'closing': 'close'}[step]
+    monkeypatch.setattr(bag_writer.Writer, method, fail)
+    expected = KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else BagError
+    with pytest.raises(expected) as raised, BagWriter(tmp_path / 'bag', storage) as bag:
+        bag.pose('/truth', 1, PLACES[0])
+    assert list(tmp_path.iterdir()) == []
+    if expected is BagError:
+        assert str(raised.value).startswith(f'{tmp_path / "bag"}: cannot be written: ')
+
+
+def test_the_error_inside_is_not_hidden_by_that_of_closing(tmp_path, monkeypatch):
+    def fail(*_args):
+        raise FULL
+
+    monkeypatch.setattr(bag_writer.Writer, 'close', fail)
+    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag'):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []

@@ -57,7 +57,8 @@ ROOMS: dict[str, set[str]] = {
     'pose_filter': {'numpy', 'scipy', 'filterpy'},
     'mdp': {'numpy', 'scipy', 'mdp'},
     'report': {'numpy', 'matplotlib'},
-    'bag': {'numpy', 'rosbags', 'yaml', 'zstandard', 'backports', 'compression', 'lz4', 'tqdm'},
+    'bag': {'numpy', 'rosbags', 'yaml', 'lz4', 'tqdm'},
+    'bag_zstd': set(),  # one of compression, backports and zstandard, by its name
     'play': {'numpy', 'tqdm', 'rosbags'} | ROS,
     'demo': {'numpy', 'tqdm'} | ROS,
     'nodes': {'numpy', 'yaml'} | ROS,

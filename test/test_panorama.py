@@ -15,6 +15,7 @@ from sfa_localization.config import CameraConfig, PanoramaConfig
 from sfa_localization.errors import CameraError
 from sfa_localization.panorama import (
     Unwrapper,
+    _in_sectors,
     looks_like_panorama,
     nearest_seen,
     normalized,
@@ -207,6 +208,23 @@ def test_shapes_of_panoramas():
 
 
 class TestMasks:
+    @pytest.mark.parametrize(
+        ('sector', 'hidden'),
+        [
+            ((-180.0, 180.0), 360),
+            ((0.0, 360.0), 360),
+            ((360.0, 0.0), 360),
+            ((-10.0, 400.0), 360),
+            ((350.0, 10.0), 20),
+            ((-10.0, 10.0), 20),
+            ((30.5, 30.5), 0),
+        ],
+    )
+    def test_a_blind_sector_hides_what_lies_from_its_start_to_its_end(self, sector, hidden):
+        azimuth = np.radians(np.arange(360) + 0.25)
+        rays = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], -1)[None]
+        assert np.count_nonzero(_in_sectors(rays, sector)) == hidden
+
     def test_a_blind_sector_repeats_its_neighbors(self):
         config = CameraConfig(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
         unwrapper, plain = Unwrapper(config, SMALL), Unwrapper(CameraConfig(), SMALL)
@@ -259,6 +277,7 @@ class TestMasks:
             (CameraConfig(blind_sectors=(0.0,)), 'a start and an end'),
             (CameraConfig(mask_file='nowhere.png'), 'nowhere.png'),
             (CameraConfig(blind_sectors=(0.0, 359.999)), 'sees no part'),
+            (CameraConfig(blind_sectors=(-180.0, 180.0)), 'sees no part'),
             (CameraConfig(radius_max=45.0), 'sees no part'),
         ],
     )

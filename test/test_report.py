@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report: errors by hand, and pictures that are whole, of the promised size, and not blank."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -103,7 +101,7 @@ def test_path_is_drawn_in_its_colour_and_to_scale(tmp_path, truth):
     assert np.ptp(rows[upper]) > 100
 
 
-def test_failed_picture_leaves_nothing(tmp_path: Path, truth, monkeypatch):
+def test_failed_picture_leaves_nothing(tmp_path, truth, monkeypatch):
     def full_disk(_figure, file, **_options):
         file.write(b'half a picture')
         raise OSError(28, 'No space left on device')

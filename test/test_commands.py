@@ -1,0 +1,617 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every option of every command, alone: it parses, it runs, and something comes of it."""
+
+import argparse
+import contextlib
+import copy
+import io
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from test_calibration import scene
+
+from sfa_localization import cli, cluster, config, simulation
+from sfa_localization.bag import Bag, BagWriter
+from sfa_localization.place_model import PlaceModel
+
+GROUPS = {group.__name__: group for group in config.Settings.__subclasses__()}
+COMMANDS = {command.name: command for command in cli.COMMANDS}
+
+
+def parser_of(name: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=name)
+    COMMANDS[name].configure(parser)
+    return parser
+
+
+def options() -> list[tuple[str, str]]:
+    """Return command and name of every option that there is."""
+    return [
+        (name, action.option_strings[-1])
+        for name in COMMANDS
+        for action in parser_of(name)._actions
+        if action.option_strings and action.dest != 'help'
+    ]
+
+
+def words_for(action: argparse.Action) -> list[str]:
+    """Return words that the action takes, whatever they mean."""
+    if action.nargs == 0:
+        return []
+    one = str(list(action.choices)[-1]) if action.choices else '7'
+    count = action.nargs if isinstance(action.nargs, int) else 1
+    return [one] * count
+
+
+@pytest.mark.parametrize(('name', 'option'), options())
+def test_an_option_reaches_one_group_of_settings_at_most(name, option):
+    """Whichever groups a command reads, an option meant for one never appears in another."""
+    parser = parser_of(name)
+    (meant,) = (a for a in parser._actions if option in a.option_strings)
+    needed = [a for a in parser._actions if a.required and a is not meant]
+    needed.sort(key=lambda action: bool(action.option_strings))  # BAG before --topics takes it
+    words = [word for a in needed for word in [*a.option_strings[:1], *words_for(a)]]
+    words += [option, *words_for(meant)]
+    given = parser.parse_args(words)
+    reached = {n: told for n, group in GROUPS.items() if (told := cli._given(group, given))}
+    group, _, setting = meant.dest.partition('.')
+    assert reached == ({group: {setting: vars(given)[meant.dest]}} if setting else {})
+
+
+# Each option alone, on small inputs: what a command is given without it, and what comes of it.
+
+
+@dataclass
+class Outcome:
+    """What a command did: its exit code, what it printed, and the folder it may have written to."""
+
+    code: int
+    text: str
+    folder: Path
+    noted: list[Any] = field(default_factory=list)
+    """What stand-ins of slow parts were handed."""
+
+    def bag(self) -> dict[str, Any]:
+        """Return what a bag that it recorded holds."""
+        with Bag(self.folder / 'bag') as bag:
+            return {
+                'topics': {topic.name: topic.kind for topic in bag.topics.values()},
+                'truth': bag.trajectory(),
+                'odometry': bag.odometry(),
+                'turns': bag.yaw_rate().omega,
+                'pictures': np.array([picture for _, picture in bag.images()]),
+            }
+
+    def model(self) -> PlaceModel:
+        return PlaceModel.load(self.folder / 'model.npz')
+
+    def yaml(self, section: str) -> dict[str, Any]:
+        document = yaml.safe_load((self.folder / 'out.yaml').read_text())
+        return document[section]['ros__parameters']
+
+    def camera(self) -> dict[str, Any]:
+        """Return the camera's parameters that were printed."""
+        return yaml.safe_load(self.text)['omnicam_node']['ros__parameters']
+
+
+@dataclass(frozen=True)
+class Case:
+    """Words of one option, words given besides with and without it, and what tells them apart.
+
+    `{data}` in words is the folder of inputs, `{out}` that of this run.
+    """
+
+    words: str
+    differs: Callable[[Outcome, Outcome], bool]
+    beside: str = ''
+    base: str | None = None
+    """Instead of what the command is given otherwise."""
+    prepare: Callable[[Path], Any] = lambda out: None
+    """What is done in the folder of the run before it."""
+
+
+def says(text: str) -> Callable[[Outcome, Outcome], bool]:
+    """Only with the option it works, and prints this."""
+    return lambda a, b: b.code == 0 and text in b.text and text not in a.text
+
+
+def refuses(text: str) -> Callable[[Outcome, Outcome], bool]:
+    """Only with the option it ends with this error, in one line."""
+    return lambda a, b: (
+        a.code == 0 and b.code == 1 and text in b.text.split('error: ')[-1] and text not in a.text
+    )
+
+
+def differ(what: Callable[[Outcome], Any]) -> Callable[[Outcome, Outcome], bool]:
+    """Both work, and this differs."""
+    return lambda a, b: a.code == b.code == 0 and not same(what(a), what(b))
+
+
+def same(a: Any, b: Any) -> bool:
+    return np.shape(a) == np.shape(b) and bool(np.all(np.asarray(a) == np.asarray(b)))
+
+
+def same_truth(a: Outcome, b: Outcome) -> bool:
+    return same(a.bag()['truth'].poses, b.bag()['truth'].poses)
+
+
+def of_pictures(a: Outcome, b: Outcome) -> bool:
+    """The same drive in other pictures."""
+    x, y = a.bag(), b.bag()
+    return same_truth(a, b) and not same(x['pictures'], y['pictures'])
+
+
+def of_wheels(a: Outcome, b: Outcome) -> bool:
+    """The same drive, measured otherwise."""
+    return same_truth(a, b) and not same(a.bag()['odometry'].poses, b.bag()['odometry'].poses)
+
+
+def of_turns(a: Outcome, b: Outcome) -> bool:
+    return same_truth(a, b) and not same(a.bag()['turns'], b.bag()['turns'])
+
+
+def another_drive(a: Outcome, b: Outcome) -> bool:
+    return not same_truth(a, b)
+
+
+def seconds(outcome: Outcome) -> float:
+    return float(np.ptp(outcome.bag()['truth'].stamps_ns)) * 1e-9
+
+
+def width(outcome: Outcome) -> float:
+    return float(np.ptp(outcome.bag()['truth'].poses[:, 0]))
+
+
+def metres(outcome: Outcome) -> float:
+    return float(np.hypot(*np.diff(outcome.bag()['truth'].poses[:, :2], axis=0).T).sum())
+
+
+def written(name: str) -> Callable[[Outcome, Outcome], bool]:
+    """Only with the option there is such a file, not empty."""
+    return lambda a, b: (
+        b.code == 0 and (b.folder / name).stat().st_size > 0 and not (a.folder / name).exists()
+    )
+
+
+def noted(*values: Any) -> Callable[[Outcome, Outcome], bool]:
+    """Only with the option the stand-ins were handed these."""
+    return lambda a, b: (
+        a.code == b.code == 0
+        and all(value in b.noted for value in values)
+        and not all(value in a.noted for value in values)
+    )
+
+
+BASE = {
+    'simulate': '{out}/bag --area 6x6 --length 4 --images panorama --size 32x8 --images-every 1',
+    'train': '{data}/bag --output {out}/model.npz --config {data}/small.yaml',
+    'evaluate': '{data}/model.npz {data}/test',
+    'play': '{data}/test --rate 1000 --wait 0',
+    'inspect': '{data}/bag',
+    'calibrate': '{data}/mirror.png',
+    'filter': '{data}/odom.csv {data}/positions.csv --output {out}/poses.tum',
+    'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml --trials 10',
+    'config': '',
+    'demo': '--out {out}/demo',
+}
+DAMAGED = {
+    'train': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
+    'play': '{data}/cut --rate 1000 --wait 0',
+    'inspect': '{data}/cut',
+}
+QUALITY = differ(lambda o: o.model().quality['left_out_error_m'])
+PRINTED = differ(lambda o: o.text)
+POSES = differ(lambda o: (o.folder / 'poses.tum').read_text())
+OPTIONS: dict[str, dict[str, Case]] = {
+    'simulate': {
+        '--size': Case('--size 40x12', lambda a, b: b.bag()['pictures'].shape[1:3] == (12, 40)),
+        '--compressed': Case(
+            '--compressed', lambda a, b: '/panorama/compressed' in {*b.bag()['topics']}
+        ),
+        '--trajectory': Case('--trajectory curves', another_drive),
+        '--seed': Case('--seed 2', another_drive),
+        '--world': Case('--world 2', differ(lambda o: o.bag()['pictures'][0])),
+        '--area': Case('--area 9x7', lambda a, b: width(b) > width(a), beside='--length 20'),
+        '--length': Case('--length 8', lambda a, b: metres(b) > metres(a) + 2),
+        '--images': Case('--images raw', lambda a, b: '/image_raw' in b.bag()['topics']),
+        '--images-every': Case(
+            '--images-every 0.5',
+            lambda a, b: len(b.bag()['pictures']) > len(a.bag()['pictures']),
+        ),
+        '--images-every-turn': Case(
+            '--images-every-turn 5',
+            lambda a, b: len(b.bag()['pictures']) > len(a.bag()['pictures']),
+        ),
+        '--compression': Case(
+            '--compression png',
+            lambda a, b: b.bag()['topics']['/panorama/compressed'].endswith('CompressedImage'),
+        ),
+        '--storage': Case('--storage sqlite3', lambda a, b: bool([*b.folder.glob('bag/*.db3')])),
+        '--camera-height': Case('--camera-height 1', of_pictures),
+        '--image-noise': Case('--image-noise 0', of_pictures),
+        '--illumination': Case('--illumination 1', of_pictures),
+        '--speed': Case('--speed 0.5', lambda a, b: seconds(b) > seconds(a) + 2),
+        '--turn-rate': Case('--turn-rate 0.3', lambda a, b: seconds(b) > seconds(a) + 0.5),
+        '--odometry-rate': Case(
+            '--odometry-rate 20',
+            lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns']),
+        ),
+        '--test-drift': Case('--test-drift 1', of_wheels, beside='--trajectory test'),
+        '--scale-error': Case('--scale-error 0.1', of_wheels),
+        '--slip': Case('--slip 0.3', of_wheels),
+        '--speed-noise': Case('--speed-noise 0.5', of_wheels),
+        '--gyro-bias': Case('--gyro-bias 0.05', of_turns),
+        '--gyro-bias-time': Case('--gyro-bias-time 1', of_turns),
+        '--gyro-noise': Case('--gyro-noise 0.1', of_turns),
+    },
+    'train': {
+        '--output': Case(
+            '--output {out}/other.npz',
+            written('other.npz'),
+        ),
+        '--config': Case(
+            '--config {data}/fewer.yaml',
+            lambda a, b: b.model().quality['features_used'] < a.model().quality['features_used'],
+        ),
+        '--report': Case('--report {out}/report', written('report/training.md')),
+        '--resume': Case(
+            '--resume',
+            refuses('train without --resume'),
+            prepare=lambda out: (out / '.model.npz.checkpoint.npz').write_bytes(b'of another'),
+        ),
+        '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['train']),
+        '--dask': Case('--dask {dask}', noted('on the cluster')),
+        '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
+        '--odom-topic': Case('--odom-topic /ground_truth', QUALITY),
+        '--imu-topic': Case('--imu-topic /nothing', refuses('/nothing')),
+        '--segments': Case(
+            '--segments straight', lambda a, b: a.code == 0 and (b.code, b.text) != (0, a.text)
+        ),
+        '--solver': Case('--solver paper', refuses('needs straight lines')),
+        '--metric-map': Case('--metric-map monomials', QUALITY),
+        '--engine': Case('--engine mdp', lambda a, b: 'pip install MDP' in b.text or QUALITY(a, b)),
+        '--normalization': Case(
+            '--normalization grey',
+            differ(lambda o: o.model().network.architecture.normalization),
+        ),
+    },
+    'evaluate': {
+        '--align': Case('--align {data}/bag', differ(lambda o: o.text.splitlines()[-1])),
+        '--config': Case('--config {data}/start.yaml', PRINTED),
+        '--report': Case('--report {out}/report', written('report/report.md')),
+        '--json': Case('--json {out}/figures.json', written('figures.json')),
+        '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
+        '--odom-topic': Case('--odom-topic /ground_truth', PRINTED),
+        '--imu-topic': Case('--imu-topic /nothing', refuses('/nothing')),
+        '--ground-truth-topic': Case('--ground-truth-topic /odom', PRINTED),
+    },
+    'play': {
+        '--loop': Case('--loop', PRINTED),
+        '--clock': Case('--clock', noted('/clock')),
+        '--topics': Case(
+            '--topics /odom', lambda a, b: b.text.count('messages') == 1 < a.text.count('messages')
+        ),
+        '--wait-for': Case('--wait-for /odom', noted(('wait for', ['/odom']))),
+        '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['play']),
+        '--rate': Case('--rate 500', noted(('rate', 500.0))),
+        '--start-offset': Case('--start-offset 10', PRINTED),
+        '--clock-rate': Case('--clock-rate 5', noted(('clock rate', 5.0)), beside='--clock'),
+        '--wait': Case('--wait 0.01', noted(('wait', 0.01))),
+    },
+    'inspect': {
+        '--json': Case('--json {out}/found.json', written('found.json')),
+        '--report': Case('--report {out}/report', written('report/bag_pictures.png')),
+        '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['inspect']),
+        '--image-topic': Case('--image-topic /nothing', lambda a, b: '/nothing' in b.text),
+        '--odom-topic': Case('--odom-topic /ground_truth', says('by /ground_truth')),
+        '--min-pictures': Case('--min-pictures 9999', says('drive until there are 9999')),
+        '--max-spacing': Case('--max-spacing 0.1', PRINTED),
+        '--reach': Case('--reach 0.2', PRINTED),
+        '--min-covered': Case('--min-covered 0', PRINTED, beside='--reach 0.3'),
+        '--min-directions': Case('--min-directions 6', PRINTED),
+        '--max-lost': Case('--max-lost 0', PRINTED, base='{data}/lossy'),
+        '--max-gap': Case('--max-gap 1', PRINTED, base='{data}/lossy'),
+        '--samples': Case(
+            '--samples 2',
+            lambda a, b: (
+                same([a.code, b.code], [0, 0])
+                and (a.folder / 'r/bag_pictures.png').read_bytes()
+                != (b.folder / 'r/bag_pictures.png').read_bytes()
+            ),
+            beside='--report {out}/r',
+        ),
+    },
+    'calibrate': {
+        '--calibration': Case('--calibration {data}/info.yaml', says('fisheye')),
+        '--center': Case(
+            '--center 300x200', lambda a, b: (b.camera()['cx'], b.camera()['cy']) == (300, 200)
+        ),
+        '--radii': Case(
+            '--radii 50x180',
+            lambda a, b: (b.camera()['radius_min'], b.camera()['radius_max']) == (50, 180),
+        ),
+        '--output': Case('--output {out}/camera.yaml', written('camera.yaml')),
+        '--check': Case('--check {out}/check.png', written('check.png')),
+        '--model': Case('--model fisheye', says('fisheye')),
+        '--field-of-view': Case('--field-of-view 150', PRINTED, beside='--model fisheye'),
+        '--angle-min': Case('--angle-min 70', lambda a, b: b.camera()['angle_min'] == 70),
+        '--angle-max': Case('--angle-max 100', lambda a, b: b.camera()['angle_max'] == 100),
+        '--axis': Case('--axis up', lambda a, b: b.camera()['axis'] == 'up'),
+        '--mirrored': Case('--mirrored no', lambda a, b: b.camera()['mirrored'] == 'no'),
+        '--mount-roll': Case('--mount-roll 5', lambda a, b: b.camera()['mount_roll'] == 5),
+        '--mount-pitch': Case('--mount-pitch 5', lambda a, b: b.camera()['mount_pitch'] == 5),
+        '--mount-yaw': Case('--mount-yaw 90', lambda a, b: b.camera()['mount_yaw'] == 90),
+    },
+    'filter': {
+        '--config': Case('--config {data}/start.yaml', POSES),
+        '--initial-pose': Case('--initial-pose 1 2 3', POSES),
+        '--output': Case('--output {out}/other.tum', written('other.tum')),
+    },
+    'tune': {
+        '--model': Case('--model {data}/other.npz', PRINTED),
+        '--config': Case(
+            '--config {data}/robot.yaml',
+            lambda a, b: (
+                b.code == 0
+                and b.yaml('ekf_node')['use_sim_time'] is True
+                and b.yaml('ekf_node')['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
+                and b.yaml('training')['odometry'] == '/ground_truth'
+                and b.text.splitlines()[-1] != a.text.splitlines()[-1]
+            ),
+        ),
+        '--output': Case('--output {out}/tuned.yaml', written('tuned.yaml')),
+        '--method': Case('--method grid', says('m mean error')),
+        '--trials': Case('--trials 14', PRINTED),
+        '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
+        '--odom-topic': Case('--odom-topic /ground_truth', PRINTED),
+        '--imu-topic': Case('--imu-topic /nothing', refuses('/nothing')),
+        '--ground-truth-topic': Case(
+            '--ground-truth-topic /nothing', refuses('/nothing'), beside='--method grid'
+        ),
+    },
+    'config': {'--output': Case('--output {out}/out.yaml', written('out.yaml'))},
+    'demo': {
+        '--out': Case('--out {out}/elsewhere', written('elsewhere/.sfa_localization_demo.json')),
+        '--world': Case('--world 3', noted(('world', 3))),
+        '--seed': Case('--seed 4', noted(('seed', 4))),
+        '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
+        '--start-timeout': Case('--start-timeout 9', noted(('start_timeout', 9.0))),
+        '--silence-timeout': Case('--silence-timeout 9', noted(('silence_timeout', 9.0))),
+        '--settle-time': Case('--settle-time 9', noted(('settle_time', 9.0))),
+        '--stop-timeout': Case('--stop-timeout 9', noted(('stop_timeout', 9.0))),
+    },
+}
+SMALL = """
+    layers: custom
+    binning: 1
+    field_rows: [16]
+    field_columns: [16]
+    stride_rows: [1]
+    stride_columns: [8]
+    linear_dimensions: [16]
+    output_dimensions: [10]
+    heading_layers: [1]
+    gp_length: 3.0
+    gp_noise: 0.01
+    slow_features: """
+
+
+@pytest.fixture(scope='module', autouse=True)
+def gardens() -> Iterator[None]:
+    """Build a garden once for all drives in it: its seed and its area make it."""
+    made: dict[Any, simulation.Garden] = {}
+    garden = simulation.Garden
+
+    def again(seed: int, settings: config.SimulationConfig) -> simulation.Garden:
+        place = (seed, settings.area)
+        if place not in made:
+            made[place] = garden(seed, settings)
+        found = copy.copy(made[place])
+        found._config = settings
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, 'Garden', again)
+        yield
+
+
+@contextlib.contextmanager
+def watched(name: str, notes: list[Any]) -> Iterator[None]:
+    """Note what no output shows; the demo's minutes of work are left out."""
+    with pytest.MonkeyPatch.context() as patch:
+        if name == 'play':
+            watch_play(patch, notes)
+        if name == 'demo':
+            watch_demo(patch, notes)
+        if name == 'train':
+            watch_cluster(patch, notes)
+        yield
+
+
+def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
+    """Note pace and patience; an endless replay ends in its third round."""
+    from sfa_localization import play
+
+    class Player(play.Player):
+        rounds = 0
+
+        def wait_for_subscribers(self, topics=()):
+            notes.extend([('rate', self.pace.rate), ('wait', self._config.wait)])
+            notes.append(('wait for', list(topics)))
+            return super().wait_for_subscribers(topics)
+
+        def _play_once(self):
+            self.rounds += 1
+            if self.rounds == 3:
+                self._node.context.try_shutdown()
+            return super()._play_once()
+
+    class Ticker(play.Ticker):
+        def __init__(self, node, rate):
+            super().__init__(node, rate)
+            notes.append(('clock rate', rate))
+
+        def tick(self, time_ns):
+            super().tick(time_ns)
+            notes.append('/clock')
+
+    patch.setattr(play, 'Player', Player)
+    patch.setattr(play, 'Ticker', Ticker)
+
+
+def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
+    """Only the demo's own steps run, with nothing in their places."""
+    from sfa_localization import demo
+
+    def run_live(programs, logs, settings):
+        notes.extend((item.name, getattr(settings, item.name)) for item in fields(settings))
+        notes.extend(pair for words in programs.values() for pair in pairwise(words))
+
+    def simulated(settings, out, progress):
+        notes.extend([('world', settings.world), ('seed', settings.seed)])
+
+    patch.setattr(demo, 'simulate', simulated)
+    patch.setattr(demo, 'train', lambda *_args, **_named: None)
+    patch.setattr(demo, 'run_live', run_live)
+    patch.setattr(demo, '_judged', lambda *_args: (SimpleNamespace(scores={}), 0.0))
+    patch.setattr(demo, '_write_results', lambda *_args: None)
+
+
+def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
+    compute = cluster._compute
+
+    def noting(*args):
+        notes.append('on the cluster')
+        return compute(*args)
+
+    patch.setattr(cluster, '_compute', noting)
+
+
+def run(name: str, words: str, folder: Path, **places: Any) -> Outcome:
+    """Run a command in this process."""
+    text, notes = io.StringIO(), []
+    filled = [word.format(out=folder, **places) for word in words.split()]
+    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text), watched(name, notes):
+        code = cli.main([name, *filled])
+    return Outcome(code, text.getvalue(), folder, notes)
+
+
+@pytest.fixture(scope='module')
+def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
+    """Return a folder with every kind of input, each as small as it may be."""
+    folder = tmp_path_factory.mktemp('data')
+    world = '--area 6x6 --images panorama --size 160x16 --odometry-rate 10 --images-every 0.3'
+    drives = {
+        'bag': '--length 30', 'test': '--length 12 --seed 2 --trajectory test --compressed',
+    }  # fmt: skip
+    for name, more in drives.items():
+        made = run('simulate', f'{{out}}/{name} {world} {more}', folder)
+        assert made.code == 0, made.text
+    settings = {'small': f'{SMALL}6', 'fewer': f'{SMALL}4'}
+    for name, text in settings.items():
+        (folder / f'{name}.yaml').write_text(f'training:\n  ros__parameters:{text}\n')
+    (folder / 'start.yaml').write_text(
+        'ekf_node:\n  ros__parameters:\n    set_initial_pose: true\n    initial_x: 3.0\n'
+    )
+    (folder / 'robot.yaml').write_text(
+        'ekf_node:\n  ros__parameters:\n    use_sim_time: true\n'
+        '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n'
+        'training:\n  ros__parameters:\n    odometry: /ground_truth\n'
+    )
+    for name, kind in (('model', 'small'), ('other', 'fewer')):
+        words = f'{{out}}/bag --output {{out}}/{name}.npz --config {{out}}/{kind}.yaml'
+        made = run('train', words, folder)
+        assert made.code == 0, made.text
+    cut = folder / 'cut'
+    shutil.copytree(folder / 'bag', cut)
+    (file,) = cut.glob('*.mcap')
+    file.write_bytes(file.read_bytes()[: int(0.9 * file.stat().st_size)])
+    cv2.imwrite(str(folder / 'mirror.png'), scene(1))
+    (folder / 'info.yaml').write_text(
+        'image_width: 640\nimage_height: 480\ndistortion_model: equidistant\n'
+        'camera_matrix: {rows: 3, cols: 3, data: [200, 0, 320, 0, 200, 240, 0, 0, 1]}\n'
+        'distortion_coefficients: {rows: 1, cols: 4, data: [0.01, 0, 0, 0]}\n'
+    )
+    write_tables(folder)
+    write_lossy(folder / 'lossy')
+    return folder
+
+
+def write_tables(folder: Path) -> None:
+    """Write the test drive as the two logs of `filter`."""
+    with Bag(folder / 'test') as bag:
+        odometry, truth = bag.odometry(), bag.trajectory()
+    rows = zip(odometry.stamps_ns * 1e-9, *odometry.twists.T, strict=True)
+    lines = ['stamp_s,v_mps,omega_radps', *(f'{t:.3f},{v},{w}' for t, v, w in rows)]
+    (folder / 'odom.csv').write_text('\n'.join(lines))
+    rows = zip(truth.stamps_ns[::5] * 1e-9, *truth.poses[::5].T, strict=True)
+    lines = ['stamp_s,x_m,y_m,yaw_rad', *(f'{t:.3f},{x},{y},{yaw}' for t, x, y, yaw in rows)]
+    (folder / 'positions.csv').write_text('\n'.join(lines))
+
+
+def write_lossy(path: Path) -> None:
+    """Write a straight drive whose odometry pauses for 1.5 s, and ends before its pictures do."""
+    start = 1_700_000_000 * 10**9
+    with BagWriter(path) as bag:
+        for i in range(400):
+            stamp = start + i * 100_000_000
+            if i < 100 or 115 <= i < 380:
+                pose = np.array([0.1 * i, 0.0, 0.0])
+                bag.odometry('/odom', stamp, pose, np.array([1.0, 0.0]), np.array([1e-4, 1e-4]))
+            bag.image('/panorama', stamp, np.full((8, 80, 3), i % 256, np.uint8), 'camera')
+
+
+def test_every_option_has_a_case_and_every_case_an_option():
+    named = {(name, option) for name, cases in OPTIONS.items() for option in cases}
+    assert named == set(options()), 'a new option needs a case in OPTIONS'
+
+
+@pytest.fixture(scope='module')
+def without(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Outcome]:
+    """Return what a command does without an option: the same for many options, so run once."""
+    known: dict[tuple[str, ...], Outcome] = {}
+
+    def outcome(name: str, words: str, case: Case) -> Outcome:
+        if (name, words) not in known:
+            folder = tmp_path_factory.mktemp(f'{name}_')
+            case.prepare(folder)
+            known[name, words] = run(name, words, folder, data=data)
+        return known[name, words]
+
+    return outcome
+
+
+@pytest.mark.parametrize(('name', 'option'), options())
+def test_an_option_alone_has_its_effect(name, option, data, without, tmp_path, request):
+    case = OPTIONS[name][option]
+    words = f'{BASE[name] if case.base is None else case.base} {case.beside}'
+    if name in ('play', 'demo'):
+        pytest.importorskip('rclpy')
+    places = {'data': data}
+    if '{dask}' in case.words:
+        places['dask'] = request.getfixturevalue('scheduler')
+    plain = without(name, words, case)
+    case.prepare(tmp_path)
+    changed = run(name, f'{words} {case.words}', tmp_path, **places)
+    assert changed.code in (0, 1)
+    assert case.differs(plain, changed), f'{plain.text}\n-- with {case.words}:\n{changed.text}'
+
+
+@pytest.fixture(scope='module')
+def scheduler() -> Iterator[str]:
+    """Return the address of a cluster of one worker in this process."""
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as local:
+        yield local.scheduler_address
