@@ -47,24 +47,28 @@ class Agreement:
 
     @classmethod
     def fit(
-        cls, disagreement: Array, squared_error: Array, variance: Array, axes: int
+        cls,
+        disagreement: Array,
+        squared_error: Array,
+        variance: Array,
+        axes: int,
+        weight: Array | None = None,
     ) -> Agreement:
-        """From left-out pictures (M,): squared error over `axes` axes, predicted variance per axis.
+        """From left-out images (M,): squared error over `axes` axes, predicted variance per axis.
 
         The exponent is the likeliest under heavy tails; the level makes half of the errors fall
-        inside the 50 % region and 95 % inside the 95 % region, whichever needs more.
+        inside the 50 % region and 95 % inside the 95 % region, whichever needs more. `weight`
+        (M,) says how much each image counts; without it, all count alike.
         """
-        typical = float(np.median(disagreement))
+        weight = np.ones(len(disagreement)) if weight is None else weight
+        typical = quantile(disagreement, 0.5, weight)
         relative = _relative(disagreement, typical)
         exponent = min(
             _EXPONENTS,
-            key=lambda e: _surprise(squared_error, variance * relative**e, axes),
+            key=lambda e: _surprise(squared_error, variance * relative**e, axes, weight),
         )
         ratio = squared_error / (variance * relative**exponent)
-        needed = [
-            np.quantile(ratio, share) / stats.chi2.ppf(share, axes) for share in _HALF_AND_MOST
-        ]
-        return cls(typical, float(max(needed)), float(exponent))
+        return cls(typical, needed_factor(ratio, axes, weight), float(exponent))
 
     def to_arrays(self) -> dict[str, Array]:
         """Arrays to save, without pickle."""
@@ -80,9 +84,35 @@ def _relative(disagreement: Array, typical: float) -> Array:
     return np.asarray(np.clip(disagreement / max(typical, 1e-9), *_LIMITS))
 
 
-def _surprise(squared_error: Array, variance: Array, axes: int) -> float:
+def _surprise(squared_error: Array, variance: Array, axes: int, weight: Array) -> float:
     """Mean negative log-likelihood of heavy-tailed errors at their best common scale."""
     ratio = squared_error / variance
-    scale = float(np.median(ratio)) / stats.chi2.ppf(0.5, axes) + 1e-300
+    scale = quantile(ratio, 0.5, weight) / stats.chi2.ppf(0.5, axes) + 1e-300
     tails = (_HEAVY_TAIL + axes) / 2 * np.log1p(ratio / (scale * _HEAVY_TAIL))
-    return float(np.mean(tails + axes / 2 * np.log(variance * scale)))
+    return float(np.average(tails + axes / 2 * np.log(variance * scale), weights=weight))
+
+
+def needed_factor(ratio: Array, axes: int, weight: Array) -> float:
+    """Factor on variances for which half of the errors fall inside the 50 % region, and 95 %
+    inside the 95 % region, whichever needs more.
+
+    `ratio` (M,) is the squared error over `axes` axes over the variance of one; `weight` (M,).
+    """
+    needed = [quantile(ratio, p, weight) / stats.chi2.ppf(p, axes) for p in _HALF_AND_MOST]
+    return float(max(needed))
+
+
+def share_within(ratio: Array, axes: int, share: float, weight: Array) -> float:
+    """Share by `weight` (M,) of the errors inside the region of that probability.
+
+    `ratio` (M,) is the squared error over `axes` axes over the variance of one.
+    """
+    return float(np.average(ratio <= stats.chi2.ppf(share, axes), weights=weight))
+
+
+def quantile(values: Array, share: float, weight: Array) -> float:
+    """Smallest of the values (M,) that at least this share, by weight (M,), does not exceed."""
+    order = np.argsort(values, kind='stable')
+    below = np.cumsum(weight[order])
+    at = int(np.searchsorted(below, share * below[-1]))
+    return float(values[order[min(at, len(values) - 1)]])

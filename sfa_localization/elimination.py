@@ -127,8 +127,11 @@ class Elimination:
 
     def leverage(self, expanded: Array) -> Array:
         """phi^T F^-1 phi (M,) of expanded features (M, m)."""
-        half = scipy.linalg.solve_triangular(self.factor, expanded.T, lower=True)
-        return np.asarray((half**2).sum(0))
+        return np.asarray((self.halved(expanded) ** 2).sum(0))
+
+    def halved(self, expanded: Array) -> Array:
+        """factor^-1 phi (m, M) of expanded features (M, m)."""
+        return np.asarray(scipy.linalg.solve_triangular(self.factor, expanded.T, lower=True))
 
     @property
     def log_determinant(self) -> float:

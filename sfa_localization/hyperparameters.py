@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.config import MetricConfig
 from sfa_localization.elimination import Links, Problem, Stack, eliminate, schur
+from sfa_localization.errors import DataError
 from sfa_localization.fitting import Fit, fit, targets
 from sfa_localization.geometry import Array, align_complex
 from sfa_localization.phases import phase_cost, refine
@@ -38,8 +39,9 @@ class LeftOut:
     """(M,) of the prediction per axis, before inflation, m^2."""
 
     @property
-    def mean_m(self) -> float:
-        return float(np.abs(self.errors).mean())
+    def ratio(self) -> Array:
+        """(M,) squared errors over both axes, over the variances of one."""
+        return np.asarray(np.abs(self.errors) ** 2 / self.variances)
 
     @property
     def typical_m(self) -> float:
@@ -48,17 +50,37 @@ class LeftOut:
 
 
 def folds(stack: Stack, config: MetricConfig) -> list[Indices]:
-    """Rows of the stack left out in turn: whole segments, in stretches of a minimum length."""
+    """Rows of the stack left out in turn: whole segments, in stretches of the drive.
+
+    Stretches of a short drive are shorter: there are as many parts as are asked for, as far as
+    there are segments, and always at least two. Raises DataError for a drive of one segment.
+    """
     steps = np.abs(np.diff(stack.path, prepend=0)) * (np.diff(stack.owner, prepend=-1) == 0)
     lengths = np.bincount(stack.owner, steps)
-    stretch = np.floor((np.cumsum(lengths) - lengths) / config.left_out_length).astype(int)
+    length = min(config.left_out_length, lengths.sum() / config.left_out_folds)
+    # The middles of the first and the last segment are at least half the drive apart.
+    middles = np.cumsum(lengths) - lengths / 2
+    stretch = np.floor(middles / max(length, 1e-9)).astype(int)
     names = np.unique(stretch)
+    if len(names) < 2:
+        raise DataError(
+            f'{lengths.sum():.1f} m of odometry with images leave nothing to check a map with: '
+            'drive farther'
+        )
     parts = min(config.left_out_folds, len(names))
     order = np.random.default_rng(config.metric_seed).permutation(len(names))
     fold = np.empty(len(names), int)
     fold[order] = np.arange(len(names)) % parts
     part = fold[np.searchsorted(names, stretch)][stack.owner]
     return [np.flatnonzero(part == k) for k in range(parts)]
+
+
+def part_of(stack: Stack, config: MetricConfig) -> Indices:
+    """(M,) which of the folds each row of the stack is in."""
+    part = np.empty(len(stack.images), np.int64)
+    for number, rows in enumerate(folds(stack, config)):
+        part[rows] = number
+    return part
 
 
 def leave_out(whole: Fit, stack: Stack, config: MetricConfig) -> LeftOut:

@@ -15,13 +15,15 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization import paper_solver
+from sfa_localization.agreement import needed_factor, share_within
 from sfa_localization.config import MetricConfig
 from sfa_localization.elimination import Links, Stack, schur
 from sfa_localization.errors import DataError
 from sfa_localization.fitting import Fit, problem_of, targets
+from sfa_localization.forecast import Forecast, forecast, nearest_used
 from sfa_localization.gauge import gauge
 from sfa_localization.geometry import Array, RigidTransform, align_complex, wrap_angle
-from sfa_localization.hyperparameters import LeftOut, choose, leave_out
+from sfa_localization.hyperparameters import LeftOut, choose, leave_out, part_of
 from sfa_localization.phases import Certificate, certify, refine
 from sfa_localization.regression import MetricMap
 from sfa_localization.segments import Segments
@@ -36,13 +38,13 @@ from sfa_localization.sufficiency import (
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
-# Directions that sway together, kept for the covariance of a position.
-_SWAYS = 12
+# Ways in which the drive's positions sway together, kept for the covariance of a position.
+_SWAYS = 24
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """How honest the covariance is on left-out segments, after inflation."""
+    """How honest the covariance is on left-out segments, after inflation, by their weights."""
 
     within_half: float
     """Share of errors inside the 50 % ellipse."""
@@ -76,8 +78,13 @@ class MetricResult:
     """(M, 2) m: as `residuals`, but the map had not seen the picture's stretch of the drive."""
     left_out_variance: Array
     """(M,) m^2 per axis: what the map claimed for `left_out`, with its inflation."""
+    left_out_weight: Array
+    """(M,) of sum 1: how much each of `left_out` says of paths between the trained ones, by how
+    far the nearest image was that the map had seen."""
     left_out_rigid_m: float
     """Mean left-out error once each left-out segment is moved rigidly onto its predictions."""
+    forecast: Forecast
+    """Errors to expect on paths between the trained ones."""
     consistency: Consistency
     diagnostics: Diagnostics
     history: Array
@@ -88,6 +95,7 @@ class MetricResult:
         """Mean error of a map at stretches of the drive that it was learnt without.
 
         The distance to where the whole drive, certified, puts the stretch; needs no ground truth.
+        Most stretches lie beyond the rest: `forecast` says what to expect between them.
         """
         return float(np.hypot(*self.left_out.T).mean())
 
@@ -110,8 +118,7 @@ def learn(features: Array, segments: Segments, config: MetricConfig) -> MetricRe
     diagnostics = diagnose(whole, stack)
     _check_certificate(whole, config)
     check(diagnostics, config)
-    left = leave_out(whole, stack, config)
-    return _result(whole, left, segments, stack, diagnostics, history, config)
+    return _result(whole, segments, stack, diagnostics, history, config)
 
 
 def _rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
@@ -153,21 +160,26 @@ def _check_certificate(whole: Fit, config: MetricConfig) -> None:
 
 def _result(
     whole: Fit,
-    left: LeftOut,
     segments: Segments,
     stack: Stack,
     diagnostics: Diagnostics,
     history: Array,
     config: MetricConfig,
 ) -> MetricResult:
+    left = leave_out(whole, stack, config)
+    sway = _sway(whole, stack)
+    swayed = (np.abs(whole.expanded @ sway) ** 2).sum(1)
+    expected = forecast(whole, stack, swayed, np.random.default_rng(config.metric_seed))
+    places = targets(whole.solution, stack)
+    weight = expected.importance(nearest_used(_plane(places), part_of(stack, config)))
+    inflation = _inflation(left, weight)
     frame = gauge(whole, segments, stack, config)
     turn = np.exp(1j * frame.yaw_rad)
-    inflation = _inflation(left)
-    places = whole.solution.o * turn + frame.x_m + 1j * frame.y_m
+    origins = whole.solution.o * turn + frame.x_m + 1j * frame.y_m
     return MetricResult(
-        map=_map(whole, stack, frame, inflation),
+        map=_map(whole, turn * sway, frame, inflation),
         angles=wrap_angle(np.angle(whole.solution.z) + frame.yaw_rad),
-        origins=_plane(places),
+        origins=_plane(origins),
         angle_covariance=angle_covariance(whole),
         yaw_bias=whole.solution.bias,
         certificate=whole.solution.certificate,
@@ -176,8 +188,10 @@ def _result(
         noise_m=float(np.sqrt(whole.variance)),
         left_out=_plane(left.errors * turn),
         left_out_variance=left.variances * inflation,
+        left_out_weight=weight,
         left_out_rigid_m=_rigid_error(left, whole, stack),
-        consistency=_consistency(left, inflation),
+        forecast=expected.moved(frame),
+        consistency=_consistency(left, inflation, weight),
         diagnostics=diagnostics,
         history=history,
     )
@@ -187,21 +201,19 @@ def _plane(values: Complex) -> Array:
     return np.column_stack([values.real, values.imag])
 
 
-def _inflation(left: LeftOut) -> float:
+def _inflation(left: LeftOut, weight: Array) -> float:
     """Factor, at least 1, on the predicted variances, by the left-out errors.
 
-    Half of these then fall inside the 50 % ellipse, and 95 % inside the 95 % ellipse.
+    Half of these, by weight (M,), then fall inside the 50 % ellipse, and 95 % inside the 95 %
+    ellipse.
     """
-    ratio = np.abs(left.errors) ** 2 / left.variances
-    # The squared distance of two normal axes is exponential: quantile q at -2 log(1 - q).
-    factors = [np.quantile(ratio, q) / (-2.0 * np.log(1.0 - q)) for q in (0.5, 0.95)]
-    return float(max(*factors, 1.0))
+    return max(needed_factor(left.ratio, 2, weight), 1.0)
 
 
-def _consistency(left: LeftOut, inflation: float) -> Consistency:
-    ratio = np.abs(left.errors) ** 2 / (left.variances * inflation)
-    inside = [float(np.mean(ratio <= -2.0 * np.log(1.0 - q))) for q in (0.5, 0.95)]
-    return Consistency(inside[0], inside[1], float(ratio.mean()))
+def _consistency(left: LeftOut, inflation: float, weight: Array) -> Consistency:
+    ratio = left.ratio / inflation
+    inside = [share_within(ratio, 2, share, weight) for share in (0.5, 0.95)]
+    return Consistency(inside[0], inside[1], float(np.average(ratio, weights=weight)))
 
 
 def _rigid_error(left: LeftOut, whole: Fit, stack: Stack) -> float:
@@ -216,15 +228,13 @@ def _rigid_error(left: LeftOut, whole: Fit, stack: Stack) -> float:
     return float(remaining.mean())
 
 
-def _map(whole: Fit, stack: Stack, frame: RigidTransform, inflation: float) -> MetricMap:
-    """The map in its frame, with the spread of its weights and the sway of the directions."""
-    turn = np.exp(1j * frame.yaw_rad)
-    weights = turn * whole.map_weights
+def _map(whole: Fit, sway: Complex, frame: RigidTransform, inflation: float) -> MetricMap:
+    """The map in its frame, with the spread of its weights and the sway of the positions."""
+    weights = np.exp(1j * frame.yaw_rad) * whole.map_weights
     weights[-1] += frame.x_m + 1j * frame.y_m
     factor = whole.elimination.factor
     inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
     spread = np.sqrt(whole.variance) * inverse.T
-    sway = turn * _sway(whole, stack)
     return MetricMap(
         basis=whole.basis,
         weights=_plane(weights),
@@ -236,19 +246,44 @@ def _map(whole: Fit, stack: Stack, frame: RigidTransform, inflation: float) -> M
 
 
 def _sway(whole: Fit, stack: Stack) -> Complex:
-    """The weights' change (m, r) per standard deviation of the r loosest joint directions."""
-    solution = whole.solution
-    origins = schur(problem_of(whole, stack).system(solution.bias))[1]
-    values, vectors = np.linalg.eigh(angle_covariance(whole))
-    keep = min(_SWAYS, stack.segments - 1)
-    loose = vectors[:, -keep:] * np.sqrt(np.maximum(values[-keep:], 0.0))
-    turned = 1j * solution.z[:, None] * loose
-    bias = solution.bias[stack.run][:, None]
-    sway = whole.elimination.weights(np.vstack([origins @ turned, turned, -bias * turned]))
-    # Moving the whole map is the gauge's matter: hold its middle still.
-    middle = whole.expanded.mean(0) @ sway
-    sway[-1] -= middle
+    """The map weights' change (m, r) per standard deviation of the r loosest joint changes of
+    the segments' origins and directions, without moving the whole map, which is the gauge's
+    matter."""
+    origins, directions = _loose(whole, stack)
+    path = stack.corrected(whole.solution.bias)
+    moved = origins[stack.owner] + directions[stack.owner] * path[:, None]
+    places = targets(whole.solution, stack)
+    round_middle = 1j * (places - places.mean())
+    turn = np.real(np.conj(round_middle) @ moved) / np.sum(np.abs(round_middle) ** 2)
+    moved = moved - moved.mean(0) - round_middle[:, None] * turn
+    values, vectors = np.linalg.eigh(np.real(moved.conj().T @ moved))
+    keep = vectors[:, np.argsort(values)[::-1][:_SWAYS]]
+    bias = whole.solution.bias[stack.run][:, None]
+    directions = directions @ keep
+    changes = np.vstack([origins @ keep, directions, -bias * directions])
+    sway = whole.elimination.weights(changes) - 1j * np.outer(whole.map_weights, turn @ keep)
+    sway[-1] -= whole.expanded.mean(0) @ sway
     return np.asarray(sway)
+
+
+def _loose(whole: Fit, stack: Stack) -> tuple[Complex, Complex]:
+    """Changes of origins and directions (N, 3N each), one standard deviation a column.
+
+    The directions', with the origins following; then the origins' own, along both axes.
+    """
+    solution = whole.solution
+    system = problem_of(whole, stack).system(solution.bias)
+    follow = schur(system)[1]
+    values, vectors = np.linalg.eigh(angle_covariance(whole))
+    turned = 1j * solution.z[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0)))
+    n = stack.segments
+    values, vectors = np.linalg.eigh(np.real(system[:n, :n]))
+    # Moving all together costs nothing, and is no error of the map.
+    held = values > 1e-9 * values[-1]
+    scale = np.sqrt(whole.variance * whole.correlation / np.where(held, values, 1.0)) * held
+    own = vectors * scale
+    origins = np.hstack([follow @ turned, own, 1j * own])
+    return origins, np.hstack([turned, np.zeros((n, 2 * n))])
 
 
 def positions(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
@@ -280,4 +315,5 @@ def with_frame(result: MetricResult, frame: RigidTransform) -> MetricResult:
         origins=frame.apply(result.origins),
         residuals=turned(result.residuals),
         left_out=turned(result.left_out),
+        forecast=result.forecast.moved(frame),
     )

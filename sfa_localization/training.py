@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from tqdm import tqdm
 
 from sfa_localization import mdp_engine
 from sfa_localization import metric as metric_learning
-from sfa_localization.agreement import Agreement, disagreement
+from sfa_localization.agreement import Agreement, disagreement, share_within
 from sfa_localization.bag import load_run
 from sfa_localization.config import (
     BagConfig,
@@ -37,6 +36,7 @@ from sfa_localization.config import (
 )
 from sfa_localization.correlation import ErrorCorrelation
 from sfa_localization.errors import DataError, ModelError
+from sfa_localization.forecast import nearest_used
 from sfa_localization.geometry import Array
 from sfa_localization.heading import HeadingFit, fit_compass
 from sfa_localization.hierarchy import (
@@ -296,12 +296,14 @@ def learn_place(
         (result.left_out**2).sum(1),
         result.left_out_variance,
         axes=2,
+        weight=result.left_out_weight,
     )
     correlation = _error_correlation(segments, result)
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
     # Of each run, s; None where the drive does not show it.
     delays = [c.delay_s if c.known else None for c in clocks]
-    yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled])
+    yaw_weight = _yaw_weight(labelled, segments, result, recipe.heading)
+    yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled], yaw_weight)
     model = PlaceModel(
         network,
         result.map,
@@ -312,9 +314,8 @@ def learn_place(
         yaw_agreement,
         layers if heading else (),
         {
-            **_quality(
-                network, views, segments, result, agreement, heading, yaw_agreement, labelled
-            ),
+            **_quality(network, views, segments, result, agreement),
+            **_yaw_quality(views.disagreement[labelled], heading, yaw_agreement, yaw_weight),
             'camera_delay_s': delays,
         },
         correlation,
@@ -427,13 +428,12 @@ def _learn_heading(
     if not config.learn_heading:
         return None, labelled[:0]
     known, at_sample, at_label = np.intersect1d(views.sampled, labelled, return_indices=True)
-    owner = assignment(segments, len(views.features))[known]
     try:
         fit = fit_compass(
             views.features[known],
             views.harmonic[at_sample],
             yaw[at_label],
-            owner % config.heading_folds,
+            _heading_part(known, segments, config),
             config,
         )
     except DataError as error:
@@ -456,10 +456,29 @@ def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrela
     )
 
 
-def _yaw_agreement(heading: HeadingFit | None, spread: Array) -> Agreement | None:
+def _heading_part(
+    labelled: NDArray[np.int64], segments: Segments, config: HeadingConfig
+) -> NDArray[np.int64]:
+    """(T,) which part of the labelled images (T,) each is left out with."""
+    return assignment(segments, int(labelled.max(initial=-1)) + 1)[labelled] % config.heading_folds
+
+
+def _yaw_weight(
+    labelled: NDArray[np.int64], segments: Segments, result: MetricResult, config: HeadingConfig
+) -> Array:
+    """How much the left-out heading of each labelled image (T,) says of paths between."""
+    images, places = metric_learning.positions(result, segments)
+    part = _heading_part(labelled, segments, config)
+    distances = nearest_used(places[np.searchsorted(images, labelled)], part)
+    return result.forecast.importance(distances)
+
+
+def _yaw_agreement(heading: HeadingFit | None, spread: Array, weight: Array) -> Agreement | None:
     if heading is None:
         return None
-    return Agreement.fit(spread, heading.left_out_error**2, heading.left_out_std**2, axes=1)
+    return Agreement.fit(
+        spread, heading.left_out_error**2, heading.left_out_std**2, axes=1, weight=weight
+    )
 
 
 def _quality(
@@ -468,12 +487,12 @@ def _quality(
     segments: Segments,
     result: MetricResult,
     agreement: Agreement,
-    heading: HeadingFit | None,
-    yaw_agreement: Agreement | None,
-    labelled: NDArray[np.int64],
 ) -> dict[str, Any]:
     """Figures of merit that travel with the model; plain numbers and lists."""
-    quality = {
+    x, y, error = result.forecast.worst
+    variance = result.left_out_variance * agreement.factor(views.disagreement[result.images])
+    ratio = (result.left_out**2).sum(1) / variance
+    return {
         'delta': network.deltas[-1].tolist(),
         'rank': [list(ranks) for ranks in network.ranks],
         **views.eta,
@@ -483,28 +502,33 @@ def _quality(
         'certificate': float(result.certificate.eigenvalue),
         'features_used': result.map.features,
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
+        'expected_error_m': result.forecast.expected_m,
+        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
         'left_out_error_m': result.left_out_error_m,
-        'left_out_within_95': _share_within_95(
-            agreement.factor(views.disagreement[result.images]) * result.left_out_variance,
-            (result.left_out**2).sum(1),
-            axes=2,
-        ),
+        'left_out_within_95': share_within(ratio, 2, 0.95, result.left_out_weight),
         'coverage': result.diagnostics.as_dict(),
     }
-    if heading is not None:
-        error = heading.left_out_error
-        variance = heading.left_out_std**2
-        if yaw_agreement is not None:
-            variance = variance * yaw_agreement.factor(views.disagreement[labelled])
-        quality['left_out_yaw_deg'] = float(np.degrees(np.abs(error).mean()))
-        quality['left_out_yaw_within_95'] = _share_within_95(variance, error**2, axes=1)
-    return quality
+
+
+def _yaw_quality(
+    spread: Array, heading: HeadingFit | None, agreement: Agreement | None, weight: Array
+) -> dict[str, float]:
+    """Figures of the heading, of the left-out images by how much they say of paths between."""
+    if heading is None or agreement is None:
+        return {}
+    error = heading.left_out_error
+    ratio = error**2 / (heading.left_out_std**2 * agreement.factor(spread))
+    return {
+        'expected_yaw_error_deg': float(np.degrees(np.average(np.abs(error), weights=weight))),
+        'left_out_yaw_within_95': share_within(ratio, 1, 0.95, weight),
+    }
 
 
 def summary(trained: Trained) -> str:
     """What a person should know of a training, in a few lines; no ground truth is needed."""
     quality = trained.model.quality
     coverage = quality['coverage']
+    worst = quality['worst']
     along, across = coverage['extent_m']
     proof = 'proven the best' if quality['certified'] else 'NOT proven the best'
     lines = [
@@ -512,13 +536,13 @@ def summary(trained: Trained) -> str:
         f'{coverage["length_m"]:.0f} m driven, about {along:.0f} m x {across:.0f} m covered',
         f'map: {quality["features_used"]} slow features, directions {proof} '
         f'(certificate {quality["certificate"]:.1e})',
-        f'position, on parts of the drive that were left out: {quality["left_out_error_m"]:.2f} m '
-        f'mean error, {100 * quality["left_out_within_95"]:.0f} % inside the 95 % ellipse',
+        f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image on paths '
+        f'between the trained ones; worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m: '
+        f'{worst["expected_error_m"]:.2f} m',
     ]
-    if 'left_out_yaw_deg' in quality:
+    if 'expected_yaw_error_deg' in quality:
         lines.append(
-            f'heading, likewise: {quality["left_out_yaw_deg"]:.1f} degrees mean error, '
-            f'{100 * quality["left_out_yaw_within_95"]:.0f} % inside the 95 % interval'
+            f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error, likewise'
         )
     for run, delay in zip(trained.runs, quality['camera_delay_s'], strict=True):
         if delay is not None and abs(delay) > _DELAY_SHOWN_S:
@@ -538,11 +562,6 @@ def _counts(trained: Trained) -> dict[str, dict[str, int]]:
     skipped['metric learning: images'] = trained.segments.images.skipped
     skipped['metric learning: odometry'] = trained.segments.odometry.skipped
     return skipped
-
-
-def _share_within_95(variance: Array, squared_error: Array, axes: int) -> float:
-    """Share of errors inside the 95 % region that variances per axis (M,) claim."""
-    return float(np.mean(squared_error <= stats.chi2.ppf(0.95, axes) * variance))
 
 
 @dataclass(frozen=True, slots=True)

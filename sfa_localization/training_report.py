@@ -39,14 +39,18 @@ def write_training_report(folder: Path, trained: Trained) -> None:
 
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
-    """Draw where pictures were taken, (M, 2) m, colored by the left-out error of the map."""
+    """Draw where images were taken, (M, 2) m, on the error to expect around them."""
     figure, axes = _figure()
-    error = np.hypot(*trained.metric.left_out.T)
+    expected = trained.metric.forecast
     dots = axes.scatter(
-        places[:, 0], places[:, 1], c=error, s=9, cmap='viridis', vmax=np.quantile(error, 0.98)
+        expected.points[:, 0], expected.points[:, 1], c=expected.local, s=30, cmap='viridis'
     )
-    figure.colorbar(dots, ax=axes, label='left-out position error (m)')
-    _places(axes, 'Pictures in the map, and how well the rest predicts them')
+    figure.colorbar(dots, ax=axes, label='expected position error of one image (m)')
+    axes.scatter(places[:, 0], places[:, 1], s=2, color='black')
+    x, y, error = expected.worst
+    axes.plot(x, y, 'x', color='red', markersize=10, label=f'worst: {error:.2f} m')
+    axes.legend(loc='upper right')
+    _places(axes, 'Images in the map, and the error to expect between them')
     report.save(figure, path)
 
 

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from sfa_localization.agreement import Agreement, disagreement
+from sfa_localization.agreement import Agreement, disagreement, quantile, share_within
 
 
 def drawn(exponent, axes, count=20_000, seed=0):
@@ -34,6 +34,24 @@ def test_fit_covers_half_and_most_of_heavy_tailed_errors():
     variance = fit.factor(u)
     assert (squared <= 1.386 * variance).mean() >= 0.49
     assert (squared <= 5.991 * variance).mean() >= 0.945
+
+
+@pytest.mark.parametrize('axes', [1, 2])
+def test_images_of_no_weight_change_nothing(axes):
+    u, squared, claimed = drawn(1.0, axes, count=3000)
+    weight = np.where(np.arange(3000) < 2000, 1.0, 0.0)
+    squared[2000:] *= 100.0
+    weighted = Agreement.fit(u, squared, claimed, axes, weight)
+    assert weighted == Agreement.fit(u[:2000], squared[:2000], claimed[:2000], axes)
+    assert weighted.level < 0.1 * Agreement.fit(u, squared, claimed, axes).level
+
+
+def test_a_weight_of_three_is_three_images():
+    values, weight = np.array([4.0, 1.0, 3.0, 2.0]), np.array([1.0, 3.0, 1.0, 2.0])
+    repeated = np.sort(np.repeat(values, weight.astype(int)))
+    for share in (0.1, 0.5, 0.6, 0.95, 1.0):
+        assert quantile(values, share, weight) == repeated[int(np.ceil(share * 7)) - 1]
+    assert share_within(np.array([1.0, 7.0]), 2, 0.95, np.array([3.0, 1.0])) == 0.75
 
 
 def test_disagreement_is_zero_for_equal_views_and_does_not_depend_on_heading():

@@ -119,7 +119,7 @@ def test_without_ground_truth_it_comes_close_to_regression_on_ground_truth(kind)
     assert unsupervised < 1.15 * errors(supervised, unseen).mean()
     assert unsupervised < 0.5 * odometry
     assert result.certificate.certified
-    assert 0.5 < result.left_out_error_m / unsupervised < 3.0
+    assert 0.7 < result.forecast.expected_m / unsupervised < 1.5
 
 
 def another_drive(known):

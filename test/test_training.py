@@ -13,9 +13,10 @@ from sfa_localization import training
 from sfa_localization.bag import BagWriter
 from sfa_localization.config import NetworkConfig
 from sfa_localization.errors import DataError, LocalizationError, ModelError
+from sfa_localization.metric import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.run import Count, Odometry, PanoramaArray, Run
-from sfa_localization.training import Recipe, drive_of, read_drive, train
+from sfa_localization.training import Recipe, drive_of, read_drive, summary, train
 
 PICTURES = 160
 NETWORK = replace(recipe().network, linear_dimensions=(6, 6, 8), output_dimensions=(6, 6, 6))
@@ -73,6 +74,22 @@ def cut_off(bag: Path, output: Path, stages: int, error: BaseException) -> None:
         patch.setattr(training._Checkpoint, 'write', write_then_fail)
         with pytest.raises(type(error)):
             train([bag], output, RECIPE)
+
+
+def test_it_says_what_error_to_expect_and_where_it_is_worst(bag, tmp_path):
+    trained = train([bag], tmp_path / 'model.npz', RECIPE)
+    quality = PlaceModel.load(tmp_path / 'model.npz').quality
+    worst = quality['worst']
+    assert 0.0 < quality['expected_error_m'] < worst['expected_error_m']
+    told = (
+        f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image on paths '
+        f'between the trained ones; worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m: '
+        f'{worst["expected_error_m"]:.2f} m'
+    )
+    assert told in summary(trained).splitlines()
+    assert f'expect {quality["expected_yaw_error_deg"]:.1f} degrees' in summary(trained)
+    _, places = positions(trained.metric, trained.segments)
+    assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
 
 
 def names(folder: Path) -> list[str]:

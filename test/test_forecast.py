@@ -1,0 +1,203 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The forecast of a training against drives whose every place is known."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from metric_worlds import criss_cross, drive, garden_features, grid, lanes, meander
+
+from sfa_localization.config import MetricConfig, SegmentConfig
+from sfa_localization.elimination import Links, Stack
+from sfa_localization.errors import DataError
+from sfa_localization.fitting import fit, targets
+from sfa_localization.forecast import REACH_M, Forecast, _beyond, _gap, _Leaver, nearest_used
+from sfa_localization.geometry import RigidTransform, align
+from sfa_localization.hyperparameters import folds
+from sfa_localization.metric import learn, positions, with_frame
+from sfa_localization.regression import Process
+from sfa_localization.segments import cut
+
+CONFIG = MetricConfig(slow_features=12, inducing_points=300, angle_std_max=180.0)
+DRIVES = {
+    'straight legs': criss_cross(30, half=(5.0, 5.0), seed=1, shortest=5.0),
+    'other legs': criss_cross(40, half=(6.0, 4.0), seed=2, shortest=5.0),
+    'wandering': meander(250.0, seed=3),
+    'wandering more': meander(400.0, seed=4),
+    'lanes along and across': (grid(10.0, 1.0, 9), (-5.0, -5.0, 0.0)),
+}
+EVERYWHERE = Forecast(np.zeros((4, 2)), np.array([0.1, 0.2, 0.3, 0.4]), np.ones(4))
+
+
+def trained(name, noise=0.05):
+    """True poses at the images, segments, features and what is learnt of a noisy drive."""
+    twists, start = DRIVES[name]
+    run = drive(twists, start=start, bias=1.4e-3, yaw_noise=0.01, speed_noise=0.03, seed=5)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    features = garden_features(run.poses[:, :2], noise=noise)
+    return run.poses, segments, features, learn(features, segments, CONFIG)
+
+
+@cache
+def legs():
+    return trained('straight legs')
+
+
+@cache
+def fitted():
+    """A fit of a small process, and its stack."""
+    _, segments, features, _ = legs()
+    stack = Stack.of(segments)
+    rows = features[stack.images]
+    basis = Process.fit(rows, np.full(12, 0.3), 1e-2, 60)
+    return fit(basis, rows, stack, Links.of(segments, True, True), CONFIG), stack
+
+
+def between(known, count=1500):
+    """Places (N, 2) drawn evenly in the middle of the known ones, and near one of them."""
+    low, high = np.quantile(known, [0.05, 0.95], axis=0)
+    places = np.random.default_rng(6).uniform(low, high, (count, 2))
+    near = [np.hypot(*(known - place).T).min() < REACH_M for place in places]
+    return places[near]
+
+
+@cache
+def judged(name):
+    """Forecast over true error of single images on paths between, and share in the ellipse."""
+    poses, _, features, result = trained(name)
+    images = result.images
+    frame = align(result.map.predict(features[images])[0], poses[images, :2])
+    places = between(poses[images, :2])
+    predicted, covariances = result.map.predict(garden_features(places, noise=0.05, seed=9))
+    turn = np.array(
+        [
+            [np.cos(frame.yaw_rad), -np.sin(frame.yaw_rad)],
+            [np.sin(frame.yaw_rad), np.cos(frame.yaw_rad)],
+        ]
+    )
+    off = (frame.apply(predicted) - places) @ turn
+    squared = np.einsum('ni,nij,nj->n', off, np.linalg.inv(covariances), off)
+    return result.forecast.expected_m / np.hypot(*off.T).mean(), np.mean(squared < 5.991)
+
+
+@pytest.mark.parametrize('name', DRIVES)
+def test_the_forecast_is_about_the_true_error(name):
+    assert 0.7 < judged(name)[0] < 1.5
+
+
+def test_forecasts_and_ellipses_are_right_on_average():
+    ratios, shares = np.transpose([judged(name) for name in DRIVES])
+    assert 0.8 < ratios.mean() < 1.25
+    assert 0.91 < shares.mean() < 0.985
+
+
+def test_it_is_worst_where_the_images_mislead():
+    poses, segments, features, _ = legs()
+    misled = poses[:, 0] > 2.5
+    noise = 0.6 * np.random.default_rng(1).standard_normal(features.shape)
+    result = learn(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
+    images, places = positions(result, segments)
+    x, y, error = result.forecast.worst
+    assert poses[images[np.hypot(*(places - [x, y]).T).argmin()], 0] > 2.0
+    assert error > 1.5 * result.forecast.expected_m
+
+
+def test_images_left_out_together_are_predicted_as_by_a_map_learnt_without_them():
+    whole, stack = fitted()
+    group = np.array([40, 41, 42, 43, 90])
+    places = targets(whole.solution, stack)
+
+    def off(used):
+        """Errors of the map learnt from the used images; the drive's own positions stay."""
+        weighted = whole.expanded * (whole.weights * used)[:, None]
+        normal = weighted.T @ whole.expanded + np.diag(whole.basis.ridge)
+        return places - whole.expanded @ np.linalg.solve(normal, weighted.T @ places)
+
+    used = np.ones(len(places))
+    whole = replace(whole, residuals=off(used))
+    used[group] = 0.0
+    assert _Leaver(whole).error(42, group) == pytest.approx(off(used)[42], rel=1e-5)
+
+
+def test_points_lie_around_the_drive():
+    result = legs()[3]
+    expected = result.forecast
+    assert expected.points.shape == (1000, 2)
+    assert expected.distances.max() <= REACH_M
+    assert np.all(expected.errors > 0)
+    spread = np.ptp(expected.points, axis=0)
+    assert np.all(spread < np.ptp(result.origins, axis=0) + 2.0)
+
+
+def test_the_gap_ends_at_the_same_distances_as_the_point_has():
+    ends = np.arange(11) * 0.5 + 0j
+    stack = replace(fitted()[1], owner=np.zeros(11, int), first=np.array([0]), images=np.arange(11))
+    rng = np.random.default_rng(1)
+    gaps = {tuple(_gap(ends, stack, 5, 0.6, 1.2, rng).tolist()) for _ in range(20)}
+    assert gaps == {(3, 4, 5, 6), (4, 5, 6, 7)}
+    places = np.array([[0.0, 1.0], [0.0, -2.0], [3.0, 0.5]])
+    assert _beyond(places, np.zeros((1, 2)), np.array([0])) == pytest.approx([2.0])
+    assert np.isinf(_beyond(places[[0, 2]], np.zeros((1, 2)), np.array([0])))
+
+
+def test_distances_to_another_part():
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]])
+    assert nearest_used(places, np.array([0, 0, 1])) == pytest.approx([np.sqrt(5), 2.0, 2.0])
+    assert np.isinf(nearest_used(places, np.zeros(3, int))).all()
+
+
+def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points():
+    rng = np.random.default_rng(2)
+    wanted, have = rng.uniform(0, 0.5, 4000), rng.uniform(0, 2.0, 4000) ** 1.5
+    weight = Forecast(np.zeros((4000, 2)), wanted, np.ones(4000)).importance(have)
+    assert weight.sum() == pytest.approx(1.0)
+    assert np.all(weight[have > 0.5] == 0.0)
+    assert weight @ have == pytest.approx(0.25, abs=0.01)
+    far = EVERYWHERE.importance(np.array([5.0, 6.0]))
+    assert far == pytest.approx([0.5, 0.5]), 'where none is near enough, all count'
+
+
+def test_a_forecast_moves_with_its_map():
+    result = legs()[3]
+    frame = RigidTransform(1.0, 2.0, -0.5)
+    moved = with_frame(result, frame).forecast
+    x, y, error = result.forecast.worst
+    assert moved.worst[:2] == pytest.approx(frame.apply(np.array([[x, y]]))[0])
+    assert moved.worst[2] == pytest.approx(error)
+
+
+@pytest.mark.parametrize('length', [0.1, 3.0, 10.0, 100.0, 1e4])
+def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length):
+    _, segments, features, _ = legs()
+    config = replace(CONFIG, left_out_length=length)
+    stack = Stack.of(segments)
+    parts = folds(stack, config)
+    assert 2 <= len(parts) <= config.left_out_folds
+    assert sorted(np.concatenate(parts)) == list(range(len(stack.images)))
+    result = learn(features, segments, config)
+    assert result.certificate.certified
+    assert np.isfinite(result.left_out_error_m)
+    assert np.isfinite(result.map.predict(features)[1]).all()
+    assert result.left_out_error_m < 2.0
+
+
+@pytest.mark.parametrize('many', [2, 3, 5])
+def test_few_segments_are_never_left_out_all_at_once(many):
+    stack = Stack.of(cut_lanes(many))
+    for number in (2, 8):
+        config = replace(CONFIG, left_out_length=1e4, left_out_folds=number)
+        assert len(folds(stack, config)) >= 2
+
+
+def cut_lanes(many):
+    """The first segments of a drive."""
+    run = drive(lanes(8.0, 1.0, 4))
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    return replace(segments, items=segments.items[:many])
+
+
+def test_a_single_segment_is_refused():
+    with pytest.raises(DataError, match='drive farther'):
+        folds(Stack.of(cut_lanes(1)), CONFIG)
