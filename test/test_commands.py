@@ -246,6 +246,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
             '--odometry-rate 20',
             lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns']),
         ),
+        '--odometry-frame': Case('--odometry-frame start', of_wheels),
         '--test-drift': Case('--test-drift 1', of_wheels, beside='--trajectory test'),
         '--scale-error': Case('--scale-error 0.1', of_wheels),
         '--slip': Case('--slip 0.3', of_wheels),
