@@ -74,7 +74,7 @@ class Forecast:
         bins = np.searchsorted(edges, distances, 'right') - 1
         inside = (bins >= 0) & (bins < _BINS)
         if not inside.any():
-            return np.full(len(distances), 1.0 / len(distances))
+            return np.full(len(distances), 1.0 / max(len(distances), 1))
         bins = np.clip(bins, 0, _BINS - 1)
         counts = np.bincount(bins[inside], minlength=_BINS)
         weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)

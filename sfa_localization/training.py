@@ -284,7 +284,8 @@ def learn_place(
         weight=result.left_out_weight,
     )
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
-    yaw_weight = _yaw_weight(labelled, segments, result, recipe.heading)
+    part = _heading_part(labelled, segments, len(views.features), recipe.heading)
+    yaw_weight = _yaw_weight(labelled, part, segments, result)
     yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled], yaw_weight)
     model = PlaceModel(
         network,
@@ -401,7 +402,7 @@ def _learn_heading(
             views.features[known],
             views.harmonic[at_sample],
             yaw[at_label],
-            _heading_part(known, segments, config),
+            _heading_part(known, segments, len(views.features), config),
             config,
         )
     except DataError as error:
@@ -411,18 +412,20 @@ def _learn_heading(
 
 
 def _heading_part(
-    labelled: NDArray[np.int64], segments: Segments, config: HeadingConfig
+    labelled: NDArray[np.int64], segments: Segments, images: int, config: HeadingConfig
 ) -> NDArray[np.int64]:
-    """(T,) which part of the labelled images (T,) each is left out with."""
-    return assignment(segments, int(labelled.max(initial=-1)) + 1)[labelled] % config.heading_folds
+    """(T,) which part each labelled one (T,) of so many images is left out with."""
+    return assignment(segments, images)[labelled] % config.heading_folds
 
 
 def _yaw_weight(
-    labelled: NDArray[np.int64], segments: Segments, result: MetricResult, config: HeadingConfig
+    labelled: NDArray[np.int64],
+    part: NDArray[np.int64],
+    segments: Segments,
+    result: MetricResult,
 ) -> Array:
-    """How much the left-out heading of each labelled image (T,) says of paths between."""
+    """(T,) how much each left-out heading says of paths between the trained ones."""
     images, places = metric_learning.positions(result, segments)
-    part = _heading_part(labelled, segments, config)
     distances = nearest_used(places[np.searchsorted(images, labelled)], part)
     return result.forecast.importance(distances)
 
