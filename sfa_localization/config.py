@@ -541,7 +541,7 @@ class MetricConfig(Settings):
     robust: bool = setting(False, 'give pictures and turns that fit badly less weight')
     left_out_folds: int = setting(8, 'parts of the drive left out in turn', low=2, high=100)
     left_out_length: float = setting(
-        10.0, 'length of a drive that is left out as a whole', unit='m', low=0.1, high=1e4
+        10.0, 'most of a drive that is left out as a whole', unit='m', low=0.1, high=1e4
     )
     angle_std_max: float = setting(
         10.0,

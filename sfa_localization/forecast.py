@@ -9,6 +9,9 @@ away, and on the other side the nearest is at another distance. Around the image
 point all images are left out up to these two distances, on the one side and on the other, and the
 map predicts it from the rest: it is then as far from its neighbours as the point is.
 
+What no left-out image can show is not in it: another light than that of the trained drives, or
+a wheel radius that is wrong everywhere.
+
 Images left out together cost no new fit: with residuals r and the hat matrix H of the least
 squares, the group G is off by (I - H_GG)^-1 r_G where it was not used.
 """
@@ -74,7 +77,7 @@ class Forecast:
         bins = np.searchsorted(edges, distances, 'right') - 1
         inside = (bins >= 0) & (bins < _BINS)
         if not inside.any():
-            return np.full(len(distances), 1.0 / len(distances))
+            return np.full(len(distances), 1.0 / max(len(distances), 1))
         bins = np.clip(bins, 0, _BINS - 1)
         counts = np.bincount(bins[inside], minlength=_BINS)
         weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)

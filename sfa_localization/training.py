@@ -302,7 +302,8 @@ def learn_place(
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
     # Of each run, s; None where the drive does not show it.
     delays = [c.delay_s if c.known else None for c in clocks]
-    yaw_weight = _yaw_weight(labelled, segments, result, recipe.heading)
+    part = _heading_part(labelled, segments, len(views.features), recipe.heading)
+    yaw_weight = _yaw_weight(labelled, part, segments, result)
     yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled], yaw_weight)
     model = PlaceModel(
         network,
@@ -433,7 +434,7 @@ def _learn_heading(
             views.features[known],
             views.harmonic[at_sample],
             yaw[at_label],
-            _heading_part(known, segments, config),
+            _heading_part(known, segments, len(views.features), config),
             config,
         )
     except DataError as error:
@@ -457,18 +458,20 @@ def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrela
 
 
 def _heading_part(
-    labelled: NDArray[np.int64], segments: Segments, config: HeadingConfig
+    labelled: NDArray[np.int64], segments: Segments, images: int, config: HeadingConfig
 ) -> NDArray[np.int64]:
-    """(T,) which part of the labelled images (T,) each is left out with."""
-    return assignment(segments, int(labelled.max(initial=-1)) + 1)[labelled] % config.heading_folds
+    """(T,) which part each labelled one (T,) of so many images is left out with."""
+    return assignment(segments, images)[labelled] % config.heading_folds
 
 
 def _yaw_weight(
-    labelled: NDArray[np.int64], segments: Segments, result: MetricResult, config: HeadingConfig
+    labelled: NDArray[np.int64],
+    part: NDArray[np.int64],
+    segments: Segments,
+    result: MetricResult,
 ) -> Array:
-    """How much the left-out heading of each labelled image (T,) says of paths between."""
+    """(T,) how much each left-out heading says of paths between the trained ones."""
     images, places = metric_learning.positions(result, segments)
-    part = _heading_part(labelled, segments, config)
     distances = nearest_used(places[np.searchsorted(images, labelled)], part)
     return result.forecast.importance(distances)
 

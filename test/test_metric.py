@@ -200,6 +200,23 @@ def test_covariances_are_honest_about_unseen_places():
     assert np.mean(squared < 5.99) > 0.85
 
 
+def test_the_maps_sway_is_about_as_large_as_the_errors_of_the_positions_it_learns_from():
+    claimed, true = [], []
+    for seed in range(4):
+        twists, start = criss_cross(25, half=(5.0, 5.0), seed=seed, shortest=5.0)
+        run = noisy_drive(twists, start, seed=seed)
+        segments = cut(run.odometry, run.stamps_ns, ANY)
+        features = garden_features(run.poses[:, :2], noise=0.05)
+        result = learn(features, segments, dataclasses.replace(GP, gp_length=1.0, gp_noise=1e-2))
+        images, places = positions(result, segments)
+        truth = run.poses[images, :2]
+        true.append((errors(align(places, truth).apply(places), truth) ** 2).mean())
+        sway = np.einsum('ij,jkl->ikl', result.map.basis.expand(features[images]), result.map.sway)
+        claimed.append((sway**2).sum((1, 2)).mean())
+    # What no drive can show, such as a wrong wheel radius, is not in it.
+    assert 0.55 < np.sqrt(np.mean(claimed) / np.mean(true)) < 1.3
+
+
 def test_strange_features_have_a_large_variance():
     _, _, features, result = noisy_result()
     usual = result.map.predict(features)[1][:, 0, 0]

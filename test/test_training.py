@@ -92,6 +92,30 @@ def test_it_says_what_error_to_expect_and_where_it_is_worst(bag, tmp_path):
     assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
 
 
+def test_without_a_heading_it_expects_none(bag, tmp_path):
+    recipe = replace(RECIPE, heading=replace(RECIPE.heading, learn_heading=False))
+    trained = train([bag], tmp_path / 'model.npz', recipe)
+    assert not trained.model.has_heading
+    assert 'expected_yaw_error_deg' not in trained.model.quality
+    assert 'heading' not in summary(trained)
+
+
+def test_a_heading_from_some_of_the_images_only(bag, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, '_SAMPLES', 97)
+    learn_heading = training._learn_heading
+
+    def of_the_first_half(views, *rest):
+        half = views.sampled < PICTURES / 2
+        return learn_heading(
+            replace(views, sampled=views.sampled[half], harmonic=views.harmonic[half]), *rest
+        )
+
+    monkeypatch.setattr(training, '_learn_heading', of_the_first_half)
+    trained = train([bag], tmp_path / 'model.npz', RECIPE)
+    assert trained.heading_images.max() < PICTURES / 2
+    assert 0.0 < trained.model.quality['expected_yaw_error_deg'] < 180.0
+
+
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
