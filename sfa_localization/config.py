@@ -600,13 +600,6 @@ class FilterConfig(Settings):
     scale_walk: float = setting(
         1e-3, 'random walk of the scale', unit='1/sqrt(m)', low=0.0, high=1.0, live=True
     )
-    camera_delay_std: float = setting(
-        0.1,
-        "deviation of the camera clock's delay before any is learnt; 0: its stamps are right",
-        unit='s',
-        low=0.0,
-        high=0.5,
-    )
     odometry_factor: float = setting(
         1.0, "factor on the odometry's own variances", low=1e-3, high=1e4, live=True
     )

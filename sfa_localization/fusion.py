@@ -16,17 +16,10 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
 from sfa_localization import motion
-from sfa_localization.camera_clock import (
-    DELAY_LIMIT,
-    Sight,
-    Trail,
-    left_behind,
-    look_back,
-)
 from sfa_localization.config import FilterConfig
 from sfa_localization.gate import Evidence, Fit, consistent, relocate, remember
 from sfa_localization.geometry import Array
-from sfa_localization.motion import DELAY, ERROR, SIZE, YAW, State, Step, V, X, Y
+from sfa_localization.motion import ERROR, SCALE, SIZE, YAW, State, Step, V, X, Y
 from sfa_localization.readings import lower_root, symmetric
 
 DISTRUST_AFTER = 3
@@ -45,8 +38,6 @@ _OBSERVE = np.eye(3, SIZE)
 _PLACE = (X, Y, ERROR, ERROR + 1, ERROR + 2)
 _REST = tuple(sorted({*range(SIZE)} - {*_PLACE}))
 """A position alone tells of these, and not of those, while the heading is lost."""
-_KEPT = slice(V, DELAY + 1)
-"""What a new pose changes nothing of."""
 
 
 class Update(NamedTuple):
@@ -88,7 +79,7 @@ class PoseEvent(NamedTuple):
 
 
 class MeasurementEvent(NamedTuple):
-    """`jacobian` (2 or 3, 11) of what is seen and its `white` noise follow from covariance."""
+    """`jacobian` (2 or 3, 10) of the measurement and its `white` noise follow from covariance."""
 
     stamp_ns: int
     value: Array
@@ -126,7 +117,6 @@ class Belief(NamedTuple):
     twist: motion.Twist
     odometry_ns: int | None
     memory: Memory
-    trail: Trail = ()
 
     @property
     def state(self) -> State | None:
@@ -163,20 +153,13 @@ class _Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self._next
 
     def correct(
-        self,
-        mean: Array,
-        covariance: Array,
-        z: Array,
-        predicted: Array,
-        jacobian: Array,
-        noise: Array,
+        self, mean: Array, covariance: Array, z: Array, jacobian: Array, noise: Array
     ) -> tuple[Array, Array, float]:
         """Mean, covariance (Joseph form) and squared Mahalanobis distance of the innovation."""
         self.x, self.P = mean, covariance
         # Array.dot throughout: on arrays this small, @ takes twice as long.
-        self.update(z, lambda _: jacobian, lambda _: predicted, noise, residual=_residual)
+        self.update(z, lambda _: jacobian, jacobian.dot, noise, residual=_residual)
         self.x[YAW] = motion.wrap(float(self.x[YAW]))
-        self.x[DELAY] = min(max(float(self.x[DELAY]), -DELAY_LIMIT), DELAY_LIMIT)
         return self.x, symmetric(self.P), float(self.y.dot(self.SI).dot(self.y))
 
 
@@ -288,56 +271,57 @@ class Fusion:
             event.twist if event else belief.twist,
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
-            left_behind(belief.trail, belief.stamp_ns, belief.reckoned),
         )
 
     def _placed(self, belief: Belief, event: PoseEvent) -> Belief:
         """The pose was set from outside: what pictures said before does not count any more."""
-        covariance = self._with_pose(belief, event.covariance)
+        covariance = self._with_pose(belief, event.covariance, 0.0)
         mean = belief.mean.copy()
         mean[:3], mean[ERROR:] = event.pose, 0.0
         mean[YAW] = motion.wrap(float(mean[YAW]))
         memory = Memory(accepted_m=belief.travelled_m)
         return belief._replace(mean=mean, covariance=covariance, located=True, memory=memory)
 
-    def _with_pose(self, belief: Belief, pose: Array) -> Array:
-        """Covariance with a new pose block; bias, scale and delay keep what is known of them."""
+    def _with_pose(self, belief: Belief, pose: Array, share: float) -> Array:
+        """Covariance with a new pose block; bias and scale keep what is known of them.
+
+        `share` of the pose's variance is the picture error that the next pictures will repeat.
+        """
         covariance = self._prior_covariance(pose)
-        covariance[_KEPT, _KEPT] = belief.covariance[_KEPT, _KEPT]
+        kept = slice(V, SCALE + 1)
+        covariance[kept, kept] = belief.covariance[kept, kept]
+        shared = -math.sqrt(share) * np.linalg.cholesky(pose)
+        covariance[:3, ERROR:], covariance[ERROR:, :3] = shared, shared.T
         return covariance
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
-        sight = look_back(belief.stamp_ns, belief.mean, belief.reckoned, belief.trail)
+        covariance = event.covariance
         blind = event.value.size == 2 and belief.covariance[YAW, YAW] > self.config.lost_yaw_std**2
         if not belief.located or blind:
-            return self._started(belief, event, sight)
-        return self._gated(belief, event, sight)
+            return self._started(belief, event, covariance)
+        return self._gated(belief, event, covariance)
 
-    def _started(self, belief: Belief, event: MeasurementEvent, sight: Sight) -> Belief:
+    def _started(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> Belief:
         """Start from one picture with heading, or from the way that several lie along."""
-        evidence = self._remembered(belief, event, sight, False)
+        evidence = self._remembered(belief, event, covariance, False)
         found = None
         if event.value.size == 3:
-            if self._sure(event.covariance):
-                found = event.value, event.covariance
+            if self._sure(covariance):
+                found = event.value, covariance
         else:
             fit = relocate(evidence, self.config)
             if fit is not None and self._sure_of_heading(fit) and self._fair(fit, evidence):
                 found = fit.pose, fit.covariance
         if found is None and belief.located:
-            return self._followed(belief, event, sight, evidence)
+            return self._followed(belief, event, evidence)
         if found is None:
             reason = 'heading unknown yet' if event.value.size == 2 else 'too unsure to start from'
             memory = belief.memory._replace(evidence=evidence, update=_refused(event, reason))
             return belief._replace(memory=memory)
-        return self._restarted(belief, event, sight, found, 'started')
+        return self._restarted(belief, event, found, 'started')
 
     def _followed(
-        self,
-        belief: Belief,
-        event: MeasurementEvent,
-        sight: Sight,
-        evidence: tuple[Evidence, ...],
+        self, belief: Belief, event: MeasurementEvent, evidence: tuple[Evidence, ...]
     ) -> Belief:
         """The heading is lost: follow positions, and draw no conclusion from them on the heading.
 
@@ -345,16 +329,8 @@ class Fusion:
         """
         apart = belief.covariance.copy()
         apart[np.ix_(_PLACE, _REST)] = apart[np.ix_(_REST, _PLACE)] = 0.0
-        # Nor is it known which way the robot went since the image was taken.
-        delay2 = float(belief.mean[DELAY] ** 2 + belief.covariance[DELAY, DELAY])
-        gone = delay2 * (sight.velocity[0] ** 2 + sight.velocity[1] ** 2)
         mean, posterior, d2 = self._kalman.correct(
-            belief.mean,
-            apart,
-            event.value,
-            event.jacobian.dot(belief.mean),
-            event.jacobian,
-            event.white + gone * np.eye(2),
+            belief.mean, apart, event.value, event.jacobian, event.white
         )
         threshold = self._thresholds[2]
         near = d2 <= threshold
@@ -380,33 +356,13 @@ class Fusion:
         return fit.pictures >= 0.6 * len(evidence)
 
     def _restarted(
-        self,
-        belief: Belief,
-        event: MeasurementEvent,
-        sight: Sight,
-        found: tuple[Array, Array],
-        reason: str,
+        self, belief: Belief, event: MeasurementEvent, found: tuple[Array, Array], reason: str
     ) -> Belief:
-        """Start anew from the pose found for when the image was taken, with its covariance.
-
-        The next pictures will repeat the shared part of its error, and the camera's delay.
-        """
-        (x, y, yaw), spread = found
-        turned = float(yaw) - sight.pose[2]
-        dx, dy = _turned(sight.offset, turned)
+        pose, spread = found
         mean = belief.mean.copy()
-        mean[:3] = x - dx, y - dy, motion.wrap(float(yaw) - sight.offset[2])
-        mean[ERROR:] = 0.0
-        lever = np.eye(3)
-        lever[:2, YAW] = dy, -dx
-        since = np.array([*_turned(sight.velocity, turned), sight.velocity[2]])
-        delay = belief.covariance[DELAY, _KEPT]
-        late = np.outer(since, since) * belief.covariance[DELAY, DELAY]
-        covariance = self._with_pose(belief, symmetric(lever @ spread @ lever.T) + late)
-        shared = -self._root_share * lever @ np.linalg.cholesky(spread)
-        covariance[:3, ERROR:], covariance[ERROR:, :3] = shared, shared.T
-        covariance[:3, _KEPT] = np.outer(since, delay)
-        covariance[_KEPT, :3] = covariance[:3, _KEPT].T
+        mean[:3], mean[ERROR:] = pose, 0.0
+        mean[YAW] = motion.wrap(float(mean[YAW]))
+        covariance = self._with_pose(belief, spread, self.config.correlated_share)
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
         memory = Memory(
             support=1,
@@ -416,33 +372,28 @@ class Fusion:
         )
         return belief._replace(mean=mean, covariance=covariance, located=True, memory=memory)
 
-    def _gated(self, belief: Belief, event: MeasurementEvent, sight: Sight) -> Belief:
+    def _gated(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> Belief:
         """Accept what fits; weigh what does not against what else did not fit."""
-        size = len(event.value)
-        predicted = event.jacobian[:, ERROR:].dot(belief.mean[ERROR:])
-        predicted += sight.pose[:size]
-        jacobian = event.jacobian.copy()
-        jacobian[:size, DELAY] = [-rate for rate in sight.velocity[:size]]
-        jacobian[:2, YAW] = -sight.offset[1], sight.offset[0]
         mean, posterior, d2 = self._kalman.correct(
-            belief.mean, belief.covariance, event.value, predicted, jacobian, event.white
+            belief.mean, belief.covariance, event.value, event.jacobian, event.white
         )
-        threshold = self._thresholds[size]
+        threshold = self._thresholds[len(event.value)]
         innovation, spread = self._kalman.y, self._kalman.S
         update = Update(event.stamp_ns, True, d2, threshold, 'accepted', innovation, spread)
         if d2 <= threshold and (
-            not self._surprising(belief, event, sight) or self._confirmed(belief, event, sight)
+            not self._surprising(belief, event, covariance)
+            or self._confirmed(belief, event, covariance)
         ):
-            return self._accepted(belief, event, sight, (mean, posterior), update)
+            return self._accepted(belief, event, covariance, (mean, posterior), update)
         reason = 'outside the gate' if d2 > threshold else 'not confirmed after an outage yet'
         refused = update._replace(accepted=False, reason=reason)
-        return self._doubted(belief, event, sight, refused)
+        return self._doubted(belief, event, covariance, refused)
 
     def _accepted(
         self,
         belief: Belief,
         event: MeasurementEvent,
-        sight: Sight,
+        covariance: Array,
         posterior: tuple[Array, Array],
         update: Update,
     ) -> Belief:
@@ -450,7 +401,7 @@ class Fusion:
             support=min(belief.memory.support + 1, _ESTABLISHED),
             accepted_ns=event.stamp_ns,
             accepted_m=belief.travelled_m,
-            evidence=self._remembered(belief, event, sight, True),
+            evidence=self._remembered(belief, event, covariance, True),
             update=update,
         )
         return Belief(
@@ -463,22 +414,21 @@ class Fusion:
             belief.twist,
             belief.odometry_ns,
             memory,
-            belief.trail,
         )
 
-    def _surprising(self, belief: Belief, event: MeasurementEvent, sight: Sight) -> bool:
+    def _surprising(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> bool:
         """The gate is wide because the estimate is poor, and the picture would move it far."""
-        prior, own = belief.covariance, event.covariance
+        prior, own = belief.covariance, covariance
         if belief.memory.support == 0:  # a pose set from outside says itself how poor it is
             return False
         if max(prior[0, 0], prior[1, 1]) < _DOMINATED * max(own[0, 0], own[1, 1]):
             return False
-        miss = event.value[:2] - sight.pose[:2]
+        miss = event.value[:2] - belief.mean[:2]
         return bool(miss @ np.linalg.solve(own[:2, :2], miss) > self._thresholds[2])
 
-    def _confirmed(self, belief: Belief, event: MeasurementEvent, sight: Sight) -> bool:
+    def _confirmed(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> bool:
         """Enough pictures in a row agree with this one, along the way that odometry tells."""
-        evidence = self._remembered(belief, event, sight, False)
+        evidence = self._remembered(belief, event, covariance, False)
         offset = float(belief.mean[YAW]) - belief.reckoned[2]
         count = consistent(evidence, offset, math.sqrt(belief.covariance[YAW, YAW]))
         if count < self.config.confirm_pictures:
@@ -487,14 +437,13 @@ class Fusion:
         return span >= self.config.confirm_distance or count >= self._many
 
     def _doubted(
-        self, belief: Belief, event: MeasurementEvent, sight: Sight, update: Update
+        self, belief: Belief, event: MeasurementEvent, covariance: Array, update: Update
     ) -> Belief:
         """Refuse a picture, unless those refused outweigh the estimate; then start anew there."""
-        evidence = self._remembered(belief, event, sight, False)
+        evidence = self._remembered(belief, event, covariance, False)
         fit = relocate(evidence, self.config) if len(evidence) > 1 else None
-        if fit is not None and self._overruled(belief, sight, fit):
-            found = fit.pose, fit.covariance
-            return self._restarted(belief, event, sight, found, 're-initialised')
+        if fit is not None and self._overruled(belief, fit):
+            return self._restarted(belief, event, (fit.pose, fit.covariance), 're-initialised')
         outside = update.d2 > update.threshold
         refused = belief.memory.refused + int(outside)
         memory = belief.memory._replace(
@@ -525,7 +474,7 @@ class Fusion:
             return memory.outage
         return event.stamp_ns - memory.accepted_ns > self.config.picture_timeout * 1e9
 
-    def _overruled(self, belief: Belief, sight: Sight, fit: Fit) -> bool:
+    def _overruled(self, belief: Belief, fit: Fit) -> bool:
         """Whether agreeing pictures outweigh the estimate that they contradict."""
         config, support = self.config, belief.memory.support
         needed = min(config.recovery_pictures, max(2, support + 1))
@@ -533,7 +482,7 @@ class Fusion:
             return False
         if fit.dissenting >= fit.pictures:
             return False
-        little = support >= config.recovery_pictures and not self._plain(sight, fit)
+        little = support >= config.recovery_pictures and not self._plain(belief, fit)
         way = max(config.recovery_distance, 8 * fit.std_m)
         way *= _AFTER_OUTAGE if belief.memory.outage else 1.0
         if fit.has_yaw and not little:
@@ -544,10 +493,10 @@ class Fusion:
         enough = fit.pictures >= needed or (fit.pictures >= 3 and fit.span_m >= 1.25 * way)
         return enough and fit.span_m >= way
 
-    def _plain(self, sight: Sight, fit: Fit) -> bool:
+    def _plain(self, belief: Belief, fit: Fit) -> bool:
         """The robot is elsewhere, or turned, by so much that no error of pictures explains it."""
-        jump = math.hypot(*(fit.pose[:2] - sight.pose[:2]))
-        turn = abs(motion.wrap(float(fit.pose[YAW] - sight.pose[YAW])))
+        jump = math.hypot(*(fit.pose[:2] - belief.mean[:2]))
+        turn = abs(motion.wrap(float(fit.pose[YAW] - belief.mean[YAW])))
         elsewhere = jump >= max(self.config.recovery_jump, _PLAIN * fit.std_m)
         return elsewhere or turn >= max(_PLAIN_TURN, _PLAIN * fit.yaw_std)
 
@@ -568,19 +517,17 @@ class Fusion:
         return np.asarray(covariance * np.outer(factor, factor))
 
     def _remembered(
-        self, belief: Belief, event: MeasurementEvent, sight: Sight, agreed: bool
+        self, belief: Belief, event: MeasurementEvent, covariance: Array, agreed: bool
     ) -> tuple[Evidence, ...]:
-        variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
-        late = float(belief.covariance[DELAY, DELAY])
-        vx, vy, omega = sight.velocity
-        variance = (variances[0] + variances[1] + late * (vx * vx + vy * vy)) / 2
+        variances, (x, y, *yaw) = covariance.diagonal().tolist(), event.value.tolist()
+        variance = (variances[0] + variances[1]) / 2
         item = Evidence(
-            sight.reckoned,
+            belief.reckoned,
             belief.travelled_m,
             (x, y),
             yaw[0] if yaw else math.nan,
             variance,
-            variances[2] + late * omega * omega if yaw else math.inf,
+            variances[2] if yaw else math.inf,
             agreed,
         )
         reach = max(3 * self.config.recovery_distance, 30 * math.sqrt(variance))
@@ -590,9 +537,8 @@ class Fusion:
         config = self.config
         bias = config.bias_std if config.estimate_bias else _CERTAIN
         scale = config.scale_std if config.estimate_scale else _CERTAIN
-        delay = max(config.camera_delay_std, _CERTAIN)
         covariance = np.diag(
-            np.square([1, 1, 1, config.speed_std, config.rate_std, bias, scale, delay, 1, 1, 1])
+            np.square([1, 1, 1, config.speed_std, config.rate_std, bias, scale, 1, 1, 1])
         )
         covariance[:3, :3] = pose
         return covariance
@@ -600,12 +546,6 @@ class Fusion:
 
 def _refused(event: MeasurementEvent, reason: str) -> Update:
     return Update(event.stamp_ns, False, math.nan, math.nan, reason)
-
-
-def _turned(vector: tuple[float, float, float], angle: float) -> tuple[float, float]:
-    """The first two of a vector, turned by an angle."""
-    c, s = math.cos(angle), math.sin(angle)
-    return c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]
 
 
 def _between(a: motion.Twist, b: motion.Twist) -> motion.Twist:

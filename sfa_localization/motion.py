@@ -3,10 +3,9 @@
 """Motion of the pose filter's state: constant turn rate and velocity (CTRV), driven by odometry.
 
 The state is [x m, y m, yaw rad, v m/s, omega rad/s, yaw-rate bias rad/s, wheel scale - 1,
-camera delay s, e_x, e_y, e_yaw]. The camera delay is by how much images are stamped late: what
-they show is the pose so long before their stamp. The last three are what pictures of one place get
-wrong alike, in standard deviations of the measurement: they fade over the distance driven, so that
-a robot that stands still learns from its thousandth picture no more than from the first.
+e_x, e_y, e_yaw]. The last three are what pictures of one place get wrong alike, in standard
+deviations of the measurement: they fade over the distance driven, so that a robot that stands
+still learns from its thousandth picture no more than from the first.
 """
 
 from __future__ import annotations
@@ -20,16 +19,15 @@ import numpy as np
 from sfa_localization.config import FilterConfig
 from sfa_localization.geometry import Array
 
-X, Y, YAW, V, OMEGA, BIAS, SCALE, DELAY, ERROR = range(9)
-SIZE = 11
-_DELAY_WALK = 3e-4
+X, Y, YAW, V, OMEGA, BIAS, SCALE, ERROR = range(8)
+SIZE = 10
 _HELD_VARIANCE = 1e-8
 _DIAGONAL = np.arange(SIZE)
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Estimate at one stamp: `mean` (11,), `covariance` (11, 11), in the order told above."""
+    """Estimate at one stamp: `mean` (10,), `covariance` (10, 10), in the order told above."""
 
     stamp_ns: int
     mean: Array
@@ -66,11 +64,6 @@ class State:
         return 1.0 + float(self.mean[SCALE])
 
     @property
-    def camera_delay_s(self) -> float:
-        """By how much images are stamped later than the odometry's clock saw them taken, s."""
-        return float(self.mean[DELAY])
-
-    @property
     def position_std(self) -> float:
         """Standard deviation along the worst direction, m."""
         a, b, c = self.covariance[0, 0], self.covariance[1, 1], self.covariance[0, 1]
@@ -83,7 +76,7 @@ class State:
 
 
 class Step(NamedTuple):
-    """A prediction: the new mean (11,), its Jacobian (11, 11), the noise it adds (11, 11)."""
+    """A prediction: the new mean (10,), its Jacobian (10, 10), the noise it adds (10, 10)."""
 
     mean: Array
     jacobian: Array
@@ -102,7 +95,7 @@ class Twist(NamedTuple):
         return abs(self.v) < config.standstill_speed and abs(self.omega) < config.standstill_rate
 
 
-class Arc(NamedTuple):
+class _Arc(NamedTuple):
     """A motion over dt at constant v and omega, and its derivatives."""
 
     dx: float
@@ -114,8 +107,7 @@ class Arc(NamedTuple):
     dy_domega: float
 
 
-def arc(yaw: float, v: float, omega: float, dt: float) -> Arc:
-    """The circle that v m/s and omega rad/s drive in dt s from a heading; dt < 0: drove."""
+def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
     half = omega * dt / 2
     if abs(half) < 1e-4:  # the straight-line limit, exact to rounding here
         sinc, slope = 1 - half * half / 6, -half / 3
@@ -124,7 +116,7 @@ def arc(yaw: float, v: float, omega: float, dt: float) -> Arc:
         slope = (math.cos(half) - sinc) / half
     c, s = math.cos(yaw + half), math.sin(yaw + half)
     reach, bend, chord = dt * sinc, v * dt * slope * dt / 2, v * dt * sinc
-    return Arc(
+    return _Arc(
         dx=chord * c,
         dy=chord * s,
         dyaw=omega * dt,
@@ -142,20 +134,20 @@ def drive(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
     """
     if twist.stands(config):
         return _stand(mean)
-    x, y, yaw, _, _, bias, scale, delay, *errors = mean.tolist()
+    x, y, yaw, _, _, bias, scale, *errors = mean.tolist()
     v, omega = (1.0 + scale) * twist.v, twist.omega - bias
-    path = arc(yaw, v, omega, dt)
+    arc = _arc(yaw, v, omega, dt)
     moved = abs(v) * dt + config.turn_radius * abs(omega) * dt
     fade = math.exp(-moved / config.decorrelation)
     after = np.array(
-        [x + path.dx, y + path.dy, wrap(yaw + path.dyaw), v, omega, bias, scale, delay]
+        [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
         + [fade * error for error in errors]
     )
-    jacobian = _arc_jacobian(path, dt, fade)
+    jacobian = _arc_jacobian(arc, dt, fade)
     # Columns of the old v and omega vanish: odometry replaces them, through scale and bias.
     gain = np.zeros((SIZE, 2))
-    gain[[X, Y, V], 0] = path.dx_dv, path.dy_dv, 1.0
-    gain[[X, Y, YAW, OMEGA], 1] = path.dx_domega, path.dy_domega, dt, 1.0
+    gain[[X, Y, V], 0] = arc.dx_dv, arc.dy_dv, 1.0
+    gain[[X, Y, YAW, OMEGA], 1] = arc.dx_domega, arc.dy_domega, dt, 1.0
     jacobian[:, V] = jacobian[:, OMEGA] = 0.0
     jacobian[:, SCALE] += twist.v * gain[:, 0]
     jacobian[:, BIAS] -= gain[:, 1]
@@ -171,18 +163,18 @@ def coast(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
 
     `twist` is the last reading, whose noise still counts.
     """
-    x, y, yaw, v, omega, bias, scale, delay, *errors = mean.tolist()
+    x, y, yaw, v, omega, bias, scale, *errors = mean.tolist()
     if v == 0.0 and omega == 0.0:
         step = _stand(mean)
     else:
-        path = arc(yaw, v, omega, dt)
+        arc = _arc(yaw, v, omega, dt)
         moved = abs(v) * dt + config.turn_radius * abs(omega) * dt
         fade = math.exp(-moved / config.decorrelation)
         after = np.array(
-            [x + path.dx, y + path.dy, wrap(yaw + path.dyaw), v, omega, bias, scale, delay]
+            [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
             + [fade * error for error in errors]
         )
-        jacobian = _arc_jacobian(path, dt, fade)
+        jacobian = _arc_jacobian(arc, dt, fade)
         noise = np.zeros((SIZE, SIZE))
         gain = jacobian[:, V : OMEGA + 1]
         variances = np.array([twist.v_variance, twist.omega_variance])
@@ -212,7 +204,7 @@ def halt(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
 
 
 def doubt(noise: Array, twist: Twist, dt: float, config: FilterConfig) -> float:
-    """Add to `noise` (11, 11) what a robot may have done unseen for `dt` s; returns its speed."""
+    """Add to `noise` (10, 10) what a robot may have done unseen for `dt` s; returns its speed."""
     speed = max(config.unknown_speed, abs(twist.v))
     spread = 2 * speed**2 * dt
     noise[X, X] += spread
@@ -232,12 +224,12 @@ def _stand(mean: Array) -> Step:
     return Step(after, jacobian, noise)
 
 
-def _arc_jacobian(path: Arc, dt: float, fade: float) -> Array:
+def _arc_jacobian(arc: _Arc, dt: float, fade: float) -> Array:
     jacobian = np.zeros((SIZE, SIZE))
-    jacobian[_DIAGONAL, _DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
-    jacobian[X, YAW], jacobian[Y, YAW] = -path.dy, path.dx
-    jacobian[X, V], jacobian[Y, V] = path.dx_dv, path.dy_dv
-    jacobian[X, OMEGA], jacobian[Y, OMEGA] = path.dx_domega, path.dy_domega
+    jacobian[_DIAGONAL, _DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
+    jacobian[X, YAW], jacobian[Y, YAW] = -arc.dy, arc.dx
+    jacobian[X, V], jacobian[Y, V] = arc.dx_dv, arc.dy_dv
+    jacobian[X, OMEGA], jacobian[Y, OMEGA] = arc.dx_domega, arc.dy_domega
     jacobian[YAW, OMEGA] = dt
     return jacobian
 
@@ -258,7 +250,7 @@ def _add_lasting_noise(
 def _add_drift(
     noise: Array, metres: float, radians: float, dt: float, fade: float, config: FilterConfig
 ) -> None:
-    """Slip in proportion to the way, and the random walks of all that is learnt."""
+    """Slip in proportion to the way, and the random walks of bias, scale and picture error."""
     slip = config.slip_per_metre**2 * metres
     noise[X, X] += slip
     noise[Y, Y] += slip
@@ -267,8 +259,6 @@ def _add_drift(
         noise[BIAS, BIAS] += config.bias_walk**2 * dt
     if config.estimate_scale:
         noise[SCALE, SCALE] += config.scale_walk**2 * metres
-    if config.camera_delay_std > 0:
-        noise[DELAY, DELAY] += _DELAY_WALK**2 * dt
     for i in range(ERROR, SIZE):
         noise[i, i] += 1 - fade * fade
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sfa_localization.camera_clock import DELAY_LIMIT
 from sfa_localization.config import FilterConfig
 from sfa_localization.correlation import ErrorCorrelation, resolved
 from sfa_localization.errors import DataError
@@ -43,7 +42,6 @@ _BACKWARD = 5
 _AHEAD = 3
 _FAR_OUTSIDE = 4.0
 _MOVED_ON = 0.5
-_DELAY_WARNED = 0.95 * DELAY_LIMIT
 
 
 class Level(enum.Enum):
@@ -291,8 +289,6 @@ def _degraded(belief: Belief, state: State, config: FilterConfig) -> list[str]:
         found.append(f'position known to {state.position_std:.1f} m only')
     if memory.refused >= DISTRUST_AFTER:
         found.append(f'{memory.refused} pictures in a row did not fit')
-    if abs(state.camera_delay_s) > _DELAY_WARNED:
-        found.append(f"the camera's stamps are off by {DELAY_LIMIT} s, or more")
     return [*found, *_silences(belief, config)]
 
 

@@ -45,7 +45,6 @@ class Drive:
     scale: float = 1.0
     share: float = 0.0
     length: float = 0.6
-    delay: float = 0.0
     seed: int = 0
     stamps_ns: np.ndarray = field(init=False)
 
@@ -62,7 +61,7 @@ class Drive:
         self.seen = self._seen(rng)
 
     def _seen(self, rng):
-        poses = self.poses_at(self.stamps_ns[self.pictures] - round(self.delay * 1e9))
+        poses = self.poses[self.pictures]
         way = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
         lasting = rng.standard_normal(3)
         errors = []
@@ -76,20 +75,14 @@ class Drive:
         seen[:, 2] = wrap_angle(seen[:, 2])
         return seen
 
-    def poses_at(self, stamps_ns):
-        """Poses (M, 3) between the samples, and beyond them at the first and last twist."""
-        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self.stamps_ns) - 1)
-        seconds = (stamps_ns - self.stamps_ns[after - 1]) * 1e-9
-        v, omega = self.twists[after].T
-        chord, turn = v * seconds * np.sinc(omega * seconds / 2 / np.pi), omega * seconds
-        steps = np.column_stack([chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn])
-        return np.array([compose(a, b) for a, b in zip(self.poses[after - 1], steps, strict=True)])
-
     def kidnap(self, picture, shift):
         """From this picture on, the robot drives the same way elsewhere: shift is (x, y, yaw)."""
         sample = self.pictures[picture]
+        offset = self.seen[:, 2] - self.poses[self.pictures, 2]
+        error = self.seen[:, :2] - self.poses[self.pictures, :2]
         self.poses[sample:] = compose(np.array(shift, float), self.poses[sample:])
-        self.seen[picture:] = compose(np.array(shift, float), self.seen[picture:])
+        moved = self.poses[self.pictures]
+        self.seen = np.column_stack([moved[:, :2] + error, wrap_angle(moved[:, 2] + offset)])
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)

@@ -154,11 +154,10 @@ def test_picture_error_fades_over_the_way_and_keeps_unit_variance():
 
 
 def test_a_state_names_its_parts():
-    mean = np.arange(11.0)
-    covariance = np.diag([4.0, 1.0, 0.25, 1, 1, 1, 1, 1, 1, 1, 1])
+    mean = np.arange(10.0)
+    covariance = np.diag([4.0, 1.0, 0.25, 1, 1, 1, 1, 1, 1, 1])
     covariance[0, 1] = covariance[1, 0] = 1.5
     state = State(5, mean, covariance)
     assert list(state.pose) == [0, 1, 2] and list(state.twist) == [3, 4]
     assert (state.yaw_rate_bias, state.wheel_scale, state.yaw_std) == (5.0, 7.0, 0.5)
-    assert state.camera_delay_s == 7.0
     assert state.position_std == pytest.approx(math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))

@@ -289,7 +289,6 @@ class EkfNode(LocalizationNode):
             values['heading deviation [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
-            values['camera delay [s]'] = f'{state.camera_delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or 'localised', values
 
 
