@@ -281,3 +281,17 @@ def test_waiting_for_pictures_is_told(bench, models):
     assert until(lambda: told and 'waiting for pictures' in told[-1].status[0].message)
     bench.publish('panorama', message())
     assert until(lambda: 'no picture on panorama for' in told[-1].status[0].message)
+
+
+def test_frames_and_the_warning_are_parameters(bench, models):
+    frames = {'map_frame': 'garden', 'feature_frame': 'slow'}
+    node = bench.run(SfaNode, model='a.npz', novelty_warning=1.0, **frames)
+    features = bench.listen(PoseStamped, 'sfa/slow_feature_pose')
+    poses = bench.listen(PoseStamped, 'sfa/pose')
+    uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    models['a.npz'].novelty = 1.2
+    bench.publish('panorama', message())
+    assert until(lambda: features and poses and uncertain)
+    assert features[0].header.frame_id == 'slow'
+    assert poses[0].header.frame_id == uncertain[0].header.frame_id == 'garden'
+    assert until(lambda: 'unlike' in node.health()[1]), 'by default 1.2 is not worth a warning'
