@@ -471,3 +471,22 @@ def test_knowledge_that_cannot_be_is_refused(bench, numbers):
     bench.publish('sfa/error_correlation', message, latched_qos())
     assert until(lambda: node.monitor('sfa/error_correlation').received == 1)
     assert node._filter._fusion.config.correlated_share == 0.7
+
+
+def test_frames_are_parameters(bench):
+    """The map's always; those of odometry and robot where the messages leave them empty."""
+    frames = {'map_frame': 'garden', 'odom_frame': 'wheels', 'base_frame': 'robot'}
+    node = bench.run(EkfNode, set_initial_pose=True, publish_tf=False, **frames)
+    assert bench.node.count_publishers('/tf') == 0, 'others may broadcast the transform'
+    fused = bench.listen(Odometry, 'ekf/odometry')
+    transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
+    drive = Drive(seconds=1)
+    message = odometry(drive, 0)
+    message.header.frame_id = message.child_frame_id = ''
+    bench.publish('odom', message)
+    assert until(lambda: fused and transforms)
+    assert (fused[0].header.frame_id, fused[0].child_frame_id) == ('garden', 'robot')
+    header, child = transforms[0].header, transforms[0].child_frame_id
+    assert (header.frame_id, child) == ('garden', 'wheels')
+    bench.publish(SEEN, picture(drive, 0, frame='garden'))
+    assert until(lambda: node.monitor(SEEN).used == 1)

@@ -367,3 +367,17 @@ def test_a_declaration_that_cannot_be_read_is_counted(bench, models):
     heard = bench.listen(PoseStamped, 'sfa/pose')
     bench.publish('panorama', message())
     assert until(lambda: heard)
+
+
+def test_frames_and_the_warning_are_parameters(bench, models):
+    frames = {'map_frame': 'garden', 'feature_frame': 'slow'}
+    node = bench.run(SfaNode, model='a.npz', novelty_warning=1.0, **frames)
+    features = bench.listen(PoseStamped, 'sfa/slow_feature_pose')
+    poses = bench.listen(PoseStamped, 'sfa/pose')
+    uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    models['a.npz'].novelty = 1.2
+    bench.publish('panorama', message())
+    assert until(lambda: features and poses and uncertain)
+    assert features[0].header.frame_id == 'slow'
+    assert poses[0].header.frame_id == uncertain[0].header.frame_id == 'garden'
+    assert until(lambda: 'unlike' in node.health()[1]), 'by default 1.2 is not worth a warning'

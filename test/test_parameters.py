@@ -1,0 +1,555 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter changes something.
+
+For each group of settings there is something to observe, in a world that is rich enough, and each
+parameter is set to another value than its default there. SPECIAL holds the values, and the
+settings beside them, for parameters that need some; OBSERVED_BY names the tests of those that
+need a camera, a node or a command to show. A new parameter is exercised without an entry.
+"""
+
+import ast
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres, recipe, run_in, wander
+from filter_drives import START_NS, Drive
+from metric_worlds import (
+    criss_cross,
+    drive,
+    garden_features,
+    lanes,
+    meander,
+    stand,
+    straight,
+    turn,
+)
+from test_commands import OPTIONS, parser_of
+
+from sfa_localization import cli, metric, sources
+from sfa_localization.bag import Bag, BagWriter, load_run
+from sfa_localization.config import (
+    BagConfig,
+    CameraConfig,
+    EkfNodeConfig,
+    FilterConfig,
+    HeadingConfig,
+    MetricConfig,
+    NetworkConfig,
+    NodeConfig,
+    OmnicamNodeConfig,
+    PanoramaConfig,
+    SegmentConfig,
+    Settings,
+    SfaNodeConfig,
+    WatchConfig,
+)
+from sfa_localization.errors import LocalizationError
+from sfa_localization.hierarchy import architecture_of, train_network
+from sfa_localization.metric import learn, positions
+from sfa_localization.observation import PictureWatch
+from sfa_localization.panorama import Unwrapper
+from sfa_localization.pose_filter import PoseFilter
+from sfa_localization.run import Odometry, PanoramaArray, Run
+from sfa_localization.segments import Segments, cut
+from sfa_localization.training import drive_of, learn_place
+
+GROUPS = {group.__name__: group for group in Settings.__subclasses__()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Other:
+    """Another value than the default, and the settings beside which it matters."""
+
+    value: Any
+    beside: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+# What is observed: numbers, of which some must change.
+
+
+def unwrapped(camera: CameraConfig, panorama: PanoramaConfig) -> Any:
+    """The panorama of a picture of noise."""
+    picture = np.random.default_rng(0).integers(0, 256, (640, 640, 3), np.uint8)
+    return Unwrapper(camera, panorama)(picture)
+
+
+def of_camera(settings: CameraConfig) -> Any:
+    return unwrapped(settings, PanoramaConfig())
+
+
+def of_panorama(settings: PanoramaConfig) -> Any:
+    return unwrapped(CameraConfig(), settings)
+
+
+def of_bag(settings: BagConfig, folder: Path) -> Any:
+    """A run from a bag with a pause of the odometry, a jump in it, and one picture's odd clock."""
+    start, tenth = 1_700_000_000 * 10**9, 10**8
+    with BagWriter(folder / 'bag') as bag:
+        for i in range(100):
+            stamp = start + i * tenth
+            if not 40 < i < 55:
+                pose = np.array([0.1 * i + 3.0 * (i > 70), 0.0, 0.0])
+                bag.odometry('/odom', stamp, pose, np.array([1.0, 0.0]), np.array([1e-4, 1e-4]))
+            odd = stamp + 15 * 10**9 if i == 20 else stamp
+            picture = bag._raw_image(bag._header(odd, 'camera'), np.full((8, 80, 3), i, np.uint8))
+            bag.message('/panorama', stamp, picture)
+    with Bag(folder / 'bag', config=settings) as bag:
+        clocks = [stamp for stamp, _ in bag.images()]
+    run = load_run(folder / 'bag', cache=folder, config=settings)
+    return run.panoramas.stamps_ns, run.odometry.poses, clocks
+
+
+def of_filter(settings: FilterConfig) -> Any:
+    """What a filter believes along a drive with everything that may happen to one."""
+    fused, seen = PoseFilter(settings), []
+    rng = np.random.default_rng(1)
+    moving = [(1.0, 0.5 * np.sin(0.05 * i)) for i in range(1200)]
+    twists = np.array(moving[:300] + [(5e-4, 1e-3)] * 40 + moving[300:])
+    trip = Drive(twists=twists, rate_hz=20.0, v_std=0.03, omega_std=0.02, position_std=0.2,
+                 yaw_std=0.1, bias=0.01, scale=0.98)  # fmt: skip
+    trip.read[300:320], trip.read[320:340] = (1.5e-3, 1e-3), (5e-4, 3e-3)
+    trip.kidnap(200, (2.5, 1.5, 0.0))
+    for event in trip.events():
+        stamp, kind, index = event
+        t = (stamp - START_NS) * 1e-9
+        if kind == 0:
+            if 20 < t < 26 or 40 < t < 40.8:
+                continue
+            told = (-1.0, -1.0) if 10 < t < 14 or 30 < t < 32 else (1e-8, 1e-8)
+            told = (4e-3, 4e-3) if 14 < t < 17 else told
+            fused.add_odometry(stamp, *trip.read[index], told)
+            if index == 600:
+                fused.add_odometry(stamp + 80 * 10**9, 1.0, 0.0)
+        elif 20.5 < t < 25.5 or 33 < t < 38:
+            continue
+        else:
+            value, spread = trip.seen[index].copy(), np.diag([0.04, 0.04, 0.01])
+            if t < 3 or 12 < t < 13.5 or 25.5 < t < 26.5 or t > 55:
+                value, spread = value[:2], np.zeros((2, 2))
+            if 5 < t < 7:
+                spread = spread * 1e-4
+            if 17 < t < 18:
+                spread[2, 2] = 1.5
+            value[:2] += (rng.random() < 0.1) * 3.0
+            late = stamp - 6 * 10**9 if index % 40 == 39 else stamp
+            update = fused.add_measurement(late, value, spread)
+            seen.append((update.d2, update.reason))
+        state = fused.at(stamp)
+        seen.append((fused.status, None if state is None else
+                     (state.pose.tolist(), state.covariance.tolist())))  # fmt: skip
+    return repr(seen)
+
+
+@cache
+def odd_drive() -> tuple[Any, Any]:
+    """A drive with lines, turns, curves, pauses and pictures near and far; and its gyroscope."""
+    parts = [
+        lanes(6.0, 1.5, 3),
+        stand(2.0),
+        meander(40.0, seed=3)[0],
+        straight(3.0, 0.5),
+        turn(2.0),
+        lanes(5.0, 0.6, 2),
+    ]
+    run = drive(np.vstack(parts), bias=0.01, speed_noise=0.02, yaw_noise=0.01, seed=3)
+    return run, run.gyro
+
+
+def of_segments(settings: SegmentConfig) -> Any:
+    """The segments of a drive whose odometry pauses and jumps, and whose pictures are uneven."""
+    run, gyro = odd_drive()
+    odometry = run.odometry
+    kept = np.ones(len(odometry.stamps_ns), bool)
+    kept[900:940] = False
+    poses = odometry.poses.copy()
+    poses[2000:, 0] += 0.5
+    variances = np.tile([1e-4, 0.0], (len(poses), 1))
+    odometry = Odometry(
+        odometry.stamps_ns[kept], poses[kept], odometry.twists[kept], variances[kept]
+    )
+    gyro = dataclasses.replace(gyro, omega=gyro.omega + 0.002)
+    stamps = np.delete(run.stamps_ns, [*range(60, 72), *range(150, 156)])
+    return plain(cut(odometry, stamps, settings, gyro))
+
+
+def plain(segments: Segments) -> str:
+    with np.printoptions(threshold=10**6, precision=12):
+        return repr(segments)
+
+
+@cache
+def garden() -> tuple[Any, Any]:
+    """Features and straight segments of a criss-cross drive with errors."""
+    twists, start = criss_cross(9)
+    run = drive(twists, start=start, bias=0.004, yaw_noise=0.01, speed_noise=0.02)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments='straight'))
+    return garden_features(run.poses[:, :2], noise=0.3, seed=2), segments
+
+
+def of_metric(settings: MetricConfig) -> Any:
+    """The map that is learnt, and how it does on what was left out."""
+    features, segments = garden()
+    result = learn(features, segments, settings)
+    _, places = positions(result, segments)
+    return result.map.predict(features), places, result.left_out, result.history
+
+
+@cache
+def panoramas() -> Run:
+    """A short drive whose odometry is not even, with a pause and a jump in it."""
+    odometry = wander(60, 2, hz=4.0)
+    stamps = odometry.stamps_ns + np.where(np.arange(60) >= 30, 8 * 10**9, 0)
+    stamps += 3 * 10**7 * (np.arange(60) % 3)
+    poses = odometry.poses + np.where(np.arange(60) >= 45, 3.0, 0.0)[:, None] * [1, 0, 0]
+    run = run_in(Spheres.about(1), odometry, recipe().panorama)
+    moved = Odometry(stamps, poses, odometry.twists, odometry.variances)
+    return Run('run', PanoramaArray(stamps, run.panoramas.images), moved)
+
+
+def of_network(settings: NetworkConfig) -> Any:
+    """What a network makes of the pictures that it was trained on."""
+    run = panoramas()
+    architecture = architecture_of(settings, run.panoramas.shape[:2])
+    network = train_network(architecture, [drive_of(run, settings)], settings)
+    return network.maps(run.panoramas.read(0, 10))[-1]
+
+
+def of_heading(settings: HeadingConfig) -> Any:
+    """The headings that are learnt with a small place."""
+    made = recipe()
+    quick = MetricConfig(slow_features=6, gp_length=3.0, gp_noise=0.01, inducing_points=60)
+    made = dataclasses.replace(made, heading=settings, metric=quick)
+    model = learn_place(place_network(), [place_run()], made).model
+    return repr([model.locate(image).yaw for image in place_run().panoramas.read(0, 10)])
+
+
+@cache
+def place_run() -> Run:
+    return run_in(Spheres.about(1), wander(150, 2, hz=4.0), recipe().panorama)
+
+
+@cache
+def place_network() -> Any:
+    made, run = recipe(), place_run()
+    architecture = architecture_of(made.network, run.panoramas.shape[:2])
+    return train_network(architecture, [drive_of(run, made.network)], made.network)
+
+
+def of_watch(settings: WatchConfig) -> Any:
+    """What is said of dark, covered, repeated and foreign pictures."""
+    watch = PictureWatch(settings)
+    noise = np.random.default_rng(0).normal(0, 1, (12, 48, 3))
+    seen = [watch.judge((m + s * noise).clip(0, 255).astype(np.uint8))
+            for m in (4, 12, 100) for s in (2, 5, 40)]  # fmt: skip
+    same = (100 + 40 * noise).clip(0, 255).astype(np.uint8)
+    return [*seen, *(watch.judge(same) for _ in range(12)), *map(watch.judge_novelty, (2, 4, 7))]
+
+
+OBSERVE: dict[type[Settings], Callable[..., Any]] = {
+    CameraConfig: of_camera,
+    PanoramaConfig: of_panorama,
+    BagConfig: of_bag,
+    FilterConfig: of_filter,
+    WatchConfig: of_watch,
+    SegmentConfig: of_segments,
+    MetricConfig: of_metric,
+    NetworkConfig: of_network,
+    HeadingConfig: of_heading,
+}
+BESIDE: dict[type[Settings], dict[str, Any]] = {
+    MetricConfig: {'slow_features': 6, 'gp_length': 3.0, 'gp_noise': 0.01, 'inducing_points': 60},
+    NetworkConfig: {
+        item.name: getattr(recipe().network, item.name)
+        for item in dataclasses.fields(NetworkConfig)
+    },
+}
+"""What is set for a whole group, where its default would be slow, or use little of it."""
+ONE_LAYER = {'field_rows': (6,), 'field_columns': (8,), 'stride_rows': (6,), 'stride_columns': (4,),
+             'linear_dimensions': (8,), 'output_dimensions': (6,)}  # fmt: skip
+STRAIGHT = {'segments': 'straight'}
+PAPER = {'solver': 'paper', 'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5,
+         'require_certificate': False, 'paper_iterations': 300}  # fmt: skip
+RANDOM = {**PAPER, 'paper_start': 'random'}
+START = {'set_initial_pose': True}
+POLAR = {'camera_model': 'polar'}
+OCAM = {'camera_model': 'ocam', 'polynomial': (-150.0, 0.0, 1e-3), 'axis': 'down'}
+TWO = {'camera_model': 'dual_fisheye', 'fx': 95.0, 'fy': 95.0, 'cx': 160.0, 'second_cx': 480.0,
+       'second_cy': 319.5}  # fmt: skip
+SPECIAL: dict[type[Settings], dict[str, Other]] = {
+    CameraConfig: {
+        'distortion': Other((0.1, 0.0, 0.0, 0.0)),
+        'polynomial': Other((-120.0, 0.0, 1e-3), OCAM),
+        'affine': Other((1.1, 0.0, 0.0), OCAM),
+        'radius_min': Other(150.0),
+        'radius_max': Other(200.0),
+        'angle_min': Other(60.0, POLAR),
+        'angle_max': Other(120.0, POLAR),
+        'second_cx': Other(470.0, TWO),
+        'second_cy': Other(300.0, TWO),
+        'second_roll': Other(5.0, TWO),
+        'axis': Other('up', {'camera_model': 'fisheye', 'axis': 'down'}),
+        'mirrored': Other('no'),
+        'blind_sectors': Other((10.0, 60.0)),
+    },
+    SegmentConfig: {
+        'line_length_min': Other(5.0, STRAIGHT),
+        'line_bend_max': Other(1.0, STRAIGHT),
+        'turn_rate_min': Other(0.02, STRAIGHT),
+        'speed_min': Other(0.6, STRAIGHT),
+        'segment_images_min': Other(12),
+        'image_step_min': Other(0.3),
+        'image_turn_min': Other(90.0),
+    },
+    MetricConfig: {
+        'ridge': Other(1.0, {'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5}),
+        'angle_std_max': Other(0.01),
+        'anchor_x': Other(1.0, {'use_anchor': True}),
+        'anchor_y': Other(1.0, {'use_anchor': True}),
+        'anchor_yaw': Other(1.0, {'use_anchor': True}),
+        'paper_start': Other('random', PAPER),
+        'paper_area_x': Other(32.0, RANDOM),
+        'paper_area_y': Other(32.0, RANDOM),
+        'paper_iterations': Other(200, PAPER),
+        'paper_learning_rate': Other(5e-6, PAPER),
+        'paper_momentum': Other(0.5, PAPER),
+        'paper_change_min': Other(1e3, PAPER),
+        'paper_turns': Other(False, PAPER),
+    },
+    FilterConfig: {
+        'correlated_share': Other(0.2),
+        'decorrelation': Other(0.3),
+        'initial_x': Other(1.0, START),
+        'initial_y': Other(1.0, START),
+        'initial_yaw': Other(1.0, START),
+        'initial_position_std': Other(1.0, START),
+        'initial_yaw_std': Other(1.0, START),
+        'largest_std': Other(3.0, {'unknown_speed': 5.0}),
+        'confirm_pictures': Other(6, {'confirm_distance': 0.0}),
+    },
+    HeadingConfig: {
+        'heading_layers': Other((1,)),
+        'heading_features': Other(3),
+        'heading_folds': Other(3),
+        'heading_inducing_points': Other(40),
+    },
+    NetworkConfig: {
+        'normalization': Other('panorama'),
+        'binning': Other(2, ONE_LAYER),
+        'field_rows': Other((4, 1, 3)),
+        'field_columns': Other((12, 4, 6)),
+        'stride_rows': Other((2, 3, 1)),
+        'stride_columns': Other((8, 1, 1)),
+        'linear_dimensions': Other((8, 8, 10)),
+        'output_dimensions': Other((6, 6, 6)),
+        'clip': Other(0.5),
+    },
+}
+OF_A_COMMAND = 'test_commands.py'
+_OMNICAM, _SOURCES = 'test_omnicam_node.py', 'test_sources.py'
+OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
+    CameraConfig: {
+        'calibration_file': 'test_calibration_files.py::'
+        'test_a_calibration_file_replaces_the_lens_and_keeps_the_mount',
+        'mask_file': 'test_panorama.py::test_a_mask_picture_hides_what_is_black',
+    },
+    MetricConfig: {
+        'require_certificate': 'test_parameters.py::'
+        'test_an_unproven_map_is_refused_unless_that_is_allowed',
+    },
+    NetworkConfig: {
+        'engine': OF_A_COMMAND,
+        'layers': 'test_hierarchy.py::test_custom_default_is_the_standard',
+    },
+    OmnicamNodeConfig: {
+        'source': f'{_OMNICAM}::test_a_folder_of_pictures',
+        'source_path': f'{_OMNICAM}::test_a_folder_of_pictures',
+        'image_transport': f'{_OMNICAM}::test_compressed_pictures_in_and_out',
+        'frame_id': f'{_OMNICAM}::test_frame_and_quality_of_service_by_parameter',
+        'lazy': f'{_OMNICAM}::test_told_not_to_be_lazy_it_works_unheard',
+        'jpeg_quality': f'{_OMNICAM}::test_compressed_pictures_in_and_out',
+        'silence_timeout': f'{_OMNICAM}::test_a_silent_camera_shows_in_diagnostics',
+        'frozen_timeout': f'{_SOURCES}::test_a_frozen_camera_is_opened_again_until_it_moves',
+        'reopen_min': f'{_SOURCES}::test_pauses_double_up_to_the_longest',
+        'reopen_max': f'{_SOURCES}::test_pauses_double_up_to_the_longest',
+        'source_rate': f'{_SOURCES}::test_video',
+        'source_loop': f'{_SOURCES}::test_again_and_again',
+        'source_width': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
+        'source_height': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
+    },
+    NodeConfig: {
+        'autostart': 'test_nodes_base.py::test_a_node_starts_itself_unless_told_not_to',
+        'diagnostics_period': 'test_ekf_node.py::test_diagnostics_tell_rates_latencies_and_counts',
+    },
+    SfaNodeConfig: {
+        'model': 'test_sfa_node.py::test_the_model_changes_while_running_and_a_bad_one_is_refused',
+        'compressed': 'test_sfa_node.py::test_compressed_panoramas_are_taken_too',
+        'camera_timeout': 'test_sfa_node.py::test_waiting_for_pictures_is_told',
+        'map_frame': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
+        'feature_frame': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
+        'novelty_warning': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
+    },
+    EkfNodeConfig: {
+        'map_frame': 'test_ekf_node.py::test_frames_are_parameters',
+        'odom_frame': 'test_ekf_node.py::test_frames_are_parameters',
+        'base_frame': 'test_ekf_node.py::test_frames_are_parameters',
+        'publish_tf': 'test_ekf_node.py::test_frames_are_parameters',
+        'transform_tolerance': 'test_ekf_node.py::'
+        'test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated',
+        'path_period': 'test_ekf_node.py::test_the_path_is_thinned_and_bounded',
+        'path_length': 'test_ekf_node.py::test_the_path_is_thinned_and_bounded',
+        'odometry_silence': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
+        'picture_silence': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
+    },
+}
+
+
+def options_of(group: type[Settings]) -> set[str]:
+    """Settings of a group that are options of commands: those are run in test_commands.py."""
+    places = {
+        action.dest: option
+        for name in OPTIONS
+        for action in parser_of(name)._actions
+        for option in action.option_strings
+        if option in OPTIONS[name]
+    }
+    return {f.name for f in dataclasses.fields(group) if cli._dest(group, f.name) in places}
+
+
+def parameters() -> list[tuple[str, str]]:
+    return [
+        (group.__name__, f.name) for group in GROUPS.values() for f in dataclasses.fields(group)
+    ]
+
+
+def another(item: dataclasses.Field[Any]) -> Any:
+    """Return a value that is allowed, and differs from the default."""
+    default, meta = item.default, item.metadata
+    if isinstance(default, bool):
+        return not default
+    if meta['choices']:
+        return next(choice for choice in meta['choices'] if choice != default)
+    if isinstance(default, str):
+        return 'another'
+    if isinstance(default, (int, float)):
+        higher = default * 2 if default else 1
+        within = meta['high'] is None or higher <= meta['high']
+        return type(default)(higher if within else (default + (meta['low'] or 0)) / 2)
+    raise AssertionError(f'{item.name}: name another value in SPECIAL')
+
+
+def differ(a: Any, b: Any) -> bool:
+    if isinstance(a, (tuple, list)) and isinstance(b, (tuple, list)):
+        return len(a) != len(b) or any(differ(x, y) for x, y in zip(a, b, strict=True))
+    return repr(a) != repr(b) if isinstance(a, str) else not np.array_equal(a, b)
+
+
+def observed(settings: Settings, folder: Path) -> Any:
+    """What is observed, or the error that says that it cannot be."""
+    observe = OBSERVE[type(settings)]
+    try:
+        return observe(settings, folder) if observe is of_bag else observe(settings)
+    except LocalizationError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize(('group', 'name'), parameters())
+def test_a_parameter_changes_something(group, name, tmp_path):
+    kind = GROUPS[group]
+    where = OBSERVED_BY.get(kind, {}).get(name, '' if kind in OBSERVE else OF_A_COMMAND)
+    if where == OF_A_COMMAND:
+        assert name in options_of(kind), f'{group}.{name}: nothing shows that it does anything'
+        return
+    if where:
+        file, _, test = where.partition('::')
+        assert re.search(rf'\b{name}\b', source_of(file, test)), f'{test} does not use {name}'
+        return
+    (item,) = (f for f in dataclasses.fields(kind) if f.name == name)
+    other = SPECIAL.get(kind, {}).get(name) or Other(another(item))
+    before = kind(**{**BESIDE.get(kind, {}), **other.beside})
+    after = dataclasses.replace(before, **{name: other.value})
+    assert after != before
+    first, then = tmp_path / 'first', tmp_path / 'then'
+    first.mkdir(), then.mkdir()
+    changed = differ(observed(before, first), observed(after, then))
+    assert changed, f'{name}: {other.value!r} changes nothing'
+
+
+@cache
+def source_of(file: str, test: str) -> str:
+    """Return the source of a test, with its decorators."""
+    text = Path(__file__).with_name(file).read_text('utf-8')
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef) and node.name == test:
+            start = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+            return '\n'.join(text.splitlines()[start - 1 : node.end_lineno])
+    raise AssertionError(f'{file} has no {test}')
+
+
+def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
+    asked = {}
+
+    class Capture:
+        def __init__(self, *_args):
+            pass
+
+        def isOpened(self):
+            return True
+
+        def set(self, what, value):
+            asked[what] = value
+
+    monkeypatch.setattr(sources.cv2, 'VideoCapture', Capture)
+    (tmp_path / 'video0').touch()
+    size = {'source_width': 1280, 'source_height': 720, 'source_rate': 15.0}
+    sources.Device(OmnicamNodeConfig(source_path=str(tmp_path / 'video0'), **size))
+    wanted = {
+        sources.cv2.CAP_PROP_FRAME_WIDTH: 1280,
+        sources.cv2.CAP_PROP_FRAME_HEIGHT: 720,
+        sources.cv2.CAP_PROP_FPS: 15.0,
+    }
+    assert asked.items() >= wanted.items()
+    asked.clear()
+    sources.Device(OmnicamNodeConfig(source_path=str(tmp_path / 'video0')))
+    assert not asked.keys() & wanted.keys(), 'a device keeps its own'
+
+
+def test_an_unproven_map_is_refused_unless_that_is_allowed(monkeypatch):
+    """Odometry that contradicts the pictures so is hard to make; the proof is taken away."""
+    features, segments = garden()
+    choose = metric.choose
+
+    def unproven(*args):
+        whole = choose(*args)
+        solution = whole.solution
+        certificate = dataclasses.replace(solution.certificate, eigenvalue=-1.0)
+        return dataclasses.replace(
+            whole, solution=dataclasses.replace(solution, certificate=certificate)
+        )
+
+    monkeypatch.setattr(metric, 'choose', unproven)
+    settings = MetricConfig(**BESIDE[MetricConfig])
+    with pytest.raises(LocalizationError, match='require_certificate: false'):
+        learn(features, segments, settings)
+    learn(features, segments, dataclasses.replace(settings, require_certificate=False))
+
+
+@pytest.mark.parametrize('kind', OBSERVE, ids=lambda kind: kind.__name__)
+def test_without_another_value_nothing_differs(kind, tmp_path):
+    """Else any parameter would seem to change something."""
+    settings = kind(**BESIDE.get(kind, {}))
+    first, then = tmp_path / 'first', tmp_path / 'then'
+    first.mkdir(), then.mkdir()
+    assert not differ(observed(settings, first), observed(settings, then))
+
+
+def test_the_tables_name_parameters_that_there_are():
+    for table in (SPECIAL, OBSERVED_BY, BESIDE):
+        for kind, entries in table.items():
+            assert set(entries) <= {item.name for item in dataclasses.fields(kind)}, kind.__name__
