@@ -3,7 +3,8 @@
 """The paper in one file: a panorama shows where the robot is, odometry how it moves, an EKF fuses.
 
 The nodes do the same in two processes: sfa_node holds the `Observer`, ekf_node the `PoseFilter`,
-and a pose with its covariance is all that passes between them. This is for programs without ROS,
+and a pose with its covariance, and how far the pictures have turned, are all that passes between
+them. This is for programs without ROS,
 and for the evaluation of bags.
 """
 
@@ -58,6 +59,7 @@ class Localizer:
     def add_observation(self, observation: Observation) -> Update:
         """Fuse what a picture shows."""
         seen = observation
+        self.filter.add_turned(seen.stamp_ns, seen.turned)
         return self.filter.add_measurement(seen.stamp_ns, seen.pose, seen.covariance)
 
     @property

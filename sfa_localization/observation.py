@@ -20,6 +20,7 @@ from sfa_localization.geometry import Array
 from sfa_localization.heading import UNKNOWN_YAW_VARIANCE
 from sfa_localization.place_model import Estimate, PlaceModel
 from sfa_localization.run import BATCH, Image, Run, Stamps
+from sfa_localization.visual_turns import VisualGyro
 
 UNKNOWN_VARIANCE = 1e6
 """Variance, m^2, of the position of an unusable picture: the filter leaves it out."""
@@ -33,6 +34,8 @@ class Observation:
     `pose` (3,) is [x m, y m, yaw rad] in the map, yaw 0 where the model has no compass;
     `covariance` (3, 3) in the same order. `problem` is why the picture cannot be believed, ''
     when it can; the covariance then says that nothing is known. `estimate` is the model's own.
+    `turned` is the heading (rad, from wherever) that the shifts between the pictures add up to,
+    NaN for a picture that shows nothing: it knows no map, and tells the filter the camera's delay.
     """
 
     stamp_ns: int
@@ -40,6 +43,7 @@ class Observation:
     covariance: Array
     problem: str
     estimate: Estimate
+    turned: float = np.nan
 
 
 class Observer:
@@ -48,22 +52,23 @@ class Observer:
     def __init__(self, model: PlaceModel, config: WatchConfig | None = None) -> None:
         self.model = model
         self.watch = PictureWatch(config)
+        self._gyro = VisualGyro(model.panorama.clockwise)
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""
         self._require_size(panorama)
-        problem = self.watch.judge(panorama)
-        return self._observation(stamp_ns, self.model.locate(panorama), problem)
+        problem, turned = self._judge(panorama)
+        return self._observation(stamp_ns, self.model.locate(panorama), problem, turned)
 
     def observe_all(self, stamps_ns: Stamps, panoramas: Image) -> list[Observation]:
         """The same for panoramas (T, H, W, 3) with stamps (T,), quicker."""
         for panorama in panoramas[:1]:
             self._require_size(panorama)
-        problems = [self.watch.judge(panorama) for panorama in panoramas]
+        judged = [self._judge(panorama) for panorama in panoramas]
         estimates = self.model.locate_all(panoramas)
         return [
-            self._observation(int(stamp_ns), estimate, problem)
-            for stamp_ns, estimate, problem in zip(stamps_ns, estimates, problems, strict=True)
+            self._observation(int(stamp_ns), estimate, *verdict)
+            for stamp_ns, estimate, verdict in zip(stamps_ns, estimates, judged, strict=True)
         ]
 
     def observe_run(self, run: Run) -> Iterator[Observation]:
@@ -72,6 +77,11 @@ class Observer:
         for batch in run.panoramas.batches(BATCH):
             yield from self.observe_all(run.panoramas.stamps_ns[at : at + len(batch)], batch)
             at += len(batch)
+
+    def _judge(self, panorama: Image) -> tuple[str, float]:
+        """The problem of the next picture, and how far it has turned."""
+        problem = self.watch.judge(panorama)
+        return problem, np.nan if problem else self._gyro.add(panorama)
 
     def _require_size(self, panorama: Image) -> None:
         size = self.model.panorama
@@ -82,15 +92,18 @@ class Observer:
                 f'{size.width}x{size.height}: set width and height of omnicam_node'
             )
 
-    def _observation(self, stamp_ns: int, estimate: Estimate, problem: str) -> Observation:
+    def _observation(
+        self, stamp_ns: int, estimate: Estimate, problem: str, turned: float
+    ) -> Observation:
         if not _is_finite(estimate):
             problem = problem or 'the model gives no finite estimate for this picture'
-            return Observation(stamp_ns, np.zeros(3), unusable_covariance(), problem, estimate)
+            nothing = unusable_covariance()
+            return Observation(stamp_ns, np.zeros(3), nothing, problem, estimate, turned)
         problem = problem or self.watch.judge_novelty(estimate.novelty)
         yaw = estimate.yaw if np.isfinite(estimate.yaw) else 0.0
         covariance = unusable_covariance() if problem else estimate.covariance
         return Observation(
-            stamp_ns, np.append(estimate.position, yaw), covariance, problem, estimate
+            stamp_ns, np.append(estimate.position, yaw), covariance, problem, estimate, turned
         )
 
 

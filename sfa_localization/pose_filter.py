@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sfa_localization.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.config import FilterConfig
 from sfa_localization.correlation import ErrorCorrelation, resolved
 from sfa_localization.errors import DataError
@@ -42,6 +43,11 @@ _BACKWARD = 5
 _AHEAD = 3
 _FAR_OUTSIDE = 4.0
 _MOVED_ON = 0.5
+DELAY_LIMIT_NS = 500_000_000
+"""Delay of the camera's stamps, either way, that is made up for."""
+_APART = 'clocks of camera and odometry are more than 0.5 s apart'
+# Some minutes of image pairs: clocks drift.
+_CAMERA_MEMORY = 1000.0
 
 
 class Level(enum.Enum):
@@ -74,6 +80,7 @@ class PoseFilter:
         self.config = config or FilterConfig()
         self.counts: Counter[str] = Counter()
         self._correlation = correlation
+        self._camera = CameraClockFinder(_CAMERA_MEMORY)
         self._fusion = Fusion(resolved(self.config, correlation))
         self._history = self._fresh(self._fusion.blank(0))
         self._forget()
@@ -96,6 +103,8 @@ class PoseFilter:
             self.reconfigure(self.config)
 
     def _forget(self) -> None:
+        # Stamps may start anew; the camera's delay stays what it was.
+        self._camera = CameraClockFinder(_CAMERA_MEMORY, self._camera.clock)
         self._history = self._fresh(self._fusion.blank(0))
         self._backward = 0
         self._ahead = (0, 0)
@@ -151,6 +160,7 @@ class PoseFilter:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
+        self._camera.add_odometry(stamp_ns, twist.omega)
         self._history.add((stamp_ns, _ODOMETRY), OdometryEvent(stamp_ns, twist))
         return ''
 
@@ -163,15 +173,39 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         try:
             fused, spread = read_measurement(value, covariance, self.config)
-            self._place(stamp_ns, _MEASUREMENT)
+            taken_ns = self._taken(stamp_ns)
+            self._place(taken_ns, _MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        event = self._fusion.measurement(stamp_ns, fused, spread)
-        update = self._history.add((stamp_ns, _MEASUREMENT), event).memory.update
+        event = self._fusion.measurement(taken_ns, fused, spread)
+        update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
-        return update
+        return update._replace(stamp_ns=stamp_ns)
+
+    def add_turned(self, stamp_ns: int, yaw_rad: float) -> None:
+        """Take how far images have turned, from wherever, at an image's stamp; NaN is left out.
+
+        The turns of images and odometry together show by how much the camera's stamps are late;
+        images are then fused where they were taken.
+        """
+        if stamp_ns > 0 and math.isfinite(yaw_rad):
+            self._camera.add_heading(int(stamp_ns), yaw_rad)
+
+    def _taken(self, stamp_ns: int) -> int:
+        """When an image was taken, on the clock of the odometry."""
+        if stamp_ns <= 0:
+            return stamp_ns
+        delay_ns = self._camera.clock_at(stamp_ns).delay_ns
+        if abs(delay_ns) > DELAY_LIMIT_NS:
+            raise DataError(_APART)
+        return max(stamp_ns - delay_ns, 1)
+
+    @property
+    def camera_clock(self) -> CameraClock:
+        """By how much images are stamped late, as far as turns have shown it."""
+        return self._camera.clock
 
     # What comes out.
 
@@ -203,7 +237,7 @@ class PoseFilter:
         if state is None:
             return Status(Level.UNINITIALISED, (_missing(belief),))
         lost = _lost(belief, state, self.config)
-        poor = _degraded(belief, state, self.config)
+        poor = [*_degraded(belief, state, self.config), *_off(self._camera.clock)]
         level = Level.LOST if lost else Level.DEGRADED if poor else Level.LOCALISED
         return Status(level, (*lost, *poor))
 
@@ -290,6 +324,14 @@ def _degraded(belief: Belief, state: State, config: FilterConfig) -> list[str]:
     if memory.refused >= DISTRUST_AFTER:
         found.append(f'{memory.refused} pictures in a row did not fit')
     return [*found, *_silences(belief, config)]
+
+
+def _off(clock: CameraClock) -> list[str]:
+    """A camera whose clock is too far off to be made up for."""
+    if abs(clock.delay_ns) <= DELAY_LIMIT_NS:
+        return []
+    late = 'late' if clock.delay_s > 0 else 'early'
+    return [f'images are stamped {abs(clock.delay_s):.1f} s {late}: bring the clocks together']
 
 
 def _silences(belief: Belief, config: FilterConfig) -> list[str]:

@@ -23,6 +23,7 @@ from sfa_localization import mdp_engine
 from sfa_localization import metric as metric_learning
 from sfa_localization.agreement import Agreement, disagreement, share_within
 from sfa_localization.bag import load_run
+from sfa_localization.camera_clock import CameraClock
 from sfa_localization.config import (
     BagConfig,
     CameraConfig,
@@ -58,12 +59,13 @@ from sfa_localization.place_model import (
     top_features,
     write_arrays,
 )
+from sfa_localization.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.rotation import Map
 from sfa_localization.run import BATCH, Run
 from sfa_localization.segments import Segments, assignment, cut, join
 from sfa_localization.sfa import Solution
 from sfa_localization.threads import one_core
-from sfa_localization.visual_turns import CameraClock, camera_clock
+from sfa_localization.visual_turns import camera_clock
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +73,7 @@ CHECKPOINT = 'sfa_localization training checkpoint'
 CHECKPOINT_VERSION = 1
 # Pictures whose maps are kept for the compass and for novelty, however long the drives.
 _SAMPLES = 3000
-_DELAY_MAX_NS, _DELAY_SHOWN_S = 500_000_000, 0.02
+_DELAY_SHOWN_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +329,7 @@ def learn_place(
 def _clock_of(run: Run) -> CameraClock:
     """The camera's clock beside the odometry's; what no filter can make up for is warned of."""
     clock = camera_clock(run)
-    if abs(clock.delay_ns) > _DELAY_MAX_NS:
+    if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
             '%s: images are stamped %.2f s later than odometry: taken into account here, but the '
             'filter makes up for half a second only; bring both to one clock', run.name,

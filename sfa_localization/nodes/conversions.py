@@ -21,6 +21,7 @@ from geometry_msgs.msg import (
     PoseStamped,
     PoseWithCovarianceStamped,
     Quaternion,
+    QuaternionStamped,
     TransformStamped,
 )
 from nav_msgs.msg import Odometry
@@ -38,6 +39,7 @@ from sfa_localization.decoding import (
     read_raw,
     read_stamp,
     read_twist,
+    read_yaw,
     require_sane,
 )
 from sfa_localization.errors import ConfigError, DataError, MessageError
@@ -202,6 +204,19 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
     message = Float64MultiArray(data=array.array('d', numbers))
     message.layout.dim = [MultiArrayDimension(label=label, size=len(numbers), stride=len(numbers))]
     return message
+
+
+def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> QuaternionStamped:
+    """How far images have turned about the vertical, from wherever."""
+    require_sane('output', yaw_rad)
+    message = QuaternionStamped(quaternion=to_quaternion(yaw_rad))
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    return message
+
+
+def read_turned(message: QuaternionStamped) -> tuple[int, float]:
+    """Stamp ns and yaw rad. Raises MessageError."""
+    return read_stamp(message), read_yaw(message.quaternion)
 
 
 def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:

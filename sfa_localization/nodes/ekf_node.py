@@ -11,7 +11,12 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    QuaternionStamped,
+    TransformStamped,
+)
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
@@ -27,6 +32,7 @@ from sfa_localization.nodes.conversions import (
     read_error_correlation,
     read_odometry,
     read_pose,
+    read_turned,
     to_odometry,
     to_pose,
     to_pose_with_covariance,
@@ -85,6 +91,7 @@ class EkfNode(LocalizationNode):
         self._make_publishers()
         self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
         self.subscribe(PoseWithCovarianceStamped, _SEEN, self._receive_pose, sensor_qos(20))
+        self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
         self.subscribe(
             Float64MultiArray,
             _CORRELATION,
@@ -169,6 +176,9 @@ class EkfNode(LocalizationNode):
             )
         if not update.accepted:
             raise MessageError(update.reason)
+
+    def _receive_turned(self, message: QuaternionStamped) -> None:
+        self._filter.add_turned(*read_turned(message))
 
     def _receive_correlation(self, message: Float64MultiArray) -> None:
         self._filter.correlate(read_error_correlation(message))
@@ -289,6 +299,9 @@ class EkfNode(LocalizationNode):
             values['heading deviation [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
+        clock = self._filter.camera_clock
+        if clock.known:
+            values['camera delay [s]'] = f'{clock.delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or 'localised', values
 
 

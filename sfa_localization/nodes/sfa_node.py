@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage
@@ -28,6 +28,7 @@ from sfa_localization.nodes.conversions import (
     to_error_correlation,
     to_pose,
     to_pose_with_covariance,
+    to_turned,
 )
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
@@ -39,6 +40,7 @@ from sfa_localization.observation import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 
 _INFO = 'panorama/info'
+_TURNED_FRAME = 'first_image'
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -66,6 +68,7 @@ class SfaNode(LocalizationNode):
         self._correlation = self.publisher(
             Float64MultiArray, 'sfa/error_correlation', latched_qos()
         )
+        self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
         self._topic = 'panorama/compressed' if self._config.compressed else 'panorama'
@@ -182,6 +185,8 @@ class SfaNode(LocalizationNode):
             self._features.publish(to_array(slow, 'slow features'))
             feature_pose = _feature_pose(slow, seen.stamp_ns, self._config.feature_frame)
             self._feature_pose.publish(feature_pose)
+        if math.isfinite(seen.turned):
+            self._turned.publish(to_turned(seen.turned, seen.stamp_ns, _TURNED_FRAME))
         if not seen.problem:
             self._pose.publish(to_pose(seen.pose, seen.stamp_ns, frame))
         self._uncertain.publish(
