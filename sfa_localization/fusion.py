@@ -64,10 +64,11 @@ class Update(NamedTuple):
 
 
 class OdometryEvent(NamedTuple):
-    """An odometry reading at its stamp."""
+    """An odometry reading at its stamp; `pose` is the message's own, in the odometry frame."""
 
     stamp_ns: int
     twist: motion.Twist
+    pose: tuple[float, float, float] | None = None
 
 
 class PoseEvent(NamedTuple):
@@ -117,6 +118,7 @@ class Belief(NamedTuple):
     twist: motion.Twist
     odometry_ns: int | None
     memory: Memory
+    odometry_pose: tuple[float, float, float] | None = None
 
     @property
     def state(self) -> State | None:
@@ -213,7 +215,10 @@ class Fusion:
     def _driven(self, belief: Belief, event: OdometryEvent) -> Belief:
         if belief.odometry_ns is None and belief.stamp_ns == 0:
             return belief._replace(
-                stamp_ns=event.stamp_ns, twist=event.twist, odometry_ns=event.stamp_ns
+                stamp_ns=event.stamp_ns,
+                twist=event.twist,
+                odometry_ns=event.stamp_ns,
+                odometry_pose=event.pose,
             )
         silence = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
         if silence > _BRIDGED_S:
@@ -221,6 +226,9 @@ class Fusion:
         twist = event.twist
         if belief.odometry_ns is not None and silence > self.config.odometry_timeout:
             twist = _between(belief.twist, event.twist)
+        elif belief.odometry_pose is not None and event.pose is not None:
+            twist = motion.driven_twist(belief.odometry_pose, event.pose, silence, twist)
+            event = event._replace(twist=twist)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         step = motion.drive(belief.mean, twist, dt, self.config)
         if silence > self.config.coast_time:
@@ -271,6 +279,7 @@ class Fusion:
             event.twist if event else belief.twist,
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
+            event.pose if event else belief.odometry_pose,
         )
 
     def _placed(self, belief: Belief, event: PoseEvent) -> Belief:
@@ -414,6 +423,7 @@ class Fusion:
             belief.twist,
             belief.odometry_ns,
             memory,
+            belief.odometry_pose,
         )
 
     def _surprising(self, belief: Belief, event: MeasurementEvent, covariance: Array) -> bool:

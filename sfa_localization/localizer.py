@@ -38,15 +38,23 @@ class Localizer:
     ) -> None:
         self.observer = Observer(model, watch)
         self.filter = PoseFilter(config, model.error_correlation)
+        self.filter.expect_delay(model.camera_delay_s)
 
     def add_odometry(
-        self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)
+        self,
+        stamp_ns: int,
+        v: float,
+        omega: float,
+        variances: Sequence[float] | Array = (0.0, 0.0),
+        pose: Sequence[float] | Array | None = None,
     ) -> State | None:
         """Take speed m/s and yaw rate rad/s at a stamp, with their variances (0: unknown).
 
+        `pose` (3,) is odometry's own, x m, y m, yaw rad, where there is one.
+
         Returns the estimate at that stamp; None before the start, and for what cannot be used.
         """
-        if self.filter.add_odometry(stamp_ns, v, omega, variances):
+        if self.filter.add_odometry(stamp_ns, v, omega, variances, pose):
             return None
         return self.filter.at(stamp_ns)
 
@@ -82,7 +90,8 @@ class Localizer:
         for stamp_ns, kind, i in in_order(odometry.stamps_ns, run.panoramas.stamps_ns):
             if kind == ODOMETRY:
                 v, omega = odometry.twists[i].tolist()
-                yield stamp_ns, None, self.add_odometry(stamp_ns, v, omega, odometry.variances[i])
+                noise, pose = odometry.variances[i], odometry.poses[i].tolist()
+                yield stamp_ns, None, self.add_odometry(stamp_ns, v, omega, noise, pose)
                 continue
             observation = next(observations)
             self.add_observation(observation)

@@ -22,6 +22,8 @@ from sfa_localization.geometry import Array
 X, Y, YAW, V, OMEGA, BIAS, SCALE, ERROR = range(8)
 SIZE = 10
 _HELD_VARIANCE = 1e-8
+# A pose that moves or turns by more than its twist explains and this was reset.
+_JUMP_M, _JUMP_RAD = 0.3, 0.5
 _DIAGONAL = np.arange(SIZE)
 
 
@@ -93,6 +95,29 @@ class Twist(NamedTuple):
 
     def stands(self, config: FilterConfig) -> bool:
         return abs(self.v) < config.standstill_speed and abs(self.omega) < config.standstill_rate
+
+
+def driven_twist(
+    before: tuple[float, float, float],
+    after: tuple[float, float, float],
+    seconds: float,
+    twist: Twist,
+) -> Twist:
+    """The reading with the mean twist by which odometry's own pose has moved since the last one.
+
+    Publishers differ in what their twist is the mean of; their pose says what it was. The twist
+    stays where the pose does not go with it: it was reset, or is not kept at all.
+    """
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    turn, way = wrap(after[2] - before[2]), math.hypot(dx, dy)
+    expected, turned = abs(twist.v) * seconds, abs(twist.omega) * seconds
+    reset = way > expected + _JUMP_M or abs(turn) > turned + _JUMP_RAD
+    if seconds <= 0 or reset or (way == 0.0 and turn == 0.0):
+        return twist
+    forward = dx * math.cos(before[2] + turn / 2) + dy * math.sin(before[2] + turn / 2)
+    half = turn / 2
+    arc = forward * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
+    return twist._replace(v=arc / seconds, omega=turn / seconds)
 
 
 class _Arc(NamedTuple):

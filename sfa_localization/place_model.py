@@ -76,6 +76,12 @@ class PlaceModel:
     def has_heading(self) -> bool:
         return self.compass is not None
 
+    @property
+    def camera_delay_s(self) -> float:
+        """By how much images of the training drives were stamped late; 0 where unknown."""
+        known = [delay for delay in self.quality.get('camera_delay_s', ()) if delay is not None]
+        return float(np.median(known)) if known else 0.0
+
     def locate(self, panorama: Image) -> Estimate:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
 

@@ -48,6 +48,7 @@ DELAY_LIMIT_NS = 500_000_000
 _APART = 'clocks of camera and odometry are more than 0.5 s apart'
 # Some minutes of image pairs: clocks drift.
 _CAMERA_MEMORY = 1000.0
+_EXPECTED_STD_S = 0.01
 
 
 class Level(enum.Enum):
@@ -146,11 +147,18 @@ class PoseFilter:
         self._history.add((stamp_ns, _POSE), PoseEvent(stamp_ns, value, spread))
 
     def add_odometry(
-        self, stamp_ns: int, v: float, omega: float, variances: Sequence[float] | Array = (0.0, 0.0)
+        self,
+        stamp_ns: int,
+        v: float,
+        omega: float,
+        variances: Sequence[float] | Array = (0.0, 0.0),
+        pose: Sequence[float] | Array | None = None,
     ) -> str:
         """Take speed m/s and turn rate rad/s, held since the message before; '' or why not.
 
-        `variances` (2,) of both; zero or less, or not finite, where unknown.
+        `variances` (2,) of both; zero or less, or not finite, where unknown. `pose` (3,) is
+        odometry's own, x m, y m, yaw rad in any frame: where it moves as the twist says, it is
+        what says how far.
         """
         stamp_ns = int(stamp_ns)
         try:
@@ -160,8 +168,9 @@ class PoseFilter:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
-        self._camera.add_odometry(stamp_ns, twist.omega)
-        self._history.add((stamp_ns, _ODOMETRY), OdometryEvent(stamp_ns, twist))
+        event = OdometryEvent(stamp_ns, twist, _finite(pose))
+        driven = self._history.add((stamp_ns, _ODOMETRY), event)
+        self._camera.add_odometry(stamp_ns, driven.twist.omega)
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -201,6 +210,11 @@ class PoseFilter:
         if abs(delay_ns) > DELAY_LIMIT_NS:
             raise DataError(_APART)
         return max(stamp_ns - delay_ns, 1)
+
+    def expect_delay(self, delay_s: float) -> None:
+        """Begin with the camera's delay of the training drives; turns under way overrule it."""
+        if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
+            self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S))
 
     @property
     def camera_clock(self) -> CameraClock:
@@ -294,6 +308,14 @@ class PoseFilter:
         self.reset()
         if self._pending is not None:
             self._begin(stamp_ns)
+
+
+def _finite(pose: Sequence[float] | Array | None) -> tuple[float, float, float] | None:
+    """A pose in plain numbers, if there is a usable one."""
+    if pose is None or not all(map(math.isfinite, pose)):
+        return None
+    x, y, yaw = map(float, pose)
+    return x, y, yaw
 
 
 def _missing(belief: Belief) -> str:

@@ -204,7 +204,8 @@ def _fuse(fused: PoseFilter, tour: Tour) -> Iterator[Update]:
     for stamp_ns, kind, i in in_order(odometry.stamps_ns, sight.stamps_ns):
         if kind == ODOMETRY:
             v, omega = odometry.twists[i]
-            fused.add_odometry(stamp_ns, v, omega, odometry.variances[i])
+            pose = odometry.poses[i].tolist()
+            fused.add_odometry(stamp_ns, v, omega, odometry.variances[i], pose)
         else:
             yield fused.add_measurement(stamp_ns, sight.poses[i], sight.covariances[i])
 

@@ -38,6 +38,7 @@ class PictureReader:
     panorama: PanoramaConfig = SIZE
     has_heading: bool = True
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
+    camera_delay_s: float = 0.0
 
     def locate(self, image):
         a, b, novelty = image[0, :3].astype(int)
@@ -88,7 +89,7 @@ class Recording:
             for stamp_ns, kind, index in self.events():
                 if kind == ODOMETRY:
                     i = self.kept[index]
-                    told = drive.poses[i], drive.read[i], drive.variances()
+                    told = drive.reckoned[i], drive.read[i], drive.variances()
                     bag.odometry('/odom', stamp_ns, *told)
                 else:
                     bag.image('/panorama', stamp_ns, self.pictures[index], 'omnicam')

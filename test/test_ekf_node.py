@@ -55,7 +55,7 @@ def odometry(drive, i, stamp_ns=None):
     spread = np.diag(drive.variances())
     stamp_ns = int(drive.stamps_ns[i]) if stamp_ns is None else stamp_ns
     frames = ('odom', 'base_link')
-    return to_odometry(drive.poses[i], np.eye(3), drive.read[i], spread, stamp_ns, frames)
+    return to_odometry(drive.reckoned[i], np.eye(3), drive.read[i], spread, stamp_ns, frames)
 
 
 def picture(drive, k, spread=SPREAD, frame='map'):
@@ -117,7 +117,7 @@ def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench)
     for i, (transform, message) in enumerate(zip(heard, told, strict=True)):
         t = transform.transform
         map_to_odom = [t.translation.x, t.translation.y, read_yaw(t.rotation)]
-        miss = compose(map_to_odom, drive.poses[i]) - pose_of(message)
+        miss = compose(map_to_odom, drive.reckoned[i]) - pose_of(message)
         assert np.hypot(*miss[:2]) < 1e-9 and abs(math.remainder(miss[2], 2 * math.pi)) < 1e-9
         assert read_stamp(transform.header.stamp) == int(drive.stamps_ns[i]) + 250_000_000
         assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')

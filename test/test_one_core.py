@@ -40,7 +40,9 @@ def message_of(recording, stamp_ns, kind, index):
         return 'panorama', to_image(recording.pictures[index], stamp_ns, 'omnicam')
     drive, i = recording.drive, recording.kept[index]
     spread, frames = np.diag(drive.variances()), ('odom', 'base_link')
-    return 'odom', to_odometry(drive.poses[i], np.eye(3), drive.read[i], spread, stamp_ns, frames)
+    return 'odom', to_odometry(
+        drive.reckoned[i], np.eye(3), drive.read[i], spread, stamp_ns, frames
+    )
 
 
 def trajectory(messages):
@@ -105,7 +107,10 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeyp
         if kind == ODOMETRY:
             i = recording.kept[index]
             state = localizer.add_odometry(
-                stamp_ns, *recording.drive.read[i], recording.drive.variances()
+                stamp_ns,
+                *recording.drive.read[i],
+                recording.drive.variances(),
+                recording.drive.reckoned[i],
             )
             if state is not None:
                 stamps.append(stamp_ns)

@@ -73,6 +73,7 @@ class ReadsPixels:
     panorama: PanoramaConfig = SIZE
     has_heading: bool = True
     error_correlation: ErrorCorrelation = dataclasses.field(default_factory=ErrorCorrelation)
+    camera_delay_s: float = 0.0
     free: threading.Event = dataclasses.field(default_factory=threading.Event)
     entered: threading.Event = dataclasses.field(default_factory=threading.Event)
 
@@ -177,7 +178,7 @@ def message(drive, stamp_ns, kind, index):
         return SEEN, to_pose_with_covariance(drive.seen[index], spread, stamp_ns, 'map')
     spread, frames = np.diag(drive.variances()), ('odom', 'base_link')
     return 'odom', to_odometry(
-        drive.poses[index], np.eye(3), drive.read[index], spread, stamp_ns, frames
+        drive.reckoned[index], np.eye(3), drive.read[index], spread, stamp_ns, frames
     )
 
 

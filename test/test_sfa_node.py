@@ -57,6 +57,7 @@ class FakeModel:
     shift: float = 0.0
     panorama: PanoramaConfig = SIZE
     error_correlation: ErrorCorrelation = KNOWN
+    camera_delay_s: float = 0.0
 
     @property
     def has_heading(self):

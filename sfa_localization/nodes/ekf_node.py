@@ -21,10 +21,11 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.config import EkfNodeConfig, FilterConfig, Settings
+from sfa_localization.decoding import require_sane
 from sfa_localization.errors import MessageError
 from sfa_localization.geometry import compose, invert
 from sfa_localization.nodes.conversions import (
@@ -91,6 +92,13 @@ class EkfNode(LocalizationNode):
         self._make_publishers()
         self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
         self.subscribe(PoseWithCovarianceStamped, _SEEN, self._receive_pose, sensor_qos(20))
+        self.subscribe(
+            Float64,
+            'sfa/camera_delay',
+            self._receive_delay,
+            latched_qos(),
+            while_inactive=True,
+        )
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
         self.subscribe(
             Float64MultiArray,
@@ -151,7 +159,9 @@ class EkfNode(LocalizationNode):
             motion.frame or self._config.odom_frame,
             motion.child_frame or self._config.base_frame,
         )
-        reason = self._filter.add_odometry(motion.stamp_ns, *motion.twist, motion.variances)
+        reason = self._filter.add_odometry(
+            motion.stamp_ns, *motion.twist, motion.variances, motion.pose.tolist()
+        )
         if reason:
             raise MessageError(reason)
         state = self._filter.at(motion.stamp_ns)
@@ -179,6 +189,10 @@ class EkfNode(LocalizationNode):
 
     def _receive_turned(self, message: QuaternionStamped) -> None:
         self._filter.add_turned(*read_turned(message))
+
+    def _receive_delay(self, message: Float64) -> None:
+        require_sane('camera delay', message.data)
+        self._filter.expect_delay(float(message.data))
 
     def _receive_correlation(self, message: Float64MultiArray) -> None:
         self._filter.correlate(read_error_correlation(message))

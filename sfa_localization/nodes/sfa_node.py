@@ -16,7 +16,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.config import PanoramaConfig, Settings, SfaNodeConfig, WatchConfig
@@ -68,6 +68,7 @@ class SfaNode(LocalizationNode):
         self._correlation = self.publisher(
             Float64MultiArray, 'sfa/error_correlation', latched_qos()
         )
+        self._delay = self.publisher(Float64, 'sfa/camera_delay', latched_qos())
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
@@ -138,6 +139,7 @@ class SfaNode(LocalizationNode):
         assert self._observer is not None
         correlation = self._observer.model.error_correlation
         self._correlation.publish(to_error_correlation(correlation))
+        self._delay.publish(Float64(data=float(self._observer.model.camera_delay_s)))
 
     # Pictures.
 
