@@ -1,0 +1,185 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Robots unlike the simulator's: what must not matter does not, over many random drives.
+
+The odometry frame lies anywhere and may start anew, the gyroscope has a bias and gaps, odometry
+comes at any rate and with pauses, images are stamped late, and a second drive starts elsewhere.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from cylinder_worlds import PLACE_SIZE, Spheres, recipe, run_in, visit, wander
+from metric_worlds import criss_cross, drive, garden_features
+
+from sfa_localization import metric, training
+from sfa_localization.camera_clock import CameraClock
+from sfa_localization.config import MetricConfig, SegmentConfig
+from sfa_localization.geometry import align, compose, wrap_angle
+from sfa_localization.hierarchy import architecture_of, train_network
+from sfa_localization.run import Odometry, PanoramaArray, YawRate
+from sfa_localization.segments import cut, join
+from sfa_localization.training import drive_of, learn_place
+
+QUICK = MetricConfig(metric_map='monomials', slow_features=5, ridge=1e-4, require_certificate=False)
+CUT = SegmentConfig()
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What is unlike the simulator's robot about one robot, drawn at random."""
+
+    frame: np.ndarray
+    gyro: str
+    gyro_bias: float
+    gyro_gap_s: tuple[float, float]
+    every: int
+    pause_s: tuple[float, float]
+
+    @classmethod
+    def draw(cls, seed, length_s):
+        rng = np.random.default_rng([77, seed])
+        frame = np.array([*rng.uniform(-100, 100, 2), rng.uniform(-np.pi, np.pi)])
+        at = rng.uniform(0.2, 0.7, 2) * length_s
+        return cls(
+            frame=frame,
+            gyro=str(rng.choice(['none', 'whole', 'gap', 'ends', 'upside down'])),
+            gyro_bias=float(rng.normal(0, 0.01)),
+            gyro_gap_s=(at[0], at[0] + rng.uniform(3, 10)),
+            every=int(rng.choice([1, 2, 5, 10])),
+            pause_s=(at[1], at[1] + float(rng.choice([0.0, 4.0]))),
+        )
+
+    def odometry(self, exact):
+        """The odometry as this robot's driver publishes it, (N,) at its own rate."""
+        seconds = (exact.stamps_ns - exact.stamps_ns[0]) * 1e-9
+        kept = np.arange(len(seconds)) % self.every == 0
+        kept &= (seconds < self.pause_s[0]) | (seconds >= self.pause_s[1])
+        poses = compose(self.frame, exact.poses[kept])
+        return Odometry(exact.stamps_ns[kept], poses, exact.twists[kept], exact.variances[kept])
+
+    def yaw_rate(self, exact):
+        """The gyroscope's readings, or None."""
+        if self.gyro == 'none':
+            return None
+        seconds = (exact.stamps_ns - exact.stamps_ns[0]) * 1e-9
+        start, stop = self.gyro_gap_s
+        kept = np.ones(len(seconds), bool)
+        if self.gyro == 'gap':
+            kept = (seconds < start) | (seconds >= stop)
+        if self.gyro == 'ends':
+            kept = seconds < start
+        omega = exact.omega + self.gyro_bias
+        omega = -omega if self.gyro == 'upside down' else omega
+        return YawRate(exact.stamps_ns[kept], omega[kept], exact.variance[kept])
+
+
+def learn(runs, seed):
+    """The map of drives (odometry, image stamps, yaw rate, true poses); (images, places, truth)."""
+    parts = [cut(odometry, stamps, CUT, gyro) for odometry, stamps, gyro, _ in runs]
+    offsets = np.cumsum([0, *(len(stamps) for _, stamps, _, _ in runs)])[:-1]
+    segments = join(parts, [int(offset) for offset in offsets])
+    truth = np.concatenate([poses for *_, poses in runs])
+    features = garden_features(truth[:, :2], noise=0.02, count=5, world=seed)
+    result = metric.learn(features, segments, QUICK)
+    images, places = metric.positions(result, segments)
+    return result, images, places, metric.headings(result, segments)[1], truth
+
+
+def errors(images, places, headings, truth):
+    """Distances (M,) m and turns (M,) rad to the truth after rigid alignment."""
+    laid = align(places, truth[images, :2])
+    off = np.hypot(*(laid.apply(places) - truth[images, :2]).T)
+    return off, wrap_angle(laid.apply_yaw(headings) - truth[images, 2])
+
+
+@pytest.mark.parametrize('seed', range(0, 100, 10))
+def test_the_odometry_frame_is_nothing_but_the_gauge(seed):
+    """Ten drives each: turned and shifted odometry turns and shifts the map, and nothing else."""
+    for draw in range(seed, seed + 10):
+        twists, start = criss_cross(8, seed=draw)
+        run = drive(twists, start=start, bias=0.002, yaw_noise=0.01, seed=draw)
+        robot = Robot.draw(draw, len(twists) / 50)
+        gyro = robot.yaw_rate(run.gyro)
+        elsewhere = replace(run.odometry, poses=compose(robot.frame, run.odometry.poses))
+        here, there = (
+            learn([(odometry, run.stamps_ns, gyro, run.poses)], draw)
+            for odometry in (run.odometry, elsewhere)
+        )
+        assert np.array_equal(here[1], there[1])
+        moved = compose(robot.frame, np.column_stack([here[2], here[3]]))
+        assert np.abs(moved[:, :2] - there[2]).max() < 1e-5
+        assert np.abs(wrap_angle(moved[:, 2] - there[3])).max() < 1e-6
+        assert here[0].noise_m == pytest.approx(there[0].noise_m, rel=1e-6)
+
+
+def two_drives(draw, others):
+    """Two drives through one place, by the simulator's robot or by two unlike it."""
+    runs = []
+    for second in (False, True):
+        twists, start = criss_cross(8, seed=draw + 1000 * second)
+        run = drive(twists, start=start, yaw_noise=0.005, seed=draw + second)
+        robot = Robot.draw(draw + 500 * second, len(twists) / 50)
+        odometry = robot.odometry(run.odometry) if others else run.odometry
+        gyro = robot.yaw_rate(run.gyro) if others else run.gyro
+        runs.append((odometry, run.stamps_ns, gyro, run.poses))
+    return runs
+
+
+def reset_midway(draw, others):
+    """One drive, whose odometry frame starts anew midway."""
+    twists, start = criss_cross(12, seed=draw)
+    run = drive(twists, start=start, yaw_noise=0.005, seed=draw)
+    poses = run.odometry.poses.copy()
+    half = len(poses) // 2
+    if others:
+        poses[half:] = compose(Robot.draw(draw, 60.0).frame, poses[half:])
+    gyro = run.gyro if draw % 2 else None
+    return [(replace(run.odometry, poses=poses), run.stamps_ns, gyro, run.poses)]
+
+
+@pytest.mark.parametrize('drives', [two_drives, reset_midway])
+def test_any_robot_gives_nearly_as_good_a_map(drives):
+    """Thirty robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
+    plain, other = [], []
+    for draw in range(30):
+        for others, found in ((False, plain), (True, other)):
+            _, images, places, headings, truth = learn(drives(draw, others), draw)
+            off, turned = errors(images, places, headings, truth)
+            found.append((off.mean(), np.degrees(np.abs(turned).mean())))
+    plain, other = np.array(plain), np.array(other)
+    assert np.all(np.median(other, axis=0) < 1.2 * np.median(plain, axis=0) + [0.02, 0.2])
+    assert np.all(other < 2.0 * plain + [0.3, 3.0])
+
+
+def placed(delay_s, seed):
+    """Mean error (m) of a place learnt from images stamped so late, after rigid alignment."""
+    config = recipe()
+    world, odometry = Spheres.about(seed), wander(400, seed + 1, hz=4.0)
+    exact = run_in(world, odometry, config.panorama)
+    shifted = PanoramaArray(
+        exact.panoramas.stamps_ns + round(delay_s * 1e9), exact.panoramas.images
+    )
+    run = replace(exact, panoramas=shifted)
+    architecture = architecture_of(config.network, PLACE_SIZE)
+    network = train_network(architecture, [drive_of(run, config.network)], config.network)
+    trained = learn_place(network, [run], config)
+    seen = visit() if seed == 1 else exact
+    estimates = trained.model.locate_all(seen.panoramas.read(0, len(seen.panoramas)))
+    places = np.array([estimate.position for estimate in estimates])
+    truth = seen.odometry.poses[:, :2]
+    return np.hypot(*(align(places, truth).apply(places) - truth).T).mean(), trained
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('delay', [-0.3, 0.3])
+def test_a_late_camera_gives_as_good_a_map(delay, monkeypatch):
+    """The delay is found from the turns, stays with the model, and is left out of the map."""
+    in_time, _ = placed(0.0, 1)
+    late, trained = placed(delay, 1)
+    assert trained.model.camera_delay_s == pytest.approx(delay, abs=0.05)
+    monkeypatch.setattr(training, 'camera_clock', lambda run: CameraClock())
+    unaware, ignorant = placed(delay, 1)
+    assert ignorant.model.camera_delay_s == 0.0
+    assert late < in_time + 0.3 * (unaware - in_time) + 0.01 < unaware
