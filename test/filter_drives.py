@@ -58,7 +58,8 @@ class Drive:
         self.read = self.twists / [self.scale, 1.0] + [0.0, self.bias]
         self.read = self.read + rng.standard_normal((count, 2)) * [self.v_std, self.omega_std]
         # The robot was switched on somewhere else, and its odometry's pose drifts as its twist.
-        switched_on = np.array([*rng.uniform(-20, 20, 2), rng.uniform(-3, 3)])
+        elsewhere = np.random.default_rng([self.seed, 1])
+        switched_on = np.array([*elsewhere.uniform(-20, 20, 2), elsewhere.uniform(-3, 3)])
         self.reckoned = integrate(self.stamps_ns, self.read, switched_on)
         self.pictures = np.arange(self.every, count, self.every)
         self.seen = self._seen(rng)

@@ -60,7 +60,11 @@ from sfa_localization.run import Odometry, PanoramaArray, Run
 from sfa_localization.segments import Segments, cut
 from sfa_localization.training import drive_of, learn_place
 
-GROUPS = {group.__name__: group for group in Settings.__subclasses__()}
+GROUPS = {
+    group.__name__: group
+    for group in Settings.__subclasses__()
+    if group.__module__.startswith('sfa_localization')
+}
 
 
 @dataclasses.dataclass(frozen=True)
