@@ -5,6 +5,8 @@
 import ast
 import errno
 import io
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -171,3 +173,13 @@ def test_the_error_inside_is_not_hidden_by_that_of_closing(tmp_path, monkeypatch
     with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag'):
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    """As in `sfa_localization config | head -1`."""
+    command = [sys.executable, '-m', 'sfa_localization', 'config']
+    writing = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    writing.stdout.close()
+    assert writing.wait(60) == 0
+    assert writing.stderr.read() == b''
+    writing.stderr.close()
