@@ -34,8 +34,8 @@ def start(tmp_path):
     """Start a node's process; all are ended with the test."""
     processes = []
 
-    def begin(node, *parameters):
-        arguments = [part for text in parameters for part in ('-p', text)]
+    def begin(node, *parameters, arguments=()):
+        arguments = [*arguments, *(part for text in parameters for part in ('-p', text))]
         code = f'import sys; from sfa_localization.nodes.{node} import main; sys.exit(main())'
         environment = {
             **os.environ,
@@ -92,6 +92,31 @@ def test_a_signal_while_unconfigured_too(bench, start):
 ])  # fmt: skip
 def test_a_wrong_parameter_ends_the_node_with_its_name(start, node, parameter, why):
     process = start(node, parameter)
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert why in told and 'Traceback' not in told
+
+
+FILES = {
+    'indented.yaml': 'ekf_node:\n ros__parameters:\n   history: 1.0\n  gate: 2.0\n',
+    'keyless.yaml': 'ekf_node:\n  history: 1.0\n',
+}
+
+
+@pytest.mark.parametrize(('arguments', 'why'), [
+    (['--params-file', 'indented.yaml'], 'near line 4'),
+    (['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
+    (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
+    (['-r', 'odom'], "remap rule: '-r odom'"),
+    (['-p', 'history'], "override rule: '-p history'"),
+    (['--nonsense'], '--nonsense'),
+])  # fmt: skip
+def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arguments, why):
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    folder = f'{tmp_path}/'
+    arguments = [folder + word if word.endswith('.yaml') else word for word in arguments]
+    process = start('ekf_node', arguments=arguments)
     _, told = process.communicate(timeout=30)
     assert process.returncode == 1
     assert why in told and 'Traceback' not in told

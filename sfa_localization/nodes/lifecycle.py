@@ -289,7 +289,8 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start."""
     node = None
     try:
-        rclpy.init(args=None if args is None else list(args))
+        if not _initialised(args):
+            return 1
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
@@ -309,6 +310,19 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     finally:
         _end(node)
     return 0
+
+
+def _initialised(args: Sequence[str] | None) -> bool:
+    """Initialise ROS; False, and why is logged, where its arguments or files cannot be used."""
+    try:
+        rclpy.init(args=None if args is None else list(args))
+    except RuntimeError as error:  # the base of all that rclpy raises here
+        # What it says of arguments that it does not know is their list, and no more.
+        unknown = isinstance(error, rclpy_implementation.UnknownROSArgsError)
+        reason = f'unknown arguments after --ros-args: {error}' if unknown else str(error)
+        rclpy.logging.get_logger('sfa_localization').fatal(reason)
+        return False
+    return True
 
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
