@@ -68,6 +68,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         everything: list[type[Settings]] = [NodeConfig, *kinds]
         for kind in everything:
             self._declare(kind)
+        parameters.warn_of_unknown(self)
 
     def _declare(self, kind: type[Settings]) -> None:
         self._settings[kind] = parameters.declare(self, kind)

@@ -8,7 +8,6 @@ while nobody listens (`lazy`), and of pictures that come too fast only the newes
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +22,7 @@ from std_msgs.msg import String
 
 from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig, Settings
 from sfa_localization.errors import LocalizationError, MessageError
+from sfa_localization.nodes import parameters
 from sfa_localization.nodes.conversions import read_image, to_compressed, to_image, to_info
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
@@ -190,18 +190,13 @@ class OmnicamNode(LocalizationNode):
     def _check_camera(self, changes: Sequence[Parameter]) -> SetParametersResult:
         """Refuse a mask, sector, mount or elevation from which no panorama can be made."""
         try:
-            camera = self._with(self.settings(CameraConfig), changes)
-            panorama = self._with(self.settings(PanoramaConfig), changes)
+            camera = parameters.changed(self.settings(CameraConfig), changes)
+            panorama = parameters.changed(self.settings(PanoramaConfig), changes)
             if (camera, panorama) != (self._unwrapper.camera, self._unwrapper.panorama):
                 self._build_tables(Unwrapper(camera, panorama))
         except LocalizationError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-    def _with(self, settings: Any, changes: Sequence[Parameter]) -> Any:
-        names = {item.name for item in dataclasses.fields(settings)}
-        values = {change.name: change.value for change in changes if change.name in names}
-        return dataclasses.replace(settings, **values)
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
         """Build the tables for the size of picture that is, or will be, in use, if it is known."""
