@@ -24,7 +24,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from sfa_localization.config import NodeConfig, Settings
 from sfa_localization.errors import LocalizationError
-from sfa_localization.nodes import parameters
+from sfa_localization.nodes import parameters, signals
 from sfa_localization.nodes.monitor import Monitor
 from sfa_localization.reasons import bounded
 from sfa_localization.threads import one_core
@@ -287,19 +287,24 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
 
 def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start."""
+    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start.
+
+    For the main thread of a process that then ends: signals are ignored afterwards.
+    """
     node = None
+    signals.end_at_once()
     try:
         if not _initialised(args):
             return 1
+        signals.leave_to_ros()
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
         if not node.start():
-            return 1
+            return int(rclpy.ok())  # a signal is no failure
         with one_core():
             _spin(executor, node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         return 0
     except rclpy_implementation.RCLError:
         if rclpy.ok():
@@ -309,7 +314,10 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
         rclpy.logging.get_logger('sfa_localization').fatal(str(error))
         return 1
     finally:
-        _end(node)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        signals.ignore()
     return 0
 
 
@@ -334,13 +342,3 @@ def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
         except rclpy_implementation.RCLError as error:
             # Asking a lifecycle node for a transition that its state does not have ends here.
             node.get_logger().error(f'request refused: {error}')
-
-
-def _end(node: LocalizationNode | None) -> None:
-    """Destroy the node and the context, also when a second signal arrives meanwhile."""
-    try:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        rclpy.try_shutdown()
