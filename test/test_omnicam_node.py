@@ -246,6 +246,64 @@ def test_sectors_are_set_by_message(bench):
         assert run.node._unwrapper.camera.blind_sectors == tuple(sent)
 
 
+@pytest.fixture
+def remapped():
+    """Return a function that makes the node with remaps; `parameters` by name."""
+    made = []
+
+    def build(*rules, **parameters):
+        words = [word for rule in rules for word in ('-r', rule)]
+        given = [Parameter(name, value=value) for name, value in parameters.items()]
+        context = new_context(63, ['--ros-args', *words])
+        made.append(OmnicamNode(context=context, parameter_overrides=given))
+        return made[-1]
+
+    yield build
+    for node in made:
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
+
+
+@pytest.mark.parametrize(
+    ('rules', 'heard'),
+    [
+        ([], '/image_raw/compressed'),
+        (['image_raw:=/cam/image_raw'], '/cam/image_raw/compressed'),
+        (['image_raw/compressed:=/jpegs'], '/jpegs'),
+        (['image_raw:=/cam/image_raw', 'image_raw/compressed:=/jpegs'], '/jpegs'),
+        (['__ns:=/robot1', 'image_raw:=front'], '/robot1/front/compressed'),
+    ],
+)
+def test_a_remap_of_the_base_topic_holds_for_its_transports(remapped, rules, heard):
+    node = remapped(*rules, image_transport='compressed', lazy=False)
+    assert node.start(), node.failure
+    assert node._subscription.topic_name == heard
+
+
+def test_a_remap_of_the_panorama_takes_its_companions_along(remapped):
+    node = remapped('panorama:=/top/view')
+    assert node.start(), node.failure
+    made = node._panoramas, node._compressed, node._info
+    assert [publisher.topic_name for publisher in made] == [
+        '/top/view', '/top/view/compressed', '/top/view/info',
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('rules', 'transport'),
+    [
+        (['image_raw:=panorama'], 'raw'),
+        (['panorama:=/image_raw'], 'raw'),
+        (['image_raw:=panorama'], 'compressed'),
+        (['image_raw/compressed:=panorama/compressed'], 'compressed'),
+    ],
+)
+def test_a_node_that_would_hear_itself_is_not_configured(remapped, rules, transport):
+    node = remapped(*rules, image_transport=transport)
+    assert not node.start()
+    assert 'which this node itself publishes' in node.failure and 'remap' in node.failure
+
+
 @contextlib.contextmanager
 def from_file(path):
     """Run the node with a parameter file."""

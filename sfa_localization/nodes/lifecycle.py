@@ -19,11 +19,12 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from sfa_localization.config import NodeConfig, Settings
-from sfa_localization.errors import LocalizationError
+from sfa_localization.errors import ConfigError, LocalizationError
 from sfa_localization.nodes import parameters, signals
 from sfa_localization.nodes.monitor import Monitor
 from sfa_localization.reasons import bounded
@@ -131,6 +132,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
         An inactive node drops messages; not `while_inactive` those that come but once, latched.
         """
+        self.require_input(topic)
         made = self.create_subscription(
             kind,
             topic,
@@ -139,6 +141,27 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self._entities.append((self.destroy_subscription, made))
+
+    def require_input(self, topic: str) -> None:
+        """Raise ConfigError for a topic that this node has a publisher on: it would feed itself."""
+        resolved = self.resolve_topic_name(topic)
+        outputs = [made for _, made in self._entities if isinstance(made, Publisher)]
+        if any(made.topic_name == resolved for made in outputs):
+            raise ConfigError(
+                f'input {topic} is {resolved}, which this node itself publishes: remap one of both'
+            )
+
+    def below(self, base: str, transport: str) -> str:
+        """The topic `base`/`transport`, which follows where `base` is remapped to.
+
+        So image_transport does; a remap of the whole name comes first.
+        """
+        topic = f'{base}/{transport}'
+        resolved = self.resolve_topic_name(base)
+        own = self.resolve_topic_name(topic) != self.resolve_topic_name(topic, only_expand=True)
+        if own or resolved == self.resolve_topic_name(base, only_expand=True):
+            return topic
+        return f'{resolved}/{transport}'
 
     def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service that answers with success and message also where its callback raises."""

@@ -39,7 +39,6 @@ from sfa_localization.sources import Feed, FeedStatus, FrozenWatch, opener
 _DEMAND_PERIOD_S = 0.1
 _LITTLE_SEEN = 0.5
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-_TOPICS = {'raw': 'image_raw', 'compressed': 'image_raw/compressed'}
 
 
 class OmnicamNode(LocalizationNode):
@@ -71,10 +70,14 @@ class OmnicamNode(LocalizationNode):
         self._build_tables(self._unwrapper)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', reliable_qos(2))
-        self._compressed = self.publisher(CompressedImage, 'panorama/compressed', reliable_qos(2))
-        self._info = self.publisher(String, 'panorama/info', latched_qos())
-        self._input = _TOPICS[self._config.image_transport]
-        if self._config.source != 'topic':
+        compressed, info = self.below('panorama', 'compressed'), self.below('panorama', 'info')
+        self._compressed = self.publisher(CompressedImage, compressed, reliable_qos(2))
+        self._info = self.publisher(String, info, latched_qos())
+        transport = self._config.image_transport
+        self._input = 'image_raw' if transport == 'raw' else self.below('image_raw', transport)
+        if self._config.source == 'topic':
+            self.require_input(self._input)
+        else:
             self._input = self._config.source_path
             self._make_feed()
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
