@@ -904,7 +904,11 @@ class PlayConfig(Settings):
     start_offset: float = setting(0.0, 'begin this far into the bag', unit='s', low=0.0, high=1e9)
     clock_rate: float = setting(40.0, 'messages on /clock', unit='Hz', low=0.1, high=1e4)
     wait: float = setting(
-        3.0, 'time given to subscribers to appear before it starts', unit='s', low=0.0, high=3600.0
+        20.0,
+        'time given to subscribers of images and odometry to appear before it starts',
+        unit='s',
+        low=0.0,
+        high=3600.0,
     )
 
 
