@@ -151,12 +151,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                 f'input {topic} is {resolved}, which this node itself publishes: remap one of both'
             )
 
-    def below(self, base: str, transport: str) -> str:
-        """The topic `base`/`transport`, which follows where `base` is remapped to.
+    def following(self, topic: str) -> str:
+        """The topic BASE/TRANSPORT, below whatever its base is remapped to.
 
         So image_transport does; a remap of the whole name comes first.
         """
-        topic = f'{base}/{transport}'
+        base, _, transport = topic.rpartition('/')
         resolved = self.resolve_topic_name(base)
         own = self.resolve_topic_name(topic) != self.resolve_topic_name(topic, only_expand=True)
         if own or resolved == self.resolve_topic_name(base, only_expand=True):

@@ -70,11 +70,11 @@ class OmnicamNode(LocalizationNode):
         self._build_tables(self._unwrapper)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', reliable_qos(2))
-        compressed, info = self.below('panorama', 'compressed'), self.below('panorama', 'info')
+        compressed = self.following('panorama/compressed')
         self._compressed = self.publisher(CompressedImage, compressed, reliable_qos(2))
-        self._info = self.publisher(String, info, latched_qos())
-        transport = self._config.image_transport
-        self._input = 'image_raw' if transport == 'raw' else self.below('image_raw', transport)
+        self._info = self.publisher(String, self.following('panorama/info'), latched_qos())
+        raw = self._config.image_transport == 'raw'
+        self._input = 'image_raw' if raw else self.following('image_raw/compressed')
         if self._config.source == 'topic':
             self.require_input(self._input)
         else:

@@ -72,9 +72,9 @@ class SfaNode(LocalizationNode):
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
         compressed = self._config.compressed
-        self._topic = self.below('panorama', 'compressed') if compressed else 'panorama'
+        self._topic = self.following('panorama/compressed') if compressed else 'panorama'
         self._declared, self._undeclared_said = None, False
-        self._info = self.below('panorama', 'info')
+        self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
         # Depth 1: when pictures come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
