@@ -76,7 +76,7 @@ setup(
     entry_points={
         'console_scripts': [
             *(f'{command} = {NAME}.cli:executable' for command in COMMANDS),
-            *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
+            *(f'{node} = {NAME}.nodes.entry:{node}' for node in NODES),
         ],
     },
 )

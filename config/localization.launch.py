@@ -5,8 +5,10 @@
 ros2 launch sfa_localization localization.launch.py model:=/path/to/model.npz
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from pathlib import Path
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushROSNamespace
 from launch_ros.parameter_descriptions import ParameterValue
@@ -37,12 +39,20 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *arguments,
+            OpaqueFunction(function=_require_config),
             PushROSNamespace(LaunchConfiguration('namespace')),
             _node('omnicam_node', pictures, transport),
             _node('sfa_node', [], {'model': LaunchConfiguration('model')}),
             _node('ekf_node', [('odom', LaunchConfiguration('odom'))], {}),
         ]
     )
+
+
+def _require_config(context: LaunchContext) -> None:
+    """Raise for a parameter file that is missing: launch would go on with every default."""
+    path = LaunchConfiguration('config').perform(context)
+    if not Path(path).is_file():
+        raise FileNotFoundError(f'config:={path}: there is no such parameter file')
 
 
 def _node(name: str, remappings: list, parameters: dict) -> Node:

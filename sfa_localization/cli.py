@@ -170,7 +170,11 @@ def _configure_play(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--topics', nargs='+', default=(), metavar='T', help='only these topics')
     parser.add_argument(
-        '--wait-for', nargs='+', default=(), metavar='T', help='topics that need a subscriber first'
+        '--wait-for',
+        nargs='+',
+        default=(),
+        metavar='T',
+        help='topics that need a subscriber first; none: one of images and one of odometry',
     )
     parser.add_argument('--strict', action='store_true', help='refuse a damaged bag')
     _add_settings(parser, PlayConfig)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -59,7 +59,8 @@ class Settings:
         for name in mapping:
             if name not in known:
                 raise ConfigError(
-                    f'{where}: unknown parameter {name!r}{_did_you_mean(name, known)}'
+                    f'{where}: unknown parameter {name!r}'
+                    f'{nearest(name, known) or "; known are " + ", ".join(sorted(known))}'
                 )
         try:
             return cls(**mapping)
@@ -67,11 +68,10 @@ class Settings:
             raise ConfigError(f'{where}: {error}') from None
 
 
-def _did_you_mean(name: str, known: set[str]) -> str:
+def nearest(name: str, known: Collection[str]) -> str:
+    """The end of a message about an unknown name: which known one may be meant; '' if none."""
     close = difflib.get_close_matches(name, sorted(known), n=1)
-    if close:
-        return f'; did you mean {close[0]!r}?'
-    return f'; known are {", ".join(sorted(known))}'
+    return f'; did you mean {close[0]!r}?' if close else ''
 
 
 def _checked(group: str, item: dataclasses.Field[Any], value: Any) -> Any:
@@ -904,7 +904,11 @@ class PlayConfig(Settings):
     start_offset: float = setting(0.0, 'begin this far into the bag', unit='s', low=0.0, high=1e9)
     clock_rate: float = setting(40.0, 'messages on /clock', unit='Hz', low=0.1, high=1e4)
     wait: float = setting(
-        3.0, 'time given to subscribers to appear before it starts', unit='s', low=0.0, high=3600.0
+        20.0,
+        'time given to subscribers of images and odometry to appear before it starts',
+        unit='s',
+        low=0.0,
+        high=3600.0,
     )
 
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, TypeVar
 import yaml
 
 from sfa_localization import config
-from sfa_localization.config import Settings
+from sfa_localization.config import Settings, nearest
 from sfa_localization.errors import ConfigError
 from sfa_localization.files import whole_file
 
@@ -77,7 +76,7 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
     _require_known(shared, anywhere, f'{path}: {_EVERY_NODE}')
     _require_known(own, set(known), f'{path}: {section}')
     return {
-        name: _number(known[name], value) if name in known else value
+        name: _value(known[name], value) if name in known else value
         for name, value in {**shared, **own}.items()
         if name in known or _of_ros(name)
     }
@@ -123,13 +122,16 @@ def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[s
 def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
     for name in values:
         if name not in known and not _of_ros(name):
-            close = difflib.get_close_matches(name, sorted(known), n=1)
-            hint = f'; did you mean {close[0]!r}?' if close else ''
-            raise ConfigError(f'{where}: unknown parameter {name!r}{hint}')
+            raise ConfigError(f'{where}: unknown parameter {name!r}{nearest(name, known)}')
 
 
-def _number(item: dataclasses.Field[Any], value: Any) -> Any:
-    """YAML 1.1 takes 1e-3 for a text; ROS does not, and neither do people. 3 is as good as 3.0."""
+def _value(item: dataclasses.Field[Any], value: Any) -> Any:
+    """YAML 1.1 takes 1e-3 for a text; ROS does not, and neither do people. 3 is as good as 3.0.
+
+    `ros2 param dump` writes an empty list as null.
+    """
+    if item.default == () and value is None:
+        return ()
     if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)

@@ -36,7 +36,7 @@ from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability
 from rosbags.typesys import Stores
 from rosgraph_msgs.msg import Clock
 
-from sfa_localization.bag_messages import typestore
+from sfa_localization.bag_messages import COMPRESSED, IMAGE, ODOMETRY, typestore
 from sfa_localization.bag_reader import Bag, Topic
 from sfa_localization.bag_storage import Record
 from sfa_localization.config import PlayConfig
@@ -73,7 +73,7 @@ def play(
     """Replay a bag until its end, or until its context is shut down; Ctrl-C raises.
 
     `topics` limits it to those named. It starts when the topics of `wait_for` have subscribers
-    (none named: when there are some and no more come), or after the configured wait.
+    (none named: when images and odometry have some and no more come), or after the configured wait.
     `context` is an initialized one to use; by default its own. Raises BagError.
     """
     with _node(context) as node, Bag(path, strict=strict) as bag, Keyboard() as keyboard:
@@ -155,21 +155,44 @@ class Player:
         self._node.get_logger().warning(f'not played: {topic.name}: {reason}')
 
     def wait_for_subscribers(self, topics: Collection[str] = ()) -> bool:
-        """Wait until the topics have subscribers (none named: until no more come); False if not."""
-        wanted = [self._publishers[topic] for topic in topics if topic in self._publishers]
+        """Wait until the topics have subscribers; False if they do not come in time.
+
+        None named: until images and odometry have some, and no more come.
+        """
+        needed = self._needed(topics)
         deadline, settled = Pace(0, 1.0), Pace(0, 1.0)
         last = 0
         while deadline.time_ns < self._config.wait * 1e9 and self._alive():
             count = sum(p.get_subscription_count() for p in self._publishers.values())
-            if wanted and all(p.get_subscription_count() for p in wanted):
+            met = all(any(p.get_subscription_count() for p in group) for group in needed.values())
+            if topics and met:
                 return True
             if count != last:
                 last = count
                 settled.jump(0)
-            if not wanted and count and settled.time_ns > SETTLED_S * 1e9:
+            if not topics and met and count and settled.time_ns > SETTLED_S * 1e9:
                 return True
             self._keyboard.read(PATIENCE_S)
+        missing = [name for name, group in needed.items()
+                   if not any(p.get_subscription_count() for p in group)]  # fmt: skip
+        if missing and self._alive() and self._config.wait:
+            self._node.get_logger().warning(
+                f'nobody listens to {" and ".join(missing)} after {self._config.wait:g} s: '
+                'playing all the same (--wait sets the time)'
+            )
         return False
+
+    def _needed(self, topics: Collection[str]) -> dict[str, list[Publisher]]:
+        """Publishers of which one needs a subscriber, by what they are called."""
+        if topics:
+            return {name: [self._publishers[name]] for name in topics if name in self._publishers}
+        kinds = {'images': (IMAGE, COMPRESSED), 'odometry': (ODOMETRY,)}
+        known = self._bag.topics
+        found = {
+            what: [made for name, made in self._publishers.items() if known[name].kind in kind]
+            for what, kind in kinds.items()
+        }
+        return {what: group for what, group in found.items() if group}
 
     def play(self, loop: bool = False) -> Played:
         """Publish everything; again and again with `loop`. Ends early when ROS shuts down."""

@@ -101,9 +101,10 @@ def send_until(bench, publisher, message, topic='panorama', more=1):
     return bench.received[topic][-1]
 
 
-def new_context(domain_id):
+def new_context(domain_id, arguments=()):
     context = rclpy.Context()
     rclpy.init(
+        args=list(arguments),
         context=context,
         domain_id=domain_id,
         signal_handler_options=rclpy.signals.SignalHandlerOptions.NO,

@@ -185,13 +185,16 @@ class Said:
     def __init__(self, *told, **named):
         self.told, self.named = told, named
 
+    def perform(self, context):
+        return context[self.told[0]]
+
 
 @pytest.fixture
-def launched(monkeypatch):
-    """Return the node actions that the launch file makes, with launch replaced by stand-ins."""
+def actions(monkeypatch):
+    """Return the actions that the launch file makes, with launch replaced by stand-ins."""
     names = {
-        'launch': ['LaunchDescription'],
-        'launch.actions': ['DeclareLaunchArgument'],
+        'launch': ['LaunchContext', 'LaunchDescription'],
+        'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
         'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
         'launch_ros.actions': ['Node', 'PushROSNamespace'],
         'launch_ros.parameter_descriptions': ['ParameterValue'],
@@ -204,7 +207,23 @@ def launched(monkeypatch):
         monkeypatch.setitem(sys.modules, name, module)
     made = runpy.run_path(str(ROOT / 'config/localization.launch.py'))
     (actions,) = made['generate_launch_description']().told
+    return actions
+
+
+@pytest.fixture
+def launched(actions):
+    """Return what the launch file says of each node."""
     return [action.named for action in actions if type(action).__name__ == 'Node']
+
+
+def test_a_missing_parameter_file_stops_the_launch(actions):
+    """Before the nodes: launch_ros itself warns of it, and starts them with every default."""
+    kinds = [type(action).__name__ for action in actions]
+    check = actions[kinds.index('OpaqueFunction')].named['function']
+    assert kinds.index('OpaqueFunction') < kinds.index('Node')
+    assert check({'config': str(ROOT / 'config/localization.yaml')}) is None
+    with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
+        check({'config': '/nowhere.yaml'})
 
 
 def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launched):

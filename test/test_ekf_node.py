@@ -38,6 +38,7 @@ from sfa_localization.nodes.conversions import (  # noqa: E402
 )
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
+from sfa_localization.nodes.monitor import steady_s  # noqa: E402
 
 SEEN = 'sfa/pose_with_covariance'
 SPREAD = np.diag([0.04, 0.04, 0.0025])
@@ -213,7 +214,13 @@ def test_reset_and_pause(bench):
     assert node._filter.state is not None
     assert bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=True)).success
     accepted = node._filter.counts['measurement: accepted']
+    odometries = bench.listen(Odometry, 'ekf/odometry')
+    poses = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
+    transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
     play(bench, node, drive, second)
+    # The estimate goes on by odometry, on every topic.
+    assert until(lambda: len(poses) == len([e for e in second if e[1]]))
+    assert until(lambda: len(odometries) == len(transforms) == len([e for e in second if not e[1]]))
     assert until(lambda: node.monitor(SEEN).refused['paused'] == len([e for e in second if e[1]]))
     assert node._filter.counts['measurement: accepted'] == accepted
     assert 'paused' in ' '.join(node._status().reasons)
@@ -370,6 +377,31 @@ def test_silence_is_told_without_any_clock_moving(bench):
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive)
     assert until(lambda: any(s.data.startswith('DEGRADED: nothing on odom') for s in states))
+
+
+def test_what_nothing_moves_on_is_lost_in_the_end_by_the_wall_clock(bench):
+    """Messages have stopped for good: only the wall clock shows how unsure the pose is by now."""
+    drive = Drive(seconds=2, **NOISY)
+    node = bench.run(EkfNode, odometry_silence=0.2, lost_std=0.5, degraded_std=0.4,
+                     coast_time=0.5, odometry_timeout=0.2, unknown_speed=2.0)  # fmt: skip
+    states = bench.listen(String, 'ekf/state', latched_qos())
+    play(bench, node, drive)
+    assert until(lambda: states[-1].data.startswith('LOST: position known to'))
+    assert node._filter.status.level.name != 'LOST', 'by the stamps of the messages it is not'
+    assert float(node.health()[2]['position deviation [m]']) > 0.5
+    further = Drive(seconds=4, **NOISY)
+    play(bench, node, further, [e for e in further.events() if e[0] > drive.stamps_ns[-1]])
+    assert node._status().level.name != 'LOST'
+
+
+def test_a_pose_that_was_set_before_anything_came_is_waited_with(bench):
+    node = bench.run(EkfNode, odometry_silence=0.1, lost_std=0.5, degraded_std=0.4,
+                     unknown_speed=50.0)  # fmt: skip
+    bench.publish('initialpose', to_pose_with_covariance([1, 1, 0], SPREAD, START_NS, 'map'))
+    assert until(lambda: node._filter.state is not None)
+    since = steady_s()
+    assert until(lambda: steady_s() - since > 1.0)
+    assert node._status().level.name == 'DEGRADED'
 
 
 def test_simulated_time_that_steps_back_starts_anew(bench):

@@ -34,9 +34,10 @@ def start(tmp_path):
     """Start a node's process; all are ended with the test."""
     processes = []
 
-    def begin(node, *parameters):
-        arguments = [part for text in parameters for part in ('-p', text)]
-        code = f'import sys; from sfa_localization.nodes.{node} import main; sys.exit(main())'
+    def begin(node, *parameters, arguments=(), before=''):
+        arguments = [*arguments, *(part for text in parameters for part in ('-p', text))]
+        code = f'{before}\nimport sys; from sfa_localization.nodes import entry\n'
+        code += f'sys.exit(entry.{node}())'
         environment = {
             **os.environ,
             'ROS_DOMAIN_ID': str(DOMAIN),
@@ -82,6 +83,59 @@ def test_a_signal_while_unconfigured_too(bench, start):
     assert process.returncode == 0 and 'Traceback' not in told
 
 
+# Code that runs before the node's: at some moment the process sends itself a signal.
+SEND = 'import os, signal, sys\ndef send(): os.kill(os.getpid(), signal.{})\n'
+MOMENTS = {
+    'importing': """
+class Finder:
+    @staticmethod
+    def find_spec(name, *_):
+        if name == 'rclpy':
+            send()
+sys.meta_path.insert(0, Finder)
+""",
+    'initialising': """
+import rclpy
+init = rclpy.init
+def late(**options):
+    send()
+    init(**options)
+rclpy.init = late
+""",
+    'starting': """
+from sfa_localization.nodes.ekf_node import EkfNode
+setup = EkfNode.setup
+def signalled(self):
+    send()
+    while self.context.ok():
+        pass
+    setup(self)
+EkfNode.setup = signalled
+""",
+    'ending': """
+from sfa_localization.nodes.ekf_node import EkfNode
+started, destroy = EkfNode.started, EkfNode.destroy_node
+EkfNode.started = lambda self: (started(self), send())
+EkfNode.destroy_node = lambda self: (send(), destroy(self), send())
+""",
+    'leaving': """
+from sfa_localization.nodes.ekf_node import EkfNode
+EkfNode.started = lambda self: send()
+leave = sys.exit
+sys.exit = lambda code: (send(), leave(code))
+""",
+}
+
+
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+@pytest.mark.parametrize('moment', MOMENTS)
+def test_a_signal_at_any_moment_ends_with_exit_code_0(start, moment, name):
+    process = start('ekf_node', before=SEND.format(name) + MOMENTS[moment])
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 0, told
+    assert 'Traceback' not in told
+
+
 @pytest.mark.parametrize(('node', 'parameter', 'why'), [
     ('sfa_node', 'model:=/nowhere/model.npz', '/nowhere/model.npz'),
     ('sfa_node', 'dark_level:=-1.0', 'dark_level'),
@@ -92,6 +146,31 @@ def test_a_signal_while_unconfigured_too(bench, start):
 ])  # fmt: skip
 def test_a_wrong_parameter_ends_the_node_with_its_name(start, node, parameter, why):
     process = start(node, parameter)
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert why in told and 'Traceback' not in told
+
+
+FILES = {
+    'indented.yaml': 'ekf_node:\n ros__parameters:\n   history: 1.0\n  gate: 2.0\n',
+    'keyless.yaml': 'ekf_node:\n  history: 1.0\n',
+}
+
+
+@pytest.mark.parametrize(('arguments', 'why'), [
+    (['--params-file', 'indented.yaml'], 'near line 4'),
+    (['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
+    (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
+    (['-r', 'odom'], "remap rule: '-r odom'"),
+    (['-p', 'history'], "override rule: '-p history'"),
+    (['--nonsense'], '--nonsense'),
+])  # fmt: skip
+def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arguments, why):
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    folder = f'{tmp_path}/'
+    arguments = [folder + word if word.endswith('.yaml') else word for word in arguments]
+    process = start('ekf_node', arguments=arguments)
     _, told = process.communicate(timeout=30)
     assert process.returncode == 1
     assert why in told and 'Traceback' not in told

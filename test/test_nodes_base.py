@@ -125,6 +125,16 @@ def test_a_wrong_live_change_is_refused_and_changes_nothing(make, change):
     assert node.settings(Knobs) == Knobs()
 
 
+def test_a_misspelt_parameter_is_warned_of_with_the_nearest_name(make, monkeypatch):
+    said = []
+    monkeypatch.setattr(LocalizationNode, 'get_logger', lambda _: type('L', (), {
+        'warning': lambda *a, **k: said.append(a[1])})())  # fmt: skip
+    given = {'gian': 0.7, 'zzz': 1, 'use_sim_time': False, 'qos_overrides./in.depth': 3}
+    # Another node's: a section `/**` of the parameter file is given to all.
+    knobs(make, history=3.0, **given)
+    assert said == ["unknown parameter 'gian'; did you mean 'gain'?", "unknown parameter 'zzz'"]
+
+
 class Echo(LocalizationNode):
     def __init__(self, **options):
         super().__init__('echo', [], **options)

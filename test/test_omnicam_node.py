@@ -3,6 +3,7 @@
 """The omnicam node on real messages: panoramas, demand, bad pictures, live parameters, sources."""
 
 import array
+import contextlib
 import dataclasses
 import threading
 import time
@@ -10,8 +11,10 @@ import time
 import cv2
 import numpy as np
 import pytest
+import yaml
 
-from sfa_localization.config import CameraConfig, PanoramaConfig
+from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig
+from sfa_localization.config_file import load_settings, write_config
 from sfa_localization.panorama import Unwrapper
 from sfa_localization.pictures import decode_compressed, encode_jpeg
 
@@ -28,6 +31,7 @@ from omnicam_bench import (  # noqa: E402
     pixels,
     send_until,
 )
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
@@ -228,6 +232,100 @@ def test_masks_are_taken_away_again(bench):
     assert run.node.start()
     assert run.set(blind_sectors=[]).successful
     assert run.node.settings(CameraConfig).blind_sectors == ()
+
+
+def test_sectors_are_set_by_message(bench):
+    """As `ros2 param set` does: numbers arrive as array.array, or as integers."""
+    run = bench()
+    assert run.node.start()
+    for sent in ([170.0, 190.0], [10, 20]):
+        message = Parameter('blind_sectors', value=sent).to_parameter_msg()
+        (answer,) = run.node.set_parameters([Parameter.from_parameter_msg(message)])
+        assert answer.successful, answer.reason
+        assert run.node.settings(CameraConfig).blind_sectors == tuple(sent)
+        assert run.node._unwrapper.camera.blind_sectors == tuple(sent)
+
+
+@pytest.fixture
+def remapped():
+    """Return a function that makes the node with remaps; `parameters` by name."""
+    made = []
+
+    def build(*rules, **parameters):
+        words = [word for rule in rules for word in ('-r', rule)]
+        given = [Parameter(name, value=value) for name, value in parameters.items()]
+        context = new_context(63, ['--ros-args', *words])
+        made.append(OmnicamNode(context=context, parameter_overrides=given))
+        return made[-1]
+
+    yield build
+    for node in made:
+        node.destroy_node()
+        rclpy.try_shutdown(context=node.context)
+
+
+@pytest.mark.parametrize(
+    ('rules', 'heard'),
+    [
+        ([], '/image_raw/compressed'),
+        (['image_raw:=/cam/image_raw'], '/cam/image_raw/compressed'),
+        (['image_raw/compressed:=/jpegs'], '/jpegs'),
+        (['image_raw:=/cam/image_raw', 'image_raw/compressed:=/jpegs'], '/jpegs'),
+        (['__ns:=/robot1', 'image_raw:=front'], '/robot1/front/compressed'),
+    ],
+)
+def test_a_remap_of_the_base_topic_holds_for_its_transports(remapped, rules, heard):
+    node = remapped(*rules, image_transport='compressed', lazy=False)
+    assert node.start(), node.failure
+    assert node._subscription.topic_name == heard
+
+
+def test_a_remap_of_the_panorama_takes_its_companions_along(remapped):
+    node = remapped('panorama:=/top/view')
+    assert node.start(), node.failure
+    made = node._panoramas, node._compressed, node._info
+    assert [publisher.topic_name for publisher in made] == [
+        '/top/view', '/top/view/compressed', '/top/view/info',
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('rules', 'transport'),
+    [
+        (['image_raw:=panorama'], 'raw'),
+        (['panorama:=/image_raw'], 'raw'),
+        (['image_raw:=panorama'], 'compressed'),
+        (['image_raw/compressed:=panorama/compressed'], 'compressed'),
+    ],
+)
+def test_a_node_that_would_hear_itself_is_not_configured(remapped, rules, transport):
+    node = remapped(*rules, image_transport=transport)
+    assert not node.start()
+    assert 'which this node itself publishes' in node.failure and 'remap' in node.failure
+
+
+@contextlib.contextmanager
+def from_file(path):
+    """Run the node with a parameter file."""
+    context = new_context(63, ['--ros-args', '--params-file', str(path)])
+    node = OmnicamNode(context=context)
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def test_what_ros2_param_dump_writes_can_be_loaded_again(tmp_path):
+    path = tmp_path / 'omnicam_node.yaml'
+    write_config(path, {'omnicam_node': {'jpeg_quality': 77}})
+    with from_file(path) as node:
+        values = {name: entry.get_parameter_value() for name, entry in node._parameters.items()}
+        dumped = {name: parameter_value_to_python(value) for name, value in values.items()}
+        settings = [node.settings(k) for k in (OmnicamNodeConfig, CameraConfig, PanoramaConfig)]
+    assert dumped['distortion'] is None and dumped['jpeg_quality'] == 77
+    path.write_text(yaml.safe_dump({'/omnicam_node': {'ros__parameters': dumped}}))
+    with from_file(path) as node:
+        assert [node.settings(type(each)) for each in settings] == settings
+    assert [load_settings(path, 'omnicam_node', type(each)) for each in settings] == settings
 
 
 @pytest.mark.parametrize(

@@ -181,7 +181,7 @@ def test_every_command_and_node_is_an_executable():
     scripts = [line.split(' = ') for line in setup_arguments()['entry_points']['console_scripts']]
     targets = dict(scripts)
     assert set(targets) == {command.name for command in COMMANDS} | set(NODES)
-    assert {targets[node] for node in NODES} == {f'{NAME}.nodes.{node}:main' for node in NODES}
+    assert {targets[node] for node in NODES} == {f'{NAME}.nodes.entry:{node}' for node in NODES}
     assert {targets[command.name] for command in COMMANDS} == {f'{NAME}.cli:executable'}
 
 

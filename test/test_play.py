@@ -140,6 +140,7 @@ def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -
 # Through ROS.
 
 rclpy = pytest.importorskip('rclpy')
+from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosbags.interfaces import (  # noqa: E402
@@ -154,7 +155,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Image, Imu  # noqa: E402
 
 from sfa_localization.bag import Bag  # noqa: E402
-from sfa_localization.play import Player, message_class, play, qos_profile  # noqa: E402
+from sfa_localization.play import SETTLED_S, Player, message_class, play, qos_profile  # noqa: E402
 
 NO_TIME = QosTime(9223372036, 854775807)
 ROS = pytest.mark.ros
@@ -333,12 +334,41 @@ def test_types_that_are_not_installed_are_named_and_skipped(
 
 
 @ROS
+def test_a_late_subscriber_of_images_misses_none(
+    context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    """The odometry's has been there for long: the chain starts one node after another."""
+    path, played = reliable(messages, tmp_path / 'bag'), []
+    with Listener(context, {'/odom': Odometry}):
+        thread = threading.Thread(
+            target=lambda: played.append(play(path, config=FAST, context=context))
+        )
+        thread.start()
+        thread.join(3 * SETTLED_S)
+        with Listener(context, {'/image_raw': Image}) as late:
+            thread.join(DEADLINE_S)
+            until(lambda: len(late.heard['/image_raw']) == IMAGES)
+    assert played[0].messages['/image_raw'] == IMAGES
+
+
+@ROS
+def test_it_plays_for_nobody_after_the_wait(
+    context: Any, tmp_path: Path, messages: list[Message]
+) -> None:
+    path = reliable(messages, tmp_path / 'bag')
+    config = PlayConfig(rate=50.0, wait=0.2)
+    assert play(path, config=config, context=context).messages['/odom'] == COUNTS['/odom']
+
+
+@ROS
 def test_a_loop_ends_when_ros_does(context: Any, tmp_path: Path, messages: list[Message]) -> None:
     path, played = reliable(messages, tmp_path / 'bag'), []
     config = PlayConfig(rate=100.0, wait=20.0)
     with Listener(context, TOPICS) as listener:
         thread = threading.Thread(
-            target=lambda: played.append(play(path, config=config, loop=True, context=context))
+            target=lambda: played.append(
+                play(path, config=config, loop=True, context=context, wait_for=list(TOPICS))
+            )
         )
         thread.start()
         until(lambda: len(listener.heard['/imu']) > 2.5 * COUNTS['/imu'])
@@ -381,6 +411,7 @@ def test_signals_end_it_cleanly(
 ) -> None:
     path = reliable(messages, tmp_path / 'bag')
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--loop', '--rate=9']
+    command += ['--wait-for', *TOPICS]
     environment = {**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN)}
     with Listener(context, TOPICS) as listener:
         process = subprocess.Popen(

@@ -47,6 +47,7 @@ from sfa_localization.nodes.lifecycle import (
     run_node,
     sensor_qos,
 )
+from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.pose_filter import Level, PoseFilter, State, Status, Update
 
 try:
@@ -82,6 +83,7 @@ class EkfNode(LocalizationNode):
         self._told = ''
         self._told_level: Level | None = None
         self._since_told = 0
+        self._moved = (0, 0.0)
 
     def setup(self) -> None:
         self._config = self.settings(EkfNodeConfig)
@@ -89,6 +91,7 @@ class EkfNode(LocalizationNode):
         self._paused = False
         self._path.clear()
         self._told_level = None
+        self._moved = (0, 0.0)
         self._make_publishers()
         self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
         self.subscribe(PoseWithCovarianceStamped, _SEEN, self._receive_pose, sensor_qos(20))
@@ -172,18 +175,14 @@ class EkfNode(LocalizationNode):
     def _receive_pose(self, message: PoseWithCovarianceStamped) -> None:
         stamp_ns, pose, covariance = self._read_in_map(message)
         if self._paused:
+            # The estimate goes on by odometry: ekf/pose as well as ekf/odometry and /tf.
+            self._publish_pose(stamp_ns)
             raise MessageError('paused')
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source that tells no heading leaves its variance 0
         update = self._filter.add_measurement(stamp_ns, pose, covariance)
         self._verdict.publish(_verdict(update))
-        state = self._filter.at(stamp_ns)
-        if state is not None:
-            self._pose.publish(
-                to_pose_with_covariance(
-                    state.pose, state.pose_covariance, stamp_ns, self._config.map_frame
-                )
-            )
+        self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
 
@@ -259,6 +258,16 @@ class EkfNode(LocalizationNode):
         if self._tf is not None:
             self._tf.publish(TFMessage(transforms=[transform]))
 
+    def _publish_pose(self, stamp_ns: int) -> None:
+        """Publish the estimate at the stamp of an image."""
+        state = self._filter.at(stamp_ns)
+        if state is not None:
+            self._pose.publish(
+                to_pose_with_covariance(
+                    state.pose, state.pose_covariance, stamp_ns, self._config.map_frame
+                )
+            )
+
     def _extend_path(self, state: State) -> None:
         if abs(state.stamp_ns - self._path_ns) < self._config.path_period * 1e9:
             return
@@ -273,6 +282,7 @@ class EkfNode(LocalizationNode):
     def _status(self) -> Status:
         """The filter's status, and what the wall clock adds: inputs that do not arrive."""
         status, added = self._filter.status, []
+        by_now = self._by_now()
         for topic, limit in (
             (_ODOM, self._config.odometry_silence),
             (_SEEN, self._config.picture_silence),
@@ -285,7 +295,23 @@ class EkfNode(LocalizationNode):
         level = status.level
         if added and level is Level.LOCALISED:
             level = Level.DEGRADED
-        return Status(level, (*status.reasons, *added))
+        unsure = _unsure(by_now, self._filter.config) if level is Level.DEGRADED else []
+        if unsure:
+            level = Level.LOST
+        return Status(level, (*unsure, *status.reasons, *added))
+
+    def _by_now(self) -> State | None:
+        """The estimate; where nothing has moved it on for long, as it is by the wall clock."""
+        state = self._filter.state
+        if state is None:
+            return None
+        if state.stamp_ns != self._moved[0]:
+            self._moved = state.stamp_ns, steady_s()
+        silent_s = steady_s() - self._moved[1]
+        heard = self.monitor(_ODOM).received or self.monitor(_SEEN).received
+        if not heard or silent_s <= self._config.odometry_silence:
+            return state
+        return self._filter.at(state.stamp_ns + round(silent_s * 1e9))
 
     def _tell_state(self) -> None:
         """Publish the state when its level changes at once, when its reasons do at most at 1 Hz."""
@@ -305,7 +331,7 @@ class EkfNode(LocalizationNode):
         self._state.publish(String(data=text))
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        status, state = self._status(), self._filter.state
+        status, state = self._status(), self._by_now()
         values = {'state': status.level.name}
         values.update({name: str(n) for name, n in sorted(self._filter.counts.items())})
         if state is not None:
@@ -317,6 +343,16 @@ class EkfNode(LocalizationNode):
         if clock.known:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or 'localised', values
+
+
+def _unsure(by_now: State | None, config: FilterConfig) -> list[str]:
+    """Why the estimate is lost by the wall clock: the filter knows the time of messages only."""
+    found = []
+    if by_now is not None and by_now.position_std > config.lost_std:
+        found.append(f'position known to {by_now.position_std:.1f} m only by now')
+    if by_now is not None and by_now.yaw_std > config.lost_yaw_std:
+        found.append(f'heading known to {math.degrees(by_now.yaw_std):.0f} deg only by now')
+    return found
 
 
 def _verdict(update: Update) -> DiagnosticArray:

@@ -19,12 +19,13 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from sfa_localization.config import NodeConfig, Settings
-from sfa_localization.errors import LocalizationError
-from sfa_localization.nodes import parameters
+from sfa_localization.errors import ConfigError, LocalizationError
+from sfa_localization.nodes import parameters, signals
 from sfa_localization.nodes.monitor import Monitor
 from sfa_localization.reasons import bounded
 from sfa_localization.threads import one_core
@@ -68,6 +69,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         everything: list[type[Settings]] = [NodeConfig, *kinds]
         for kind in everything:
             self._declare(kind)
+        parameters.warn_of_unknown(self)
 
     def _declare(self, kind: type[Settings]) -> None:
         self._settings[kind] = parameters.declare(self, kind)
@@ -130,6 +132,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
         An inactive node drops messages; not `while_inactive` those that come but once, latched.
         """
+        self.require_input(topic)
         made = self.create_subscription(
             kind,
             topic,
@@ -138,6 +141,27 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self._entities.append((self.destroy_subscription, made))
+
+    def require_input(self, topic: str) -> None:
+        """Raise ConfigError for a topic that this node has a publisher on: it would feed itself."""
+        resolved = self.resolve_topic_name(topic)
+        outputs = [made for _, made in self._entities if isinstance(made, Publisher)]
+        if any(made.topic_name == resolved for made in outputs):
+            raise ConfigError(
+                f'input {topic} is {resolved}, which this node itself publishes: remap one of both'
+            )
+
+    def following(self, topic: str) -> str:
+        """The topic BASE/TRANSPORT, below whatever its base is remapped to.
+
+        So image_transport does; a remap of the whole name comes first.
+        """
+        base, _, transport = topic.rpartition('/')
+        resolved = self.resolve_topic_name(base)
+        own = self.resolve_topic_name(topic) != self.resolve_topic_name(topic, only_expand=True)
+        if own or resolved == self.resolve_topic_name(base, only_expand=True):
+            return topic
+        return f'{resolved}/{transport}'
 
     def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service that answers with success and message also where its callback raises."""
@@ -286,18 +310,24 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
 
 def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start."""
+    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start.
+
+    For the main thread of a process that then ends: signals are ignored afterwards.
+    """
     node = None
+    signals.end_at_once()
     try:
-        rclpy.init(args=None if args is None else list(args))
+        if not _initialised(args):
+            return 1
+        signals.leave_to_ros()
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
         if not node.start():
-            return 1
+            return int(rclpy.ok())  # a signal is no failure
         with one_core():
             _spin(executor, node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         return 0
     except rclpy_implementation.RCLError:
         if rclpy.ok():
@@ -307,8 +337,24 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
         rclpy.logging.get_logger('sfa_localization').fatal(str(error))
         return 1
     finally:
-        _end(node)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+        signals.ignore()
     return 0
+
+
+def _initialised(args: Sequence[str] | None) -> bool:
+    """Initialise ROS; False, and why is logged, where its arguments or files cannot be used."""
+    try:
+        rclpy.init(args=None if args is None else list(args))
+    except RuntimeError as error:  # the base of all that rclpy raises here
+        # What it says of arguments that it does not know is their list, and no more.
+        unknown = isinstance(error, rclpy_implementation.UnknownROSArgsError)
+        reason = f'unknown arguments after --ros-args: {error}' if unknown else str(error)
+        rclpy.logging.get_logger('sfa_localization').fatal(reason)
+        return False
+    return True
 
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
@@ -319,13 +365,3 @@ def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
         except rclpy_implementation.RCLError as error:
             # Asking a lifecycle node for a transition that its state does not have ends here.
             node.get_logger().error(f'request refused: {error}')
-
-
-def _end(node: LocalizationNode | None) -> None:
-    """Destroy the node and the context, also when a second signal arrives meanwhile."""
-    try:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        rclpy.try_shutdown()

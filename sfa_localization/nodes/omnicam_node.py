@@ -8,7 +8,6 @@ while nobody listens (`lazy`), and of pictures that come too fast only the newes
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +22,7 @@ from std_msgs.msg import String
 
 from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig, Settings
 from sfa_localization.errors import LocalizationError, MessageError
+from sfa_localization.nodes import parameters
 from sfa_localization.nodes.conversions import read_image, to_compressed, to_image, to_info
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
@@ -39,7 +39,6 @@ from sfa_localization.sources import Feed, FeedStatus, FrozenWatch, opener
 _DEMAND_PERIOD_S = 0.1
 _LITTLE_SEEN = 0.5
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-_TOPICS = {'raw': 'image_raw', 'compressed': 'image_raw/compressed'}
 
 
 class OmnicamNode(LocalizationNode):
@@ -71,10 +70,14 @@ class OmnicamNode(LocalizationNode):
         self._build_tables(self._unwrapper)
         self._frozen = FrozenWatch()
         self._panoramas = self.publisher(ImageMessage, 'panorama', reliable_qos(2))
-        self._compressed = self.publisher(CompressedImage, 'panorama/compressed', reliable_qos(2))
-        self._info = self.publisher(String, 'panorama/info', latched_qos())
-        self._input = _TOPICS[self._config.image_transport]
-        if self._config.source != 'topic':
+        compressed = self.following('panorama/compressed')
+        self._compressed = self.publisher(CompressedImage, compressed, reliable_qos(2))
+        self._info = self.publisher(String, self.following('panorama/info'), latched_qos())
+        raw = self._config.image_transport == 'raw'
+        self._input = 'image_raw' if raw else self.following('image_raw/compressed')
+        if self._config.source == 'topic':
+            self.require_input(self._input)
+        else:
             self._input = self._config.source_path
             self._make_feed()
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
@@ -190,18 +193,13 @@ class OmnicamNode(LocalizationNode):
     def _check_camera(self, changes: Sequence[Parameter]) -> SetParametersResult:
         """Refuse a mask, sector, mount or elevation from which no panorama can be made."""
         try:
-            camera = self._with(self.settings(CameraConfig), changes)
-            panorama = self._with(self.settings(PanoramaConfig), changes)
+            camera = parameters.changed(self.settings(CameraConfig), changes)
+            panorama = parameters.changed(self.settings(PanoramaConfig), changes)
             if (camera, panorama) != (self._unwrapper.camera, self._unwrapper.panorama):
                 self._build_tables(Unwrapper(camera, panorama))
         except LocalizationError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-    def _with(self, settings: Any, changes: Sequence[Parameter]) -> Any:
-        names = {item.name for item in dataclasses.fields(settings)}
-        values = {change.name: change.value for change in changes if change.name in names}
-        return dataclasses.replace(settings, **values)
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
         """Build the tables for the size of picture that is, or will be, in use, if it is known."""

@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
+import array
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import (
@@ -19,7 +20,8 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import Settings
+from sfa_localization.config import Settings, nearest
+from sfa_localization.config_file import SECTIONS
 from sfa_localization.errors import ConfigError
 
 S = TypeVar('S', bound=Settings)
@@ -32,8 +34,7 @@ def declare(node: Node, kind: type[S]) -> S:
     Settings that are not `live` become read-only. Raises ConfigError for a value that is refused.
     """
     values = {
-        item.name: _without_none(item, _declare_field(node, item))
-        for item in dataclasses.fields(kind)
+        item.name: _plain(item, _declare_field(node, item)) for item in dataclasses.fields(kind)
     }
     return kind.from_mapping(values, f'parameters of node {node.get_name()!r}')
 
@@ -47,13 +48,13 @@ def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) 
 
     def check(changes: list[Parameter]) -> SetParametersResult:
         try:
-            _changed(current(), changes)
+            changed(current(), changes)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def accept(changes: list[Parameter]) -> None:
-        settings = _changed(current(), changes)
+        settings = changed(current(), changes)
         if settings != current():
             apply(settings)
 
@@ -61,19 +62,42 @@ def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) 
     node.add_post_set_parameters_callback(accept)
 
 
-def _changed(settings: S, changes: list[Parameter]) -> S:
-    """The settings with those of `changes` that belong to them."""
+def changed(settings: S, changes: Sequence[Parameter]) -> S:
+    """The settings with those of `changes` that belong to them. Raises ConfigError."""
     values = {item.name: getattr(settings, item.name) for item in dataclasses.fields(settings)}
     given = {change.name: change.value for change in changes if change.name in values}
     for item in dataclasses.fields(settings):
         if item.name in given:
-            values[item.name] = _without_none(item, given[item.name])
+            values[item.name] = _plain(item, given[item.name])
     return type(settings).from_mapping(values, 'parameters')
 
 
-def _without_none(item: dataclasses.Field[Any], value: Any) -> Any:
-    """An empty list arrives from a parameter file as nothing at all."""
-    return () if value is None and item.default == () else value
+def _plain(item: dataclasses.Field[Any], value: Any) -> Any:
+    """A parameter's value in the types that settings take."""
+    if isinstance(value, array.array):  # so arrays arrive in messages
+        return value.tolist()
+    # An empty list arrives from a parameter file as nothing at all, and `ros2 param dump` writes
+    # that as null, which is a text to the parser of ROS.
+    return () if item.default == () and value in (None, 'null') else value
+
+
+def warn_of_unknown(node: Node) -> None:
+    """Warn of each value given to the node for a parameter that it does not have.
+
+    Parameters of the other nodes are passed over: a section `/**` gives them to all.
+    """
+    others = {
+        item.name
+        for kinds in SECTIONS.values()
+        for kind in kinds
+        for item in dataclasses.fields(kind)
+    }
+    # rclpy has no public way to ask what was given but not declared.
+    given = node._parameter_overrides
+    known = node.list_parameters([], 0).names
+    for name in sorted(set(given) - set(known) - others):
+        if not name.startswith('qos_overrides.'):  # declared with their topics
+            node.get_logger().warning(f'unknown parameter {name!r}{nearest(name, known)}')
 
 
 def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:

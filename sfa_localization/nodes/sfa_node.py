@@ -39,7 +39,6 @@ from sfa_localization.nodes.lifecycle import (
 from sfa_localization.observation import Observation, Observer
 from sfa_localization.place_model import PlaceModel
 
-_INFO = 'panorama/info'
 _TURNED_FRAME = 'first_image'
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -72,9 +71,11 @@ class SfaNode(LocalizationNode):
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         kind = CompressedImage if self._config.compressed else ImageMessage
-        self._topic = 'panorama/compressed' if self._config.compressed else 'panorama'
+        compressed = self._config.compressed
+        self._topic = self.following('panorama/compressed') if compressed else 'panorama'
         self._declared, self._undeclared_said = None, False
-        self.subscribe(String, _INFO, self._receive_info, latched_qos(), while_inactive=True)
+        self._info = self.following('panorama/info')
+        self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
         # Depth 1: when pictures come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
 
@@ -161,11 +162,11 @@ class SfaNode(LocalizationNode):
 
     def _say_undeclared(self, expected: PanoramaConfig) -> None:
         """Say once that elevations and direction of a foreign source's panoramas are believed."""
-        if self._undeclared_said or self.count_publishers(self.resolve_topic_name(_INFO)):
+        if self._undeclared_said or self.count_publishers(self.resolve_topic_name(self._info)):
             return
         self._undeclared_said = True
         self.get_logger().info(
-            f'nobody declares on {_INFO} what the panoramas show: they are taken to be from '
+            f'nobody declares on {self._info} what the panoramas show: they are taken to be from '
             f'{expected.elevation_min:g} to {expected.elevation_max:g} deg, '
             f'{"clockwise" if expected.clockwise else "counter-clockwise"}, as in training'
         )
