@@ -9,7 +9,7 @@ message that is not used is counted with its reason. Bags are never written to.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,14 +20,22 @@ from sfa_localization import bag_messages as messages
 from sfa_localization.bag_recording import Recording
 from sfa_localization.bag_storage import Channel, Record, inflate_message
 from sfa_localization.bag_stream import StampFilter, Stream, Tally
-from sfa_localization.bag_values import Values, to_odometry, to_trajectory, to_yaw_rate
+from sfa_localization.bag_values import (
+    Values,
+    poses_stand,
+    to_odometry,
+    to_trajectory,
+    to_yaw_rate,
+)
 from sfa_localization.config import BagConfig
 from sfa_localization.decoding import read_yaw_rate
 from sfa_localization.errors import BagError, MessageError
-from sfa_localization.run import Count, Image, Odometry, Trajectory, YawRate
+from sfa_localization.run import Count, Image, Odometry, Trajectory, YawRate, integrate
 
 SERIALIZATIONS = ('cdr', 'ros1')
 MAX_SHOWN = 8
+# More resets of the odometry than this are none: pose and twist are of different units.
+_RESETS_MIN, _RESETS_SHARE = 20, 0.01
 COMPRESSED_START = b'\x28'
 """First byte of zstd data; no CDR message begins so."""
 
@@ -189,6 +197,16 @@ class Bag:
     def to_odometry(self, stream: Stream, values: Values) -> Odometry:
         """Odometry of a stream's values; a reset is joined, and noted as a problem."""
         odometry, resets = to_odometry(values, self.config.odometry_jump)
+        if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
+            raise BagError(
+                f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
+                f'{len(values)} messages: are both in metres, radians and seconds?'
+            )
+        if poses_stand(odometry):
+            text = f'{stream.topic}: the pose never moves; the twist is summed up instead'
+            self.recording.problems.append(text)
+            poses = integrate(odometry.stamps_ns, odometry.twists)
+            odometry = replace(odometry, poses=poses)
         if resets:
             text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
             self.recording.problems.append(text)

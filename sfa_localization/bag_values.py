@@ -46,6 +46,16 @@ def to_odometry(values: Values, jump_m: float) -> tuple[Odometry, int]:
     return Odometry(stamps, poses, motion[:, :2], motion[:, 2:]), resets
 
 
+def poses_stand(odometry: Odometry) -> bool:
+    """Whether all poses are one while twists say that the robot drives: no pose is kept."""
+    if len(odometry.stamps_ns) < 2 or np.ptp(odometry.poses, axis=0).any():
+        return False
+    return bool(np.abs(odometry.twists[:, 0]).max() > _DRIVES_MPS)
+
+
+_DRIVES_MPS = 0.01
+
+
 def _rejoined(stamps: Stamps, poses: Array, twists: Array, jump_m: float) -> tuple[Array, int]:
     """Poses whose jumps are replaced by what the twist says happened, and their number."""
     step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps) * 1e-9

@@ -23,11 +23,13 @@ LONGEST_S = 2.5
 class CameraClock:
     """`delay_s` by which images are stamped later than odometry, known to `std_s`.
 
-    0 and infinity where the drive does not show it: it takes turns that begin and end.
+    0 and infinity where the drive does not show it: it takes turns that begin and end. What is
+    `assumed` holds however small it is beside its standard deviation.
     """
 
     delay_s: float = 0.0
     std_s: float = np.inf
+    assumed: bool = False
 
     @property
     def known(self) -> bool:
@@ -37,7 +39,8 @@ class CameraClock:
     @property
     def delay_ns(self) -> int:
         """What to take off the images' stamps: 0 for a delay that may well be none."""
-        return round(self.delay_s * 1e9) if abs(self.delay_s) > _SIGNIFICANT * self.std_s else 0
+        shown = self.assumed or abs(self.delay_s) > _SIGNIFICANT * self.std_s
+        return round(self.delay_s * 1e9) if shown else 0
 
 
 _SIGNIFICANT = 2.0

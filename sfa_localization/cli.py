@@ -9,7 +9,7 @@ import dataclasses
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -575,6 +575,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         count = judged.counts[stream]
         reasons = ''.join(f'; {n} skipped: {why}' for why, n in sorted(count['skipped'].items()))
         print(f'{stream}: {count["used"]} used{reasons}')
+    for line in _fusion_lines(judged.counts):
+        print(line)
     print(f'aligned on {judged.aligned_on}')
     if arguments.report:
         report.write_report(
@@ -598,6 +600,20 @@ EVALUATE = Command(
     _configure_evaluate,
     _evaluate,
 )
+
+
+def _fusion_lines(counts: Mapping[str, Any]) -> list[str]:
+    """What the filter rejected, how long it was in each state, and how late images were."""
+    usual = {'odometry: used', 'measurement: accepted', 'measurement: started'}
+    rejected = {why: n for why, n in counts['fusion'].items() if why not in usual}
+    lines = [f'filter: {n} times {why}' for why, n in sorted(rejected.items())]
+    states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
+    lines.append(f'state: {states}')
+    if 'camera_delay_s' in counts:
+        delay = counts['camera_delay_s']
+        late = 'late' if delay > 0 else 'early'
+        lines.append(f'camera: images are stamped {abs(delay):.2f} s {late}')
+    return lines
 
 
 def _configure_demo(parser: argparse.ArgumentParser) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from scipy import linalg
 from tqdm import tqdm
 
+from sfa_localization.camera_clock import CameraClock
 from sfa_localization.config import FilterConfig, WatchConfig
 from sfa_localization.errors import DataError
 from sfa_localization.files import whole_file
@@ -36,6 +37,7 @@ from sfa_localization.observation import Observation
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.run import Count, Run, Stamps, Trajectory
 from sfa_localization.training import Recipe, as_live, read_drive
+from sfa_localization.visual_turns import camera_clock
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
@@ -70,6 +72,7 @@ class _Drive:
     sfa: Trajectory
     features: Array
     observations: Count
+    clock: CameraClock
 
 
 def evaluate(
@@ -93,13 +96,13 @@ def evaluate(
     if align_bag is not None:
         with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
             run = _read(align_bag, Path(cache), recipe, progress)
-            trained, _ = _replayed(Localizer(model, config, watch), run, progress)
+            trained, _, _ = _replayed(Localizer(model, config, watch), run, progress)
             transform = fit_transform(trained.truth, trained.sfa)
             supervised = _supervised_weights(model, trained)
     with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
         run = _read(bag, Path(cache), recipe, progress)
         localizer = Localizer(model, config, watch)
-        drive, ekf = _replayed(localizer, run, progress)
+        drive, ekf, states = _replayed(localizer, run, progress)
     transform = transform or fit_transform(drive.truth, drive.sfa)
     estimates = {'odometry': odometry_from_start(drive.truth, run)}
     estimates['sfa'] = moved(drive.sfa, transform)
@@ -110,6 +113,9 @@ def evaluate(
     counts = {name: count.as_dict() for name, count in run.counts.items()}
     counts['observations'] = drive.observations.as_dict()
     counts['fusion'] = dict(localizer.filter.counts)
+    if drive.clock.delay_ns:
+        counts['camera_delay_s'] = round(drive.clock.delay_s, 3)
+    counts['states_s'] = states
     aligned_on = str(align_bag or bag)
     return Evaluation(drive.truth, estimates, scores, counts, drive.features, aligned_on)
 
@@ -121,35 +127,43 @@ def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
     return run
 
 
-def _replayed(localizer: Localizer, run: Run, progress: bool) -> tuple[_Drive, Trajectory]:
-    """What the model makes of a drive, and the filter at every odometry message."""
+def _replayed(
+    localizer: Localizer, run: Run, progress: bool
+) -> tuple[_Drive, Trajectory, dict[str, float]]:
+    """What the model makes of a drive, the filter at each odometry message, seconds by state."""
     seen: list[Observation] = []
-    stamps, poses = [], []
+    stamps, poses, states = [], [], dict[str, float]()
+    before_ns = int(run.odometry.stamps_ns[0])
     title = f'locating {run.name}'
     with tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
             if observation is not None:
                 seen.append(observation)
                 bar.update()
-            elif state is not None:
+                continue
+            level = localizer.status.level.name
+            states[level] = states.get(level, 0.0) + (stamp_ns - before_ns) * 1e-9
+            before_ns = stamp_ns
+            if state is not None:
                 stamps.append(stamp_ns)
                 poses.append(state.pose)
     path = Trajectory(np.array(stamps, np.int64), np.reshape(poses, (-1, 3)))
-    return _drive(run, seen), path
+    # The map is judged where images were taken; the filter has to find out by itself.
+    return _drive(run, seen, camera_clock(run)), path, states
 
 
-def _drive(run: Run, seen: list[Observation]) -> _Drive:
+def _drive(run: Run, seen: list[Observation], clock: CameraClock) -> _Drive:
     assert run.ground_truth is not None
     usable = [one for one in seen if not one.problem]
     if not usable:
         raise DataError(f'{run.name}: no picture can be used: {seen[0].problem}')
     estimates = [one.estimate for one in usable]
-    stamps = np.array([one.stamp_ns for one in usable], np.int64)
+    stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
     poses = np.array([np.append(e.position, e.yaw) for e in estimates])
     features = np.array([e.slow_features for e in estimates])
     skipped = Counter(one.problem for one in seen if one.problem)
     count = Count(len(usable), dict(skipped))
-    return _Drive(run, run.ground_truth, Trajectory(stamps, poses), features, count)
+    return _Drive(run, run.ground_truth, Trajectory(stamps, poses), features, count, clock)
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:

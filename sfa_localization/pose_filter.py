@@ -48,7 +48,7 @@ DELAY_LIMIT_NS = 500_000_000
 _APART = 'clocks of camera and odometry are more than 0.5 s apart'
 # Some minutes of image pairs: clocks drift.
 _CAMERA_MEMORY = 1000.0
-_EXPECTED_STD_S = 0.01
+_EXPECTED_STD_S = 0.05
 
 
 class Level(enum.Enum):
@@ -187,6 +187,7 @@ class PoseFilter:
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
+        spread = spread + self._time_noise(taken_ns, stamp_ns, fused)
         event = self._fusion.measurement(taken_ns, fused, spread)
         update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
         assert update is not None
@@ -214,7 +215,19 @@ class PoseFilter:
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
-            self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S))
+            self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+
+    def _time_noise(self, taken_ns: int, stamp_ns: int, value: Array) -> Array:
+        """Covariance that a moving robot's pose has because the time it was seen is uncertain."""
+        std_s = self._camera.clock_at(stamp_ns).std_s
+        twist = self._history.before(taken_ns).twist
+        if not math.isfinite(std_s):
+            return np.zeros((len(value), len(value)))
+        if len(value) == 2:
+            return np.eye(2) * (std_s * twist.v) ** 2
+        yaw = float(value[2])
+        moved = np.array([twist.v * math.cos(yaw), twist.v * math.sin(yaw), twist.omega])
+        return np.outer(moved, moved) * std_s**2
 
     @property
     def camera_clock(self) -> CameraClock:

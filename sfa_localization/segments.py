@@ -29,6 +29,7 @@ logger = logging.getLogger(__name__)
 # must then agree within this factor: skidding wheels are off by two, degrees by 57.
 _TURNS_TO_JUDGE = 1.0
 _GYRO_RATIO = 5.0
+_PERIODS = 2.5
 # Jumps of yaw between two odometry messages, beyond what the twist explains: a reset.
 _YAW_JUMP_RAD = 0.5
 # Yaw rates are averaged over this long before they are compared with a threshold.
@@ -253,7 +254,8 @@ def _breaks(
     step = relative(poses[:-1], poses[1:])
     speed = np.maximum(np.abs(twists[:-1, 0]), np.abs(twists[1:, 0]))
     rate = np.maximum(np.abs(twists[:-1, 1]), np.abs(twists[1:, 1]))
-    gap = dt > config.odometry_gap_max
+    # Odometry that is always slow does not pause at each message.
+    gap = dt > max(config.odometry_gap_max, _PERIODS * float(np.median(dt)))
     reset = np.hypot(step[:, 0], step[:, 1]) > speed * dt + config.odometry_jump_max
     reset |= np.abs(step[:, 2]) > rate * dt + _YAW_JUMP_RAD
     for reason, mask in (('pauses', gap), ('resets', reset & ~gap)):

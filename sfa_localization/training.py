@@ -160,6 +160,13 @@ def _load(
 ) -> tuple[Run, ...]:
     """Read all bags; their panoramas must be of one size."""
     runs = tuple(read_drive(bag, cache, recipe, progress, strict=strict) for bag in bags)
+    for k, run in enumerate(runs):
+        for other in runs[:k]:
+            if np.array_equal(run.panoramas.stamps_ns, other.panoramas.stamps_ns):
+                raise DataError(
+                    f'{bags[k]}: the same drive as {other.name}: name each drive once, for a drive '
+                    'that is left out must not be known from its copy'
+                )
     sizes = {run.panoramas.shape for run in runs}
     if len(sizes) > 1:
         told = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)
@@ -303,7 +310,7 @@ def learn_place(
     correlation = _error_correlation(segments, result)
     heading, labelled = _learn_heading(views, segments, result, recipe.heading)
     # Of each run, s; None where the drive does not show it.
-    delays = [c.delay_s if c.known else None for c in clocks]
+    delays = [c.delay_ns * 1e-9 if c.known else None for c in clocks]
     part = _heading_part(labelled, segments, len(views.features), recipe.heading)
     yaw_weight = _yaw_weight(labelled, part, segments, result)
     yaw_agreement = _yaw_agreement(heading, views.disagreement[labelled], yaw_weight)
@@ -331,9 +338,8 @@ def _clock_of(run: Run) -> CameraClock:
     clock = camera_clock(run)
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
-            '%s: images are stamped %.2f s later than odometry: taken into account here, but the '
-            'filter makes up for half a second only; bring both to one clock', run.name,
-            clock.delay_s,
+            '%s: the stamps of images and odometry are %.2f s apart: the filter makes up for half '
+            'a second only; bring both to one clock', run.name, abs(clock.delay_s),
         )  # fmt: skip
     return clock
 
@@ -551,7 +557,10 @@ def summary(trained: Trained) -> str:
         )
     for run, delay in zip(trained.runs, quality['camera_delay_s'], strict=True):
         if delay is not None and abs(delay) > _DELAY_SHOWN_S:
-            lines.append(f'{run.name}: images are stamped {delay:.2f} s late: taken into account')
+            late = 'late' if delay > 0 else 'early'
+            lines.append(
+                f'{run.name}: images are stamped {abs(delay):.2f} s {late}: taken into account'
+            )
     for name, count in _counts(trained).items():
         lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
     return '\n'.join(lines)
