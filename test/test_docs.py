@@ -212,6 +212,14 @@ def test_nav2_uses_our_frames():
     assert navigator['robot_base_frame'] == frames.base_frame
 
 
+def test_nav2_plans_without_a_map():
+    """A rolling window whose layers wait for no map; Nav2's default has the static layer."""
+    settings = yaml.safe_load((ROOT / 'config/nav2.yaml').read_text('utf-8'))
+    window = settings['global_costmap']['global_costmap']['ros__parameters']
+    assert window['rolling_window'] is True
+    assert window['plugins'] == ['obstacle_layer', 'inflation_layer']
+
+
 class Said:
     """Stands in for every class of launch: remembers what it was told."""
 
