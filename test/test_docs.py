@@ -10,6 +10,7 @@ import argparse
 import ast
 import dataclasses
 import json
+import math
 import re
 import runpy
 import shlex
@@ -19,8 +20,10 @@ import types
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from filter_drives import Drive
 
 from sfa_localization import cli, config
 
@@ -171,12 +174,50 @@ def test_robot_localization_takes_position_and_heading_of_our_pose():
     assert used == [0, 1, 5], 'x, y and yaw'
 
 
+def test_robot_localization_finds_a_robot_that_starts_anywhere():
+    """Its arithmetic, of x, y and yaw: predicted from zero, images that are too far off refused."""
+    text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
+    settings = yaml.safe_load(text)['ekf_filter_node_map']['ros__parameters']
+    given = np.reshape(settings.get('initial_estimate_covariance', 1e-9 * np.eye(15)), (15, 15))
+    planar = np.ix_([0, 1, 5], [0, 1, 5])
+    drive = Drive(seconds=20, start=(40.0, -25.0, 2.5), v_std=0.02, omega_std=0.01,
+                  position_std=0.3, yaw_std=0.1)  # fmt: skip
+    spread = np.diag([0.09, 0.09, 0.01])
+    pose, covariance, errors = np.zeros(3), given[planar], []
+    for _, kind, index in drive.events():
+        if kind == 0:
+            v, omega = drive.read[index] / drive.rate_hz
+            turn = np.eye(3)
+            turn[:2, 2] = [-v * math.sin(pose[2]), v * math.cos(pose[2])]
+            pose += v * math.cos(pose[2]), v * math.sin(pose[2]), omega
+            covariance = turn @ covariance @ turn.T + np.diag([1e-4, 1e-4, 1e-5])
+            continue
+        innovation = drive.seen[index] - pose
+        innovation[2] = math.remainder(innovation[2], 2 * math.pi)
+        expected = covariance + spread
+        d2 = innovation @ np.linalg.solve(expected, innovation)
+        if d2 <= settings['pose0_rejection_threshold'] ** 2:
+            gain = np.linalg.solve(expected, covariance).T
+            pose, covariance = pose + gain @ innovation, covariance - gain @ covariance
+        truth = drive.poses[drive.pictures[index]]
+        errors.append(math.hypot(*(pose - truth)[:2]))
+    assert np.mean(errors) < 0.3
+
+
 def test_nav2_uses_our_frames():
     settings = yaml.safe_load((ROOT / 'config/nav2.yaml').read_text('utf-8'))
     navigator = settings['bt_navigator']['ros__parameters']
     frames = config.EkfNodeConfig()
     assert navigator['global_frame'] == frames.map_frame
     assert navigator['robot_base_frame'] == frames.base_frame
+
+
+def test_nav2_plans_without_a_map():
+    """A rolling window whose layers wait for no map; Nav2's default has the static layer."""
+    settings = yaml.safe_load((ROOT / 'config/nav2.yaml').read_text('utf-8'))
+    window = settings['global_costmap']['global_costmap']['ros__parameters']
+    assert window['rolling_window'] is True
+    assert window['plugins'] == ['obstacle_layer', 'inflation_layer']
 
 
 class Said:
