@@ -110,7 +110,7 @@ def evaluate(
     if supervised is not None:
         estimates['supervised'] = _supervised(model, supervised, drive)
     scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    counts = {name: count.as_dict() for name, count in run.counts.items()}
+    counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
     counts['observations'] = drive.observations.as_dict()
     counts['fusion'] = dict(localizer.filter.counts)
     if drive.clock.delay_ns:

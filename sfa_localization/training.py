@@ -162,7 +162,9 @@ def _load(
     runs = tuple(read_drive(bag, cache, recipe, progress, strict=strict) for bag in bags)
     for k, run in enumerate(runs):
         for other in runs[:k]:
-            if np.array_equal(run.panoramas.stamps_ns, other.panoramas.stamps_ns):
+            stamps = run.panoramas.stamps_ns, other.panoramas.stamps_ns
+            firsts = run.panoramas.read(0, 1), other.panoramas.read(0, 1)
+            if np.array_equal(*stamps) and np.array_equal(*firsts):
                 raise DataError(
                     f'{bags[k]}: the same drive as {other.name}: name each drive once, for a drive '
                     'that is left out must not be known from its copy'

@@ -403,6 +403,34 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
         load_run(tmp_path / 'bag', cache=tmp_path / 'cache', topics=TopicNames(imu='/imu'))
 
 
+def drive_bag(path: Path, pose: Callable[[int], Any], twist: Any, count: int = 100) -> Path:
+    with BagWriter(path) as bag:
+        for k in range(count):
+            bag.image('/image', stamp(k), np.full((8, 32, 3), k, np.uint8), 'camera')
+            bag.odometry('/odom', stamp(k), np.array(pose(k)), np.array(twist), np.zeros(2))
+    return path
+
+
+def test_a_pose_and_a_twist_of_different_units_are_refused(tmp_path: Path) -> None:
+    """A pose in centimetres would else be taken for odometry that is reset at every message."""
+    step = PERIOD * 1e-9
+    metres = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
+    with Bag(metres) as bag:
+        assert len(bag.odometry().poses) == 100 and bag.problems == []
+    centimetres = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), (10.0, 0.0))
+    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* metres')
+    with refusal, Bag(centimetres) as bag:
+        bag.odometry()
+
+
+def test_a_pose_that_is_never_kept_is_summed_up_from_the_twist(tmp_path: Path) -> None:
+    path = drive_bag(tmp_path / 'bag', lambda k: (0.0, 0.0, 0.0), (1.0, 0.0))
+    with Bag(path) as bag:
+        x = bag.odometry().poses[:, 0]
+        assert x == pytest.approx(np.arange(100) * PERIOD * 1e-9)
+        assert bag.problems == ['/odom: the pose never moves; the twist is summed up instead']
+
+
 # The writer.
 
 

@@ -3,15 +3,17 @@
 """evaluate and tune look at a drive as the nodes do, by the same parameter file."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from picture_readers import PictureReader, Recording
 
-from sfa_localization import tuning
+from sfa_localization import evaluation, tuning
 from sfa_localization.cli import main
 from sfa_localization.config import WatchConfig
 from sfa_localization.config_file import write_config
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.run import PanoramaArray
 from sfa_localization.training import Recipe
 
 
@@ -77,3 +79,33 @@ def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path,
     assert main([*arguments[command], '--config', str(tmp_path / 'own.yaml')]) == 1
     assert 'elevation_max 30.0 instead of 24.0' in capsys.readouterr().err
     assert not (tmp_path / 'new.yaml').exists()
+
+
+def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(bag, tmp_path, capsys):
+    figures = evaluated(bag, tmp_path, ekf_node={'gate_probability': 0.5})
+    out = capsys.readouterr().out
+    rejected = figures['counts']['fusion']['measurement: outside the gate']
+    assert f'filter: {rejected} times measurement: outside the gate' in out
+    seconds = figures['counts']['states_s']
+    assert seconds['LOCALISED'] > 1.0
+    assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
+
+
+@pytest.mark.slow
+def test_the_map_is_laid_on_the_truth_where_late_images_were_taken(tmp_path, monkeypatch):
+    """Drives of one late camera, and of one in time: the model that both get is judged alike."""
+    from test_other_robots import placed
+
+    _, trained = placed(0.0, 1)
+    run = trained.runs[0]
+    truth = run.odometry.trajectory
+    stamps = run.panoramas.stamps_ns + 300_000_000
+    late = replace(run, ground_truth=truth, panoramas=PanoramaArray(stamps, run.panoramas.images))
+    in_time = replace(run, ground_truth=truth)
+    means = {}
+    for name, one in (('late', late), ('in time', in_time)):
+        monkeypatch.setattr(evaluation, 'read_drive', lambda *_, one=one, **__: one)
+        judged = evaluation.evaluate(trained.model, tmp_path)
+        means[name] = judged.scores['sfa']['mean'], judged.counts.get('camera_delay_s', 0.0)
+    assert means['late'][1] == pytest.approx(0.3, abs=0.05) and means['in time'][1] == 0.0
+    assert means['late'][0] < 1.2 * means['in time'][0] + 0.005

@@ -298,3 +298,11 @@ def test_a_gyro_on_another_clock_is_as_good_as_none():
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT, other)
     assert segments.odometry.skipped['without a usable gyroscope'] > 0
     check_segments(segments, run.poses)
+
+
+def test_odometry_that_is_always_slow_does_not_pause_at_each_message():
+    run = drive(np.vstack([SQUARE, SQUARE]))
+    slow = picked(run.odometry, np.arange(len(run.odometry.stamps_ns)) % 30 == 0)
+    segments = cut(slow, run.stamps_ns, ANY)
+    assert 'pauses' not in segments.odometry.skipped
+    assert segments.images.used > 0.8 * len(run.stamps_ns)

@@ -235,6 +235,13 @@ def test_the_mdp_engine_learns_the_same_place(bag, tmp_path):
         assert abs(np.corrcoef(a, b)[0, 1]) > 0.999
 
 
+def test_a_drive_given_twice_is_refused(bag, tmp_path):
+    """What is left out would be known from its copy, and the forecast would promise too much."""
+    with pytest.raises(DataError, match=r'the same drive as .*: name each drive once'):
+        train([bag, bag], tmp_path / 'm.npz', RECIPE)
+    assert not (tmp_path / 'm.npz').exists()
+
+
 def test_two_bags_are_two_drives(bag, tmp_path):
     other = write_bag(tmp_path / 'other', seed=5)
     trained = train([bag, other], tmp_path / 'model.npz', RECIPE)
