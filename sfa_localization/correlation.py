@@ -18,8 +18,7 @@ from sfa_localization.config import FilterConfig
 from sfa_localization.errors import DataError
 from sfa_localization.geometry import Array
 
-# Left-out maps bridge a gap that the whole map does not have, and so err more alike than it does.
-LARGEST_SHARE = 0.8
+LARGEST_SHARE = 0.95
 _FARTHEST_M = 8.0
 _DISTANCES_M = np.geomspace(0.1, 20.0, 81)
 _BINS_M = np.geomspace(0.02, _FARTHEST_M, 25)

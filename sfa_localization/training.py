@@ -71,6 +71,8 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT = 'sfa_localization training checkpoint'
 CHECKPOINT_VERSION = 1
+# Left-out maps bridge a gap that the whole map does not have, and so err more alike than it does.
+_LARGEST_SHARE = 0.8
 # Pictures whose maps are kept for the compass and for novelty, however long the drives.
 _SAMPLES = 3000
 _DELAY_SHOWN_S = 0.02
@@ -465,9 +467,10 @@ def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrela
         for s in segments
     ]
     owner = np.repeat(np.arange(len(ways)), [len(way) for way in ways])
-    return ErrorCorrelation.fit(
+    found = ErrorCorrelation.fit(
         result.left_out, result.left_out_variance, np.concatenate(ways), owner
     )
+    return ErrorCorrelation(min(found.share, _LARGEST_SHARE), found.distance_m)
 
 
 def _heading_part(
