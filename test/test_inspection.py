@@ -59,6 +59,7 @@ def write(
     shape: tuple[int, int] = (8, 60),
     brightness: int = 120,
     odometry_until: float = 1.0,
+    speed: float = 1.0,
 ) -> Path:
     """Record a drive along a route with a picture every 0.2 s."""
     rng = np.random.default_rng(0)
@@ -68,7 +69,7 @@ def write(
             picture = rng.integers(0, 2 * brightness + 1, (*shape, 3), np.uint8)
             bag.image('/panorama', at, picture, 'camera')
             if share <= odometry_until:
-                bag.odometry('/odom', at, (*route(share), 0.0), (1.0, 0.0), (0.0, 0.0))
+                bag.odometry('/odom', at, (*route(share), 0.0), (speed, 0.0), (0.0, 0.0))
     return path
 
 
@@ -102,7 +103,7 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
         ({'pictures': 149}, '149 pictures with odometry are few'),
         ({'route': line}, 'driven along 1 of 6 directions'),
         ({'route': circle}, 'of the area lie within 1 m of a picture'),
-        ({'route': lambda share: (0.0, 0.0)}, 'the robot did not move'),
+        ({'route': lambda share: (0.0, 0.0), 'speed': 0.0}, 'the robot did not move'),
         ({'shape': (48, 64)}, 'the pictures do not look around'),
         ({'brightness': 4}, 'the pictures are dark'),
         ({'odometry_until': 0.5}, '299 of 600 pictures have no odometry nearby'),
