@@ -12,10 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from sfa_localization.config import InspectionConfig
-from sfa_localization.geometry import Array
-from sfa_localization.inspection import area, covered, directions, way
-from sfa_localization.routes import Lawn, coverage
+from sfa_localization.data.geometry import Array
+from sfa_localization.inspection import InspectionConfig, area, covered, directions, way
+from sfa_localization.simulation.routes import Lawn, coverage
 
 HALF = np.array([8.0, 9.0])
 SPACING_M = 0.2

@@ -15,31 +15,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from sfa_localization import __version__
-from sfa_localization.config import (
+from sfa_localization.bags.settings import TopicNames
+from sfa_localization.camera.settings import (
     CalibrationConfig,
     CameraConfig,
-    DemoConfig,
-    FilterConfig,
-    InspectionConfig,
-    MetricConfig,
-    NetworkConfig,
     PanoramaConfig,
-    PlayConfig,
-    SegmentConfig,
-    Settings,
-    SimulationConfig,
-    TopicNames,
-    TuneConfig,
     WatchConfig,
 )
-from sfa_localization.config_file import (
+from sfa_localization.commands.settings import DemoConfig, PlayConfig
+from sfa_localization.config import (
     SECTIONS,
     load_changes,
     load_settings,
     render,
     write_config,
 )
-from sfa_localization.errors import ConfigError, DataError, LocalizationError
+from sfa_localization.data.errors import ConfigError, DataError, LocalizationError
+from sfa_localization.data.settings import Settings
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.inspection import InspectionConfig
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.simulation.settings import SimulationConfig
+from sfa_localization.tuning import TuneConfig
 
 if TYPE_CHECKING:
     from sfa_localization.training import Recipe
@@ -133,7 +131,7 @@ def _configure_simulate(parser: argparse.ArgumentParser) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from sfa_localization.simulation import simulate
+    from sfa_localization.simulation.drive import simulate
 
     config = _settings(SimulationConfig, arguments)
     panorama, progress = _panorama_of(arguments.size), sys.stderr.isatty()
@@ -182,7 +180,7 @@ def _configure_play(parser: argparse.ArgumentParser) -> None:
 
 def _play(arguments: argparse.Namespace) -> int:
     try:
-        from sfa_localization.play import play
+        from sfa_localization.commands.play import play
     except ImportError as error:
         raise LocalizationError(f'play needs ROS 2 ({error}); install ros-jazzy-rclpy') from None
 
@@ -246,7 +244,7 @@ def _add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
-    from sfa_localization.inspection_files import inspect_bags
+    from sfa_localization.commands.inspection_files import inspect_bags
 
     reports = inspect_bags(
         arguments.bags,
@@ -300,7 +298,7 @@ def _configure_calibrate(parser: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from sfa_localization import calibration
+    from sfa_localization.camera import calibration
 
     pictures = calibration.read_pictures(arguments.images)
     circles = None
@@ -424,7 +422,7 @@ def _configure_tune(parser: argparse.ArgumentParser) -> None:
 
 def _tune(arguments: argparse.Namespace) -> int:
     from sfa_localization import tuning
-    from sfa_localization.correlation import resolved
+    from sfa_localization.fusion.settings import resolved
     from sfa_localization.place_model import PlaceModel
 
     how, model = _settings(TuneConfig, arguments), PlaceModel.load(arguments.model)
@@ -511,7 +509,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
 
 def _train(arguments: argparse.Namespace) -> int:
     from sfa_localization import training
-    from sfa_localization.cluster import executor_at
+    from sfa_localization.features.cluster import executor_at
 
     with executor_at(arguments.dask) as executor:
         trained = training.train(
@@ -525,7 +523,7 @@ def _train(arguments: argparse.Namespace) -> int:
         )
     print(training.summary(trained))
     if arguments.report:
-        from sfa_localization.training_report import write_training_report
+        from sfa_localization.reports.training import write_training_report
 
         write_training_report(arguments.report, trained)
     print(f'{arguments.output}: written')
@@ -556,8 +554,9 @@ def _configure_evaluate(parser: argparse.ArgumentParser) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from sfa_localization import evaluation, report
+    from sfa_localization import evaluation
     from sfa_localization.place_model import PlaceModel
+    from sfa_localization.reports import evaluation as report
 
     model = PlaceModel.load(arguments.model)
     _require_same_panorama(arguments.config, model.panorama)
@@ -624,8 +623,9 @@ def _configure_demo(parser: argparse.ArgumentParser) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from sfa_localization import demo, report
-    from sfa_localization.processes import terminable
+    from sfa_localization.commands import demo
+    from sfa_localization.commands.processes import terminable
+    from sfa_localization.reports import evaluation as report
 
     with terminable():
         judged = demo.demonstrate(arguments.out, _settings(DemoConfig, arguments), progress=True)

@@ -20,11 +20,11 @@ import numpy as np
 from scipy import linalg
 from tqdm import tqdm
 
-from sfa_localization.camera_clock import CameraClock
-from sfa_localization.config import FilterConfig, WatchConfig
-from sfa_localization.errors import DataError
-from sfa_localization.files import whole_file
-from sfa_localization.geometry import (
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.camera.turns import headings
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.files import whole_file
+from sfa_localization.data.geometry import (
     Array,
     RigidTransform,
     align,
@@ -32,12 +32,12 @@ from sfa_localization.geometry import (
     invert,
     wrap_angle,
 )
-from sfa_localization.localizer import Localizer
-from sfa_localization.observation import Observation
+from sfa_localization.data.run import Count, Run, Stamps, Trajectory
+from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.localizer import Localizer, Observation
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.run import Count, Run, Stamps, Trajectory
 from sfa_localization.training import Recipe, as_live, read_drive
-from sfa_localization.visual_turns import camera_clock
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
@@ -149,7 +149,13 @@ def _replayed(
                 poses.append(state.pose)
     path = Trajectory(np.array(stamps, np.int64), np.reshape(poses, (-1, 3)))
     # The map is judged where images were taken; the filter has to find out by itself.
-    return _drive(run, seen, camera_clock(run)), path, states
+    return (
+        _drive(
+            run, seen, camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+        ),
+        path,
+        states,
+    )
 
 
 def _drive(run: Run, seen: list[Observation], clock: CameraClock) -> _Drive:

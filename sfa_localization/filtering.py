@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sfa_localization.config import FilterConfig
-from sfa_localization.errors import DataError
-from sfa_localization.events import PICTURE, in_order
-from sfa_localization.files import whole_file
-from sfa_localization.geometry import Array, align
-from sfa_localization.pose_filter import PoseFilter, Status
-from sfa_localization.run import Stamps, Trajectory, integrate
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.events import PICTURE, in_order
+from sfa_localization.data.files import whole_file
+from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.run import Stamps, Trajectory, integrate
+from sfa_localization.fusion.pose_filter import PoseFilter, Status
+from sfa_localization.fusion.settings import FilterConfig
 
 _NS = Decimal(1_000_000_000)
 _SECOND_NS = 1_000_000_000

@@ -13,14 +13,15 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
-from sfa_localization import bag_messages as messages
-from sfa_localization.bag_reader import KINDS, Bag
-from sfa_localization.bag_stream import Stream
-from sfa_localization.config import BagConfig, InspectionConfig, TopicNames
-from sfa_localization.errors import BagError
-from sfa_localization.geometry import Array
-from sfa_localization.panorama import looks_like_panorama
-from sfa_localization.run import Image, Odometry, Stamps
+from sfa_localization.bags import messages
+from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.streams import Stream
+from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.data.errors import BagError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image, Odometry, Stamps
+from sfa_localization.data.settings import Settings, setting
 
 PANORAMA, OMNIDIRECTIONAL, FISHEYE = 'panorama', 'omnidirectional', 'fisheye'
 DUAL_FISHEYE, ORDINARY = 'dual fisheye', 'ordinary camera'
@@ -29,6 +30,26 @@ SAMPLE_SIDE = 640
 STILL_M = 0.02
 GRID = 100
 DARK = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class InspectionConfig(Settings):
+    """What a drive needs to be enough to train on."""
+
+    min_pictures: int = setting(300, 'pictures with odometry', low=1)
+    max_spacing: float = setting(
+        0.5, 'way between pictures (90th percentile)', unit='m', low=0.01, high=100.0
+    )
+    reach: float = setting(
+        1.0, 'ground this near to a picture is covered', unit='m', low=0.01, high=100.0
+    )
+    min_covered: float = setting(0.65, 'share of the area that is covered', low=0.0, high=1.0)
+    min_directions: int = setting(3, 'line directions, of six, driven along', low=1, high=6)
+    max_lost: float = setting(0.1, 'share of pictures that cannot be used', low=0.0, high=1.0)
+    max_gap: float = setting(
+        2.0, 'pause of a topic that is worth telling', unit='s', low=0.0, high=1e6
+    )
+    samples: int = setting(16, 'pictures on the contact sheet', low=1, high=400)
 
 
 @dataclass

@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.agreement import Agreement, disagreement
-from sfa_localization.config import PanoramaConfig
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.errors import ConfigError, DataError, ModelError
-from sfa_localization.fast_map import Predictor, fast_map
-from sfa_localization.files import whole_file
-from sfa_localization.geometry import Array
-from sfa_localization.heading import UNKNOWN_YAW_VARIANCE, Compass, harmonics
-from sfa_localization.network import Architecture, Layer, Network, Node
-from sfa_localization.novelty import Novelty
-from sfa_localization.regression import MetricMap
-from sfa_localization.rotation import Map
-from sfa_localization.run import Image
-from sfa_localization.threads import one_core
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import ConfigError, DataError, ModelError
+from sfa_localization.data.files import whole_file
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image
+from sfa_localization.data.threads import one_core
+from sfa_localization.features.agreement import Agreement, disagreement
+from sfa_localization.features.network import Architecture, Layer, Network, Node
+from sfa_localization.features.novelty import Novelty
+from sfa_localization.features.rotation import Map
+from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass, harmonics
+from sfa_localization.metric.expansions import MetricMap
+from sfa_localization.metric.fast_expansions import Predictor, fast_map
 
 FORMAT = 'sfa_localization place model'
 VERSION = 2

@@ -19,28 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sfa_localization import mdp_engine
-from sfa_localization import metric as metric_learning
-from sfa_localization.agreement import Agreement, disagreement, share_within
-from sfa_localization.bag import load_run
-from sfa_localization.camera_clock import CameraClock
-from sfa_localization.config import (
-    BagConfig,
-    CameraConfig,
-    FilterConfig,
-    HeadingConfig,
-    MetricConfig,
-    NetworkConfig,
-    PanoramaConfig,
-    SegmentConfig,
-    TopicNames,
-)
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.errors import DataError, ModelError
-from sfa_localization.forecast import nearest_used
-from sfa_localization.geometry import Array
-from sfa_localization.heading import HeadingFit, fit_compass
-from sfa_localization.hierarchy import (
+from sfa_localization.bags.loading import load_run
+from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.turns import headings
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import BATCH, Run
+from sfa_localization.data.threads import one_core
+from sfa_localization.features import mdp_engine
+from sfa_localization.features.agreement import Agreement, disagreement, share_within
+from sfa_localization.features.network import Architecture, Network, Node
+from sfa_localization.features.network_training import (
     Drive,
     Executor,
     Partial,
@@ -48,10 +40,19 @@ from sfa_localization.hierarchy import (
     in_this_process,
     train_network,
 )
-from sfa_localization.metric import MetricResult
-from sfa_localization.network import Architecture, Network, Node
-from sfa_localization.novelty import Novelty, describe
-from sfa_localization.panorama import Unwrapper
+from sfa_localization.features.novelty import Novelty, describe
+from sfa_localization.features.rotation import Map
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.sfa import Solution
+from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.metric import learning as metric_learning
+from sfa_localization.metric.compass import HeadingFit, fit_compass
+from sfa_localization.metric.forecast import nearest_used
+from sfa_localization.metric.learning import MetricResult
+from sfa_localization.metric.segments import Segments, assignment, cut, join
+from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
 from sfa_localization.place_model import (
     PlaceModel,
     heading_input,
@@ -59,13 +60,6 @@ from sfa_localization.place_model import (
     top_features,
     write_arrays,
 )
-from sfa_localization.pose_filter import DELAY_LIMIT_NS
-from sfa_localization.rotation import Map
-from sfa_localization.run import BATCH, Run
-from sfa_localization.segments import Segments, assignment, cut, join
-from sfa_localization.sfa import Solution
-from sfa_localization.threads import one_core
-from sfa_localization.visual_turns import camera_clock
 
 logger = logging.getLogger(__name__)
 
@@ -342,7 +336,7 @@ def learn_place(
 
 def _clock_of(run: Run) -> CameraClock:
     """The camera's clock beside the odometry's; what no filter can make up for is warned of."""
-    clock = camera_clock(run)
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
             '%s: the stamps of images and odometry are %.2f s apart: the filter makes up for half '

@@ -23,15 +23,16 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from sfa_localization.config import FilterConfig, TuneConfig, WatchConfig
-from sfa_localization.correlation import resolved
-from sfa_localization.errors import DataError
-from sfa_localization.events import ODOMETRY, in_order
-from sfa_localization.geometry import Array, align
-from sfa_localization.observation import Observer
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.run import Odometry, Run, Stamps, Trajectory
+from sfa_localization.data.settings import Settings, setting
+from sfa_localization.fusion.pose_filter import PoseFilter, Update
+from sfa_localization.fusion.settings import FilterConfig, resolved
+from sfa_localization.localizer import Observer
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.pose_filter import PoseFilter, Update
-from sfa_localization.run import Odometry, Run, Stamps, Trajectory
 from sfa_localization.training import Recipe, as_live, read_drive
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -47,6 +48,18 @@ TUNED = (
 _SPREAD = 0.7
 _ENOUGH = 20
 _TAIL = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class TuneConfig(Settings):
+    """How the filter's noise parameters are sought."""
+
+    method: str = setting(
+        'likelihood',
+        'likelihood (needs no ground truth), or grid (the search of the paper, which does)',
+        choices=('likelihood', 'grid'),
+    )
+    trials: int = setting(120, 'settings to try by likelihood', low=10, high=100_000)
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bag_writer import RELIABLE, BagWriter
+from sfa_localization.bags.writer import RELIABLE, BagWriter
 
 if sys.version_info >= (3, 14):
     from compression import zstd

@@ -9,10 +9,12 @@ from functools import cache
 
 import numpy as np
 
-from sfa_localization.config import MetricConfig, NetworkConfig, PanoramaConfig
-from sfa_localization.hierarchy import Drive, architecture_of, train_network
-from sfa_localization.network import Architecture, Layer
-from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.features.network import Architecture, Layer
+from sfa_localization.features.network_training import Drive, architecture_of, train_network
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.training import Recipe, Trained, drive_of, learn_place
 
 SIZE = (12, 48)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sfa_localization.geometry import compose, wrap_angle
-from sfa_localization.run import integrate
+from sfa_localization.data.geometry import compose, wrap_angle
+from sfa_localization.data.run import integrate
 
 START_NS = 1_700_000_000_000_000_000
 

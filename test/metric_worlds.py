@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.run import Odometry, Stamps, Trajectory, YawRate, integrate
+from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, integrate
 
 RATE = 50
 STEP_NS = 1_000_000_000 // RATE

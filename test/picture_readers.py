@@ -8,10 +8,10 @@ import math
 import numpy as np
 from filter_drives import Drive
 
-from sfa_localization.bag import BagWriter
-from sfa_localization.config import PanoramaConfig
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.events import ODOMETRY, in_order
+from sfa_localization.bags.loading import BagWriter
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.events import ODOMETRY, in_order
 from sfa_localization.place_model import Estimate
 
 SIZE = PanoramaConfig(width=64, height=16)

@@ -31,9 +31,9 @@ from bag_formats import (
 )
 from rosbags.rosbag2 import Reader
 
-from sfa_localization.bag import Bag, BagWriter, load_run
-from sfa_localization.config import BagConfig, TopicNames
-from sfa_localization.errors import BagError
+from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.data.errors import BagError
 
 
 @pytest.fixture(scope='session')

@@ -23,10 +23,10 @@ from bag_formats import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.bag import Bag, load_run
-from sfa_localization.bag_reader import KINDS
-from sfa_localization.config import TopicNames
-from sfa_localization.errors import LocalizationError
+from sfa_localization.bags.loading import Bag, load_run
+from sfa_localization.bags.reader import KINDS
+from sfa_localization.bags.settings import TopicNames
+from sfa_localization.data.errors import LocalizationError
 from sfa_localization.inspection import inspect
 
 TOPICS = {

@@ -11,8 +11,11 @@ import pytest
 from bag_formats import COUNTS, FORMATS, Message, drive
 from test_package import setup_arguments
 
-from sfa_localization import bag_mcap, bag_storage, bag_zstd, cli
-from sfa_localization.bag import Bag
+from sfa_localization import cli
+from sfa_localization.bags import mcap as bag_mcap
+from sfa_localization.bags import storage as bag_storage
+from sfa_localization.bags import zstd as bag_zstd
+from sfa_localization.bags.loading import Bag
 
 STANDARD = ('compression.zstd', 'backports.zstd')
 

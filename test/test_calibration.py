@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 from sfa_localization import cli
-from sfa_localization.calibration import check_picture, find_circles, given_circles
-from sfa_localization.config import CameraConfig, PanoramaConfig
-from sfa_localization.errors import CameraError
-from sfa_localization.panorama import Unwrapper
+from sfa_localization.camera.calibration import check_picture, find_circles, given_circles
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.data.errors import CameraError
 
 CENTER, RADII = (330.3, 241.7), (42.0, 205.0)
 

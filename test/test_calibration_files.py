@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.calibration_files import read_calibration, with_calibration
-from sfa_localization.cameras import make_camera
-from sfa_localization.config import CameraConfig
-from sfa_localization.errors import CameraError
+from sfa_localization.camera.calibration_files import read_calibration, with_calibration
+from sfa_localization.camera.lenses import make_camera
+from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.data.errors import CameraError
 
 OCAM = """#polynomial coefficients of the direct mapping
 

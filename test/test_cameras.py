@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.cameras import MirrorLens, make_camera
-from sfa_localization.config import CameraConfig, PanoramaConfig
-from sfa_localization.errors import CameraError
+from sfa_localization.camera.lenses import MirrorLens, make_camera
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.data.errors import CameraError
 
 FORWARD, LEFT, UP = np.eye(3)
 OPEN = {'radius_min': 0.0, 'radius_max': 0.0}

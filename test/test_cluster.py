@@ -13,11 +13,12 @@ import pytest
 from cylinder_worlds import ARCHITECTURE, drive
 from test_hierarchy import correlations
 
-from sfa_localization import cluster, hierarchy
-from sfa_localization.config import NetworkConfig
-from sfa_localization.errors import ConfigError, DataError
-from sfa_localization.hierarchy import Drive, train_network
-from sfa_localization.run import PanoramaArray
+from sfa_localization.data.errors import ConfigError, DataError
+from sfa_localization.data.run import PanoramaArray
+from sfa_localization.features import cluster
+from sfa_localization.features import network_training as hierarchy
+from sfa_localization.features.network_training import Drive, train_network
+from sfa_localization.features.settings import NetworkConfig
 
 distributed = pytest.importorskip('distributed', reason='the extra distributed is not installed')
 

@@ -20,9 +20,11 @@ import pytest
 import yaml
 from test_calibration import scene
 
-from sfa_localization import cli, cluster, config, simulation
-from sfa_localization.bag import Bag, BagWriter
+from sfa_localization import cli, config
+from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.simulation import drive as simulation
 
 GROUPS = {group.__name__: group for group in config.Settings.__subclasses__()}
 COMMANDS = {command.name: command for command in cli.COMMANDS}
@@ -439,7 +441,7 @@ def watched(name: str, notes: list[Any]) -> Iterator[None]:
 
 def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Note pace and patience; an endless replay ends in its third round."""
-    from sfa_localization import play
+    from sfa_localization.commands import play
 
     class Player(play.Player):
         rounds = 0
@@ -470,7 +472,7 @@ def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
 
 def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
-    from sfa_localization import demo
+    from sfa_localization.commands import demo
 
     def run_live(programs, logs, settings):
         notes.extend((item.name, getattr(settings, item.name)) for item in fields(settings))

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from sfa_localization import config_file
+from sfa_localization import config as config_file
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.cli import main
-from sfa_localization.config import FilterConfig, NodeConfig, PanoramaConfig
-from sfa_localization.config_file import SECTIONS, load_settings, render, write_config
-from sfa_localization.errors import ConfigError
+from sfa_localization.config import SECTIONS, load_settings, render, write_config
+from sfa_localization.data.errors import ConfigError
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.nodes.settings import NodeConfig
 
 SHIPPED = Path(__file__).parents[1] / 'config' / 'localization.yaml'
 EVERY = [(section, kind) for section, kinds in SECTIONS.items() for kind in kinds]

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from sfa_localization.config import FilterConfig
-from sfa_localization.correlation import ErrorCorrelation, resolved
-from sfa_localization.errors import DataError
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import DataError
+from sfa_localization.fusion.settings import FilterConfig, resolved
 
 
 def made(share, distance, seed=0, step=0.1, stretches=60, length=80):

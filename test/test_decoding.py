@@ -8,9 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfa_localization.bag import Bag, BagWriter
-from sfa_localization.decoding import read_planar, read_stamp, read_twist, read_yaw, read_yaw_rate
-from sfa_localization.errors import MessageError
+from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.data.errors import MessageError
+from sfa_localization.data.messages import (
+    read_planar,
+    read_stamp,
+    read_twist,
+    read_yaw,
+    read_yaw_rate,
+)
 
 
 def quaternion(yaw, length=1.0, roll=0.0):

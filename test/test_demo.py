@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
-from sfa_localization import demo
-from sfa_localization.config import DemoConfig
-from sfa_localization.errors import LocalizationError
-from sfa_localization.run import Trajectory
+from sfa_localization.commands import demo
+from sfa_localization.commands.settings import DemoConfig
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.run import Trajectory
 
 OURS = ('coverage', 'test', 'logs', 'report')
 

@@ -14,11 +14,11 @@ import numpy as np
 import psutil
 import pytest
 
-from sfa_localization.config import DemoConfig
-from sfa_localization.errors import NodeError
+from sfa_localization.commands.settings import DemoConfig
+from sfa_localization.data.errors import NodeError
 
 pytest.importorskip('rclpy')
-from sfa_localization import demo_nodes
+from sfa_localization.commands import demo_nodes
 
 pytestmark = pytest.mark.ros
 CONFIG = DemoConfig(start_timeout=20.0, silence_timeout=1.0, settle_time=0.3, stop_timeout=3.0)

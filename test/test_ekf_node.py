@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from filter_drives import START_NS, Drive
 
-from sfa_localization.config import FilterConfig
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.geometry import compose
-from sfa_localization.pose_filter import PoseFilter
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.geometry import compose
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -28,7 +28,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
-from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
+from sfa_localization.data.messages import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes import ekf_node  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,

@@ -9,11 +9,11 @@ import pytest
 from picture_readers import PictureReader, Recording
 
 from sfa_localization import evaluation, tuning
+from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.cli import main
-from sfa_localization.config import WatchConfig
-from sfa_localization.config_file import write_config
+from sfa_localization.config import write_config
+from sfa_localization.data.run import PanoramaArray
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.run import PanoramaArray
 from sfa_localization.training import Recipe
 
 

@@ -14,23 +14,19 @@ import pytest
 from matplotlib.figure import Figure
 
 import sfa_localization
-from sfa_localization import (
-    bag_writer,
-    calibration,
-    config_file,
-    evaluation,
-    files,
-    filtering,
-    inspection_files,
-    place_model,
-    report,
-    report_bag,
-)
-from sfa_localization.bag_writer import BagWriter
-from sfa_localization.config import DemoConfig
-from sfa_localization.errors import BagError, DataError, LocalizationError
-from sfa_localization.files import whole_file
+from sfa_localization import config as config_file
+from sfa_localization import evaluation, filtering, place_model
+from sfa_localization.bags import writer as bag_writer
+from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera import calibration
+from sfa_localization.commands import inspection_files
+from sfa_localization.commands.settings import DemoConfig
+from sfa_localization.data import files
+from sfa_localization.data.errors import BagError, DataError, LocalizationError
+from sfa_localization.data.files import whole_file
 from sfa_localization.inspection import BagReport
+from sfa_localization.reports import bag as report_bag
+from sfa_localization.reports import evaluation as report
 
 FULL = OSError(errno.ENOSPC, 'No space left on device')
 PICTURE = np.zeros((8, 16, 3), np.uint8)
@@ -39,7 +35,7 @@ PLACES = np.zeros((5, 3))
 
 def mark_a_demo(path: Path) -> None:
     pytest.importorskip('rclpy')
-    from sfa_localization import demo
+    from sfa_localization.commands import demo
 
     demo._mark(path, DemoConfig())
 

@@ -14,10 +14,10 @@ import pytest
 from filter_drives import stamps
 from scipy.stats import chi2
 
-from sfa_localization.config import FilterConfig
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.geometry import compose, wrap_angle
-from sfa_localization.pose_filter import PoseFilter
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.geometry import compose, wrap_angle
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
 
 SHIPPED = FilterConfig()
 V_STD, OMEGA_STD = 0.03, 0.02

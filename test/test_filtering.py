@@ -10,9 +10,9 @@ from filter_drives import START_NS, Drive
 
 from sfa_localization import filtering
 from sfa_localization.cli import main
-from sfa_localization.config import FilterConfig
-from sfa_localization.errors import DataError
-from sfa_localization.pose_filter import PoseFilter
+from sfa_localization.data.errors import DataError
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
 
 NOISY = {'v_std': 0.02, 'omega_std': 0.01, 'position_std': 0.2, 'scale': 1.01, 'bias': 0.002}
 

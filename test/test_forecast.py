@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, garden_features, grid, lanes, meander
 
-from sfa_localization.config import MetricConfig, SegmentConfig
-from sfa_localization.elimination import Links, Stack
-from sfa_localization.errors import DataError
-from sfa_localization.fitting import fit, targets
-from sfa_localization.forecast import REACH_M, Forecast, _beyond, _gap, _Leaver, nearest_used
-from sfa_localization.geometry import RigidTransform, align
-from sfa_localization.hyperparameters import folds
-from sfa_localization.metric import learn, positions, with_frame
-from sfa_localization.regression import Process
-from sfa_localization.segments import cut
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import RigidTransform, align
+from sfa_localization.metric.alternation import fit, targets
+from sfa_localization.metric.expansions import Process
+from sfa_localization.metric.forecast import REACH_M, Forecast, _beyond, _gap, _Leaver, nearest_used
+from sfa_localization.metric.learning import learn, positions, with_frame
+from sfa_localization.metric.quadratic_form import Links, Stack
+from sfa_localization.metric.segments import cut
+from sfa_localization.metric.selection import folds
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 CONFIG = MetricConfig(slow_features=12, inducing_points=300, angle_std_max=180.0)
 DRIVES = {

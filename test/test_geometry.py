@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfa_localization.errors import DataError
-from sfa_localization.geometry import align, align_complex
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import align, align_complex
 
 
 @given(st.integers(0, 1000), st.floats(-3.1, 3.1), st.floats(-50, 50), st.floats(-50, 50))

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from cylinder_worlds import place, visit
 
-from sfa_localization.config import HeadingConfig
-from sfa_localization.errors import DataError
-from sfa_localization.geometry import wrap_angle
-from sfa_localization.heading import (
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.metric.compass import (
     UNKNOWN_YAW_VARIANCE,
     Compass,
     HeadingFit,
@@ -20,6 +19,7 @@ from sfa_localization.heading import (
     fit_compass,
     harmonics,
 )
+from sfa_localization.metric.settings import HeadingConfig
 
 CONFIG = HeadingConfig(heading_inducing_points=80)
 

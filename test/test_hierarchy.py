@@ -9,10 +9,11 @@ import pytest
 from cylinder_worlds import ARCHITECTURE, SIZE, drive
 from test_rotation import assert_equal, brute_force, views
 
-from sfa_localization import hierarchy
-from sfa_localization.config import NetworkConfig
-from sfa_localization.errors import ConfigError, DataError
-from sfa_localization.hierarchy import (
+from sfa_localization.data.errors import ConfigError, DataError
+from sfa_localization.data.run import PanoramaArray
+from sfa_localization.features import network_training as hierarchy
+from sfa_localization.features.network import LAYERS, Network, Node, expand, prepare
+from sfa_localization.features.network_training import (
     Drive,
     Partial,
     Shard,
@@ -21,9 +22,8 @@ from sfa_localization.hierarchy import (
     stage_statistics,
     train_network,
 )
-from sfa_localization.network import LAYERS, Network, Node, expand, prepare
-from sfa_localization.run import PanoramaArray
-from sfa_localization.sfa import solve
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.sfa import solve
 
 CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
 

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from sfa_localization.history import History
+from sfa_localization.fusion.history import History
 
 
 def trail(span_ns=1000):

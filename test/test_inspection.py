@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.bag import BagWriter
+from sfa_localization.bags.loading import BagWriter
 from sfa_localization.cli import main
-from sfa_localization.config import InspectionConfig
 from sfa_localization.inspection import (
     DUAL_FISHEYE,
     FISHEYE,
     OMNIDIRECTIONAL,
     ORDINARY,
     PANORAMA,
+    InspectionConfig,
     area,
     covered,
     directions,

@@ -12,11 +12,12 @@ import pytest
 from cylinder_worlds import ARCHITECTURE, drive
 from test_hierarchy import correlations
 
-from sfa_localization import hierarchy, mdp_engine, mdp_shim
-from sfa_localization.config import NetworkConfig
-from sfa_localization.errors import ConfigError, DataError
-from sfa_localization.network import prepare
-from sfa_localization.rotation import unfold
+from sfa_localization.data.errors import ConfigError, DataError
+from sfa_localization.features import mdp_engine, mdp_shim
+from sfa_localization.features import network_training as hierarchy
+from sfa_localization.features.network import prepare
+from sfa_localization.features.rotation import unfold
+from sfa_localization.features.settings import NetworkConfig
 
 CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
 
@@ -92,7 +93,7 @@ def test_shim_leaves_no_patch_behind():
         'import inspect, logging, numpy\n'
         'logging.basicConfig(level=logging.INFO)\n'
         'before = set(vars(numpy)), inspect.getfullargspec\n'
-        'from sfa_localization.mdp_shim import import_mdp\n'
+        'from sfa_localization.features.mdp_shim import import_mdp\n'
         'mdp = import_mdp()\n'
         'assert import_mdp() is mdp\n'
         'gone = set(vars(numpy)) - before[0]\n'

@@ -19,15 +19,15 @@ from metric_worlds import (
     turn,
 )
 
-from sfa_localization.config import MetricConfig, SegmentConfig
-from sfa_localization.elimination import Links, Problem, Stack, eliminate
-from sfa_localization.errors import DataError
-from sfa_localization.geometry import RigidTransform, align, compose, invert, wrap_angle
-from sfa_localization.metric import headings, learn, positions, with_frame
-from sfa_localization.paper_solver import Lines, Parameters, odometry_start
-from sfa_localization.phases import certify
-from sfa_localization.regression import MetricMap, Monomials, monomials
-from sfa_localization.segments import assignment, cut, join
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
+from sfa_localization.metric.expansions import MetricMap, Monomials, monomials
+from sfa_localization.metric.learning import headings, learn, positions, with_frame
+from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
+from sfa_localization.metric.phases import certify
+from sfa_localization.metric.quadratic_form import Links, Problem, Stack, eliminate
+from sfa_localization.metric.segments import assignment, cut, join
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 ANY = SegmentConfig()
 STRAIGHT = SegmentConfig(segments='straight')

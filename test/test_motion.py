@@ -9,11 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfa_localization import motion
-from sfa_localization.config import FilterConfig
-from sfa_localization.correlation import resolved
-from sfa_localization.geometry import wrap_angle
-from sfa_localization.motion import BIAS, ERROR, OMEGA, SCALE, SIZE, YAW, State, Twist, V
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.fusion import motion
+from sfa_localization.fusion.motion import BIAS, ERROR, OMEGA, SCALE, SIZE, YAW, State, Twist, V
+from sfa_localization.fusion.settings import FilterConfig, resolved
 
 CONFIG = resolved(FilterConfig())
 QUIET = replace(CONFIG, slip_per_metre=0.0, yaw_per_metre=0.0, yaw_per_radian=0.0, bias_walk=0.0,

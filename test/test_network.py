@@ -8,9 +8,9 @@ import pytest
 from cylinder_worlds import ARCHITECTURE, LAYERS, SIZE
 from test_rotation import views
 
-from sfa_localization.errors import ConfigError, ModelError
-from sfa_localization.network import LAYERS as STANDARD
-from sfa_localization.network import (
+from sfa_localization.data.errors import ConfigError, ModelError
+from sfa_localization.features.network import LAYERS as STANDARD
+from sfa_localization.features.network import (
     NORMALIZATIONS,
     Architecture,
     Layer,

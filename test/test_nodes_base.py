@@ -9,9 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sfa_localization.config import NodeConfig, PanoramaConfig, Settings, setting
-from sfa_localization.decoding import read_stamp, read_yaw
-from sfa_localization.errors import ConfigError, LocalizationError, MessageError
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError
+from sfa_localization.data.messages import read_stamp, read_yaw
+from sfa_localization.data.settings import Settings, setting
+from sfa_localization.nodes.settings import NodeConfig
 
 rclpy = pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe, visit
 
-from sfa_localization.errors import DataError
-from sfa_localization.novelty import Familiarity, Novelty, describe
+from sfa_localization.data.errors import DataError
+from sfa_localization.features.novelty import Familiarity, Novelty, describe
 
 
 @pytest.fixture(scope='module')

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from picture_readers import PictureReader, panorama
 
-from sfa_localization.config import WatchConfig
-from sfa_localization.errors import ModelError
-from sfa_localization.events import ODOMETRY, PICTURE, in_order
-from sfa_localization.observation import Observer, PictureWatch, unusable_covariance
-from sfa_localization.pose_filter import PoseFilter
-from sfa_localization.run import BATCH, Odometry, PanoramaArray, Run
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.data.errors import ModelError
+from sfa_localization.data.events import ODOMETRY, PICTURE, in_order
+from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.localizer import Observer, unusable_covariance
 
 
 def test_a_good_picture_is_believed():

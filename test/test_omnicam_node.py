@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig
-from sfa_localization.config_file import load_settings, write_config
-from sfa_localization.panorama import Unwrapper
-from sfa_localization.pictures import decode_compressed, encode_jpeg
+from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, OmnicamNodeConfig, PanoramaConfig
+from sfa_localization.config import load_settings, write_config
 
 rclpy = pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros

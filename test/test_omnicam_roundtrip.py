@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sfa_localization.config import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 
 rclpy = pytest.importorskip('rclpy')
 pytest.importorskip('trimesh')
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 
 from omnicam_bench import Bench, image_message, new_context, pixels, send_until  # noqa: E402
 
-from sfa_localization.garden import Garden  # noqa: E402
+from sfa_localization.simulation.garden import Garden  # noqa: E402
 
 OPEN = {'radius_min': 0.0, 'radius_max': 0.0}
 CAMERAS = {

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from picture_readers import SIZE, PictureReader, Recording
 
-from sfa_localization.config import FilterConfig, WatchConfig
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.data.events import ODOMETRY
+from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import evaluate, fit_transform, moved
-from sfa_localization.events import ODOMETRY
+from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.run import Trajectory
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -20,7 +21,7 @@ from geometry_msgs.msg import PoseStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from ros_bench import Bench, until  # noqa: E402
 
-from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
+from sfa_localization.data.messages import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     to_image,
     to_odometry,

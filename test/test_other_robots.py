@@ -13,13 +13,14 @@ import pytest
 from cylinder_worlds import PLACE_SIZE, Spheres, recipe, run_in, visit, wander
 from metric_worlds import criss_cross, drive, garden_features
 
-from sfa_localization import metric, training
-from sfa_localization.camera_clock import CameraClock
-from sfa_localization.config import MetricConfig, SegmentConfig
-from sfa_localization.geometry import align, compose, wrap_angle
-from sfa_localization.hierarchy import architecture_of, train_network
-from sfa_localization.run import Odometry, PanoramaArray, YawRate
-from sfa_localization.segments import cut, join
+from sfa_localization import training
+from sfa_localization.data.geometry import align, compose, wrap_angle
+from sfa_localization.data.run import Odometry, PanoramaArray, YawRate
+from sfa_localization.features.network_training import architecture_of, train_network
+from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.metric import learning as metric
+from sfa_localization.metric.segments import cut, join
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.training import drive_of, learn_place
 
 QUICK = MetricConfig(metric_map='monomials', slow_features=5, ridge=1e-4, require_certificate=False)

@@ -10,10 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.cameras import make_camera
-from sfa_localization.config import CameraConfig, PanoramaConfig
-from sfa_localization.errors import CameraError
-from sfa_localization.panorama import (
+from sfa_localization.camera.lenses import make_camera
+from sfa_localization.camera.panorama import (
     Unwrapper,
     _in_sectors,
     looks_like_panorama,
@@ -21,6 +19,8 @@ from sfa_localization.panorama import (
     normalized,
     panorama_rays,
 )
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.data.errors import CameraError
 
 SIZE = (400, 400)
 SMALL = PanoramaConfig(width=180, height=24)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, exact_features
 
-from sfa_localization.config import MetricConfig, SegmentConfig
-from sfa_localization.elimination import Links, Stack
-from sfa_localization.errors import DataError
-from sfa_localization.paper_solver import (
+from sfa_localization.data.errors import DataError
+from sfa_localization.metric.expansions import monomials
+from sfa_localization.metric.paper_solver import (
     Lines,
     Parameters,
     descend,
@@ -17,8 +16,9 @@ from sfa_localization.paper_solver import (
     odometry_start,
     random_start,
 )
-from sfa_localization.regression import monomials
-from sfa_localization.segments import cut
+from sfa_localization.metric.quadratic_form import Links, Stack
+from sfa_localization.metric.segments import cut
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 
 def problem(turns=True, seed=0):

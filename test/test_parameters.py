@@ -32,32 +32,30 @@ from metric_worlds import (
 )
 from test_commands import OPTIONS, parser_of
 
-from sfa_localization import cli, metric, sources
-from sfa_localization.bag import Bag, BagWriter, load_run
-from sfa_localization.config import (
-    BagConfig,
+from sfa_localization import cli
+from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.settings import BagConfig
+from sfa_localization.camera import capture as sources
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import (
     CameraConfig,
-    EkfNodeConfig,
-    FilterConfig,
-    HeadingConfig,
-    MetricConfig,
-    NetworkConfig,
-    NodeConfig,
     OmnicamNodeConfig,
     PanoramaConfig,
-    SegmentConfig,
-    Settings,
-    SfaNodeConfig,
     WatchConfig,
 )
-from sfa_localization.errors import LocalizationError
-from sfa_localization.hierarchy import architecture_of, train_network
-from sfa_localization.metric import learn, positions
-from sfa_localization.observation import PictureWatch
-from sfa_localization.panorama import Unwrapper
-from sfa_localization.pose_filter import PoseFilter
-from sfa_localization.run import Odometry, PanoramaArray, Run
-from sfa_localization.segments import Segments, cut
+from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.run import Odometry, PanoramaArray, Run
+from sfa_localization.data.settings import Settings
+from sfa_localization.features.network_training import architecture_of, train_network
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.metric import learning as metric
+from sfa_localization.metric.learning import learn, positions
+from sfa_localization.metric.segments import Segments, cut
+from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
+from sfa_localization.nodes.settings import EkfNodeConfig, NodeConfig, SfaNodeConfig
 from sfa_localization.training import drive_of, learn_place
 
 GROUPS = {

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sfa_localization.phases import (
+from sfa_localization.metric.phases import (
     angle_hessian,
     certify,
     metric_upgrade,

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.errors import CameraError
-from sfa_localization.pictures import (
+from sfa_localization.camera.encodings import (
     ENCODINGS,
     decode_compressed,
     decode_image,
     encode_jpeg,
     encode_png,
 )
+from sfa_localization.data.errors import CameraError
 
 BLUE, GREEN, RED = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
 
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.errors import ModelError
-from sfa_localization.fast_map import FastProcess, fast_map
-from sfa_localization.geometry import wrap_angle
-from sfa_localization.heading import UNKNOWN_YAW_VARIANCE
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import ModelError
+from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.localizer import Localizer
+from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
+from sfa_localization.metric.fast_expansions import FastProcess, fast_map
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, read_arrays
 
 

@@ -30,9 +30,9 @@ from bag_formats import (
     write_version,
 )
 
-from sfa_localization.config import PlayConfig
-from sfa_localization.errors import BagError
-from sfa_localization.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace
+from sfa_localization.commands.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace
+from sfa_localization.commands.settings import PlayConfig
+from sfa_localization.data.errors import BagError
 
 DEADLINE_S = 30.0
 DOMAIN = 67
@@ -154,8 +154,8 @@ from rosbags.interfaces import (  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Image, Imu  # noqa: E402
 
-from sfa_localization.bag import Bag  # noqa: E402
-from sfa_localization.play import SETTLED_S, Player, message_class, play, qos_profile  # noqa: E402
+from sfa_localization.bags.loading import Bag  # noqa: E402
+from sfa_localization.commands.play import SETTLED_S, Player, message_class, play, qos_profile  # noqa: E402
 
 NO_TIME = QosTime(9223372036, 854775807)
 ROS = pytest.mark.ros

@@ -11,10 +11,10 @@ import pytest
 from filter_drives import START_NS, Drive, winding
 from scipy.stats import chi2
 
-from sfa_localization.config import FilterConfig
-from sfa_localization.errors import ConfigError, DataError
-from sfa_localization.geometry import wrap_angle
-from sfa_localization.pose_filter import Level, PoseFilter
+from sfa_localization.data.errors import ConfigError, DataError
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.fusion.pose_filter import Level, PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
 
 SECOND = 1_000_000_000
 NOISY = {

@@ -11,8 +11,8 @@ import time
 import psutil
 import pytest
 
-from sfa_localization.errors import NodeError
-from sfa_localization.processes import Processes, terminable
+from sfa_localization.commands.processes import Processes, terminable
+from sfa_localization.data.errors import NodeError
 
 DEADLINE_S = 20
 WAIT = 'import time; print("ready", flush=True); time.sleep(60)'
@@ -93,7 +93,7 @@ def test_nothing_is_left_when_the_starter_is_told_to_end(tmp_path, number):
     code = f"""
 import os, time
 from pathlib import Path
-from sfa_localization.processes import Processes, terminable
+from sfa_localization.commands.processes import Processes, terminable
 with terminable(), Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as processes:
     processes.start('node', [{sys.executable!r}, '-c', {WAIT!r}])
     while 'ready' not in processes.log('node').read_text():

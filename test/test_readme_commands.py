@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.bag_reader import Bag
-from sfa_localization.config import DemoConfig
-from sfa_localization.geometry import align
+from sfa_localization.bags.reader import Bag
+from sfa_localization.commands.settings import DemoConfig
+from sfa_localization.data.geometry import align
 from sfa_localization.place_model import PlaceModel
 
 ROOT = Path(__file__).parents[1]
@@ -96,7 +96,7 @@ def test_report_holds_its_pictures(folder):
 @pytest.mark.ros
 def test_nodes_run_as_told(folder, monkeypatch):
     pytest.importorskip('rclpy')
-    from sfa_localization import demo_nodes
+    from sfa_localization.commands import demo_nodes
 
     monkeypatch.chdir(folder)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What senders write can fill neither the memory nor the diagnostics."""
 
-from sfa_localization.bag_stream import Tally
-from sfa_localization.reasons import LONGEST, MOST, OTHER, ReasonCounter, bounded
+from sfa_localization.bags.streams import Tally
+from sfa_localization.data.reasons import LONGEST, MOST, OTHER, ReasonCounter, bounded
 
 
 def test_reasons_are_counted_apart_up_to_a_number_and_then_together():

@@ -5,9 +5,16 @@
 import numpy as np
 import pytest
 
-from sfa_localization.errors import DataError, ModelError
-from sfa_localization.geometry import RigidTransform
-from sfa_localization.regression import MetricMap, Monomials, Process, matern, monomials, spread
+from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.data.geometry import RigidTransform
+from sfa_localization.metric.expansions import (
+    MetricMap,
+    Monomials,
+    Process,
+    matern,
+    monomials,
+    spread,
+)
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.standard_normal((80, 6))

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization import report
-from sfa_localization.errors import LocalizationError
-from sfa_localization.run import Trajectory
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.run import Trajectory
+from sfa_localization.reports import evaluation as report
 
 SECOND = 1_000_000_000
 

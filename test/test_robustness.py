@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from robustness import TABLE, robustness_table
 
-from sfa_localization.config import FilterConfig, PanoramaConfig
-from sfa_localization.correlation import ErrorCorrelation
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.place_model import Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
@@ -43,7 +44,7 @@ from ros_bench import Bench, until  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Empty, String  # noqa: E402
 
-from sfa_localization.decoding import read_stamp  # noqa: E402
+from sfa_localization.data.messages import read_stamp  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     to_image,
     to_odometry,

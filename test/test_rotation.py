@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.rotation import (
+from sfa_localization.features.rotation import (
     Field,
     FieldStatistics,
     SampleStatistics,
@@ -15,7 +15,7 @@ from sfa_localization.rotation import (
     strips,
     unfold,
 )
-from sfa_localization.sfa import Statistics
+from sfa_localization.features.sfa import Statistics
 
 FIELDS = (
     Field(2, 3, 1),

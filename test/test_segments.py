@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, meander, stand, straight, turn
 
-from sfa_localization.config import SegmentConfig
-from sfa_localization.errors import DataError
-from sfa_localization.geometry import compose, relative, wrap_angle
-from sfa_localization.run import Odometry, Trajectory, YawRate
-from sfa_localization.segments import assignment, cut, join
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import compose, relative, wrap_angle
+from sfa_localization.data.run import Odometry, Trajectory, YawRate
+from sfa_localization.metric.segments import assignment, cut, join
+from sfa_localization.metric.settings import SegmentConfig
 
 ANY = SegmentConfig()
 STRAIGHT = SegmentConfig(segments='straight')

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.errors import DataError
-from sfa_localization.sfa import Statistics, StreamingSFA, solve
+from sfa_localization.data.errors import DataError
+from sfa_localization.features.sfa import Statistics, StreamingSFA, solve
 
 PERIODS = (400.0, 130.0, 47.0, 9.0)
 

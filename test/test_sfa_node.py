@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from sfa_localization.config import PanoramaConfig
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.errors import ModelError
-from sfa_localization.observation import UNKNOWN_VARIANCE
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import ModelError
+from sfa_localization.localizer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
@@ -34,7 +34,7 @@ from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
 from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from sfa_localization.decoding import read_stamp, read_yaw  # noqa: E402
+from sfa_localization.data.messages import read_stamp, read_yaw  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_error_correlation,
     read_pose,

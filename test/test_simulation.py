@@ -15,18 +15,15 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from sfa_localization.camera.encodings import decode_compressed
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.cli import main
-from sfa_localization.config import CameraConfig, PanoramaConfig, SimulationConfig
-from sfa_localization.errors import BagError, CameraError, ConfigError
-from sfa_localization.garden import Garden, panel
-from sfa_localization.geometry import compose, relative, wrap_angle
-from sfa_localization.panorama import Unwrapper
-from sfa_localization.pictures import decode_compressed
-from sfa_localization.pose_filter import PoseFilter
-from sfa_localization.rendering import Dome, Light, Scene
-from sfa_localization.routes import CLEARANCE_M, ROUTES, Lawn
-from sfa_localization.run import differences, integrate
-from sfa_localization.simulation import (
+from sfa_localization.data.errors import BagError, CameraError, ConfigError
+from sfa_localization.data.geometry import compose, relative, wrap_angle
+from sfa_localization.data.run import differences, integrate
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.simulation.drive import (
     START_NS,
     drive,
     lights,
@@ -34,6 +31,10 @@ from sfa_localization.simulation import (
     simulate,
     wandering,
 )
+from sfa_localization.simulation.garden import Garden, panel
+from sfa_localization.simulation.rendering import Dome, Light, Scene
+from sfa_localization.simulation.routes import CLEARANCE_M, ROUTES, Lawn
+from sfa_localization.simulation.settings import SimulationConfig
 
 TINY = SimulationConfig(area=(8.0, 8.0), length=20.0, images='panorama', images_every=0.4)
 SMALL = PanoramaConfig(width=300, height=30)

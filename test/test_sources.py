@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.config import OmnicamNodeConfig
-from sfa_localization.errors import CameraError
-from sfa_localization.sources import Feed, FrozenWatch, Lost, opener
+from sfa_localization.camera.capture import Feed, FrozenWatch, Lost, opener
+from sfa_localization.camera.settings import OmnicamNodeConfig
+from sfa_localization.data.errors import CameraError
 
 PATIENCE_S = 10.0
 

@@ -10,12 +10,12 @@ import pytest
 from cylinder_worlds import Spheres, panorama_config, recipe, run_in, wander
 
 from sfa_localization import training
-from sfa_localization.bag import BagWriter
-from sfa_localization.config import NetworkConfig
-from sfa_localization.errors import DataError, LocalizationError, ModelError
-from sfa_localization.metric import positions
+from sfa_localization.bags.loading import BagWriter
+from sfa_localization.data.errors import DataError, LocalizationError, ModelError
+from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.run import Count, Odometry, PanoramaArray, Run
 from sfa_localization.training import Recipe, drive_of, read_drive, summary, train
 
 PICTURES = 160

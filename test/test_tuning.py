@@ -7,10 +7,10 @@ import pytest
 from filter_drives import Drive
 
 from sfa_localization import tuning
-from sfa_localization.config import FilterConfig, TuneConfig
-from sfa_localization.errors import DataError
-from sfa_localization.run import Odometry, Trajectory
-from sfa_localization.tuning import Outcome, Sight, Tour
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.run import Odometry, Trajectory
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.tuning import Outcome, Sight, Tour, TuneConfig
 
 
 def tour(told=0.2, true=0.2, seed=0, truth=True, seconds=40):

@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
-from sfa_localization.bag import load_run
-from sfa_localization.geometry import wrap_angle
-from sfa_localization.run import Odometry, PanoramaArray, Run, integrate
-from sfa_localization.visual_turns import camera_clock, headings
+from sfa_localization.bags.loading import load_run
+from sfa_localization.camera.turns import headings
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
+from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 
 BAGS = Path(__file__).parents[1] / 'bags'
 SIZE = (20, 120)
+
+
+def clock_of(run: Run) -> CameraClock:
+    return camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
 
 
 def run_of(odometry, seed=0, every=3, clockwise=True):
@@ -44,7 +49,7 @@ def test_the_columns_shift_as_the_robot_turns(clockwise):
 def test_a_delay_is_found_within_what_is_claimed(delay):
     for seed in range(4):
         run = late(run_of(wander(400, seed, hz=20.0), seed, clockwise=seed % 2 == 0), delay)
-        clock = camera_clock(run)
+        clock = clock_of(run)
         assert clock.known and clock.std_s < 0.02
         assert abs(clock.delay_s - delay) < 3 * clock.std_s + 1e-3
 
@@ -58,7 +63,7 @@ def test_the_frame_and_the_rate_of_the_odometry_do_not_matter():
         replace(odometry, poses=turned),
         Odometry(*(getattr(odometry, n)[slow] for n in Odometry.__slots__)),
     ):
-        assert camera_clock(replace(run, odometry=other)).delay_s == pytest.approx(0.1, abs=0.02)
+        assert clock_of(replace(run, odometry=other)).delay_s == pytest.approx(0.1, abs=0.02)
 
 
 def test_what_the_robot_carries_in_every_image_does_not_count():
@@ -66,7 +71,7 @@ def test_what_the_robot_carries_in_every_image_does_not_count():
     images = run.panoramas.images.copy()
     images[:, :, 20:35], images[:, -6:, 60:100] = 0, 255
     masked = replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images))
-    assert camera_clock(masked).delay_s == pytest.approx(0.2, abs=0.02)
+    assert clock_of(masked).delay_s == pytest.approx(0.2, abs=0.02)
 
 
 @pytest.mark.parametrize('kind', ['straight', 'even', 'noise', 'dark', 'few'])
@@ -86,7 +91,7 @@ def test_where_nothing_shows_the_delay_none_is_claimed(kind):
     if kind == 'few':
         images = images[:5]
     run = replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns[: len(images)], images))
-    clock = camera_clock(run)
+    clock = clock_of(run)
     assert not clock.known and clock.delay_ns == 0
 
 
@@ -94,5 +99,5 @@ def test_where_nothing_shows_the_delay_none_is_claimed(kind):
 def test_the_sample_is_on_one_clock(name, tmp_path):
     run = load_run(BAGS / name, cache=tmp_path)
     for delay in (0.0, 0.15):
-        clock = camera_clock(late(run, delay))
+        clock = clock_of(late(run, delay))
         assert clock.known and abs(clock.delay_s - delay) < 3 * clock.std_s

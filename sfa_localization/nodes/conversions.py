@@ -30,22 +30,20 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
-from sfa_localization.config import PanoramaConfig
-from sfa_localization.correlation import ErrorCorrelation
-from sfa_localization.decoding import (
+from sfa_localization.camera.encodings import encode_jpeg, read_compressed, read_raw
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import ConfigError, DataError, MessageError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import (
     NANOSECONDS,
-    read_compressed,
     read_planar,
-    read_raw,
     read_stamp,
     read_twist,
     read_yaw,
     require_sane,
 )
-from sfa_localization.errors import ConfigError, DataError, MessageError
-from sfa_localization.geometry import Array
-from sfa_localization.pictures import encode_jpeg
-from sfa_localization.run import Image
+from sfa_localization.data.run import Image
 
 _FIXED_VARIANCE = 1e-6
 """Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""

@@ -24,10 +24,12 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from sfa_localization.config import EkfNodeConfig, FilterConfig, Settings
-from sfa_localization.decoding import require_sane
-from sfa_localization.errors import MessageError
-from sfa_localization.geometry import compose, invert
+from sfa_localization.data.errors import MessageError
+from sfa_localization.data.geometry import compose, invert
+from sfa_localization.data.messages import require_sane
+from sfa_localization.data.settings import Settings
+from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
+from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes.conversions import (
     Motion,
     read_error_correlation,
@@ -48,7 +50,7 @@ from sfa_localization.nodes.lifecycle import (
     sensor_qos,
 )
 from sfa_localization.nodes.monitor import steady_s
-from sfa_localization.pose_filter import Level, PoseFilter, State, Status, Update
+from sfa_localization.nodes.settings import EkfNodeConfig
 
 try:
     from tf2_msgs.msg import TFMessage

@@ -23,12 +23,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from sfa_localization.config import NodeConfig, Settings
-from sfa_localization.errors import ConfigError, LocalizationError
+from sfa_localization.data.errors import ConfigError, LocalizationError
+from sfa_localization.data.reasons import bounded
+from sfa_localization.data.settings import Settings
+from sfa_localization.data.threads import one_core
 from sfa_localization.nodes import parameters, signals
 from sfa_localization.nodes.monitor import Monitor
-from sfa_localization.reasons import bounded
-from sfa_localization.threads import one_core
+from sfa_localization.nodes.settings import NodeConfig
 
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE

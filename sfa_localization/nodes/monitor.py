@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from sfa_localization.reasons import ReasonCounter
+from sfa_localization.data.reasons import ReasonCounter
 
 _WINDOW = 500
 

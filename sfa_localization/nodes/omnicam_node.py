@@ -20,8 +20,12 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
-from sfa_localization.config import CameraConfig, OmnicamNodeConfig, PanoramaConfig, Settings
-from sfa_localization.errors import LocalizationError, MessageError
+from sfa_localization.camera.capture import Feed, FeedStatus, FrozenWatch, opener
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, OmnicamNodeConfig, PanoramaConfig
+from sfa_localization.data.errors import LocalizationError, MessageError
+from sfa_localization.data.run import Image
+from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import parameters
 from sfa_localization.nodes.conversions import read_image, to_compressed, to_image, to_info
 from sfa_localization.nodes.lifecycle import (
@@ -32,9 +36,6 @@ from sfa_localization.nodes.lifecycle import (
     sensor_qos,
 )
 from sfa_localization.nodes.monitor import steady_s
-from sfa_localization.panorama import Unwrapper
-from sfa_localization.run import Image
-from sfa_localization.sources import Feed, FeedStatus, FrozenWatch, opener
 
 _DEMAND_PERIOD_S = 0.1
 _LITTLE_SEEN = 0.5

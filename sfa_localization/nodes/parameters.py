@@ -20,9 +20,9 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import Settings, nearest
-from sfa_localization.config_file import SECTIONS
-from sfa_localization.errors import ConfigError
+from sfa_localization.config import SECTIONS
+from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.settings import Settings, nearest
 
 S = TypeVar('S', bound=Settings)
 _LARGEST_INTEGER = 2**63 - 1

@@ -19,8 +19,10 @@ from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from sfa_localization.config import PanoramaConfig, Settings, SfaNodeConfig, WatchConfig
-from sfa_localization.errors import ConfigError, LocalizationError, MessageError, ModelError
+from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
+from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError, ModelError
+from sfa_localization.data.settings import Settings
+from sfa_localization.localizer import Observation, Observer
 from sfa_localization.nodes.conversions import (
     read_image,
     read_info,
@@ -36,7 +38,7 @@ from sfa_localization.nodes.lifecycle import (
     run_node,
     sensor_qos,
 )
-from sfa_localization.observation import Observation, Observer
+from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.place_model import PlaceModel
 
 _TURNED_FRAME = 'first_image'

@@ -19,7 +19,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bag import Bag, BagWriter
+from sfa_localization.bags.loading import Bag, BagWriter
 
 START = 1_700_000_000_000_000_000
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -30,7 +30,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
-from sfa_localization.decoding import read_stamp
+from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import (
     to_image,
     to_odometry,

@@ -18,11 +18,10 @@ import time
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from sfa_localization import motion
-from sfa_localization.config import FilterConfig
-from sfa_localization.correlation import resolved
-from sfa_localization.motion import ERROR, SIZE, YAW, Twist
-from sfa_localization.pose_filter import PoseFilter
+from sfa_localization.fusion import motion
+from sfa_localization.fusion.motion import ERROR, SIZE, YAW, Twist
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig, resolved
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 20_000_000

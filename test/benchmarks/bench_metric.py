@@ -22,21 +22,21 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from metric_worlds import Drive, criss_cross, drive, garden_features, grid, meander
 
-from sfa_localization.config import MetricConfig, SegmentConfig
-from sfa_localization.elimination import Links, Stack
-from sfa_localization.errors import DataError
-from sfa_localization.fitting import fit
-from sfa_localization.geometry import align
-from sfa_localization.paper_solver import (
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import align
+from sfa_localization.metric.alternation import fit
+from sfa_localization.metric.expansions import Monomials, monomials
+from sfa_localization.metric.paper_solver import (
     Lines,
     descend,
     odometry_start,
     random_start,
 )
-from sfa_localization.phases import phase_cost
-from sfa_localization.regression import Monomials, monomials
-from sfa_localization.segments import Segments, cut
-from sfa_localization.sufficiency import check, diagnose
+from sfa_localization.metric.phases import phase_cost
+from sfa_localization.metric.quadratic_form import Links, Stack
+from sfa_localization.metric.segments import Segments, cut
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.sufficiency import check, diagnose
 
 NOISE = {'bias': 1e-3, 'yaw_noise': 0.01, 'speed_noise': 0.03}
 # The paper's eight features and no ridge; the yaw-rate bias has no place in its costs.

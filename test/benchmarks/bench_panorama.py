@@ -16,8 +16,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from sfa_localization.config import CameraConfig, PanoramaConfig
-from sfa_localization.panorama import Unwrapper, build_tables
+from sfa_localization.camera.panorama import Unwrapper, build_tables
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 
 CAMERA = CameraConfig(
     image_width=1280,
@@ -79,7 +79,7 @@ def bench_unwrap(rounds: int = 400) -> dict[str, float]:
 
 def bench_roundtrip() -> dict[str, float]:
     """PSNR in dB of unwrapped simulated pictures against the directly rendered panorama."""
-    from sfa_localization.garden import Garden
+    from sfa_localization.simulation.garden import Garden
 
     lens = {'radius_min': 0.0, 'radius_max': 0.0, 'image_width': 800, 'image_height': 800}
     center = {'cx': 399.5, 'cy': 399.5}

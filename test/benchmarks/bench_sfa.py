@@ -25,20 +25,28 @@ import numpy as np
 import psutil
 from scipy import linalg
 
-from sfa_localization import hierarchy, mdp_engine
-from sfa_localization.agreement import Agreement
-from sfa_localization.config import HeadingConfig, MetricConfig, NetworkConfig, PanoramaConfig
-from sfa_localization.errors import ConfigError
-from sfa_localization.fast_map import FastProcess
-from sfa_localization.heading import Compass, _kernel, _solve, harmonics
-from sfa_localization.hierarchy import Drive, architecture_of, in_this_process, train_network
-from sfa_localization.network import prepare
-from sfa_localization.novelty import Novelty, describe
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.run import PanoramaArray
+from sfa_localization.data.threads import one_core
+from sfa_localization.features import mdp_engine
+from sfa_localization.features import network_training as hierarchy
+from sfa_localization.features.agreement import Agreement
+from sfa_localization.features.network import prepare
+from sfa_localization.features.network_training import (
+    Drive,
+    architecture_of,
+    in_this_process,
+    train_network,
+)
+from sfa_localization.features.novelty import Novelty, describe
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.sfa import StreamingSFA
+from sfa_localization.metric.compass import Compass, _kernel, _solve, harmonics
+from sfa_localization.metric.expansions import MetricMap, Process
+from sfa_localization.metric.fast_expansions import FastProcess
+from sfa_localization.metric.settings import HeadingConfig, MetricConfig
 from sfa_localization.place_model import PlaceModel, heading_input, top_features
-from sfa_localization.regression import MetricMap, Process
-from sfa_localization.run import PanoramaArray
-from sfa_localization.sfa import StreamingSFA
-from sfa_localization.threads import one_core
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773

@@ -37,10 +37,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe
 
-from sfa_localization.decoding import read_stamp
+from sfa_localization.data.messages import read_stamp
+from sfa_localization.data.threads import one_core
 from sfa_localization.nodes.conversions import to_image, to_odometry
 from sfa_localization.nodes.lifecycle import latched_qos
-from sfa_localization.threads import one_core
 
 DOMAIN = 69
 START_NS = 1_700_000_000_000_000_000

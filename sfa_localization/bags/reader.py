@@ -1,0 +1,327 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read a recorded drive: any ROS 1 or ROS 2 bag as pictures, odometry, yaw rates and poses.
+
+Nothing is lost in silence: what a bag says it holds is compared with what was read, and every
+message that is not used is counted with its reason. Bags are never written to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.interfaces import Qos
+
+from sfa_localization.bags import messages
+from sfa_localization.bags.arrays import (
+    Values,
+    poses_stand,
+    to_odometry,
+    to_trajectory,
+    to_yaw_rate,
+)
+from sfa_localization.bags.recording import Recording
+from sfa_localization.bags.settings import BagConfig
+from sfa_localization.bags.storage import Channel, Record, inflate_message
+from sfa_localization.bags.streams import StampFilter, Stream, Tally
+from sfa_localization.data.errors import BagError, MessageError
+from sfa_localization.data.messages import read_yaw_rate
+from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
+
+SERIALIZATIONS = ('cdr', 'ros1')
+MAX_SHOWN = 8
+# More resets of the odometry than this are none: pose and twist are of different units.
+_RESETS_MIN, _RESETS_SHARE = 20, 0.01
+COMPRESSED_START = b'\x28'
+"""First byte of zstd data; no CDR message begins so."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a topic is wanted for: its name in errors, its flag, the types that can serve.
+
+    `found` are the types by which it is found, `named` those accepted when it is named.
+    """
+
+    title: str
+    flag: str
+    found: tuple[str, ...]
+    named: tuple[str, ...]
+
+
+_IMAGES = (messages.IMAGE, messages.COMPRESSED)
+KINDS = {
+    'image': Kind('pictures', '--image-topic', _IMAGES, _IMAGES),
+    'odometry': Kind('odometry', '--odom-topic', (messages.ODOMETRY,), messages.POSES),
+    'imu': Kind('yaw rates', '--imu-topic', (messages.IMU,), (messages.IMU,)),
+    'ground_truth': Kind(
+        'true poses', '--ground-truth-topic', messages.STAMPED_POSES, messages.POSES
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag; `count` is the larger of what its metadata and its files tell."""
+
+    name: str
+    kind: str
+    count: int
+    serialization: str
+    qos: tuple[Qos, ...]
+
+
+class Bag:
+    """Context manager over one bag: a folder, or a single .db3, .mcap or .bag file.
+
+    `strict` refuses damaged bags and messages instead of counting what is lost of them.
+    `stamp_source` is 'header' or 'receive' (None: as in `config`). Raises BagError.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        strict: bool = False,
+        stamp_source: str | None = None,
+        config: BagConfig | None = None,
+    ) -> None:
+        self.path, self.config, self.strict = Path(path), config or BagConfig(), strict
+        self._by_header = (stamp_source or self.config.stamp_source) == 'header'
+        self._decode = messages.Decoder()
+        self._tallies: dict[str, Tally] = {}
+        self._recording: Recording | None = None
+
+    def __enter__(self) -> Bag:
+        self._recording = Recording(self.path)
+        self._refuse_problems()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.recording.close()
+        self._recording = None
+
+    @property
+    def recording(self) -> Recording:
+        """The files beneath. Raises BagError outside the `with` block."""
+        if self._recording is None:
+            raise BagError(f'{self.path}: is not open; use it in a with statement')
+        return self._recording
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """All topics by name."""
+        return {name: self._topic(channel) for name, channel in self.recording.channels.items()}
+
+    def _topic(self, channel: Channel) -> Topic:
+        recording, name = self.recording, channel.topic
+        count = max(recording.declared.get(name, 0), recording.stored(name))
+        return Topic(name, channel.kind, count, channel.serialization, channel.qos)
+
+    @property
+    def counts(self) -> dict[str, Count]:
+        """What became of the messages of each topic read so far."""
+        return {topic: tally.count for topic, tally in self._tallies.items()}
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found damaged or missing so far."""
+        return self.recording.all_problems()
+
+    def find(self, kind: str, topic: str = '') -> str:
+        """Name of the topic that serves as `kind` (a key of KINDS): the named, or the only one.
+
+        Raises BagError when it is missing, of another type, or one of several.
+        """
+        wanted = KINDS[kind]
+        if topic:
+            return self._named(wanted, topic)
+        found = [t for t in self.topics.values() if t.kind in wanted.found and t.count]
+        if len(found) == 1:
+            return self._readable(found[0]).name
+        if not found:
+            types = ' or '.join(name.rsplit('/', 1)[1] for name in wanted.found)
+            raise BagError(
+                f'{self.path}: has no {wanted.title} ({types}); {self._contents(wanted)}'
+            )
+        names = ', '.join(sorted(topic.name for topic in found))
+        raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
+                       f'choose one with {wanted.flag}')  # fmt: skip
+
+    def _named(self, wanted: Kind, name: str) -> str:
+        topic = self.topics.get(_plain_name(name)) or self.topics.get(_plain_name(name).lstrip('/'))
+        if topic is None:
+            raise BagError(f'{self.path}: has no topic {name}; {self._contents(wanted)}')
+        if topic.kind not in wanted.named:
+            types = ', '.join(entry.rsplit('/', 1)[1] for entry in wanted.named)
+            raise BagError(f'{self.path}: {topic.name} is {topic.kind or "of unknown type"}, not '
+                           f'one of {types}; name another with {wanted.flag}')  # fmt: skip
+        if topic.count == 0:
+            raise BagError(f'{self.path}: {topic.name} has no messages; {self._contents(wanted)}')
+        _, _, child_frame = name.partition(':')
+        return self._readable(topic).name + (f':{child_frame}' if child_frame else '')
+
+    def _readable(self, topic: Topic) -> Topic:
+        if topic.serialization in SERIALIZATIONS:
+            return topic
+        raise BagError(f'{self.path}: {topic.name} is serialized as {topic.serialization!r}; '
+                       f'only cdr can be read: record it so')  # fmt: skip
+
+    def _contents(self, wanted: Kind) -> str:
+        """What the bag has instead, and the remedy."""
+        kinds = [f'{t.name} ({t.kind.rsplit("/", 1)[-1]}, {t.count})' for t in self.topics.values()]
+        shown = ', '.join(sorted(kinds)[:MAX_SHOWN]) + (', ...' if len(kinds) > MAX_SHOWN else '')
+        return f'it has {shown or "no topics"}: record one, or name one with {wanted.flag}'
+
+    # Streams of values.
+
+    def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
+        """Stamps and pictures (H, W, 3) BGR, one at a time."""
+        stream = self.stream(self.find('image', topic), messages.image_of)
+        return ((stamp, image) for _, stamp, image in self.read([stream]))
+
+    def odometry(self, topic: str = '') -> Odometry:
+        """All odometry; of a topic that tells poses only, twists are their differences."""
+        stream = self.odometry_stream(topic)
+        return self.to_odometry(stream, [(stamp, value) for _, stamp, value in self.read([stream])])
+
+    def to_odometry(self, stream: Stream, values: Values) -> Odometry:
+        """Odometry of a stream's values; a reset is joined, and noted as a problem."""
+        odometry, resets = to_odometry(values, self.config.odometry_jump)
+        if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
+            raise BagError(
+                f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
+                f'{len(values)} messages: are both in metres, radians and seconds?'
+            )
+        if poses_stand(odometry):
+            text = f'{stream.topic}: the pose never moves; the twist is summed up instead'
+            self.recording.problems.append(text)
+            poses = integrate(odometry.stamps_ns, odometry.twists)
+            odometry = replace(odometry, poses=poses)
+        if resets:
+            text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
+            self.recording.problems.append(text)
+            self._refuse_problems()
+        return odometry
+
+    def yaw_rate(self, topic: str = '') -> YawRate:
+        """All yaw rates of an Imu."""
+        stream = self.stream(self.find('imu', topic), read_yaw_rate)
+        return to_yaw_rate([(stamp, value) for _, stamp, value in self.read([stream])])
+
+    def trajectory(self, topic: str = '') -> Trajectory:
+        """All poses of a topic, by default the one that holds true poses."""
+        stream = self.stream(self.find('ground_truth', topic), messages.pose_of)
+        return to_trajectory([(stamp, value) for _, stamp, value in self.read([stream])])
+
+    def odometry_stream(self, topic: str = '') -> Stream:
+        """Stream of (pose, twist and its variances, or None where only poses are told)."""
+        name = self.find('odometry', topic)
+        return self.stream(name, messages.odometry_of)
+
+    def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
+        """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
+        topic, _, child_frame = name.partition(':')
+        chooser = messages.TransformChooser(topic, child_frame)
+        is_tf = self.topics[topic].kind == messages.TF
+        return self._stream(topic, chooser if is_tf else _whole, convert)
+
+    def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
+        """A topic of any type, which may well be empty; `convert` gets None of unknown types."""
+        stream = self._stream(topic, _whole, convert)
+        channel = self.recording.channels[topic]
+        stream.opaque = not self._decode.knows(channel.kind, channel.serialization)
+        stream.required = False
+        return stream
+
+    def _stream(
+        self, topic: str, select: Callable[[Any], Any], convert: Callable[[Any], Any]
+    ) -> Stream:
+        self._tallies[topic] = tally = Tally(f'{self.path}: {topic}', self.strict)
+        stamps = StampFilter(int(self.config.clock_jump * 1e9), tally)
+        return Stream(topic, select, convert, stamps, tally)
+
+    def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
+        """Read the streams' topics in one pass: stream, stamp in ns, value.
+
+        Raises BagError when a topic gives nothing usable, or in strict reading on any loss.
+        """
+        streams = list(streams)
+        by_topic = {
+            stream.topic: [s for s in streams if s.topic == stream.topic] for stream in streams
+        }
+        for record in self.messages(by_topic):
+            for stream in by_topic[record[0].topic]:
+                for stamp_ns, value in self._pushed(stream, record):
+                    yield stream, stamp_ns, value
+        for stream in streams:
+            for stamp_ns, value in stream.flush():
+                yield stream, stamp_ns, value
+            self._check_complete(stream)
+
+    def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
+        """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
+        for record in self.recording.messages(set(topics), start_ns):
+            if record[2][:1] != COMPRESSED_START:
+                yield record
+                continue
+            try:
+                yield record[0], record[1], inflate_message(record[2])
+            except BagError as error:
+                self.recording.problems.append(f'{record[0].topic}: {error}')
+
+    def _pushed(self, stream: Stream, record: Record) -> Values:
+        """Stamps and values that a message gives its stream."""
+        channel, receive_ns, data = record
+        stream.received += 1
+        if stream.opaque:
+            return stream.push(receive_ns, receive_ns, None)
+        try:
+            part = stream.select(self._decode(data, channel.kind, channel.serialization))
+            if part is None:
+                stream.tally.leave('tells of other frames')
+                return []
+            stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
+        except MessageError as error:
+            stream.tally.skip(str(error))
+            return []
+        return stream.push(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part)
+
+    def _check_complete(self, stream: Stream) -> None:
+        """Compare what was read with what is said to be there; nothing usable is an error."""
+        expected, count = self.topics[stream.topic].count, stream.tally.count
+        if stream.received < expected:
+            lost = f'{stream.received} of {expected} messages read'
+            self.recording.problems.append(f'{stream.topic}: {lost}')
+            stream.tally.leave('lost in a damaged bag', expected - stream.received)
+        self._refuse_problems()
+        if stream.required and count.used == 0:
+            raise BagError(f'{self.path}: {stream.topic}: {_reasons(stream.tally.count)}')
+
+    def _refuse_problems(self) -> None:
+        if self.strict and self.problems:
+            raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
+
+
+def _whole(message: Any) -> Any:
+    return message
+
+
+def _plain_name(name: str) -> str:
+    """A topic's name without a frame, and with its leading slash."""
+    return '/' + name.partition(':')[0].lstrip('/')
+
+
+def _reasons(count: Count) -> str:
+    reasons = ', '.join(f'{number} {reason}' for reason, number in count.skipped.items())
+    remedy = '; try the time of reception (stamp_source: receive)' if 'zero' in reasons else ''
+    return f'no usable message ({reasons or "none recorded"}){remedy}'

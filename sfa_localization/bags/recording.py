@@ -1,0 +1,246 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A bag as it lies on disk: its files, its metadata, and what each of them says it holds."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+import yaml
+
+from sfa_localization.bags import mcap as bag_mcap
+from sfa_localization.bags import ros1 as bag_ros1
+from sfa_localization.bags import sqlite as bag_sqlite
+from sfa_localization.bags.storage import (
+    ZSTD_MAGIC,
+    Channel,
+    Record,
+    Storage,
+    inflate_file,
+    load_yaml,
+    make_channel,
+    one_line,
+)
+from sfa_localization.data.errors import BagError
+
+METADATA = 'metadata.yaml'
+NEWEST_METADATA = 9
+SUFFIXES = ('.db3', '.mcap', '.bag', '.db3.zstd', '.mcap.zstd')
+READERS: dict[bytes, type[Storage]] = {
+    bag_sqlite.MAGIC: bag_sqlite.SqliteStorage,
+    bag_mcap.MAGIC: bag_mcap.McapStorage,
+    bag_ros1.MAGIC: bag_ros1.Ros1Storage,
+}
+
+
+@dataclass
+class Metadata:
+    """What metadata.yaml tells, of any version: files, channels, messages per topic."""
+
+    files: list[str] = field(default_factory=list)
+    version: int = NEWEST_METADATA
+    channels: list[Channel] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    file_counts: dict[str, int] = field(default_factory=dict)
+
+
+class Recording:
+    """The files of a bag opened as one; `path` is a folder, a single file or a metadata.yaml.
+
+    `channels` are by topic, `declared` and `stored` the messages per topic as told by the
+    metadata and by the files, `problems` what is damaged, `notes` what is only unusual.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.parent if path.name == METADATA else path
+        self.problems: list[str] = []
+        self.notes: list[str] = []
+        self.storages: list[Storage] = []
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.metadata = self._read_metadata()
+        try:
+            self._open_files()
+        except BaseException:
+            self.close()
+            raise
+        self.declared = self.metadata.counts
+        self.channels = self._merge_channels()
+
+    def close(self) -> None:
+        """Release all files."""
+        for storage in self.storages:
+            storage.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def all_problems(self) -> list[str]:
+        """Problems of the bag and of its files, so far."""
+        return [*self.problems, *(text for storage in self.storages for text in storage.problems)]
+
+    def stored(self, topic: str) -> int:
+        """Messages of a topic as the files tell."""
+        return sum(storage.counts.get(topic, 0) for storage in self.storages)
+
+    def messages(self, topics: Collection[str], start_ns: int = 0) -> Iterator[Record]:
+        """Messages of the topics received at or after `start_ns`, file after file."""
+        for storage in self.storages:
+            yield from storage.messages(topics, start_ns)
+
+    @property
+    def start_ns(self) -> int:
+        """Reception of the first message."""
+        return min(storage.start_ns for storage in self.storages)
+
+    # What belongs to the bag.
+
+    def _read_metadata(self) -> Metadata:
+        if not self.path.exists():
+            raise BagError(f'{self.path}: no such bag; check the path')
+        if self.path.is_file():
+            return Metadata([self.path.name])
+        file = self.path / METADATA
+        if not file.exists():
+            self.notes.append(f'no {METADATA}; rebuilt from the files')
+            return self._rebuilt()
+        try:
+            metadata = parse_metadata(file.read_text(encoding='utf-8', errors='replace'))
+        except OSError as error:
+            raise BagError(f'{file}: cannot be read: {error.strerror}') from None
+        except ValueError as error:
+            self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files')
+            return self._rebuilt()
+        if metadata.version > NEWEST_METADATA:
+            self.notes.append(f'{METADATA} has version {metadata.version}, newer than known')
+        return metadata
+
+    def _rebuilt(self) -> Metadata:
+        try:
+            names = [file.name for file in self.path.iterdir() if file.name.endswith(SUFFIXES)]
+        except OSError as error:
+            raise BagError(f'{self.path}: cannot be read: {error.strerror}') from None
+        if not names:
+            raise BagError(f'{self.path}: no bag: it has neither {METADATA} nor .db3, .mcap, .bag')
+        return Metadata(sorted(names, key=_natural))
+
+    def _open_files(self) -> None:
+        folder = self.path if self.path.is_dir() else self.path.parent
+        failures: list[BagError] = []
+        for name in self.metadata.files:
+            try:
+                self._open_file(folder / name)
+            except BagError as failure:
+                failures.append(failure)
+        if not self.storages:
+            raise failures[0] if failures else BagError(f'{self.path}: {METADATA} names no files')
+        self.problems += [str(failure) for failure in failures]
+        if not self.metadata.counts:
+            self.storages.sort(key=lambda storage: storage.start_ns)
+
+    def _open_file(self, path: Path) -> None:
+        """Open one file by what its first bytes say it is. Raises BagError."""
+        try:
+            plain = self._plain(path)
+            self.storages.append(_opened(plain, path))
+            self.notes += self.storages[-1].notes
+        except FileNotFoundError:
+            count = self.metadata.file_counts.get(path.name)
+            lost = f' with {count} messages' if count else ''
+            raise BagError(f'{path}: is missing{lost}; copy the whole bag') from None
+        except OSError as error:
+            raise BagError(f'{path}: cannot be read: {error.strerror}') from None
+
+    def _plain(self, path: Path) -> Path:
+        """The file itself, or a decompressed copy of it."""
+        with path.open('rb') as file:
+            if file.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
+                return path
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix='bag-')
+        target = Path(self._folder.name) / path.stem
+        trouble = inflate_file(path, target)
+        if trouble:
+            self.problems.append(f'{path.name}: {trouble}')
+        return target
+
+    def _merge_channels(self) -> dict[str, Channel]:
+        """One channel per topic: the files' word counts, the metadata fills in."""
+        merged = {channel.topic: channel for channel in self.metadata.channels}
+        for storage in self.storages:
+            for channel in storage.channels:
+                told = merged.get(channel.topic)
+                if told is not None and told.kind and told.kind != channel.kind:
+                    text = f'{channel.topic} is {told.kind} in one place, {channel.kind} in another'
+                    self.notes.append(text)
+                merged[channel.topic] = _completed(channel, told)
+        return merged
+
+
+def _completed(channel: Channel, told: Channel | None) -> Channel:
+    if told is None or channel.qos:
+        return channel
+    return channel._replace(qos=told.qos)
+
+
+def _natural(name: str) -> list[Any]:
+    """Sorting key that puts bag_10 behind bag_2."""
+    parts = re.split(r'(\d+)', name)
+    return [(int(part), '') if part.isdigit() else (-1, part) for part in parts]
+
+
+def _opened(plain: Path, path: Path) -> Storage:
+    """Open a file, whose errors name the file it was decompressed from."""
+    try:
+        return open_storage(plain)
+    except BagError as error:
+        raise BagError(str(error).replace(str(plain), str(path))) from None
+
+
+def open_storage(path: Path) -> Storage:
+    """Open a bag file by its first bytes. Raises BagError, or OSError."""
+    with path.open('rb') as file:
+        start = file.read(max(map(len, READERS)))
+    if not start:
+        raise BagError(f'{path}: is empty (0 bytes); record it again')
+    for magic, reader in READERS.items():
+        if start.startswith(magic):
+            return reader(path)  # type: ignore[call-arg]
+    raise BagError(f'{path}: is no bag file: neither sqlite3, mcap nor ROS 1 by its first bytes')
+
+
+def parse_metadata(text: str) -> Metadata:
+    """Read metadata.yaml of any version. Raises ValueError when it does not make sense."""
+    try:
+        tree = load_yaml(text)
+        information = tree['rosbag2_bagfile_information']
+        topics = information['topics_with_message_count']
+        pairs = [(_channel(topic['topic_metadata']), topic['message_count']) for topic in topics]
+        return Metadata(
+            version=int(information['version']),
+            files=[PurePath(one_line(file)).name for file in information['relative_file_paths']],
+            channels=[channel for channel, _ in pairs],
+            counts=_summed([(channel.topic, int(count)) for channel, count in pairs]),
+            file_counts=_file_counts(information.get('files') or []),
+        )
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(type(error).__name__) from None
+
+
+def _channel(topic: dict[str, Any]) -> Channel:
+    qos = topic.get('offered_qos_profiles') or ''
+    return make_channel(topic['name'], topic['type'], topic['serialization_format'], qos)
+
+
+def _summed(counts: list[tuple[str, int]]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for topic, count in counts:
+        total[topic] = total.get(topic, 0) + count
+    return total
+
+
+def _file_counts(files: list[dict[str, Any]]) -> dict[str, int]:
+    return {PurePath(str(file['path'])).name: int(file['message_count']) for file in files}

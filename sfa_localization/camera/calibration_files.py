@@ -1,0 +1,204 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration files of other tools, read into camera parameters.
+
+Known are: camera_info as YAML (also as printed by ``ros2 topic echo``), what OpenCV's FileStorage
+writes (pinhole, fisheye, omnidir), Kalibr's camchain, camodocal's MEI and KANNALA_BRANDT, and
+OCamCalib's calib_results.txt.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.data.errors import CameraError, ConfigError
+
+_KNOWN = 'known are camera_info, OpenCV, Kalibr and camodocal YAML and OCamCalib calib_results.txt'
+_PLUMB_BOB = ('', 'none', 'plumb_bob', 'radtan', 'rational_polynomial')
+_FISHEYE = ('equidistant', 'equi', 'fisheye', 'kannala_brandt')
+
+
+def with_calibration(config: CameraConfig) -> CameraConfig:
+    """Return the parameters with those of `calibration_file`, where one is named, filled in.
+
+    Radii left at their defaults, which are those of the simulated mirror, then limit nothing.
+    """
+    if not config.calibration_file:
+        return config
+    values = read_calibration(Path(config.calibration_file))
+    defaults = CameraConfig()
+    for name in ('radius_min', 'radius_max'):
+        if getattr(config, name) == getattr(defaults, name):
+            values.setdefault(name, 0.0)
+    try:
+        return dataclasses.replace(config, calibration_file='', **values)
+    except ConfigError as error:
+        raise CameraError(f'{config.calibration_file}: {error}') from None
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """Read a calibration file into fields of CameraConfig.
+
+    Raises CameraError naming the file when it is missing, of an unknown kind, or of a camera
+    model that is not supported.
+    """
+    try:
+        text = path.read_text(encoding='utf-8', errors='replace')
+    except OSError as error:
+        raise CameraError(f'{path}: {error.strerror or error}') from None
+    try:
+        return _from_yaml(text) if path.suffix.lower() != '.txt' else _from_ocam(text)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise CameraError(f'{path}: no camera calibration ({error}); {_KNOWN}') from None
+    except CameraError as error:
+        raise CameraError(f'{path}: {error}') from None
+
+
+def _from_ocam(text: str) -> dict[str, Any]:
+    """OCamCalib's rows: polynomial, its inverse, center (row, column), c d e, size (H, W)."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and line.strip()[0] != '#']
+    numbers = [[float(entry) for entry in row] for row in rows]
+    if len(numbers) < 5 or int(numbers[0][0]) != len(numbers[0]) - 1:
+        raise CameraError('not the five rows of OCamCalib calib_results.txt')
+    (cy, cx), (height, width) = numbers[2], numbers[4]
+    return {
+        'camera_model': 'ocam',
+        'polynomial': tuple(numbers[0][1:]),
+        'affine': tuple(numbers[3]),
+        'cx': cx,
+        'cy': cy,
+        'image_width': int(width),
+        'image_height': int(height),
+    }
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """Plain YAML, and the matrices of OpenCV's FileStorage as mappings."""
+
+
+def _matrix_node(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return dict(loader.construct_mapping(node, deep=True))
+
+
+_Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _matrix_node)
+
+
+def _from_yaml(text: str) -> dict[str, Any]:
+    text = re.sub(r'\A%YAML:1\.0\s*', '', text)
+    try:
+        # A topic that is echoed ends each message with a document mark.
+        content = next(iter(yaml.load_all(text, _Loader)), None)
+    except yaml.YAMLError:
+        raise CameraError(f'not valid YAML; {_KNOWN}') from None
+    if not isinstance(content, Mapping):
+        raise CameraError(f'no camera calibration; {_KNOWN}')
+    if 'cam0' in content:
+        return _from_kalibr(content['cam0'])
+    if 'model_type' in content:
+        return _from_camodocal(content)
+    return _from_matrix(content)
+
+
+def _from_kalibr(camera: Mapping[str, Any]) -> dict[str, Any]:
+    model = camera['camera_model']
+    numbers = _numbers(camera['intrinsics'])
+    if model not in ('omni', 'pinhole'):
+        raise CameraError(
+            f'Kalibr camera model {model!r} is not supported; calibrate with omni-radtan or '
+            'pinhole-equi'
+        )
+    xi = numbers.pop(0) if model == 'omni' else 0.0
+    distortion = _numbers(camera.get('distortion_coeffs', []))
+    kind = str(camera.get('distortion_model', 'none'))
+    return {
+        **_lens(kind, numbers, distortion, xi, has_mirror=model == 'omni'),
+        **_size(*camera['resolution']),
+    }
+
+
+def _from_camodocal(content: Mapping[str, Any]) -> dict[str, Any]:
+    kind, projection = str(content['model_type']).upper(), content['projection_parameters']
+    size = _size(content['image_width'], content['image_height'])
+    if kind == 'MEI':
+        focal = [projection[name] for name in ('gamma1', 'gamma2', 'u0', 'v0')]
+        distortion = [content['distortion_parameters'][name] for name in ('k1', 'k2', 'p1', 'p2')]
+        xi = float(content['mirror_parameters']['xi'])
+        return {**_lens('radtan', _numbers(focal), _numbers(distortion), xi, True), **size}
+    if kind == 'KANNALA_BRANDT':
+        focal = [projection[name] for name in ('mu', 'mv', 'u0', 'v0')]
+        distortion = [projection[name] for name in ('k2', 'k3', 'k4', 'k5')]
+        return {**_lens('equidistant', _numbers(focal), _numbers(distortion)), **size}
+    raise CameraError(f'camodocal model {kind} is not supported; use MEI or KANNALA_BRANDT')
+
+
+def _from_matrix(content: Mapping[str, Any]) -> dict[str, Any]:
+    """camera_info and OpenCV: a camera matrix, coefficients, and in some way the kind of them."""
+    matrix = _numbers(_first(content, 'camera_matrix', 'K', 'k', 'cameraMatrix', 'intrinsics'))
+    if len(matrix) != 9:
+        raise CameraError(f'the camera matrix has {len(matrix)} numbers, not 9')
+    if matrix[0] == 0.0:
+        raise CameraError('the camera is not calibrated: its focal length is 0')
+    focal = [matrix[0], matrix[4], matrix[2], matrix[5]]
+    names = ('distortion_coefficients', 'D', 'd', 'distCoeffs', 'dist_coeffs')
+    distortion = _numbers(_first(content, *names))
+    kind = str(content.get('distortion_model', ''))
+    if content.get('fisheye_model'):
+        kind = 'fisheye'
+    xi = _numbers(content.get('xi', [0.0]))[0]
+    lens = _lens(kind, focal, distortion, xi, has_mirror='xi' in content)
+    return {**lens, **_size_in(content)}
+
+
+def _size_in(content: Mapping[str, Any]) -> dict[str, Any]:
+    for names in (('image_width', 'image_height'), ('width', 'height')):
+        if names[0] in content:
+            return _size(content[names[0]], content[names[1]])
+    return _size(0, 0)
+
+
+def _lens(
+    kind: str,
+    focal: list[float],
+    distortion: list[float],
+    xi: float = 0.0,
+    has_mirror: bool = False,
+) -> dict[str, Any]:
+    """Fields of a lens with focal = [fx, fy, cx, cy]; `kind` names the distortion."""
+    lens = dict(zip(('fx', 'fy', 'cx', 'cy'), focal, strict=True))
+    coefficients = tuple((distortion + [0.0] * 4)[:4]) if any(distortion) else ()
+    if any(distortion[4:]):
+        raise CameraError(f'{len(distortion)} coefficients of distortion; only 4 are supported')
+    if kind.lower() in _FISHEYE and not has_mirror:
+        return {'camera_model': 'fisheye', **lens, 'distortion': coefficients}
+    if kind.lower() not in _PLUMB_BOB:
+        raise CameraError(f'distortion model {kind!r} is not supported here')
+    # A lens without a mirror shows the world as it is, and looks where it is pointed.
+    plain = {} if has_mirror else {'mirrored': 'no', 'axis': 'forward'}
+    return {'camera_model': 'mirror', 'xi': xi, **plain, **lens, 'distortion': coefficients}
+
+
+def _size(width: Any, height: Any) -> dict[str, Any]:
+    return {'image_width': int(width), 'image_height': int(height)}
+
+
+def _first(content: Mapping[str, Any], *names: str) -> Any:
+    for name in names:
+        if name in content:
+            return content[name]
+    raise CameraError(f'none of {", ".join(names)} is given; {_KNOWN}')
+
+
+def _numbers(value: Any) -> list[float]:
+    """Flatten a number, nested lists, or a matrix with `data` to floats."""
+    if isinstance(value, Mapping):
+        return _numbers(value['data'])
+    if isinstance(value, (list, tuple)):
+        return [number for entry in value for number in _numbers(entry)]
+    return [float(value)]

@@ -1,0 +1,227 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The three nodes as real processes on a ROS domain of their own, fed by a player of a bag.
+
+A recorder listens to what they publish, and notices when one of them ends or stays silent.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Image
+
+from sfa_localization.commands.processes import Processes
+from sfa_localization.commands.settings import DemoConfig
+from sfa_localization.data.errors import LocalizationError, NodeError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import read_stamp
+from sfa_localization.data.run import Trajectory
+from sfa_localization.nodes.conversions import read_odometry, read_pose
+
+NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+PLAYER = 'play'
+# What each node publishes, by which it is known to be at work.
+OUTPUTS = {
+    'omnicam_node': 'panorama',
+    'sfa_node': 'sfa/pose_with_covariance',
+    'ekf_node': 'ekf/odometry',
+}
+INPUTS = ('/odom', 'sfa/pose_with_covariance', 'panorama')
+LARGEST_DOMAIN = 101
+# A heading is unknown when its variance is that of any direction, pi^2 / 3.
+KNOWN_YAW_VARIANCE = np.pi**2 / 3 - 0.1
+QUEUE = 1000
+
+
+class Recorder:
+    """A ROS node that keeps what the three nodes publish, on a context of its own."""
+
+    def __init__(self, domain_id: int) -> None:
+        self._context = Context()
+        rclpy.init(
+            context=self._context,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._node = rclpy.create_node(
+            'demo_recorder', context=self._context, use_global_arguments=False
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._poses: dict[str, list[tuple[int, Array]]] = {name: [] for name in NODES}
+        self._heard_s = dict.fromkeys(NODES, -np.inf)
+        self._subscribe('omnicam_node', Image, self._keep_panorama)
+        self._subscribe('sfa_node', PoseWithCovarianceStamped, self._keep_pose)
+        self._subscribe('ekf_node', Odometry, self._keep_odometry)
+
+    def close(self) -> None:
+        """Leave the ROS graph."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def _subscribe(self, name: str, kind: Any, keep: Any) -> None:
+        def receive(message: Any) -> None:
+            try:
+                self._poses[name].append(keep(message))
+            except LocalizationError as error:
+                raise NodeError(f'{name} published nonsense on {OUTPUTS[name]}: {error}') from None
+            self._heard_s[name] = time.monotonic()
+
+        self._node.create_subscription(kind, OUTPUTS[name], receive, QoSProfile(depth=QUEUE))
+
+    @staticmethod
+    def _keep_panorama(message: Image) -> tuple[int, Array]:
+        return read_stamp(message.header.stamp), np.empty(0)
+
+    @staticmethod
+    def _keep_pose(message: PoseWithCovarianceStamped) -> tuple[int, Array]:
+        stamp_ns, pose, covariance = read_pose(message)
+        known = covariance[2, 2] < KNOWN_YAW_VARIANCE
+        return stamp_ns, np.where([True, True, known], pose, np.nan)
+
+    @staticmethod
+    def _keep_odometry(message: Odometry) -> tuple[int, Array]:
+        motion = read_odometry(message)
+        return motion.stamp_ns, motion.pose
+
+    def spin(self, seconds: float) -> None:
+        """Receive what arrives; raises NodeError for an output that is no pose."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def connected(self) -> bool:
+        """True when every node of the chain publishes and listens."""
+        speaks = all(self._node.count_publishers(topic) for topic in OUTPUTS.values())
+        return speaks and all(self._listened(topic) for topic in INPUTS)
+
+    def _listened(self, topic: str) -> bool:
+        own = topic in OUTPUTS.values()
+        return int(self._node.count_subscribers(topic)) > own
+
+    def silence_s(self, name: str) -> float:
+        """Seconds since a node's last output."""
+        return time.monotonic() - self._heard_s[name]
+
+    def count(self, name: str) -> int:
+        """Number of a node's outputs so far."""
+        return len(self._poses[name])
+
+    def trajectory(self, name: str) -> Trajectory:
+        """The poses that a node published, in the order of their stamps."""
+        poses = sorted(self._poses[name], key=lambda item: item[0])
+        stamps = np.array([stamp for stamp, _ in poses], np.int64)
+        return Trajectory(stamps, np.array([pose for _, pose in poses]).reshape(-1, 3))
+
+
+def commands(model: Path, bag: Path, rate: float) -> dict[str, list[str]]:
+    """The command lines of the three nodes and of the player of `bag`, by name."""
+    program = [sys.executable, '-m', 'sfa_localization']
+    nodes = {name: [*program, name, '--ros-args'] for name in NODES}
+    nodes['omnicam_node'] += ['-p', 'image_transport:=compressed']
+    nodes['sfa_node'] += ['-p', f'model:={model}']
+    return {**nodes, PLAYER: [*program, PLAYER, str(bag), '--rate', str(rate)]}
+
+
+def run_live(
+    programs: Mapping[str, Sequence[str]], folder: Path, config: DemoConfig
+) -> dict[str, Trajectory]:
+    """Run the nodes, then the player; return what the nodes published, as 'sfa' and 'ekf'.
+
+    `programs` are command lines, see `commands`; logs go to `folder`. Raises NodeError when one
+    ends too soon, does not start, or stays silent. No process is left behind.
+    """
+    domain_id = 1 + os.getpid() % LARGEST_DOMAIN
+    with (
+        _ros_environment(domain_id, folder) as environment,
+        _recording(domain_id) as recorder,
+        Processes(folder, environment, config.stop_timeout) as processes,
+    ):
+        for name in NODES:
+            processes.start(name, programs[name])
+        _await_nodes(recorder, processes, config)
+        processes.start(PLAYER, programs[PLAYER])
+        _record(recorder, processes, config)
+        return {name: recorder.trajectory(f'{name}_node') for name in ('sfa', 'ekf')}
+
+
+@contextmanager
+def _ros_environment(domain_id: int, folder: Path) -> Iterator[Mapping[str, str]]:
+    """The environment of the processes, in force here too while the recorder is made and used."""
+    changes = {
+        'ROS_DOMAIN_ID': str(domain_id),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_LOG_DIR': str(folder.resolve() / 'ros'),
+        'PYTHONUNBUFFERED': '1',
+    }
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield dict(os.environ)
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _recording(domain_id: int) -> Iterator[Recorder]:
+    recorder = Recorder(domain_id)
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+def _await_nodes(recorder: Recorder, processes: Processes, config: DemoConfig) -> None:
+    """Return when all nodes have found one another. Raises NodeError when that does not happen."""
+    end = time.monotonic() + config.start_timeout
+    while not recorder.connected():
+        processes.require_alive(NODES)
+        if time.monotonic() > end:
+            logs = ', '.join(str(processes.log(name)) for name in NODES)
+            raise NodeError(f'the nodes did not start in {config.start_timeout:g} s; see {logs}')
+        recorder.spin(0.1)
+
+
+def _record(recorder: Recorder, processes: Processes, config: DemoConfig) -> None:
+    """Receive until the replay is over and all is quiet. Raises NodeError for a silent node."""
+    start = time.monotonic()
+    while not processes.ended(PLAYER):
+        recorder.spin(0.2)
+        processes.require_alive(NODES)
+        if time.monotonic() - start > config.silence_timeout:
+            _require_speech(recorder, processes, config.silence_timeout)
+    while min(recorder.silence_s(name) for name in NODES) < config.settle_time:
+        recorder.spin(0.1)
+        processes.require_alive(NODES)
+    _require_speech(recorder, processes, np.inf)
+
+
+def _require_speech(recorder: Recorder, processes: Processes, longest_s: float) -> None:
+    """Raise NodeError for the first node of the chain that is silent."""
+    for name in NODES:
+        if recorder.count(name) == 0 or recorder.silence_s(name) > longest_s:
+            since = f' in the last {longest_s:g} s' if np.isfinite(longest_s) else ''
+            raise NodeError(
+                f'{name} is silent: {recorder.count(name)} messages on {OUTPUTS[name]}, '
+                f'none{since}; see {processes.log(name)}'
+            )

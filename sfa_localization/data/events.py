@@ -1,0 +1,24 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded streams in the one order in which a filter gets them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sfa_localization.data.run import Stamps
+
+ODOMETRY, PICTURE = range(2)
+
+
+def in_order(odometry_ns: Stamps, pictures_ns: Stamps) -> Iterator[tuple[int, int, int]]:
+    """Stamp, ODOMETRY or PICTURE, and index in its own stream, by stamp (N,) and (M,).
+
+    At equal stamps odometry comes first, and a stream keeps its order.
+    """
+    stamps = np.concatenate([odometry_ns, pictures_ns]).astype(np.int64)
+    for position in np.argsort(stamps, kind='stable').tolist():
+        kind = ODOMETRY if position < len(odometry_ns) else PICTURE
+        yield int(stamps[position]), kind, position - kind * len(odometry_ns)

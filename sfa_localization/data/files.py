@@ -1,0 +1,38 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from sfa_localization.data.errors import LocalizationError
+
+
+@contextmanager
+def whole_file(
+    path: Path, error: type[LocalizationError] = LocalizationError, *, make_folder: bool = False
+) -> Iterator[IO[bytes]]:
+    """Write to a temporary name that becomes `path` in the end, or vanishes after any error.
+
+    `make_folder` makes missing folders first. Raises `error`, naming the path.
+    """
+    temporary = None
+    try:
+        if make_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp('.part', f'.{path.name}-', path.parent)
+        with os.fdopen(handle, 'wb') as file:
+            yield file
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as reason:
+        raise error(f'{path}: cannot be written: {reason.strerror or reason}') from None
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)

@@ -1,0 +1,100 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Planar geometry: angles, poses in SE(2), rigid alignment.
+
+A pose is (x m, y m, yaw rad): x forward, y left, yaw counter-clockwise (REP-103).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.errors import DataError
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+
+def wrap_angle(angle_rad: Array | float) -> Array:
+    """Wrap to [-pi, pi)."""
+    return np.asarray((np.asarray(angle_rad) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def rotation(yaw_rad: float) -> Array:
+    """Rotation matrix (2, 2) of a counter-clockwise turn."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def compose(a: Array, b: Array) -> Array:
+    """Pose `b`, given in the frame of pose `a`, expressed in a's parent frame; (..., 3) each."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def invert(a: Array) -> Array:
+    """Inverse of poses (..., 3): compose(invert(a), a) is the identity."""
+    a = np.asarray(a, float)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = -c * a[..., 0] - s * a[..., 1]
+    y = s * a[..., 0] - c * a[..., 1]
+    return np.stack([x, y, wrap_angle(-a[..., 2])], axis=-1)
+
+
+def relative(a: Array, b: Array) -> Array:
+    """Pose of `b` seen from `a`; (..., 3) each."""
+    return compose(invert(a), b)
+
+
+@dataclass(frozen=True, slots=True)
+class RigidTransform:
+    """A rotation and a translation of the plane: p -> R(yaw) p + (x, y)."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+    def apply(self, points: Array) -> Array:
+        """Transform points (N, 2) in metres."""
+        return np.asarray(points @ rotation(self.yaw_rad).T + [self.x_m, self.y_m])
+
+    def apply_yaw(self, yaw_rad: Array) -> Array:
+        """Transform headings (N,)."""
+        return wrap_angle(yaw_rad + self.yaw_rad)
+
+
+def align(source: Array, target: Array) -> RigidTransform:
+    """Least-squares rotation and translation (no scale, no mirror) from source to target.
+
+    Both (N, 2), N >= 2. Raises DataError for fewer points or mismatched shapes.
+    """
+    source, target = np.asarray(source, float), np.asarray(target, float)
+    if source.shape != target.shape or source.ndim != 2 or len(source) < 2:
+        raise DataError(f'cannot align points of shapes {source.shape} and {target.shape}')
+    turn, shift = align_complex(_complex(source), _complex(target))
+    return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
+
+
+def _complex(points: Array) -> Complex:
+    return np.asarray(points[:, 0] + 1j * points[:, 1])
+
+
+def align_complex(
+    source: Complex, target: Complex, weights: Array | None = None
+) -> tuple[complex, complex]:
+    """Least-squares unit turn and shift, turn * source + shift = target, of points x + iy (N,).
+
+    `weights` (N,) of the squared distances, all equal by default. Points that show no direction
+    are not turned.
+    """
+    a, b = np.average(source, weights=weights), np.average(target, weights=weights)
+    products = np.conj(source - a) * (target - b)
+    product = complex(np.sum(products if weights is None else weights * products))
+    turn = product / abs(product) if product != 0 else 1.0 + 0.0j
+    return turn, complex(b - turn * a)

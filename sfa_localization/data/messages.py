@@ -1,0 +1,78 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the fields of ROS messages mean, the same for messages of bags and of topics.
+
+Takes any object with the fields of the message, and knows neither ROS nor bags. Stamps are integer
+nanoseconds, poses (x m, y m, yaw rad). A message that cannot be used raises MessageError with the
+reason, in short words that can be counted.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from sfa_localization.data.errors import MessageError
+
+NANOSECONDS = 1_000_000_000
+NO_STAMP = 'zero or negative stamp'
+_LARGEST = 1e9
+_LARGEST_VARIANCE = 1e6
+_SHORTEST_QUATERNION = 1e-3
+
+
+def read_stamp(stamp: Any) -> int:
+    """Nanoseconds of a builtin_interfaces/Time."""
+    if not 0 <= stamp.nanosec < NANOSECONDS:
+        raise MessageError('impossible stamp')
+    total = int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    if total <= 0:
+        raise MessageError(NO_STAMP)
+    return total
+
+
+def read_yaw(q: Any) -> float:
+    """Heading of a Quaternion, of any length but (nearly) none: its direction is what counts."""
+    norm = math.hypot(q.x, q.y, q.z, q.w)
+    require_sane('quaternion', norm)
+    if norm < _SHORTEST_QUATERNION:
+        raise MessageError('quaternion is zero')
+    sine, cosine = q.w * q.z + q.x * q.y, norm * norm / 2 - (q.y * q.y + q.z * q.z)
+    return math.atan2(sine, cosine)
+
+
+def read_planar(position: Any, orientation: Any) -> tuple[float, float, float]:
+    """Pose in the plane of a position (or translation) and a Quaternion."""
+    x, y = float(position.x), float(position.y)
+    require_sane('pose', x, y)
+    return x, y, read_yaw(orientation)
+
+
+def read_twist(message: Any) -> tuple[float, float, float, float]:
+    """Of an Odometry: v m/s, omega rad/s, and their variances, 0 where unknown."""
+    twist, covariance = message.twist.twist, message.twist.covariance
+    v, omega = float(twist.linear.x), float(twist.angular.z)
+    require_sane('twist', v, omega)
+    return v, omega, _variance(covariance[0]), _variance(covariance[35])
+
+
+def read_yaw_rate(message: Any) -> tuple[float, float]:
+    """Of an Imu: omega rad/s about its z axis, and its variance, 0 where unknown."""
+    if message.angular_velocity_covariance[0] == -1.0:
+        raise MessageError('the message marks its yaw rate as unknown')
+    omega = float(message.angular_velocity.z)
+    require_sane('yaw rate', omega)
+    return omega, _variance(message.angular_velocity_covariance[8])
+
+
+def require_sane(name: str, *numbers: float) -> None:
+    """Raise MessageError for numbers that are not finite, or that no robot reaches."""
+    if not all(map(math.isfinite, numbers)):
+        raise MessageError(f'{name} is not finite')
+    if any(abs(number) > _LARGEST for number in numbers):
+        raise MessageError(f'{name} is absurdly large')
+
+
+def _variance(value: float) -> float:
+    """A variance, or 0 (unknown) where the message holds something that is none."""
+    return float(value) if math.isfinite(value) and 0 < value < _LARGEST_VARIANCE else 0.0

@@ -1,0 +1,200 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Plain data that every driver shares: what one drive recorded. Time is integer nanoseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array, compose, relative, wrap_angle
+
+Stamps = NDArray[np.int64]
+Image = NDArray[np.uint8]
+BATCH = 16
+"""Pictures that are read and looked at together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses at stamps: `stamps_ns` (N,) increasing, `poses` (N, 3) as x m, y m, yaw rad."""
+
+    stamps_ns: Stamps
+    poses: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def covers(self, stamps_ns: Stamps, tolerance_ns: int = 0) -> NDArray[np.bool_]:
+        """Mask (M,) of the stamps between the first and the last pose, and in no gap.
+
+        A stamp is covered when both neighbouring poses lie within `tolerance_ns` (0: any gap).
+        """
+        if len(self) == 0:
+            return np.zeros(len(stamps_ns), bool)
+        inside = (stamps_ns >= self.stamps_ns[0]) & (stamps_ns <= self.stamps_ns[-1])
+        if tolerance_ns <= 0:
+            return np.asarray(inside)
+        before = np.searchsorted(self.stamps_ns, stamps_ns, side='right') - 1
+        after = np.searchsorted(self.stamps_ns, stamps_ns, side='left')
+        before, after = np.clip([before, after], 0, len(self) - 1)
+        close = (stamps_ns - self.stamps_ns[before] <= tolerance_ns) & (
+            self.stamps_ns[after] - stamps_ns <= tolerance_ns
+        )
+        return np.asarray(inside & close)
+
+    def at(self, stamps_ns: Stamps) -> Array:
+        """Poses (M, 3) interpolated along constant twist between neighbours; clamped outside."""
+        if len(self) == 1:
+            return np.repeat(self.poses, len(stamps_ns), axis=0)
+        i = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, 'right') - 1, 0, len(self) - 2)
+        span = np.maximum(self.stamps_ns[i + 1] - self.stamps_ns[i], 1)
+        t = np.clip((stamps_ns - self.stamps_ns[i]) / span, 0.0, 1.0)
+        return _along(self.poses[i], self.poses[i + 1], t)
+
+
+def _along(start: Array, end: Array, t: Array) -> Array:
+    """Poses a fraction t (M,) of the way along the arc from start to end, both (M, 3)."""
+    step = relative(start, end)
+    half = step[:, 2] / 2
+    # An arc's chord lies at half its turn; a shorter part of the arc has a shorter chord.
+    chord = np.hypot(step[:, 0], step[:, 1]) * np.sinc(t * half / np.pi) / np.sinc(half / np.pi)
+    bearing = np.arctan2(step[:, 1], step[:, 0]) - half + t * half
+    part = np.stack([t * chord * np.cos(bearing), t * chord * np.sin(bearing), t * step[:, 2]], -1)
+    return compose(start, part)
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Wheel odometry: poses in the odom frame and the twist that moved them.
+
+    `stamps_ns` (N,), `poses` (N, 3), `twists` (N, 2) as v m/s, omega rad/s; `variances` (N, 2) of
+    v and omega as in the messages, 0 where unknown. The odometry frame may start anywhere.
+
+    Everywhere in this package a twist is the mean over the time since the message before: what
+    drivers of wheel encoders publish, whose pose has moved by just this twist. The first message's
+    twist moves nothing.
+    """
+
+    stamps_ns: Stamps
+    poses: Array
+    twists: Array
+    variances: Array
+
+    @property
+    def trajectory(self) -> Trajectory:
+        return Trajectory(self.stamps_ns, self.poses)
+
+
+@dataclass(frozen=True, slots=True)
+class YawRate:
+    """A gyroscope about the vertical: `stamps_ns` (N,), `omega` (N,) rad/s, `variance` (N,)."""
+
+    stamps_ns: Stamps
+    omega: Array
+    variance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Count:
+    """What became of a stream's messages: how many were used, and why others were not."""
+
+    used: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        return {'used': self.used, 'skipped': dict(self.skipped)}
+
+
+class Panoramas(Protocol):
+    """The pictures of a run, streamed: never all in memory at once."""
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """Stamps (N,)."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Rows, columns, channels (BGR, uint8) of each panorama."""
+
+    def __len__(self) -> int: ...
+
+    def read(self, start: int, stop: int) -> Image:
+        """Panoramas start .. stop - 1 as a (stop - start, H, W, C) uint8 array."""
+
+    def batches(self, size: int) -> Iterator[Image]:
+        """Panoramas in order as (<= size, H, W, C) uint8 arrays."""
+
+
+@dataclass(frozen=True, slots=True)
+class PanoramaArray:
+    """Panoramas held in an array, or in a memory-mapped file: `images` (N, H, W, C) uint8."""
+
+    stamps_ns: Stamps
+    images: Image
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return tuple(self.images.shape[1:])  # type: ignore[return-value]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def read(self, start: int, stop: int) -> Image:
+        if not isinstance(self.images, np.memmap) or self.images.filename is None:
+            return np.asarray(self.images[start:stop])
+        # Read, not mapped: pages of a map would count as memory that grows with the bag.
+        stop = min(stop, len(self))
+        size = int(np.prod(self.shape))
+        offset = self.images.offset + start * size
+        flat = np.fromfile(self.images.filename, np.uint8, (stop - start) * size, offset=offset)
+        return flat.reshape(stop - start, *self.shape)
+
+    def batches(self, size: int) -> Iterator[Image]:
+        for start in range(0, len(self), size):
+            yield self.read(start, min(start + size, len(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One drive: pictures, odometry, and, for evaluation only, the truth.
+
+    `counts` tells per stream ('images', 'odometry', ...) what was used and skipped.
+    """
+
+    name: str
+    panoramas: Panoramas
+    odometry: Odometry
+    yaw_rate: YawRate | None = None
+    ground_truth: Trajectory | None = None
+    counts: dict[str, Count] = field(default_factory=dict)
+
+
+def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:
+    """Dead reckoning: poses (N, 3) from twists (N, 2), each held since the stamp before."""
+    poses = np.zeros((len(stamps_ns), 3))
+    poses[0] = 0.0 if start is None else start
+    dt = np.diff(stamps_ns) * 1e-9
+    v, omega = twists[1:].T
+    yaw = poses[0, 2] + np.concatenate([[0.0], np.cumsum(omega * dt)])
+    chord = v * dt * np.sinc(omega * dt / 2 / np.pi)
+    middle = (yaw[:-1] + yaw[1:]) / 2
+    poses[1:, 0] = poses[0, 0] + np.cumsum(chord * np.cos(middle))
+    poses[1:, 1] = poses[0, 1] + np.cumsum(chord * np.sin(middle))
+    poses[:, 2] = wrap_angle(yaw)
+    return poses
+
+
+def differences(stamps_ns: Stamps, poses: Array) -> Array:
+    """Twists (N, 2) that lead to each pose (N, 3) from the one before; the first is repeated."""
+    if len(poses) < 2:
+        return np.zeros((len(poses), 2))
+    step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps_ns) * 1e-9
+    arc = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / 2 / np.pi)
+    bearing = np.arctan2(step[:, 1], step[:, 0]) - step[:, 2] / 2
+    twists = np.stack([arc * np.sign(np.cos(bearing)), step[:, 2]], -1) / seconds[:, None]
+    return np.concatenate([twists[:1], twists])

@@ -1,0 +1,112 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Base of all settings: typed, described, ranged, and with their only default.
+
+Each room has a module `settings` of its own; nodes declare their ROS parameters from its classes,
+and `sfa_localization.config` reads and writes the parameter file from them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from sfa_localization.data.errors import ConfigError
+
+S = TypeVar('S', bound='Settings')
+
+
+def setting(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    """Declare one parameter: `doc` describes it, [low, high] or `choices` bound it.
+
+    `live` parameters may change while a node runs; the others are read-only after start.
+    """
+    bounds = {'low': low, 'high': high, 'choices': choices}
+    return dataclasses.field(
+        default=default, metadata={'doc': doc, 'unit': unit, 'live': live, **bounds}
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Base of the parameter groups: immutable and checked when made."""
+
+    def __post_init__(self) -> None:
+        for item in dataclasses.fields(self):
+            value = _checked(type(self).__name__, item, getattr(self, item.name))
+            object.__setattr__(self, item.name, value)
+
+    @classmethod
+    def from_mapping(cls: type[S], mapping: Mapping[str, Any], where: str) -> S:
+        """Build from plain names and values; `where` names their origin in errors.
+
+        Raises ConfigError for an unknown name, a wrong type or a value out of range.
+        """
+        known = {item.name for item in dataclasses.fields(cls)}
+        for name in mapping:
+            if name not in known:
+                raise ConfigError(
+                    f'{where}: unknown parameter {name!r}'
+                    f'{nearest(name, known) or "; known are " + ", ".join(sorted(known))}'
+                )
+        try:
+            return cls(**mapping)
+        except ConfigError as error:
+            raise ConfigError(f'{where}: {error}') from None
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """The end of a message about an unknown name: which known one may be meant; '' if none."""
+    close = difflib.get_close_matches(name, sorted(known), n=1)
+    return f'; did you mean {close[0]!r}?' if close else ''
+
+
+def _checked(group: str, item: dataclasses.Field[Any], value: Any) -> Any:
+    """Return the value in the default's type, or raise ConfigError."""
+    where = f'{group}.{item.name}'
+    value = _converted(where, item.default, value)
+    numbers = value if isinstance(value, tuple) else (value,)
+    for number in numbers:
+        _check_bounds(where, item.metadata, number)
+    return value
+
+
+def _converted(where: str, default: Any, value: Any) -> Any:
+    """Accept an int where a float is expected, a list where a tuple is, and nothing else."""
+    if isinstance(default, tuple) and isinstance(value, (list, tuple)):
+        kind = default[0] if default else 0.0
+        return tuple(_converted(where, kind, entry) for entry in value)
+    if isinstance(default, bool) or isinstance(value, bool):
+        matches = isinstance(default, bool) and isinstance(value, bool)
+    elif isinstance(default, float) and isinstance(value, (int, float)):
+        return float(value)
+    else:
+        matches = isinstance(value, type(default))
+    if not matches:
+        raise ConfigError(f'{where}: {value!r} is not of type {type(default).__name__}')
+    return value
+
+
+def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
+    if metadata['choices'] and value not in metadata['choices']:
+        raise ConfigError(f'{where}: {value!r} is not one of {", ".join(metadata["choices"])}')
+    if not isinstance(value, (int, float)) or isinstance(value, bool):
+        return
+    if not math.isfinite(value):
+        raise ConfigError(f'{where}: {value!r} is not a finite number')
+    low, high = metadata['low'], metadata['high']
+    if (low is not None and value < low) or (high is not None and value > high):
+        raise ConfigError(f'{where}: {value!r} is outside [{low}, {high}] {metadata["unit"]}')

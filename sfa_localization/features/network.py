@@ -1,0 +1,346 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The hierarchical SFA network: receptive fields, quadratic expansion, shared weights.
+
+Section 2.2 of the paper: each node performs linear SFA to reduce dimensions, expands
+quadratically, and extracts slow features by a second linear SFA; layers converge onto one node.
+Nodes of a layer share weights and their fields wrap around the panorama, so that a layer's map
+shifts with the robot's rotation (see rotation.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.errors import ConfigError, ModelError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image
+from sfa_localization.features.rotation import Field, Map, unfold
+from sfa_localization.features.sfa import Solution
+
+Weights = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One layer of shared nodes.
+
+    `field` and `stride` are (rows, columns): pixels for the first layer, units of the layer below
+    for the others. `linear` dimensions are kept by the first SFA and expanded quadratically,
+    `outputs` slow features leave the second, limited to +-`clip` (unit variance).
+    """
+
+    field: tuple[int, int]
+    stride: tuple[int, int]
+    linear: int
+    outputs: int
+    clip: float = 4.0
+
+    @property
+    def expanded(self) -> int:
+        return self.linear + self.linear * (self.linear + 1) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class Architecture:
+    """The whole network as data.
+
+    `size` is (rows, columns) of the panorama; pixels are averaged in squares of `binning`.
+    `normalization` 'panorama' takes each channel's mean and scale out of each picture.
+    """
+
+    size: tuple[int, int]
+    binning: int
+    normalization: str
+    layers: tuple[Layer, ...]
+
+    def __post_init__(self) -> None:
+        _check_binning(self.size, self.binning)
+        _check_columns(self)
+        for depth, rows in enumerate(self.map_rows[:-1]):
+            _check_rows(depth, rows, self.layers[depth])
+
+    @property
+    def rotations(self) -> int:
+        """Columns of every map: steps of the simulated rotation."""
+        return self.size[1] // self.binning // self.layers[0].stride[1]
+
+    @property
+    def fields(self) -> tuple[Field, ...]:
+        """Receptive fields in columns of the maps, one rotation step apart."""
+        first = self.layers[0]
+        made = [Field(first.field[0], first.field[1] // first.stride[1], first.stride[0])]
+        spacing = 1
+        for layer in self.layers[1:]:
+            made.append(Field(*layer.field, layer.stride[0], spacing))
+            spacing *= layer.stride[1]
+        return tuple(made)
+
+    @property
+    def map_rows(self) -> list[int]:
+        """Rows of the binned picture and of every layer's map."""
+        rows = [self.size[0] // self.binning]
+        for receptive in self.fields:
+            rows.append(receptive.rows_out(rows[-1]))
+        return rows
+
+    @property
+    def channels(self) -> list[int]:
+        """Channels of the map below each layer."""
+        colors = 1 if self.normalization == 'grey' else 3
+        above = (layer.outputs for layer in self.layers[:-1])
+        return [self.layers[0].stride[1] * colors, *above]
+
+    @property
+    def outputs(self) -> int:
+        return self.layers[-1].outputs
+
+
+def _check_binning(size: tuple[int, int], binning: int) -> None:
+    if size[0] % binning or size[1] % binning:
+        fit = ' x '.join(str(round(n / binning) * binning) for n in reversed(size))
+        raise ConfigError(
+            f'a panorama of {size[1]} x {size[0]} cannot be binned by {binning}: use {fit}'
+        )
+
+
+def _check_columns(architecture: Architecture) -> None:
+    """Fields must cover whole strides, and strides the panorama."""
+    first, columns = architecture.layers[0], architecture.size[1] // architecture.binning
+    stride = first.stride[1]
+    if first.field[1] % stride:
+        raise ConfigError(
+            f'layer 1: a field {first.field[1]} wide is no multiple of the stride {stride}: '
+            f'use {_multiples(first.field[1], stride)}'
+        )
+    if columns % stride:
+        raise ConfigError(
+            f'a panorama {architecture.size[1]} wide does not hold whole strides of {stride} '
+            f'pixels: use a width of '
+            f'{_multiples(architecture.size[1], stride * architecture.binning)}'
+        )
+    for depth, receptive in enumerate(architecture.fields):
+        if receptive.columns * receptive.spacing > architecture.rotations + receptive.spacing - 1:
+            raise ConfigError(
+                f'layer {depth + 1}: a field of {receptive.columns} columns, {receptive.spacing} '
+                f'apart, is wider than the {architecture.rotations} columns of its map'
+            )
+
+
+def _multiples(size: int, unit: int) -> str:
+    """The multiples of `unit` on both sides of a size that is none."""
+    below = size // unit * unit
+    return f'{below} or {below + unit}' if below else f'{unit}'
+
+
+def _check_rows(depth: int, rows: int, layer: Layer) -> None:
+    height, stride = layer.field[0], layer.stride[0]
+    if rows < height or (rows - height) % stride:
+        below = height + max(0, (rows - height) // stride) * stride
+        raise ConfigError(
+            f'layer {depth + 1}: fields of {height} rows, stride {stride}, do not fill {rows} '
+            f'rows: use {below} or {below + stride}'
+        )
+
+
+# 600 x 60 colour panoramas, the paper's size; layers measured on path-traced gardens.
+PAPER_LAYERS = (
+    Layer(field=(10, 10), stride=(4, 5), linear=32, outputs=32),
+    Layer(field=(3, 5), stride=(1, 1), linear=32, outputs=32),
+    Layer(field=(4, 20), stride=(1, 1), linear=48, outputs=32),
+)
+# 320 x 40 pictures, the sizes published for this family of networks.
+SMALL_LAYERS = (
+    Layer(field=(8, 10), stride=(4, 5), linear=32, outputs=32),
+    Layer(field=(6, 14), stride=(3, 7), linear=32, outputs=32),
+    Layer(field=(2, 9), stride=(1, 1), linear=32, outputs=32),
+)
+
+# Name -> (binning, layers).
+LAYERS = {
+    '600x60': (2, PAPER_LAYERS),
+    '300x30': (1, PAPER_LAYERS),
+    '320x40': (1, SMALL_LAYERS),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """Trained weights shared by a layer's nodes, float32, means folded into offsets.
+
+    z = x `linear` - `linear_offset`; s = expand(z) `slow` - `slow_offset`.
+    """
+
+    linear: Weights
+    linear_offset: Weights
+    slow: Weights
+    slow_offset: Weights
+
+    @classmethod
+    def from_solutions(cls, linear: Solution, slow: Solution) -> Node:
+        return cls(*folded(linear), *folded(slow))
+
+
+def folded(solution: Solution) -> tuple[Weights, Weights]:
+    """Weights (D, K) of a solution, and its mean as an offset (K,): x weights - offset."""
+    weights = solution.weights.astype(np.float32)
+    return weights, (solution.mean @ solution.weights).astype(np.float32)
+
+
+def expand(z: Map) -> Map:
+    """All monomials of degree 1 and 2 of signals (L, ...): (L + L (L + 1) / 2, ...)."""
+    n = len(z)
+    out = np.empty((n + n * (n + 1) // 2, *z.shape[1:]), z.dtype)
+    expand_into(z, out)
+    return out
+
+
+def expand_into(z: Map, out: Map) -> None:
+    """Write the monomials of z (L, ...) into `out`."""
+    n = len(z)
+    out[:n] = z
+    at = n
+    for i in range(n):
+        np.multiply(z[i:], z[i], out=out[at : at + n - i])
+        at += n - i
+
+
+def prepare(images: Image, architecture: Architecture) -> Map:
+    """Panoramas (T, H, W, C) uint8 -> binned, normalized map (T, rows, R, stride * C) float32.
+
+    Raises ModelError when the pictures have another size than the network's.
+    """
+    if images.ndim != 4 or images.shape[1:3] != architecture.size:
+        height, width = architecture.size
+        raise ModelError(
+            f'the model expects panoramas of {width} x {height} pixels, got {images.shape[-2]} x '
+            f'{images.shape[-3]}: set the panorama size of the omnicam node, or train again'
+        )
+    normalize = _NORMALIZATIONS[architecture.normalization]
+    maps = np.stack([normalize(_binned(image, architecture.binning)) for image in images])
+    return maps.reshape(len(maps), maps.shape[1], architecture.rotations, -1)
+
+
+def _binned(image: Image, binning: int) -> Image:
+    if binning == 1:
+        return image
+    size = (image.shape[1] // binning, image.shape[0] // binning)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def _plain(image: Image) -> Map:
+    channels = image.shape[2]
+    return _affine(image, np.full(channels, 1 / 128), np.full(channels, -1.0))
+
+
+def _affine(image: Image, gain: Array, offset: Array) -> Map:
+    """image * gain + offset, both per channel (C,): (H, W, C) float32."""
+    rows, columns, _ = image.shape
+    out = np.multiply(
+        image.reshape(rows, -1), np.tile(gain.astype(np.float32), columns), dtype=np.float32
+    )
+    out += np.tile(offset.astype(np.float32), columns)
+    return out.reshape(image.shape)
+
+
+def _grey(image: Image) -> Map:
+    return np.asarray(_plain(image) @ np.array([[0.114], [0.587], [0.299]], np.float32))
+
+
+def _per_panorama(image: Image) -> Map:
+    """Zero mean and unit scale of each channel over the whole picture: blind to exposure."""
+    mean, std = _moments(image)
+    gain = 1 / np.maximum(std, 1.0)
+    return _affine(image, gain, -mean * gain)
+
+
+def _moments(image: Image) -> tuple[Array, Array]:
+    """Mean and standard deviation of each channel, (C,)."""
+    mean, std = cv2.meanStdDev(image)
+    return np.asarray(mean, np.float64).ravel(), np.asarray(std, np.float64).ravel()
+
+
+def _brightness(image: Image) -> Map:
+    """Zero mean and unit scale of the whole picture, colours kept in proportion."""
+    mean, std = _moments(image)
+    variance = float((std**2 + mean**2).mean() - mean.mean() ** 2)
+    gain = np.full(len(mean), 1 / max(np.sqrt(variance), 1.0))
+    return _affine(image, gain, -mean.mean() * gain)
+
+
+def _log(image: Image) -> Map:
+    """Logarithm, zero mean of each channel over the whole picture: gains cancel."""
+    logs = _LOGS[image]
+    return np.asarray(logs - logs.mean((0, 1), dtype=np.float32))
+
+
+_LOGS = np.log(np.arange(256, dtype=np.float32) + 16)
+
+_NORMALIZATIONS = {
+    'none': _plain,
+    'grey': _grey,
+    'panorama': _per_panorama,
+    'brightness': _brightness,
+    'log': _log,
+}
+NORMALIZATIONS = tuple(_NORMALIZATIONS)
+
+
+def linear_stage(below: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
+    """First half of a layer: reduced signals (L, rows, R) of one map (rows, R, channels)."""
+    fields = unfold(below[None], receptive)[0]
+    reduced = linear.T @ fields.reshape(-1, fields.shape[-1]).T
+    reduced -= offset[:, None]
+    return np.asarray(reduced.reshape(-1, *fields.shape[:2]))
+
+
+def slow_stage(reduced: Map, node: Node, clip: float, out: Map) -> None:
+    """Second half: slow features of reduced signals (L, rows, R) into (rows, R, K), clipped."""
+    expanded = expand(reduced.reshape(len(reduced), -1))
+    slow = out.reshape(-1, out.shape[-1])
+    np.matmul(expanded.T, node.slow, out=slow)
+    slow -= node.slow_offset
+    np.minimum(slow, np.float32(clip), out=slow)
+    np.maximum(slow, np.float32(-clip), out=slow)
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A trained hierarchy: panoramas in, slow features out.
+
+    `deltas` holds each layer's Delta values, `ranks` the dimensions its two SFAs kept.
+    """
+
+    architecture: Architecture
+    nodes: tuple[Node, ...]
+    deltas: tuple[Array, ...] = field(default=())
+    ranks: tuple[tuple[int, int], ...] = field(default=())
+
+    def layer(self, maps: Map, depth: int) -> Map:
+        """Output map of layer `depth` (0-based) from the map below."""
+        node, layer = self.nodes[depth], self.architecture.layers[depth]
+        receptive = self.architecture.fields[depth]
+        count, rows, columns, _ = maps.shape
+        out = np.empty((count, receptive.rows_out(rows), columns, layer.outputs), np.float32)
+        # One picture at a time: its signals stay in the processor's cache.
+        for below, above in zip(maps, out, strict=True):
+            reduced = linear_stage(below, receptive, node.linear, node.linear_offset)
+            slow_stage(reduced, node, layer.clip, above)
+        return out
+
+    def maps(self, images: Image) -> list[Map]:
+        """Every layer's output map (T, rows, R, outputs) for panoramas (T, H, W, C)."""
+        below = prepare(images, self.architecture)
+        made = []
+        for depth in range(len(self.nodes)):
+            below = self.layer(below, depth)
+            made.append(below)
+        return made
+
+    def slow_features(self, images: Image) -> Array:
+        """Slow features averaged over all rotations (T, K): the same whatever the heading."""
+        return np.asarray(self.maps(images)[-1].mean((1, 2), dtype=np.float64))

@@ -1,0 +1,276 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Exact SFA statistics of a full simulated rotation, without rotating a single picture.
+
+The paper trains each layer on "image t at rotations 0 .. R-1, then image t+1 at rotations
+0 .. R-1, ...". Turning the robot shifts a panorama's columns, and layers with shared weights
+commute with that shift. So with a feature map of R columns, one rotation step apart, the R views
+of a node are its map's R columns, and the sums over the whole sequence, over the R nodes of a
+row, are sums over the columns of one map per image:
+
+    samples              R       sum_c        x_c x_c^T
+    within an image      (R - 1) sum_c        (x_{c+1} - x_c) (x_{c+1} - x_c)^T
+    between images               sum_c        (x_{t+1,c} - x_{t,c-1}) (...)^T
+
+all indices cyclic. Everything here is divided by R. Maps are (T, rows, R, channels) float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.features.sfa import Statistics
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A receptive field: `rows` x `columns` units of a map, columns `spacing` apart.
+
+    Fields start at every column, wrapping around, and at every `row_stride`-th row.
+    """
+
+    rows: int
+    columns: int
+    row_stride: int
+    spacing: int = 1
+
+    def rows_out(self, rows: int) -> int:
+        return (rows - self.rows) // self.row_stride + 1
+
+    def row_slices(self, rows: int) -> list[slice]:
+        starts = range(0, rows - self.rows + 1, self.row_stride)
+        return [slice(start, start + self.rows) for start in starts]
+
+
+def strips(maps: Map, field: Field) -> Map:
+    """Single columns of every field: (T, rows_out, R, field.rows * channels)."""
+    t, rows, columns, channels = maps.shape
+    cut = np.empty((t, field.rows_out(rows), columns, field.rows, channels), maps.dtype)
+    for out, rows_of in enumerate(field.row_slices(rows)):
+        cut[:, out] = maps[:, rows_of].transpose(0, 2, 1, 3)
+    return cut.reshape(t, cut.shape[1], columns, field.rows * channels)
+
+
+def unfold(maps: Map, field: Field) -> Map:
+    """All fields: (T, rows_out, R, field.columns * field.rows * channels), columns outermost."""
+    return windows(strips(maps, field), field.columns, field.spacing)
+
+
+def windows(columns: Map, count: int, spacing: int) -> Map:
+    """The columns c, c + spacing, ... (cyclic), `count` of them: (..., R, count * P)."""
+    *lead, period, width = columns.shape
+    wrapped = np.concatenate([columns, columns[..., : (count - 1) * spacing, :]], axis=-2)
+    step = wrapped.strides[-2]
+    shape = (*lead, period, count, width)
+    strides = (*wrapped.strides[:-1], spacing * step, wrapped.strides[-1])
+    return as_strided(wrapped, shape, strides, writeable=False).reshape(*lead, period, -1)
+
+
+def shifted(columns: Map, shifts: list[int]) -> Map:
+    """Stack the columns c + shift (cyclic) for every shift: (..., R, len(shifts) * P)."""
+    width = columns.shape[-1]
+    period = columns.shape[-2]
+    out = np.empty((*columns.shape[:-1], len(shifts) * width), columns.dtype)
+    for i, shift in enumerate(shifts):
+        part = out[..., i * width : (i + 1) * width]
+        k = shift % period
+        part[..., : period - k, :] = columns[..., k:, :]
+        part[..., period - k :, :] = columns[..., :k, :]
+    return out
+
+
+class Sums(Protocol):
+    """Sums over the rotation sequence, fed picture after picture."""
+
+    def lead(self, maps: Map) -> None:
+        """Tell the map (1, ...) before the first one, which counts only as a neighbor."""
+
+    def add(self, maps: Map, scale: Map) -> None:
+        """Add maps (T, ...), and differences to the map before times scale (T,); 0: a break."""
+
+    def merge(self, other: Any) -> None:
+        """Add what another has seen."""
+
+    def result(self) -> Statistics:
+        """The sums over the explicit rotation sequence, divided by the number of rotations."""
+
+
+class FieldStatistics:
+    """Statistics of linear SFA on the fields of a map, in their block-Toeplitz form.
+
+    Over all cyclic column positions, block (i, j) of a field's second moment is
+    R(l) = sum_c x_c x_{c+l}^T with l the distance of columns j and i. Every R(l) that the three
+    sums need comes from one product of the strips with their shifted copies.
+    """
+
+    def __init__(self, field: Field, rotations: int, strip: int) -> None:
+        self.field = field
+        self.rotations = rotations
+        self.lags = self._lags()
+        self.total = np.zeros(strip)
+        self.same = np.zeros((strip, len(self.lags) * strip))
+        self.between = np.zeros((strip, field.columns * strip))
+        self.samples = self.pairs = 0
+        self._last: Map | None = None
+
+    def _lags(self) -> list[int]:
+        """Column lags of the blocks of samples and of differences within images."""
+        steps = range(self.field.columns)
+        return sorted({i * self.field.spacing + e for i in steps for e in (-1, 0, 1)})
+
+    def lead(self, maps: Map) -> None:
+        self._last = strips(maps, self.field)
+
+    def add(self, maps: Map, scale: Map) -> None:
+        columns = strips(maps, self.field)
+        self.samples += columns.shape[0] * columns.shape[1]
+        self.total += columns.sum((0, 1, 2), dtype=np.float64)
+        self.same += _product(columns, shifted(columns, self.lags))
+        difference = _between_images(columns, self._last, scale)
+        self.pairs += difference.shape[0] * difference.shape[1]
+        if len(difference):
+            neighbors = windows(difference, self.field.columns, self.field.spacing)
+            self.between += _product(difference, neighbors)
+        self._last = columns[-1:]
+
+    def merge(self, other: FieldStatistics) -> None:
+        self.samples += other.samples
+        self.pairs += other.pairs
+        self.total += other.total
+        self.same += other.same
+        self.between += other.between
+
+    def result(self) -> Statistics:
+        count, r = self.samples * self.rotations, self.rotations
+        steps = self.samples * (r - 1) + self.pairs
+        total = np.tile(self.total, self.field.columns)
+        second, difference = self._blocks(self._lag), self._blocks(self._difference)
+        return Statistics(float(count), total, second, float(steps), difference)
+
+    def _blocks(self, block_of: Callable[[int], Array]) -> Array:
+        """Assemble (D, D) from the blocks of column lags l >= 0."""
+        p, n = len(self.total), self.field.columns
+        out = np.empty((n, p, n, p))
+        for lag in range(n):
+            block = block_of(lag * self.field.spacing)
+            for i in range(n - lag):
+                out[i, :, i + lag] = block
+                out[i + lag, :, i] = block.T
+        return out.reshape(n * p, n * p)
+
+    def _difference(self, lag: int) -> Array:
+        """Within images R - 1 times, between images once."""
+        r = self.rotations
+        within = 2 * self._lag(lag) - self._lag(lag + 1) - self._lag(lag - 1)
+        return within * ((r - 1) / r) + self._lag_between(lag) / r
+
+    def _lag(self, lag: int) -> Array:
+        p, at = len(self.total), self.lags.index(lag)
+        return self.same[:, at * p : (at + 1) * p]
+
+    def _lag_between(self, lag: int) -> Array:
+        p, at = len(self.total), lag // self.field.spacing
+        return self.between[:, at * p : (at + 1) * p]
+
+
+def _between_images(columns: Map, last: Map | None, scale: Map) -> Map:
+    """scale[t] (x_{t,c} - x_{t-1,c-1}) for the pairs of nonzero scale: (pairs, rows, R, P)."""
+    if last is None:
+        columns, last, scale = columns[1:], columns[:1], scale[1:]
+        before = np.concatenate([last, columns[:-1]]) if len(columns) else columns
+    else:
+        before = np.concatenate([last, columns[:-1]])
+    joined = scale > 0
+    difference = columns[joined] - np.roll(before[joined], 1, axis=2)
+    difference *= scale[joined, None, None, None]
+    return np.asarray(difference)
+
+
+def _product(a: Map, b: Map) -> Map:
+    """a^T b over all leading axes."""
+    return np.asarray(a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1]))
+
+
+class SampleStatistics:
+    """Statistics of linear SFA on signals of D dimensions, given signal-major: (D, T, rows, R)."""
+
+    def __init__(self, rotations: int, dimensions: int) -> None:
+        self.rotations = rotations
+        self.samples = self.pairs = 0
+        self.total = np.zeros(dimensions)
+        self.second, self.within, self.between = np.zeros((3, dimensions, dimensions))
+        self._last: Map | None = None
+
+    def lead(self, maps: Map) -> None:
+        self._last = maps[:, -1]
+
+    def add(self, maps: Map, scale: Map) -> None:
+        self.samples += maps.shape[1] * maps.shape[2]
+        self.total += maps.sum((1, 2, 3), dtype=np.float64)
+        self.second += _square(maps)
+        self.within += _square(_turned(maps))
+        self._add_pairs(maps, scale)
+        self._last = maps[:, -1].copy()
+
+    def merge(self, other: SampleStatistics) -> None:
+        self.samples += other.samples
+        self.pairs += other.pairs
+        self.total += other.total
+        self.second += other.second
+        self.within += other.within
+        self.between += other.between
+
+    def result(self) -> Statistics:
+        r = self.rotations
+        difference = self.within * ((r - 1) / r) + self.between / r
+        steps = self.samples * (r - 1) + self.pairs
+        return Statistics(
+            float(self.samples * r), self.total, self.second, float(steps), difference
+        )
+
+    def _add_pairs(self, maps: Map, scale: Map) -> None:
+        joined = np.flatnonzero(scale > 0)
+        if self._last is None:
+            joined = joined[joined > 0]
+        pairs = np.empty((len(maps), len(joined), *maps.shape[2:]), maps.dtype)
+        for at, t in enumerate(joined.tolist()):
+            _difference_into(maps[:, t], self._before(maps, t), float(scale[t]), pairs[:, at])
+        if len(joined):
+            self.between += _square(pairs)
+            self.pairs += pairs.shape[1] * pairs.shape[2]
+
+    def _before(self, maps: Map, t: int) -> Map:
+        if t > 0:
+            return maps[:, t - 1]
+        assert self._last is not None
+        return self._last
+
+
+def _difference_into(second: Map, first: Map, scale: float, out: Map) -> None:
+    """scale (x_{t,c} - x_{t-1,c-1}), cyclic in the last axis."""
+    np.subtract(second[..., 1:], first[..., :-1], out=out[..., 1:])
+    np.subtract(second[..., 0], first[..., -1], out=out[..., 0])
+    if scale != 1.0:
+        out *= np.float32(scale)
+
+
+def _turned(signals: Map) -> Map:
+    """Differences between columns one rotation step apart (cyclic)."""
+    out = np.empty_like(signals)
+    np.subtract(signals[..., 1:], signals[..., :-1], out=out[..., :-1])
+    np.subtract(signals[..., 0], signals[..., -1], out=out[..., -1])
+    return out
+
+
+def _square(signals: Map) -> Map:
+    flat = signals.reshape(len(signals), -1)
+    return np.asarray(flat @ flat.T)

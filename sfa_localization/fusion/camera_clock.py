@@ -1,0 +1,203 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""By how much the camera's stamps are late, from turns that images and odometry have both seen.
+
+The time by which the turns between images lag behind those of the odometry is what the two clocks,
+or exposure and transfer, differ by. No map is needed: it works from the first turns on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.run import Odometry, Stamps
+
+LONGEST_S = 2.5
+"""Clocks farther apart are not recognized."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraClock:
+    """`delay_s` by which images are stamped later than odometry, known to `std_s`.
+
+    0 and infinity where the drive does not show it: it takes turns that begin and end. What is
+    `assumed` holds however small it is beside its standard deviation.
+    """
+
+    delay_s: float = 0.0
+    std_s: float = np.inf
+    assumed: bool = False
+
+    @property
+    def known(self) -> bool:
+        """Whether the drive shows the delay at all."""
+        return bool(np.isfinite(self.std_s))
+
+    @property
+    def delay_ns(self) -> int:
+        """What to take off the images' stamps: 0 for a delay that may well be none."""
+        shown = self.assumed or abs(self.delay_s) > _SIGNIFICANT * self.std_s
+        return round(self.delay_s * 1e9) if shown else 0
+
+
+_SIGNIFICANT = 2.0
+# Mean absolute value of a standard normal variable.
+_MEAN_OF_NORMAL = 0.798
+_STEP_S = 0.02
+_GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
+# Images farther apart in time are not compared, nor such with a pause of the odometry between.
+_APART_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
+# Of images that come faster than this, not all are compared: turns between them are too small.
+_NEAR_NS = 150_000_000
+# An estimate holds for images stamped so much later: those already under way keep the old one,
+# so that what is made of them does not depend on which message came first.
+_UNDER_WAY_NS = 1_000_000_000
+_WINDOW_NS = round(LONGEST_S * 1e9) + 100_000_000
+_REMEMBERED_NS = 10_000_000_000
+# Differences beyond a few of these are mismatches of images and count no more, rad.
+_SCALE_RAD, _OUTLIER = 0.05, 4.0
+# A turn by less does not say how well images and odometry agree on turns, rad.
+_TURN_RAD = 0.05
+_TURNS_MIN = 10
+# Neighbouring pairs err alike: what they say counts for half.
+_CAUTION = 2.0
+_SCALE_MIN_RAD = 1e-3
+_STD_MAX_S = 0.03
+
+
+class CameraClockFinder:
+    """Compares the turns between images with those of the odometry, as both come in.
+
+    `memory` is the number of image pairs after which an old one counts little; clocks drift.
+    `start` is what is believed of the clock before anything is found.
+    """
+
+    def __init__(self, memory: float = np.inf, start: CameraClock | None = None) -> None:
+        self._keep = 1.0 - 1.0 / memory
+        self._found: deque[tuple[int, CameraClock]] = deque([(0, start or CameraClock())])
+        self._stamps: deque[int] = deque()
+        self._yaws: deque[float] = deque()
+        self._pauses: deque[int] = deque()
+        self._last: tuple[int, float] | None = None
+        self._pairs: deque[tuple[int, int, float]] = deque()
+        # By the sign of the columns and the delay: cost, its curvature, and of the pairs with
+        # turns their number, their size and their differences.
+        self._cost, self._power, self._turns, self._size, self._left = np.zeros((5, 2, len(_GRID)))
+
+    def expect(self, clock: CameraClock) -> None:
+        """Believe this of the clock until something is found."""
+        self._found[0] = 0, clock
+
+    @property
+    def clock(self) -> CameraClock:
+        """The newest estimate."""
+        return self._found[-1][1]
+
+    def clock_at(self, stamp_ns: int) -> CameraClock:
+        """The estimate that holds for an image of this stamp."""
+        for found_ns, clock in reversed(self._found):
+            if found_ns + _UNDER_WAY_NS <= stamp_ns:
+                return clock
+        return self._found[0][1]
+
+    def add_odometry(self, stamp_ns: int, omega: float) -> None:
+        """Take a turn rate rad/s, held since the message before; stale stamps are passed over."""
+        if self._stamps:
+            gap = stamp_ns - self._stamps[-1]
+            if gap <= 0:
+                return
+            if gap > _PAUSE_NS:
+                self._pauses.append(stamp_ns)
+        yaw = self._yaws[-1] + omega * gap * 1e-9 if self._yaws else 0.0
+        self._stamps.append(stamp_ns)
+        self._yaws.append(yaw)
+        while self._pairs and self._pairs[0][1] + _WINDOW_NS <= stamp_ns:
+            self._compare(*self._pairs.popleft())
+        oldest = (self._pairs[0][0] if self._pairs else stamp_ns - _APART_NS) - _WINDOW_NS
+        while len(self._stamps) > 2 and self._stamps[1] < oldest - _WINDOW_NS:
+            self._stamps.popleft()
+            self._yaws.popleft()
+
+    def add_heading(self, stamp_ns: int, yaw_rad: float) -> None:
+        """Take the heading that a `VisualGyro` has added up at an image's stamp."""
+        if self._last is not None and 0 <= stamp_ns - self._last[0] < _NEAR_NS:
+            return
+        if self._last is not None and 0 < stamp_ns - self._last[0] < _APART_NS:
+            turn = float(wrap_angle(yaw_rad - self._last[1]))
+            self._pairs.append((self._last[0], stamp_ns, turn))
+        self._last = stamp_ns, yaw_rad
+
+    def _compare(self, start_ns: int, stop_ns: int, turn: float) -> None:
+        """Add a pair of images to all sums, once odometry surrounds it by any delay."""
+        first, last = start_ns - _WINDOW_NS, stop_ns + _WINDOW_NS
+        while self._pauses and self._pauses[0] < first:
+            self._pauses.popleft()
+        if first < self._stamps[0] or (self._pauses and self._pauses[0] <= last):
+            return
+        at = (np.array(self._stamps, np.int64) - start_ns) * 1e-9
+        yaw = np.array(self._yaws)
+        span = (stop_ns - start_ns) * 1e-9
+        driven = np.interp(span - _GRID, at, yaw) - np.interp(-_GRID, at, yaw)
+        left = np.abs(wrap_angle(np.array([[turn], [-turn]]) - driven)) / _SCALE_RAD
+        fits, turning = left < _OUTLIER, np.abs(driven) > _TURN_RAD
+        for total, new in (
+            (self._cost, np.minimum(left, _OUTLIER)),
+            # A moment more of delay changes the turn by the change of the turn rate.
+            (self._power, fits * np.gradient(driven, _STEP_S) ** 2),
+            (self._turns, turning),
+            (self._size, turning * np.abs(driven)),
+            (self._left, turning * np.minimum(left, _OUTLIER) * _SCALE_RAD),
+        ):
+            total *= self._keep
+            total += new
+        found = self._estimate()
+        if found.known:
+            self._found.append((last, found))
+        while len(self._found) > 2 and self._found[1][0] < last - _REMEMBERED_NS:
+            self._found.popleft()
+
+    def _estimate(self) -> CameraClock:
+        """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
+        side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
+        turns, size, left = (a[side, best] for a in (self._turns, self._size, self._left))
+        # Columns may grow either way: the better sign is the right one.
+        if turns < _TURNS_MIN or left > size / 2 or not 0 < best < len(_GRID) - 1:
+            return CameraClock()
+        scale = max(left / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
+        power = float(self._power[side, best])
+        std = _CAUTION * scale / np.sqrt(power) if power > 0 else np.inf
+        if std > _STD_MAX_S:
+            return CameraClock()
+        below, least, above = self._cost[side, best - 1 : best + 2]
+        # Two slopes meet in the minimum of a sum of absolute values.
+        steepest = max(below - least, above - least)
+        part = (below - above) / (2 * steepest) if steepest > 0 else 0.0
+        return CameraClock(float(_GRID[best] + part * _STEP_S), float(std))
+
+
+def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float]) -> CameraClock:
+    """The delay of a recorded camera whose images, at stamps (N,), show these headings, rad.
+
+    `headings` are what `sfa_localization.camera.turns.headings` reads from the images.
+    """
+    finder, seen = CameraClockFinder(), iter(headings)
+    rates = _turn_rates(odometry).tolist()
+    for stamp_ns, kind, i in in_order(odometry.stamps_ns, stamps_ns):
+        if kind == ODOMETRY:
+            finder.add_odometry(stamp_ns, rates[i])
+        else:
+            finder.add_heading(stamp_ns, next(seen))
+    return finder.clock
+
+
+def _turn_rates(odometry: Odometry) -> Array:
+    """The poses' own turn rates (N,): also where messages hold no twist."""
+    turned = np.diff(np.unwrap(odometry.poses[:, 2]))
+    seconds = np.maximum(np.diff(odometry.stamps_ns) * 1e-9, 1e-9)
+    return np.concatenate([[0.0], turned / seconds])

@@ -1,0 +1,163 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What sensors tell, made fit for the filter: checked, with floors and factors on their noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array
+from sfa_localization.fusion.motion import Twist
+from sfa_localization.fusion.settings import FilterConfig
+
+_LARGEST_VARIANCE = 1e6
+_LARGEST_COORDINATE = 1e9
+_LARGEST_TWIST = 100.0
+_UNKNOWN_YAW_STD = 0.2
+_LARGEST_ENTRY = 1e12
+_SINGULAR = 1e-10
+_LARGEST_YAW = 1e6
+
+
+def read_twist(
+    v: float, omega: float, variances: Sequence[float] | Array, config: FilterConfig
+) -> Twist:
+    """A reading with the noise it is believed to have, from the `variances` (2,) it tells.
+
+    DataError says why it cannot be one.
+    """
+    v, omega = float(v), float(omega)
+    if not (math.isfinite(v) and math.isfinite(omega)):
+        raise DataError('not finite')
+    if abs(v) > _LARGEST_TWIST or abs(omega) > _LARGEST_TWIST:
+        raise DataError('absurdly fast')
+    told_v, told_omega = variances
+    return Twist(
+        v,
+        omega,
+        _variance(told_v, config.speed_std_floor, config.speed_std, config),
+        _variance(told_omega, config.rate_std_floor, config.rate_std, config),
+    )
+
+
+def _variance(told: float, floor: float, default: float, config: FilterConfig) -> float:
+    if not (math.isfinite(told) and 0 < told < _LARGEST_VARIANCE):
+        return default**2
+    return max(config.odometry_factor * float(told), floor**2)
+
+
+def read_measurement(
+    value: ArrayLike, covariance: ArrayLike, config: FilterConfig
+) -> tuple[Array, Array]:
+    """A position (2,) or pose (3,) and its covariance as they are fused.
+
+    A heading that is not known well enough is left out. DataError says why there is nothing left.
+    """
+    given, spread = np.asarray(value, float), np.asarray(covariance, float)
+    if given.shape not in ((2,), (3,)) or spread.shape != (given.size, given.size):
+        raise DataError('shape is not that of a position or a pose')
+    # In plain numbers from here: arrays of two or three cost more than what is done with them.
+    told, rows = given.tolist(), spread.tolist()
+    if not (abs(told[0]) <= _LARGEST_COORDINATE and abs(told[1]) <= _LARGEST_COORDINATE):
+        raise DataError('position is not finite')
+    if len(told) == 3 and not _knows_yaw(told[2], rows, config):
+        given, rows = given[:2], [row[:2] for row in rows[:2]]
+    if not any(map(any, rows)):
+        stds = [config.position_std, config.position_std, _UNKNOWN_YAW_STD][: len(rows)]
+        rows = np.diag(np.square(stds)).tolist()
+    if not _is_positive(rows):
+        raise DataError('covariance is not symmetric positive')
+    if rows[0][0] >= _LARGEST_VARIANCE or rows[1][1] >= _LARGEST_VARIANCE:
+        raise DataError('covariance tells that nothing is known')
+    return given.copy(), _conditioned(rows, config)
+
+
+def _knows_yaw(yaw: float, rows: list[list[float]], config: FilterConfig) -> bool:
+    variance = rows[2][2]
+    if not (abs(yaw) < _LARGEST_YAW and variance <= config.yaw_std_limit**2):
+        return False
+    return variance > 0 or not any(map(any, rows))
+
+
+def _is_positive(rows: list[list[float]]) -> bool:
+    """Finite, symmetric, and with leading minors well above 0: positive definite (Sylvester)."""
+    if len(rows) == 2:
+        (a, b), (b2, d) = rows
+        largest, skew = max(a, d), abs(b - b2)
+        determinant = a * d - b * b
+        limit = _SINGULAR * a * d
+    else:
+        (a, b, c), (b2, d, e), (c2, e2, f) = rows
+        largest, skew = max(a, d, f), abs(b - b2) + abs(c - c2) + abs(e - e2)
+        if not (f > 0 and a * d - b * b > _SINGULAR * a * d):
+            return False
+        determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+        limit = _SINGULAR * a * d * f
+    # Comparisons with NaN are false, so that one anywhere ends here; so do infinities.
+    return a > 0 and d > 0 and determinant > limit and skew <= 1e-6 * largest < _LARGEST_ENTRY
+
+
+def _conditioned(rows: list[list[float]], config: FilterConfig) -> Array:
+    """Symmetric, with the factor applied, then what is below the floor raised to it."""
+    half = config.measurement_factor / 2
+    floor, yaw_floor = config.position_std_floor**2, config.yaw_std_floor**2
+    xx = max((rows[0][0] + rows[0][0]) * half, floor)
+    xy = (rows[0][1] + rows[1][0]) * half
+    yy = max((rows[1][1] + rows[1][1]) * half, floor)
+    if len(rows) == 2:
+        return np.array([[xx, xy], [xy, yy]])
+    xt, yt = (rows[0][2] + rows[2][0]) * half, (rows[1][2] + rows[2][1]) * half
+    tt = max((rows[2][2] + rows[2][2]) * half, yaw_floor)
+    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+
+
+def lower_root(covariance: Array, factor: float) -> list[list[float]]:
+    """`factor` times the lower triangular root (Cholesky) of a covariance (2, 2) or (3, 3)."""
+    rows = covariance.tolist()
+    a = math.sqrt(rows[0][0])
+    b = rows[1][0] / a
+    d = math.sqrt(rows[1][1] - b * b)
+    if len(rows) == 2:
+        return [[factor * a, 0.0], [factor * b, factor * d]]
+    c = rows[2][0] / a
+    e = (rows[2][1] - b * c) / d
+    f = math.sqrt(rows[2][2] - c * c - e * e)
+    return [
+        [factor * a, 0.0, 0.0],
+        [factor * b, factor * d, 0.0],
+        [factor * c, factor * e, factor * f],
+    ]
+
+
+def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
+    """A pose (3,) and covariance (3, 3) set from outside; DataError where they are none."""
+    value, spread = np.asarray(pose, float), np.asarray(covariance, float)
+    if value.shape != (3,) or not np.all(np.isfinite(value)):
+        raise DataError(f'initial pose {pose!r} is not x, y, yaw')
+    if np.abs(value).max() > _LARGEST_COORDINATE:
+        raise DataError(f'initial pose {pose!r} is absurdly far away')
+    if spread.shape != (3, 3) or not is_covariance(spread):
+        raise DataError('covariance of the initial pose is not a symmetric positive (3, 3) one')
+    return value, symmetric(spread)
+
+
+def is_covariance(matrix: Array) -> bool:
+    """Finite, symmetric and positive definite."""
+    if not np.all(np.isfinite(matrix)):
+        return False
+    scale = float(np.abs(matrix).max())
+    if not 0 < scale < _LARGEST_ENTRY or float(np.abs(matrix - matrix.T).max()) > 1e-6 * scale:
+        return False
+    return bool(np.linalg.eigvalsh(symmetric(matrix))[0] > 0)
+
+
+def symmetric(matrix: Array) -> Array:
+    """The symmetric part."""
+    total: Array = matrix + matrix.T
+    total *= 0.5
+    return total

@@ -1,0 +1,185 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The error to expect of one image on a path between the trained ones; needs no ground truth.
+
+A stretch of the drive that is left out lies, as a rule, farther from all other images than a path
+of later use: legs end at the border, and lanes are alone in their strip. So the forecast asks at
+points drawn evenly over the covered ground. The nearest image of such a point is one distance
+away, and on the other side the nearest is at another distance. Around the image nearest to the
+point all images are left out up to these two distances, on the one side and on the other, and the
+map predicts it from the rest: it is then as far from its neighbours as the point is.
+
+What no left-out image can show is not in it: another light than that of the trained drives, or
+a wheel radius that is wrong everywhere.
+
+Images left out together cost no new fit: with residuals r and the hat matrix H of the least
+squares, the group G is off by (I - H_GG)^-1 r_G where it was not used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, cKDTree
+
+from sfa_localization.data.geometry import Array, RigidTransform
+from sfa_localization.metric.alternation import Fit, targets
+from sfa_localization.metric.quadratic_form import Stack
+
+Indices = NDArray[np.int64]
+
+REACH_M = 1.0
+"""Ground further than this from every image is not covered by the drive."""
+_POINTS = 1000
+_BINS = 12
+# Images before and after one that tell in which direction the robot was driving.
+_AROUND = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """Expected errors of single images at K points, drawn evenly over the covered ground."""
+
+    points: Array
+    """(K, 2) m, in the map frame."""
+    distances: Array
+    """(K,) m to the nearest image of the drive."""
+    errors: Array
+    """(K,) m: of the map without the images as near as that, and of the drive's own positions."""
+
+    @property
+    def expected_m(self) -> float:
+        """Mean error to expect of one image on a path between the trained ones."""
+        return float(self.errors.mean())
+
+    @property
+    def local(self) -> Array:
+        """(K,) m: mean of the errors within `REACH_M` of each point."""
+        near = cKDTree(self.points).query_ball_point(self.points, REACH_M)
+        return np.array([self.errors[rows].mean() for rows in near])
+
+    @property
+    def worst(self) -> tuple[float, float, float]:
+        """x, y (m, map frame) where the expected error is largest, and this error (m)."""
+        local = self.local
+        at = int(local.argmax())
+        return float(self.points[at, 0]), float(self.points[at, 1]), float(local[at])
+
+    def importance(self, distances: Array) -> Array:
+        """Weights (M,), of sum 1, of left-out images so far (m) from the nearest used one.
+
+        As many, by weight, are then at each distance as points of the covered ground are.
+        """
+        edges = np.quantile(self.distances, np.linspace(0.0, 1.0, _BINS + 1))
+        edges[0] = 0.0
+        bins = np.searchsorted(edges, distances, 'right') - 1
+        inside = (bins >= 0) & (bins < _BINS)
+        if not inside.any():
+            return np.full(len(distances), 1.0 / max(len(distances), 1))
+        bins = np.clip(bins, 0, _BINS - 1)
+        counts = np.bincount(bins[inside], minlength=_BINS)
+        weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)
+        return np.asarray(weights / weights.sum())
+
+    def moved(self, frame: RigidTransform) -> Forecast:
+        """The same forecast in another frame."""
+        return replace(self, points=frame.apply(self.points))
+
+
+def forecast(whole: Fit, stack: Stack, sway: Array, rng: np.random.Generator) -> Forecast:
+    """The forecast of a fit, in its own frame.
+
+    `sway` (M,) m^2 is how uncertain the drive's own positions are where each image was taken:
+    the map repeats their errors, which leaving out images cannot show.
+    """
+    ends = targets(whole.solution, stack)
+    places = np.column_stack([ends.real, ends.imag])
+    points = _covered(places, rng)
+    near, nearest = cKDTree(places).query(points)
+    far = _beyond(places, points, nearest)
+    leaver = _Leaver(whole)
+    errors = np.empty(len(points))
+    for k, image in enumerate(nearest):
+        gap = _gap(ends, stack, int(image), near[k], far[k], rng)
+        errors[k] = abs(leaver.error(int(image), gap))
+    return Forecast(points, near, np.hypot(errors, np.sqrt(sway[nearest])))
+
+
+def nearest_used(places: Array, part: Indices) -> Array:
+    """Distance (M,) m from each place (M, 2) to the nearest one of another part (M,).
+
+    Infinite where there is no other part.
+    """
+    distances = np.full(len(places), np.inf)
+    for name in np.unique(part):
+        own = part == name
+        if not own.all():
+            distances[own] = cKDTree(places[~own]).query(places[own])[0]
+    return distances
+
+
+def _covered(places: Array, rng: np.random.Generator) -> Array:
+    """Points drawn evenly where the tracks (M, 2) are around and one is near: (K, 2)."""
+    hull = ConvexHull(places)
+    normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
+    tree = cKDTree(places)
+    low, high = places.min(0), places.max(0)
+    found: list[Array] = []
+    while sum(len(points) for points in found) < _POINTS:
+        points = rng.uniform(low, high, (4 * _POINTS, 2))
+        points = points[np.all(points @ normals.T + offsets <= 0.0, axis=1)]
+        found.append(points[tree.query(points)[0] <= REACH_M])
+    return np.concatenate(found)[:_POINTS]
+
+
+def _beyond(places: Array, points: Array, nearest: Indices) -> Array:
+    """Distance (K,) to the nearest place on the side away from the nearest one of all."""
+    distances = np.empty(len(points))
+    for k, point in enumerate(points):
+        away = places - point
+        opposite = away @ away[nearest[k]] < 0.0
+        distances[k] = np.hypot(*away[opposite].T).min() if opposite.any() else np.inf
+    return distances
+
+
+def _gap(
+    ends: NDArray[np.complex128],
+    stack: Stack,
+    image: int,
+    near: float,
+    far: float,
+    rng: np.random.Generator,
+) -> Indices:
+    """Rows around an image: within `near`, and on one side, fore or aft, nearer than `far`."""
+    first = stack.first[stack.owner[image]]
+    last = np.append(stack.first[1:], len(ends))[stack.owner[image]] - 1
+    along = ends[min(image + _AROUND, last)] - ends[max(image - _AROUND, first)]
+    # A robot that turned on the spot was driving in no direction.
+    if along == 0.0:
+        along = np.exp(2j * np.pi * rng.random())
+    side = along * rng.choice([-1.0, 1.0])
+    away = ends - ends[image]
+    distance = np.abs(away)
+    inside = (distance <= near) | ((np.real(away * np.conj(side)) > 0.0) & (distance < far))
+    inside[image] = True
+    return np.flatnonzero(inside)
+
+
+class _Leaver:
+    """Errors of images where they, and others, were not used."""
+
+    def __init__(self, whole: Fit) -> None:
+        self._half = whole.elimination.halved(whole.expanded).T
+        self._weights = whole.weights
+        self._residuals = whole.residuals
+
+    def error(self, image: int, group: Indices) -> complex:
+        """Of the map at an image of the group of rows that it is learnt without, metres."""
+        half = self._half[group]
+        own = np.eye(len(group)) - (half @ half.T) * self._weights[group]
+        # Where the rest fixes nothing, the group held the map alone.
+        own[np.diag_indices_from(own)] += 1e-9
+        left = np.linalg.solve(own, self._residuals[group])
+        return complex(left[group == image][0])

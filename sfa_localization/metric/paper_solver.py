@@ -1,0 +1,181 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's own solver: momentum descent on equations 1 to 8, kept as the reference.
+
+Equation 6 lacks the case of the last line, which has only its second term; the cosine of
+equation 5 cannot tell a turn from its mirror image. Both are kept as they must be meant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array
+from sfa_localization.metric.alternation import Fit, residual_variance
+from sfa_localization.metric.expansions import Monomials, monomials
+from sfa_localization.metric.phases import certify, phase_cost
+from sfa_localization.metric.quadratic_form import Links, Problem, Solution, Stack, eliminate
+from sfa_localization.metric.settings import MetricConfig
+
+Complex = NDArray[np.complex128]
+
+_PAPER_FEATURES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """theta: alpha (N,) rad, origins (N, 2) m, weights (J, 2)."""
+
+    alpha: Array
+    origins: Array
+    weights: Array
+
+    def flat(self) -> Array:
+        """All in one vector (N + 2N + 2J,)."""
+        return np.concatenate([self.alpha, self.origins.ravel(), self.weights.ravel()])
+
+    @classmethod
+    def of(cls, flat: Array, lines: int) -> Parameters:
+        alpha, origins, weights = np.split(flat, [lines, 3 * lines])
+        return cls(alpha, origins.reshape(lines, 2), weights.reshape(-1, 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """M points on N lines: regressors (M, J), distances (M,), the line of each, N - 1 turns."""
+
+    regressors: Array
+    distances: Array
+    line: NDArray[np.int64]
+    turns: Array
+    """(N - 1,) rad, NaN where unknown; empty for the cost C without turns."""
+
+    def cost(self, theta: Parameters) -> float:
+        """C of equation 1, or C' of equation 5 when there are turns."""
+        cost = 0.5 * float((self._misfit(theta) ** 2).sum())
+        if len(self.turns):
+            cost += 0.5 * float(np.nansum(self._turn_misfit(theta) ** 2))
+        return cost
+
+    def gradient(self, theta: Parameters) -> Parameters:
+        """Equations 2 to 4, and equation 6 when there are turns."""
+        lines = len(theta.alpha)
+        misfit = self._misfit(theta)
+        predicted = self.regressors @ theta.weights - theta.origins[self.line]
+        sine, cosine = np.sin(theta.alpha)[self.line], np.cos(theta.alpha)[self.line]
+        lever = self.distances * (sine * predicted[:, 0] - cosine * predicted[:, 1])
+        alpha: Array = np.bincount(self.line, lever, lines).astype(float)
+        if len(self.turns):
+            alpha = alpha + self._turn_gradient(theta)
+        origins: Array = np.zeros((lines, 2))
+        np.add.at(origins, self.line, misfit)
+        return Parameters(alpha, origins, -self.regressors.T @ misfit)
+
+    def _misfit(self, theta: Parameters) -> Array:
+        direction = np.column_stack([np.cos(theta.alpha), np.sin(theta.alpha)])[self.line]
+        placed = theta.origins[self.line] + self.distances[:, None] * direction
+        return np.asarray(placed - self.regressors @ theta.weights)
+
+    def _turn_misfit(self, theta: Parameters) -> Array:
+        return np.asarray(np.cos(theta.alpha[:-1] - theta.alpha[1:]) - np.cos(self.turns))
+
+    def _turn_gradient(self, theta: Parameters) -> Array:
+        step = theta.alpha[:-1] - theta.alpha[1:]
+        pull = np.nan_to_num(np.sin(step) * -self._turn_misfit(theta))
+        gradient = np.zeros(len(theta.alpha))
+        gradient[:-1] += pull
+        gradient[1:] -= pull
+        return gradient
+
+
+def descend(lines: Lines, start: Parameters, config: MetricConfig) -> tuple[Parameters, Array]:
+    """Equations 7 and 8 until the iterations are used up or the cost stands still.
+
+    Returns the parameters and the cost (I,) before each iteration and after the last. Raises
+    DataError when the descent diverges.
+    """
+    count, theta = len(start.alpha), start.flat()
+    velocity, history = np.zeros_like(theta), [lines.cost(start)]
+    for _ in range(config.paper_iterations):
+        slope = lines.gradient(Parameters.of(theta, count)).flat()
+        velocity = config.paper_momentum * velocity + config.paper_learning_rate * slope
+        theta = theta - velocity
+        history.append(lines.cost(Parameters.of(theta, count)))
+        if not np.isfinite(history[-1]):
+            raise DataError('the descent diverges: lower paper_learning_rate')
+        if abs(history[-1] - history[-2]) < config.paper_change_min:
+            break
+    return Parameters.of(theta, count), np.array(history)
+
+
+def random_start(lines: Lines, config: MetricConfig) -> Parameters:
+    """The paper's simulator start: everything uniform."""
+    rng = np.random.default_rng(config.metric_seed)
+    count = int(lines.line[-1]) + 1
+    half = np.array([config.paper_area_x, config.paper_area_y]) / 2
+    return Parameters(
+        rng.uniform(0.0, 2.0 * np.pi, count),
+        rng.uniform(-half, half, (count, 2)),
+        rng.uniform(-1.0, 1.0, (lines.regressors.shape[1], 2)),
+    )
+
+
+def odometry_start(lines: Lines, starts: Array) -> Parameters:
+    """The paper's robot start: lines (N, 3) where odometry has them, weights fitted to that."""
+    alpha, origins = starts[:, 2], starts[:, :2]
+    direction = np.column_stack([np.cos(alpha), np.sin(alpha)])[lines.line]
+    placed = origins[lines.line] + lines.distances[:, None] * direction
+    weights = np.linalg.lstsq(lines.regressors, placed, rcond=None)[0]
+    return Parameters(np.array(alpha), np.array(origins), weights)
+
+
+def learn(features: Array, stack: Stack, links: Links, config: MetricConfig) -> tuple[Fit, Array]:
+    """The descent on the stack's features (M, K): its fit, and the cost (I,) of its iterations.
+
+    Raises DataError when the segments are not straight lines: the paper's costs know no other.
+    """
+    if np.any(stack.path.imag):
+        raise DataError('the paper solver needs straight lines: set segments: straight')
+    count = min(config.slow_features or _PAPER_FEATURES, features.shape[1])
+    regressors = monomials(features[:, :count])
+    turns = np.full(stack.segments - 1, np.nan)
+    turns[links.at] = links.turn
+    lines = Lines(
+        regressors, stack.path.real, stack.owner, turns if config.paper_turns else np.zeros(0)
+    )
+    random = config.paper_start == 'random'
+    start = random_start(lines, config) if random else odometry_start(lines, stack.starts)
+    theta, history = descend(lines, start, config)
+    if _mirrored(theta.alpha, turns):
+        theta = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
+    return _fit(theta, regressors, count, stack, links), history
+
+
+def _mirrored(alpha: Array, turns: Array) -> bool:
+    """Whether the signed turns (N - 1,) fit the mirror image better: no cosine can tell."""
+    step = np.diff(alpha)
+    return bool(np.nansum(np.cos(step - turns)) < np.nansum(np.cos(-step - turns)))
+
+
+def _fit(theta: Parameters, regressors: Array, count: int, stack: Stack, links: Links) -> Fit:
+    """The descent's end in the certified solver's terms, certificate included."""
+    terms = regressors.shape[1]
+    basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
+    expanded = np.column_stack([regressors[:, 1:], np.ones(len(regressors))])
+    weights = np.roll(theta.weights, -1, axis=0) @ np.array([1.0, 1.0j])
+    o, z = theta.origins @ np.array([1.0, 1.0j]), np.exp(1j * theta.alpha)
+    residuals = o[stack.owner] + z[stack.owner] * stack.path - expanded @ weights
+    freedom = len(residuals) - terms - 1.5 * stack.segments
+    variance = residual_variance(residuals, freedom)
+    elimination = eliminate(expanded, basis.ridge, np.ones(len(expanded)), stack)
+    bias = np.zeros(stack.run[-1] + 1)
+    h = Problem(elimination.gram, links, stack.run, variance, 0.0).reduced(bias)
+    solution = Solution(z, o, bias, certify(h, z), h, phase_cost(h, z))
+    trust = np.ones(len(expanded))
+    return Fit(
+        basis, expanded, trust, links, variance, elimination, solution, 1.0, residuals, weights
+    )

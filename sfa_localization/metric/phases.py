@@ -1,0 +1,175 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Phase synchronization: minimize z^H H z / 2 over unit phases, and prove the minimum global.
+
+H (N, N) is Hermitian and positive semidefinite; z (N,) has |z_n| = 1. Unsupervised metric
+learning is this problem once the map and the segments' origins are eliminated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+
+Complex = NDArray[np.complex128]
+
+# Relative to the largest eigenvalue of H; what rounding leaves of an exact zero.
+CERTIFICATE_TOLERANCE = 1e-9
+_NEWTON_STEPS = 100
+# Newton's steps shrink quadratically: the one after this would be rounding.
+_CONVERGED = 1e-9
+_SWEEPS = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """Proof that no other angles are better.
+
+    With Lambda = diag(Re(conj(z) * (H z))), H - Lambda >= 0 proves global optimality.
+    `eigenvalue` is its smallest eigenvalue, `gap` its second, both over H's largest.
+    """
+
+    eigenvalue: float
+    gap: float
+
+    @property
+    def certified(self) -> bool:
+        return self.eigenvalue >= -CERTIFICATE_TOLERANCE
+
+
+def phase_cost(h: Complex, z: Complex) -> float:
+    """z^H H z / 2."""
+    return float(np.real(np.vdot(z, h @ z))) / 2
+
+
+def certify(h: Complex, z: Complex) -> Certificate:
+    """Certificate of the phases z (N,) for H (N, N)."""
+    multipliers = np.real(np.conj(z) * (h @ z))
+    values = scipy.linalg.eigvalsh(h - np.diag(multipliers))
+    scale = max(float(scipy.linalg.eigvalsh(h, subset_by_index=[len(h) - 1] * 2)[0]), 1e-300)
+    second = values[1] if len(values) > 1 else np.inf
+    return Certificate(float(values[0]) / scale, float(second) / scale)
+
+
+def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Certificate]:
+    """Global minimizer z (N,) and its certificate.
+
+    Starts from `starts`, then from the smallest eigenvector, from the metric upgrade, and at last
+    from the semidefinite relaxation, which the certificate is dual to; the first certified minimum
+    ends the search. What is returned may be uncertified: ask the certificate.
+    """
+    z = min([refine(h, unit(s)) for s in starts] or [_spectral(h)], key=lambda c: phase_cost(h, c))
+    certificate = certify(h, z)
+    for more in (_spectral_starts, _upgraded_starts, _relaxed_starts):
+        if certificate.certified:
+            break
+        z = min([z, *(refine(h, c) for c in more(h, z))], key=lambda c: phase_cost(h, c))
+        certificate = certify(h, z)
+    return z, certificate
+
+
+def _spectral(h: Complex) -> Complex:
+    return refine(h, spectral_start(h))
+
+
+def _spectral_starts(h: Complex, z: Complex) -> list[Complex]:
+    return [spectral_start(h)]
+
+
+def unit(z: Complex) -> Complex:
+    """Phases of complex numbers, 1 for 0."""
+    size = np.abs(z)
+    return np.where(size > 0, z / np.where(size > 0, size, 1.0), 1.0)
+
+
+def spectral_start(h: Complex) -> Complex:
+    """Phases of the smallest eigenvector of H."""
+    return unit(scipy.linalg.eigh(h, subset_by_index=[0, 0])[1][:, 0])
+
+
+def metric_upgrade(g: Complex) -> tuple[Complex, float]:
+    """Phases from the two smallest eigenvectors of real G, and how well they are fixed.
+
+    The eigenvectors give the directions u_n up to an affine map; the symmetric B (2, 2) with
+    u_n^T B u_n = 1 for all n undoes it, up to rotation and mirror. The condition is the smallest
+    singular value over the largest of that linear problem: 0 when fewer than three directions
+    are known, and any shear explains the data.
+    """
+    u = scipy.linalg.eigh(np.real(g), subset_by_index=[0, 1])[1]
+    u = u * np.sqrt(len(u))
+    design = np.column_stack([u[:, 0] ** 2, u[:, 1] ** 2, 2 * u[:, 0] * u[:, 1]])
+    singular = np.linalg.svd(design, compute_uv=False)
+    a, b, c = np.linalg.lstsq(design, np.ones(len(u)), rcond=1e-10)[0]
+    values, axes = np.linalg.eigh(np.array([[a, c], [c, b]]))
+    points = u @ axes * np.sqrt(np.maximum(values, 1e-12))
+    return unit(points[:, 0] + 1j * points[:, 1]), float(singular[-1] / singular[0])
+
+
+def _upgraded_starts(h: Complex, z: Complex) -> list[Complex]:
+    start = metric_upgrade(h)[0] if len(h) > 2 else z
+    return [start, np.conj(start), np.conj(z)]
+
+
+def _relaxed_starts(h: Complex, z: Complex) -> list[Complex]:
+    """Phases of the leading vector of the relaxation's solution, by descent block by block."""
+    rank = min(len(h), 4)
+    rows = np.zeros((len(h), rank), complex)
+    rows[:, 0] = z
+    rows += 0.1 * np.exp(2j * np.pi * np.outer(np.arange(len(h)), np.arange(rank)) * 0.618)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    off = h - np.diag(np.diag(h))
+    for _ in range(_SWEEPS):
+        for n in range(len(h)):
+            pull = -off[n] @ rows
+            size = np.linalg.norm(pull)
+            rows[n] = pull / size if size > 0 else rows[n]
+    return [unit(np.linalg.svd(rows, full_matrices=False)[0][:, 0])]
+
+
+def refine(h: Complex, z: Complex) -> Complex:
+    """Local minimum from z (N,) by damped Newton steps on the angles."""
+    damping, cost = 0.0, phase_cost(h, z)
+    scale = max(float(np.real(np.diag(h)).max()), 1e-300)
+    for _ in range(_NEWTON_STEPS):
+        gradient, hessian = _derivatives(h, z)
+        step = _step(hessian, gradient, damping + 1e-12 * scale)
+        proposal = z * np.exp(1j * step)
+        new = phase_cost(h, proposal)
+        if new > cost + 1e-14 * abs(cost) + 1e-300 and np.abs(step).max() > 1e-12:
+            damping = max(4 * damping, 1e-6 * scale)
+            continue
+        z, cost, damping = proposal, min(new, cost), damping / 8 if damping > 1e-9 * scale else 0.0
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return z
+
+
+def _derivatives(h: Complex, z: Complex) -> tuple[Array, Array]:
+    """Gradient (N,) and Hessian (N, N) of the cost by the angles of z."""
+    product = np.conj(z) * (h @ z)
+    hessian = np.real(np.conj(z)[:, None] * h * z[None, :]) - np.diag(product.real)
+    return np.asarray(product.imag), np.asarray(hessian)
+
+
+def angle_hessian(h: Complex, z: Complex) -> Array:
+    """Hessian (N, N) of the cost by the angles of z."""
+    return _derivatives(h, z)[1]
+
+
+def _step(hessian: Array, gradient: Array, damping: float) -> Array:
+    """Newton step; where the Hessian is not positive, along its absolute value."""
+    # Turning all together changes nothing: hold the mean.
+    damped = hessian + np.mean(np.abs(np.diag(hessian))) / len(hessian)
+    damped[np.diag_indices_from(damped)] += damping
+    try:
+        return np.asarray(-scipy.linalg.solve(damped, gradient, assume_a='pos'))
+    except np.linalg.LinAlgError:
+        values, vectors = scipy.linalg.eigh(hessian)
+        values = np.maximum(np.abs(values), damping + 1e-9 * np.abs(values).max() + 1e-300)
+        return np.asarray(-vectors @ ((vectors.T @ gradient) / values))

@@ -1,0 +1,148 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a drive can fix a map at all, and what to drive instead."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array
+from sfa_localization.metric.alternation import Fit, targets
+from sfa_localization.metric.phases import angle_hessian, metric_upgrade, refine
+from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.settings import MetricConfig
+
+Complex = NDArray[np.complex128]
+
+_SEGMENTS_MIN = 3
+_WIDTH_MIN_M = 0.5
+# Of the metric upgrade's singular values: below, some shear is as good as the map.
+_UPGRADE_MIN = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """What the drive offered."""
+
+    segments: int
+    images: int
+    length_m: float
+    extent_m: tuple[float, float]
+    """Four standard deviations of the positions along and across their main axis."""
+    directions: float
+    """Spread of driving directions: 0 all parallel, 1 evenly spread (opposite counts as same)."""
+    crossings: int
+    """Pairs of segments that cross, of different stretches of the drive."""
+    upgrade_condition: float
+    """0: without turns any shear explains the data; NaN when turns rule that out."""
+    mirror_ambiguous: bool
+    """Nothing tells the map from its mirror image."""
+    angle_std_rad: float
+    """Largest uncertainty of a segment's direction relative to the whole map."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def check_amount(stack: Stack) -> None:
+    """Raises DataError when there are too few segments to try."""
+    if stack.segments < _SEGMENTS_MIN:
+        raise DataError(
+            f'only {stack.segments} segments of odometry with pictures: drive at least '
+            f'{_SEGMENTS_MIN}, in different directions and crossing each other'
+        )
+
+
+def diagnose(fit: Fit, stack: Stack) -> Diagnostics:
+    """Diagnostics of a fit."""
+    places = targets(fit.solution, stack)
+    steps = stack.path[1:] - stack.path[:-1]
+    same = stack.owner[1:] == stack.owner[:-1]
+    heading = steps[same] * fit.solution.z[stack.owner[1:][same]]
+    links = fit.links
+    signed = bool(np.any(links.turn_trust > 0) or np.any(links.displacement_trust > 0))
+    signed = signed or not _straight(stack)
+    condition = np.nan if signed else metric_upgrade(np.real(fit.solution.h))[1]
+    return Diagnostics(
+        segments=stack.segments,
+        images=len(places),
+        length_m=float(np.abs(heading).sum()),
+        extent_m=_extent(places),
+        directions=_directions(heading),
+        crossings=_crossings(places, stack),
+        upgrade_condition=float(condition),
+        mirror_ambiguous=not signed and len(links.at) == 0,
+        angle_std_rad=float(np.sqrt(np.diag(angle_covariance(fit))).max()),
+    )
+
+
+def angle_covariance(fit: Fit) -> Array:
+    """Covariance (N, N) of the directions, rad^2, relative to the whole map's rotation."""
+    hessian = angle_hessian(fit.solution.h, refine(fit.solution.h, fit.solution.z))
+    values, vectors = np.linalg.eigh(hessian)
+    n = len(values)
+    common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
+    inverse = np.where(common, 0.0, 1.0 / np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
+    centered = np.eye(n) - 1.0 / n
+    spread = centered @ vectors
+    scale = fit.variance * fit.correlation
+    return np.asarray(scale * (spread * inverse) @ spread.T)
+
+
+def check(diagnostics: Diagnostics, config: MetricConfig) -> None:
+    """Raises DataError, telling what to drive, when the data cannot fix the map."""
+    if diagnostics.upgrade_condition < _UPGRADE_MIN:
+        raise DataError(
+            'without turns the lines leave the map sheared or collapsed: drive at least three '
+            'well-spread directions, or set use_turns'
+        )
+    if min(diagnostics.extent_m) < _WIDTH_MIN_M:
+        raise DataError(
+            f'the drive covers {diagnostics.extent_m[0]:.1f} m by {diagnostics.extent_m[1]:.1f} m: '
+            'drive in other directions too, so that the area is covered'
+        )
+    if diagnostics.crossings == 0:
+        raise DataError(
+            'no segment crosses another, so nothing ties them together but odometry: drive across '
+            'earlier tracks, from well-spread directions'
+        )
+    if np.rad2deg(diagnostics.angle_std_rad) > config.angle_std_max:
+        raise DataError(
+            f'directions are uncertain by up to {np.rad2deg(diagnostics.angle_std_rad):.0f} deg: '
+            'drive longer, in more directions, and cross earlier tracks '
+            f'({diagnostics.crossings} crossings now)'
+        )
+
+
+def _straight(stack: Stack) -> bool:
+    return not np.any(stack.path.imag)
+
+
+def _extent(places: Complex) -> tuple[float, float]:
+    spread = np.linalg.eigvalsh(np.cov(places.real, places.imag))
+    major, minor = 4.0 * np.sqrt(np.maximum(spread[::-1], 0.0))
+    return float(major), float(minor)
+
+
+def _directions(steps: Complex) -> float:
+    """From the length-weighted double angle, which is blind to driving to or fro."""
+    total = np.abs(steps).sum()
+    return 1.0 - float(abs((steps**2 / np.maximum(np.abs(steps), 1e-12)).sum()) / max(total, 1e-12))
+
+
+def _crossings(places: Complex, stack: Stack) -> int:
+    """Chords of segments that cross, leaving out neighbours on the drive."""
+    ends = np.append(stack.first[1:], len(places)) - 1
+    a, b = places[stack.first], places[ends]
+    i, j = np.triu_indices(len(a), 2)
+
+    def side(p: Complex, q: Complex, r: Complex) -> Array:
+        return np.asarray(np.sign(np.imag(np.conj(q - p) * (r - p))))
+
+    apart = side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) < 0
+    return int((apart & (side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]) < 0)).sum())

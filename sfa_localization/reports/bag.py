@@ -1,0 +1,50 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of what a bag holds: a contact sheet, and the path its odometry tells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image
+from sfa_localization.reports.evaluation import save
+
+
+def write_contact_sheet(samples: Sequence[Image], title: str, path: Path) -> None:
+    """Write BGR pictures (H, W, 3) as a PNG, in reading order. Raises LocalizationError."""
+    height, width = samples[0].shape[:2]
+    columns = max(1, round(np.sqrt(len(samples) * height / width)))
+    rows = -(-len(samples) // columns)
+    wide = 10 / columns
+    figure = Figure((10, rows * wide * height / width + 0.5), layout='constrained')
+    figure.suptitle(title, fontsize=10)
+    axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, sample in zip(axes, samples, strict=False):
+        axis.imshow(sample[..., ::-1], interpolation='lanczos')
+    save(figure, path)
+
+
+def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
+    """Write the odometry's path (N, 3) and the places (M, 3) of the pictures as a PNG.
+
+    Raises LocalizationError.
+    """
+    figure = Figure((6.5, 6), layout='constrained')
+    axes = figure.add_subplot()
+    axes.plot(poses[:, 0], poses[:, 1], color='0.8', linewidth=1, zorder=1)
+    order = np.linspace(0, 100, len(places))
+    dots = axes.scatter(places[:, 0], places[:, 1], c=order, s=5, cmap='viridis', zorder=2)
+    axes.plot(*poses[0, :2], 'o', color='#D55E00', markersize=7, label='start', zorder=3)
+    axes.set_aspect('equal', adjustable='datalim')
+    axes.set(title=title, xlabel='x in m (odometry)', ylabel='y in m (odometry)')
+    axes.title.set_fontsize(10)
+    axes.legend(loc='upper right')
+    figure.colorbar(dots, label='pictures, % of the drive', shrink=0.7)
+    save(figure, path)

@@ -1,0 +1,301 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A robot drives through a simulated garden and records what its sensors tell.
+
+All that is random follows from the seeds of the garden and of the drive: same seeds, same bytes.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+from tqdm import tqdm
+
+from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
+from sfa_localization.simulation.garden import Garden, rounded
+from sfa_localization.simulation.rendering import Light, View
+from sfa_localization.simulation.routes import ROUTES, Lawn, Motion, Route
+from sfa_localization.simulation.settings import SimulationConfig
+
+START_NS = 1_700_000_000 * 10**9
+REST_S = 0.5
+ACCELERATION = 1.0
+TURN_ACCELERATION = 2.0
+SLIP_TIME_S = 2.0
+LIGHT_TIME_S = 30.0
+
+Entry = tuple[int, Callable[[], None]]
+
+# The errors that make odometry drift, and how they are scaled to a wanted drift.
+_DRIFT_ERRORS = ('scale_error', 'slip', 'gyro_bias')
+_DRIFT_ITERATIONS = 3
+_DRIFT_FACTOR_MAX = 5.0
+_NO_DRIFT_M = 0.01
+ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM = range(5)
+# The robot may have been switched on this far from where the recording starts.
+_FRAME_REACH_M = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What happened and what was measured: truth in frame `world`, stamps of the pictures."""
+
+    truth: Trajectory
+    odometry: Odometry
+    yaw_rate: YawRate
+    image_stamps_ns: Stamps
+
+    @property
+    def image_poses(self) -> Array:
+        """True poses (M, 3) of the pictures."""
+        return self.truth.at(self.image_stamps_ns)
+
+
+def random_stream(config: SimulationConfig, stream: int, item: int = 0) -> np.random.Generator:
+    """The generator of one kind of randomness of one drive."""
+    drive_index = list(ROUTES).index(config.trajectory)
+    return np.random.default_rng([config.seed, config.world, drive_index, stream, item])
+
+
+def drive(garden: Garden, config: SimulationConfig) -> Drive:
+    """Plan the route of `config`, drive it from the dock and measure; no pictures are made."""
+    lawn = Lawn(garden.half, garden.obstacles)
+    plan = ROUTES[config.trajectory]
+    route = plan(lawn, garden.dock, random_stream(config, ROUTE_STREAM), config.length)
+    stamps, twists, pictures = _motion(route, config)
+    truth = Trajectory(stamps, integrate(stamps, twists, garden.dock))
+    if config.trajectory == 'test' and config.test_drift > 0:
+        config = _drifting(truth, twists, config)
+    measured, variances = _measured(twists, config, random_stream(config, SENSOR_STREAM))
+    poses = integrate(stamps, measured, _odometry_start(config))
+    odometry = Odometry(stamps, poses, measured, variances)
+    gyro = YawRate(stamps, measured[:, 1], variances[:, 1])
+    return Drive(truth, odometry, gyro, _image_stamps(stamps, twists, pictures, config))
+
+
+def _odometry_start(config: SimulationConfig) -> Array:
+    """Pose (3,) of the robot in the odometry frame when the recording starts."""
+    if config.odometry_frame == 'start':
+        return np.zeros(3)
+    rng = random_stream(config, FRAME_STREAM)
+    return np.array([*rng.uniform(-_FRAME_REACH_M, _FRAME_REACH_M, 2), rng.uniform(-np.pi, np.pi)])
+
+
+def _motion(route: Route, config: SimulationConfig) -> tuple[Stamps, Array, Array]:
+    """Stamps (N,), true twists (N, 2) held since the stamp before, pictures wanted (N,)."""
+    dt_ns = round(1e9 / config.odometry_rate)
+    rest = Motion(np.zeros((1, 2)), pictures=False)
+    parts = [_increments(motion, config, dt_ns * 1e-9) for motion in [rest, *route, rest]]
+    increments = np.concatenate([np.zeros((1, 2)), *parts])
+    wanted = [
+        part[:, 0] * 0 + motion.pictures for part, motion in zip(parts[1:-1], route, strict=True)
+    ]
+    pictures = np.concatenate([[0], parts[0][:, 0], *wanted, parts[-1][:, 0]])
+    stamps = START_NS + np.arange(len(increments), dtype=np.int64) * dt_ns
+    return stamps, increments / (dt_ns * 1e-9), pictures
+
+
+def _increments(motion: Motion, config: SimulationConfig, dt: float) -> Array:
+    """Way and turn (N, 2) in each time step of a motion, from rest to rest."""
+    way = np.concatenate([[0], np.cumsum(motion.steps[:, 0])])
+    turn = np.concatenate([[0], np.cumsum(motion.steps[:, 1])])
+    if way[-1] > 0:
+        done = _profile(way[-1], config.speed, ACCELERATION, dt)
+        return np.diff(np.stack([done, np.interp(done, way, turn)], -1), axis=0)
+    if turn[-1] == 0:
+        return np.zeros((round(REST_S / dt), 2))
+    done = np.sign(turn[-1]) * _profile(abs(turn[-1]), config.turn_rate, TURN_ACCELERATION, dt)
+    return np.diff(np.stack([0 * done, done], -1), axis=0)
+
+
+def _profile(distance: float, speed: float, acceleration: float, dt: float) -> Array:
+    """Distance gone (N + 1,) after every time step: speeding up, steady, slowing down."""
+    speed = min(speed, float(np.sqrt(distance * acceleration)))
+    ramp = speed / acceleration
+    total = distance / speed + ramp
+    count = max(1, int(np.ceil(total / dt)))
+    t = np.linspace(0, total, count + 1)
+    rising, falling = np.minimum(t, ramp), np.maximum(t - (total - ramp), 0)
+    steady = np.clip(t - ramp, 0, total - 2 * ramp)
+    gone = acceleration * rising**2 / 2 + speed * steady + speed * falling
+    return np.asarray(gone - acceleration * falling**2 / 2)
+
+
+def _drifting(truth: Trajectory, twists: Array, config: SimulationConfig) -> SimulationConfig:
+    """The same errors of wheels and gyroscope, scaled to drift by `config.test_drift` on average.
+
+    What is drawn makes some test drives nearly perfect and others useless; so all compare.
+    """
+    for _ in range(_DRIFT_ITERATIONS):
+        measured, _ = _measured(twists, config, random_stream(config, SENSOR_STREAM))
+        path = integrate(truth.stamps_ns, measured, truth.poses[0])
+        drift = float(np.hypot(*(path - truth.poses)[:, :2].T).mean())
+        if drift < _NO_DRIFT_M:
+            break
+        factor = min(config.test_drift / drift, _DRIFT_FACTOR_MAX)
+        errors = {name: factor * getattr(config, name) for name in _DRIFT_ERRORS}
+        config = replace(config, **errors)
+    return config
+
+
+def _measured(
+    twists: Array, config: SimulationConfig, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Measured twists (N, 2) and the variances (N, 2) of their errors.
+
+    The wheels' scale and slip err in proportion to the speed, and not at all at rest. The yaw rate
+    is a gyroscope's: scale, wandering bias, white noise. Each variance is that of one message's
+    error; the slow parts of the errors do not average out from message to message.
+    """
+    dt = 1 / config.odometry_rate
+    count = len(twists)
+    wheel, gyro = 1 + config.scale_error * rng.standard_normal(2)
+    slip = config.slip * wandering(count, dt, SLIP_TIME_S, rng)
+    bias = config.gyro_bias * wandering(count, dt, config.gyro_bias_time, rng)
+    noise = rng.standard_normal((count, 2)) * [config.speed_noise, config.gyro_noise]
+    v, omega = twists.T
+    measured_v = v * (wheel + slip) + noise[:, 0] * (v != 0)
+    measured = np.stack([measured_v, omega * gyro + bias + noise[:, 1]], -1)
+    relative = config.scale_error**2 + config.slip**2
+    variance_v = config.speed_noise**2 + relative * v**2
+    variance_omega = config.gyro_noise**2 + config.gyro_bias**2 + (config.scale_error * omega) ** 2
+    return measured, np.stack([variance_v, variance_omega], -1)
+
+
+def wandering(count: int, dt: float, time_s: float, rng: np.random.Generator) -> Array:
+    """A stationary random process (count,) of unit variance, correlated over `time_s`."""
+    keep = np.exp(-dt / time_s)
+    pushes = rng.standard_normal(count) * np.sqrt(1 - keep**2)
+    values, _ = lfilter([1.0], [1.0, -keep], pushes, zi=keep * rng.standard_normal(1))
+    return np.asarray(values, float)
+
+
+def _image_stamps(
+    stamps: Stamps, twists: Array, pictures: Array, config: SimulationConfig
+) -> Stamps:
+    """Stamps (M,) of the pictures: one at every `images_every` m, or degrees of a turn in place."""
+    turning = (twists[:, 0] == 0) / np.radians(config.images_every_turn)
+    rate = np.abs(twists[:, 0]) / config.images_every + np.abs(twists[:, 1]) * turning
+    dt = np.diff(stamps) * 1e-9
+    progress = np.concatenate([[0], np.cumsum((rate * pictures)[1:] * dt)])
+    marks = np.arange(0.5, progress[-1])
+    after = np.searchsorted(progress, marks)
+    part = (marks - progress[after - 1]) / (progress[after] - progress[after - 1])
+    span = stamps[after] - stamps[after - 1]
+    return np.asarray(stamps[after - 1] + np.rint(part * span).astype(np.int64))
+
+
+def lights(stamps_ns: Stamps, config: SimulationConfig) -> list[Light]:
+    """The light at each stamp: clouds before the sun, exposure and tone wander from the start."""
+    if not len(stamps_ns):
+        return []
+    rng = random_stream(config, LIGHT_STREAM)
+    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
+    grid = np.arange(0, seconds[-1] + 2)
+    waves = [
+        np.interp(seconds, grid, wandering(len(grid), 1.0, LIGHT_TIME_S, rng)) for _ in range(3)
+    ]
+    strength = config.illumination
+    sun = np.clip(1 - strength * (0.4 + 0.5 * waves[0]), 0.05, 1.2)
+    exposure = np.exp(0.4 * strength * waves[1])
+    return [
+        Light(*map(float, row))
+        for row in zip(sun, exposure, 0.08 * strength * waves[2], strict=True)
+    ]
+
+
+def pictures(garden: Garden, drive: Drive, config: SimulationConfig, view: View) -> Iterator[Image]:
+    """The noisy pictures of a drive in order, rendered ahead by a thread per core."""
+    jobs = zip(drive.image_poses, lights(drive.image_stamps_ns, config), strict=True)
+    take = partial(_take, garden, config, view)
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        try:
+            yield from _ahead(pool, (partial(take, i, *job) for i, job in enumerate(jobs)))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _take(
+    garden: Garden, config: SimulationConfig, view: View, index: int, pose: Array, light: Light
+) -> Image:
+    picture = garden.picture(pose, view, light)
+    rng = random_stream(config, PIXEL_STREAM, index)
+    noise = rng.standard_normal(picture.shape, dtype=np.float32)
+    return rounded(picture + np.float32(config.image_noise) * noise)
+
+
+def _ahead(pool: ThreadPoolExecutor, jobs: Iterator[Callable[[], Image]]) -> Iterator[Image]:
+    """Results in order; only a few jobs are under way, so that memory stays small."""
+    waiting: deque[Future[Image]] = deque()
+    for job in jobs:
+        waiting.append(pool.submit(job))
+        if len(waiting) > 8:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+def simulate(
+    config: SimulationConfig,
+    out: Path,
+    panorama: PanoramaConfig | None = None,
+    camera: CameraConfig | None = None,
+    progress: bool = False,
+) -> Drive:
+    """Record a drive to the bag `out`; `progress` shows a bar. Returns what was recorded.
+
+    Raises BagError when the bag exists or cannot be written, ConfigError for a senseless setting.
+    After an error or Ctrl-C nothing is left.
+    """
+    garden = Garden(config.world, config)
+    recorded = drive(garden, config)
+    if config.images == 'panorama':
+        view = garden.panorama_view(panorama or PanoramaConfig())
+    else:
+        view = garden.raw_view(camera or CameraConfig())
+    with BagWriter(out, config.storage) as bag:
+        stills = pictures(garden, recorded, config, view)
+        count = len(recorded.image_stamps_ns)
+        shown = tqdm(stills, out.name, count, unit='picture', disable=not progress)
+        _write(bag, recorded, shown, config)
+    return recorded
+
+
+def _write(bag: BagWriter, drive: Drive, stills: Iterable[Image], config: SimulationConfig) -> None:
+    """Write all messages in the order of their stamps."""
+    entries = heapq.merge(
+        _readings(bag, drive), _stills(bag, drive, stills, config), key=lambda entry: entry[0]
+    )
+    for _, write in entries:
+        write()
+
+
+def _stills(
+    bag: BagWriter, drive: Drive, stills: Iterable[Image], config: SimulationConfig
+) -> Iterator[Entry]:
+    compressed = None if config.compression == 'none' else config.compression
+    topic = '/panorama' if config.images == 'panorama' else '/image_raw'
+    topic += '/compressed' if compressed else ''
+    for stamp, image in zip(map(int, drive.image_stamps_ns), stills, strict=True):
+        yield stamp, partial(bag.image, topic, stamp, image, 'camera', compressed)
+
+
+def _readings(bag: BagWriter, drive: Drive) -> Iterator[Entry]:
+    odometry, gyro = drive.odometry, drive.yaw_rate
+    for i, stamp in enumerate(map(int, odometry.stamps_ns)):
+        twist, variance = odometry.twists[i], odometry.variances[i]
+        yield stamp, partial(bag.odometry, '/odom', stamp, odometry.poses[i], twist, variance)
+        yield stamp, partial(bag.imu, '/imu', stamp, gyro.omega[i], gyro.variance[i])
+        yield stamp, partial(bag.pose, '/ground_truth', stamp, drive.truth.poses[i])

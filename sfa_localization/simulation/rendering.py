@@ -1,0 +1,271 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ray-cast pictures of a scene of triangles, as an omnidirectional camera sees it.
+
+Rays are cast on a *dome*, a grid of elevations and azimuths about the camera; a picture is the
+dome resampled: into a panorama, or into the raw picture of a mirror. The light of sun and sky is
+worked out once for every vertex, so that a picture costs one ray per point of the dome.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.geometry import Array
+from sfa_localization.simulation.textures import (
+    SKY_COLUMNS,
+    SKY_HIGHEST_DEG,
+    SKY_LOWEST_DEG,
+    SKY_ROWS,
+    SURFACE_INDEX,
+    Atlas,
+    Floats,
+    sky,
+)
+
+SUN_BGR = np.array([1.04, 1.21, 1.30], np.float32)
+SKY_BGR = np.array([0.78, 0.65, 0.56], np.float32)
+BOUNCE = 0.22
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Triangles of one surface: `vertices` (V, 3) m, `normals` (V, 3), `faces` (F, 3).
+
+    `tint` is the BGR albedo, `shade` (V,) a factor of brightness.
+    """
+
+    vertices: Array
+    normals: Array
+    faces: NDArray[np.int64]
+    surface: str
+    tint: tuple[float, float, float]
+    shade: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """The light of one moment: factors of the sun, of everything, and of blue and red."""
+
+    sun: float = 1.0
+    exposure: float = 1.0
+    warmth: float = 0.0
+
+    @property
+    def gain(self) -> Floats:
+        """Factor (3,) of the BGR brightness on display."""
+        tone = np.array([1 - self.warmth, 1, 1 + self.warmth])
+        return np.asarray(np.sqrt(self.exposure) * tone, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Dome:
+    """Rays of the camera in the robot's axes: `rays` (rows, columns, 3), x ahead, z up.
+
+    Column c looks towards azimuth -(c + 0.5 - columns / 2) * 2 pi / columns, clockwise.
+    """
+
+    elevations_rad: Array
+    columns: int
+    rays: Floats
+
+    @classmethod
+    def build(cls, elevations_rad: Array, columns: int) -> Dome:
+        """Rays at the given elevations (R,), falling, and evenly spread azimuths."""
+        azimuth = -(np.arange(columns) + 0.5 - columns / 2) * 2 * np.pi / columns
+        e, a = np.meshgrid(elevations_rad, azimuth, indexing='ij')
+        rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
+        return cls(elevations_rad, columns, rays.astype(np.float32))
+
+    def turned(self, yaw_rad: float) -> Floats:
+        """The rays (rows, columns, 3) of a robot turned counter-clockwise."""
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+        matrix = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
+        return np.asarray(self.rays @ matrix, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A kind of picture: the dome it needs, and how the dome becomes the picture."""
+
+    dome: Dome
+    picture: Callable[[Floats, Floats], Floats]
+
+
+def panorama_view(config: PanoramaConfig) -> View:
+    """A panorama: each of its pixels is the mean of 2 x 2 rays."""
+    band = np.radians([config.elevation_max, config.elevation_min])
+    rows = band[0] - (np.arange(2 * config.height) + 0.5) * (band[0] - band[1]) / config.height / 2
+    size = (config.width, config.height)
+
+    def picture(dome: Floats, gain: Floats) -> Floats:
+        small = cv2.resize(dome, size, interpolation=cv2.INTER_AREA) * gain
+        return np.asarray(small if config.clockwise else small[:, ::-1], np.float32)
+
+    return View(Dome.build(rows, 2 * config.width), picture)
+
+
+def raw_view(
+    unproject: Callable[[Array], Array], size: tuple[int, int], config: PanoramaConfig
+) -> View:
+    """The raw picture of a camera, sharp where the panorama of `config` will look.
+
+    `unproject` maps pixels (N, 2) to unit rays (N, 3) in the robot's axes, NaN where nothing is
+    seen; `size` is (width, height). Below the lawn's near edge the picture shows the robot.
+    """
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = unproject(np.stack([columns.ravel(), rows.ravel()], -1).astype(float))
+    azimuth = np.arctan2(rays[:, 1], rays[:, 0])
+    elevation = np.arcsin(np.clip(rays[:, 2], -1, 1))
+    dome = Dome.build(_rows_for(elevation, config), 2 * config.width)
+    # The dome gets one wrapped column on either side, hence + 1.
+    x = (0.5 - azimuth / (2 * np.pi)) * dome.columns - 0.5 + 1
+    falling = dome.elevations_rad[::-1]
+    y = np.interp(elevation, falling, np.arange(len(falling))[::-1])
+    map_x, map_y = (_as_map(axis, size) for axis in (x, y))
+    below = elevation < falling[0] - np.radians(1)
+    cover = np.where(np.isnan(elevation), 1.0, below).reshape(size[::-1]).astype(np.float32)
+    hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(size[1], size[0], 3)
+
+    def picture(dome_picture: Floats, gain: Floats) -> Floats:
+        wrapped = np.concatenate([dome_picture[:, -1:], dome_picture, dome_picture[:, :1]], 1)
+        seen = cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray((seen * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
+
+    return View(dome, picture)
+
+
+def _as_map(values: Array, size: tuple[int, int]) -> Floats:
+    return np.nan_to_num(values).reshape(size[::-1]).astype(np.float32)
+
+
+def _rows_for(elevation: Array, config: PanoramaConfig) -> Array:
+    """Falling elevations (R,) rad: fine in the panorama's band, coarse outside of it."""
+    step = np.radians(config.elevation_max - config.elevation_min) / config.height / 2
+    top, bottom = np.radians(config.elevation_max), np.radians(config.elevation_min)
+    fine = np.arange(top + 2.5 * step, bottom - 3 * step, -step)
+    highest, lowest = np.nanmax(elevation), max(np.nanmin(elevation), HULL_RAD)
+    above = np.arange(fine[0] + 2 * step, highest + 2 * step, 2 * step)[::-1]
+    below = np.arange(fine[-1] - 4 * step, lowest - 4 * step, -4 * step)
+    return np.concatenate([above, fine, below])
+
+
+HULL_RAD = float(np.radians(-38.0))
+
+
+def _hull(azimuth: Array, elevation: Array) -> Floats:
+    """Brightness (N, 3) of the robot itself: a dark deck with an orange bonnet in front."""
+    light = 70 + 18 * np.cos(azimuth - 0.7) + 12 * np.sin(6 * elevation)
+    bonnet = (np.cos(azimuth) > 0.55) & (elevation > np.radians(-70))
+    tint = np.where(bonnet[:, None], [0.35, 1.1, 2.2], [0.95, 0.9, 0.85])
+    return np.asarray(light[:, None] * tint, np.float32)
+
+
+class Scene:
+    """Triangles with textures under a sun and a sky."""
+
+    def __init__(self, shapes: Sequence[Shape], sun: Array, rng: np.random.Generator) -> None:
+        """Index the triangles of `shapes` and light them; `sun` (3,) points towards it."""
+        self._atlas = Atlas.build(rng)
+        self._sky = sky(rng)
+        offsets = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
+        self._vertices = np.concatenate([shape.vertices for shape in shapes])
+        self._faces = np.concatenate(
+            [shape.faces + start for shape, start in zip(shapes, offsets, strict=False)]
+        )
+        self._embree = EmbreeScene()
+        self._mesh = TriangleMesh(self._embree, self._vertices[self._faces].astype(np.float32))
+        light = self._light_vertices(shapes, sun, rng)
+        self._table = np.concatenate([self._corners(light), self._constants(shapes)], 1)
+
+    @property
+    def triangles(self) -> Array:
+        """All triangles (F, 3, 3) in metres."""
+        return np.asarray(self._vertices[self._faces])
+
+    def _light_vertices(
+        self, shapes: Sequence[Shape], sun: Array, rng: np.random.Generator
+    ) -> Array:
+        """Light (V, 2) that every vertex gets from the sun and from sky and surroundings."""
+        normals = np.concatenate([shape.normals for shape in shapes])
+        shade = np.concatenate([shape.shade for shape in shapes])
+        start = (self._vertices + 0.03 * normals).astype(np.float32)
+        sunny = np.mean([self._free(start, _about(sun, 0.03, rng)) for _ in range(4)], 0)
+        sunny *= np.clip(normals @ sun, 0, None)
+        open_sky = np.mean([self._open(start, normals, rng) for _ in range(24)], 0)
+        return np.stack([sunny * shade, (open_sky + BOUNCE * (1 - open_sky)) * shade], -1)
+
+    def _open(self, start: Floats, normals: Array, rng: np.random.Generator) -> Array:
+        """Whether a random ray (cosine-weighted) from every vertex reaches the sky (V,)."""
+        ray = rng.standard_normal(normals.shape)
+        ray = normals + ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        return np.asarray(self._free(start, ray) * (ray[:, 2] > 0))
+
+    def _free(self, start: Floats, rays: Array) -> Array:
+        """1 where nothing lies on the ray from start (V, 3) along rays (V, 3) or (3,), else 0."""
+        rays = np.broadcast_to(rays, start.shape).astype(np.float32)
+        hits: Array = self._embree.run(start, rays, query='OCCLUDED')
+        return (hits < 0).astype(float)
+
+    def _corners(self, light: Array) -> Floats:
+        """Per face (F, 12): texture metres and light at corner 0, and their change to 1 and 2."""
+        corners = self._vertices[self._faces]
+        normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(1)]
+        metres = np.take_along_axis(corners, axes[:, None, :], 2)
+        values = np.concatenate([metres, light[self._faces]], 2)
+        parts = [values[:, 0], values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]]
+        return np.concatenate(parts, 1).astype(np.float32)
+
+    def _constants(self, shapes: Sequence[Shape]) -> Floats:
+        """Per face (F, 4): BGR albedo and index of the surface."""
+        rows = [[*shape.tint, SURFACE_INDEX[shape.surface]] for shape in shapes]
+        return np.repeat(rows, [len(shape.faces) for shape in shapes], 0).astype(np.float32)
+
+    def look(self, position: Array, yaw_rad: float, dome: Dome, light: Light) -> Floats:
+        """Brightness 0..255 (rows, columns, 3) BGR of a dome about `position` (3,) m."""
+        rays = dome.turned(yaw_rad)
+        start = np.broadcast_to(position, (rays.shape[0] * rays.shape[1], 3)).astype(np.float32)
+        hits = self._embree.run(start, rays.reshape(-1, 3), output=True)
+        seen = self._surfaces(hits, rays, 2 * np.pi / dome.columns, light)
+        missed = (hits['primID'] < 0).reshape(rays.shape[:2])
+        return np.asarray(np.where(missed[..., None], self._sky_at(dome, yaw_rad), seen))
+
+    def _surfaces(
+        self, hits: dict[str, NDArray[np.float32]], rays: Floats, pixel_rad: float, light: Light
+    ) -> Floats:
+        shape = rays.shape[:2]
+        rows = self._table.take(np.maximum(hits['primID'], 0), 0)
+        values = (
+            rows[:, :4] + hits['u'][:, None] * rows[:, 4:8] + hits['v'][:, None] * rows[:, 8:12]
+        )
+        normal = hits['Ng']
+        slant = np.abs(np.einsum('ij,ij->i', normal, rays.reshape(-1, 3)))
+        slant /= np.sqrt(np.einsum('ij,ij->i', normal, normal)) + 1e-12
+        footprint = hits['tfar'] * pixel_rad / np.sqrt(slant + 0.01)
+        u, v = values[:, 0].reshape(shape), values[:, 1].reshape(shape)
+        texture = self._atlas.sample(u, v, rows[:, 15].reshape(shape), footprint.reshape(shape))
+        lit = values[:, 2:3] * (SUN_BGR * light.sun) + values[:, 3:4] * SKY_BGR
+        return np.asarray(texture * np.sqrt(np.maximum(lit * rows[:, 12:15], 0)).reshape(*shape, 3))
+
+    def _sky_at(self, dome: Dome, yaw_rad: float) -> Floats:
+        """The sky (rows, columns, 3) behind the dome."""
+        column = -(np.arange(dome.columns) + 0.5 - dome.columns / 2) * 2 * np.pi / dome.columns
+        x = np.mod((column + yaw_rad) / (2 * np.pi), 1) * SKY_COLUMNS
+        degrees = np.degrees(dome.elevations_rad)
+        y = (SKY_HIGHEST_DEG - degrees) / (SKY_HIGHEST_DEG - SKY_LOWEST_DEG) * (SKY_ROWS - 1)
+        grid = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        return np.asarray(cv2.remap(self._sky, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+
+
+def _about(direction: Array, spread: float, rng: np.random.Generator) -> Array:
+    """A direction (3,) near the given one: the sun is no point."""
+    return direction + spread * rng.standard_normal(3)

@@ -1,0 +1,208 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Procedural textures of the simulated garden: tileable surfaces with mip levels, and the sky.
+
+All values are display brightness, the square root of the light that a surface sends back; images
+are BGR. A surface's texture covers PERIOD_M by PERIOD_M metres and repeats without a seam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sfa_localization.data.run import Image
+
+Floats = NDArray[np.float32]
+
+TILE = 512
+PERIOD_M = 4.0
+LEVELS = 7
+SKY_ROWS, SKY_COLUMNS = 384, 2048
+SKY_LOWEST_DEG, SKY_HIGHEST_DEG = -6.0, 90.0
+
+
+def noise(
+    rng: np.random.Generator, low: float, high: float, stretch: float = 1.0, fall: float = 1.0
+) -> Floats:
+    """Tileable noise (TILE, TILE) of unit deviation, between `low` and `high` cycles per tile.
+
+    `stretch` > 1 draws it out into vertical streaks; amplitudes fall with frequency ** `fall`.
+    """
+    across = np.fft.fftfreq(TILE)[None] * TILE
+    along = np.fft.fftfreq(TILE)[:, None] * TILE * stretch
+    cycles = np.hypot(across, along)
+    spectrum = np.where((cycles >= low) & (cycles <= high), np.maximum(cycles, 1) ** -fall, 0)
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((TILE, TILE))) * spectrum).real
+    return np.asarray(field / field.std(), np.float32)
+
+
+def _coloured(brightness: Floats, hue: Floats | float = 0.0) -> Floats:
+    """Stack to BGR; positive `hue` leans from green-blue to yellow-red."""
+    blue, green, red = brightness - hue, brightness + 0 * hue, brightness + hue
+    return np.stack(np.broadcast_arrays(blue, green, red), -1).astype(np.float32)
+
+
+def _grass(rng: np.random.Generator) -> Floats:
+    fine, coarse = noise(rng, 20, 220), noise(rng, 2, 14)
+    return _coloured(0.76 + 0.09 * fine + 0.05 * coarse, 0.035 * noise(rng, 2, 40))
+
+
+def _leaves(rng: np.random.Generator) -> Floats:
+    clumps, leaves = noise(rng, 6, 24), noise(rng, 24, 120)
+    return _coloured(0.72 + 0.12 * clumps + 0.13 * leaves, 0.04 * noise(rng, 8, 60))
+
+
+def _bark(rng: np.random.Generator) -> Floats:
+    return _coloured(0.72 + 0.15 * noise(rng, 16, 160, stretch=4))
+
+
+def _plaster(rng: np.random.Generator) -> Floats:
+    return _coloured(0.86 + 0.035 * noise(rng, 1, 10) + 0.03 * noise(rng, 30, 200))
+
+
+def _plain(rng: np.random.Generator) -> Floats:
+    return _coloured(0.85 + 0.03 * noise(rng, 2, 60))
+
+
+def _cells(rng: np.random.Generator, wide: int, high: int, joint: int, shift: float) -> Floats:
+    """Rectangles of wide x high pixels of random brightness with darker joints between."""
+    row = np.arange(TILE)[:, None] // high
+    column = (np.arange(TILE)[None] + (row * int(shift * wide))) % TILE
+    shades = 0.80 + 0.07 * rng.standard_normal((TILE // high, TILE // wide))
+    cells = shades[row, column // wide]
+    gap = (column % wide < joint) | (np.arange(TILE)[:, None] % high < joint)
+    return np.asarray(np.where(gap, 0.55, cells), np.float32)
+
+
+def _boards(rng: np.random.Generator) -> Floats:
+    return _coloured(_cells(rng, 16, TILE, 2, 0) + 0.06 * noise(rng, 8, 160, stretch=6))
+
+
+def _bricks(rng: np.random.Generator) -> Floats:
+    return _coloured(_cells(rng, 32, 16, 2, 0.5) + 0.04 * noise(rng, 20, 160))
+
+
+def _paving(rng: np.random.Generator) -> Floats:
+    return _coloured(_cells(rng, 64, 64, 3, 0) + 0.05 * noise(rng, 10, 160))
+
+
+def _roof(rng: np.random.Generator) -> Floats:
+    slope = (np.arange(TILE)[:, None] % 32) / 32
+    return _coloured(_cells(rng, 32, 32, 2, 0.5) - 0.15 * slope.astype(np.float32))
+
+
+def _stones(rng: np.random.Generator) -> Floats:
+    """Rubble: the cells nearest to random points, dark where two cells meet."""
+    points = rng.uniform(0, TILE, (320, 2))
+    rows, columns = np.mgrid[0:TILE, 0:TILE] + 0.5
+    pixels = np.stack([rows.ravel(), columns.ravel()], -1)
+    distance, nearest = cKDTree(points, boxsize=TILE).query(pixels, 2)
+    shades = 0.78 + 0.10 * rng.standard_normal(len(points))
+    edge = np.clip((distance[:, 1] - distance[:, 0]) / 4, 0, 1)
+    field = shades[nearest[:, 0]] * (0.6 + 0.4 * edge)
+    return _coloured(field.reshape(TILE, TILE).astype(np.float32) + 0.04 * noise(rng, 30, 160))
+
+
+SURFACES: dict[str, Callable[[np.random.Generator], Floats]] = {
+    'plain': _plain,
+    'grass': _grass,
+    'leaves': _leaves,
+    'bark': _bark,
+    'boards': _boards,
+    'bricks': _bricks,
+    'plaster': _plaster,
+    'stones': _stones,
+    'roof': _roof,
+    'paving': _paving,
+}
+SURFACE_INDEX = {name: index for index, name in enumerate(SURFACES)}
+
+
+@dataclass(frozen=True, slots=True)
+class Atlas:
+    """All surfaces at all mip levels in one BGR image: a row of tiles per surface."""
+
+    pixels: Image
+
+    @classmethod
+    def build(cls, rng: np.random.Generator) -> Atlas:
+        """Draw every surface."""
+        return cls(np.concatenate([_strip(surface(rng)) for surface in SURFACES.values()]))
+
+    def sample(self, u: Floats, v: Floats, surface: Floats, footprint_m: Floats) -> Image:
+        """Colours (..., 3) at metres (u, v) on surfaces by index, averaged over footprint_m."""
+        texel = PERIOD_M / TILE
+        level = np.clip(np.rint(np.log2(footprint_m / texel + 1e-6)), 0, LEVELS - 1)
+        side = np.exp2(-level) * TILE
+        # Widths of the wider levels to the left, and two columns of padding for each.
+        left = 2 * TILE - 2 * side + 2 * level
+        x = left + 0.5 + _fraction(u) * side
+        y = surface * (TILE + 2) + 0.5 + _fraction(v) * side
+        return np.asarray(cv2.remap(self.pixels, x, y, cv2.INTER_LINEAR), np.uint8)
+
+
+def _fraction(metres: Floats) -> Floats:
+    turns = metres * np.float32(1 / PERIOD_M)
+    return np.asarray(turns - np.floor(turns), np.float32)
+
+
+def _strip(texture: Floats) -> Image:
+    """One surface's levels side by side, each with a wrapped border of one pixel."""
+    strip = []
+    for level in range(LEVELS):
+        side = TILE >> level
+        tile = cv2.resize(texture, (side, side), interpolation=cv2.INTER_AREA)
+        tile = np.pad(tile, ((1, TILE + 1 - side), (1, 1), (0, 0)), mode='wrap')
+        strip.append(np.clip(np.rint(tile * 255), 0, 255).astype(np.uint8))
+    return np.concatenate(strip, 1)
+
+
+def sky(rng: np.random.Generator) -> Image:
+    """Sky with clouds, haze and far hills: BGR (SKY_ROWS, SKY_COLUMNS, 3), highest row first.
+
+    Columns grow counter-clockwise from the world's +x axis.
+    """
+    elevation = np.linspace(SKY_HIGHEST_DEG, SKY_LOWEST_DEG, SKY_ROWS, dtype=np.float32)[:, None]
+    azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False, dtype=np.float32)[None]
+    height = np.clip(elevation / 60, 0, 1)
+    blue = np.array([0.93, 0.74, 0.55], np.float32) - height[..., None] * [0.05, 0.18, 0.28]
+    white = np.array([0.95, 0.94, 0.93], np.float32)
+    colour = _mix(blue.astype(np.float32), white, _clouds(rng, elevation, azimuth))
+    for distance in (1.0, 0.5):
+        hills = 0.6 + 2.2 * (1.2 - distance) + 1.1 * _outline(rng, azimuth)
+        cover = np.clip((hills - elevation) / 0.3 + 0.5, 0, 1)
+        green = np.array([0.42, 0.44, 0.38], np.float32) * (0.55 + 0.55 * distance)
+        colour = _mix(colour, green.astype(np.float32), cover)
+    return np.clip(np.rint(colour * 255), 0, 255).astype(np.uint8)
+
+
+def _mix(below: Floats, above: Floats, cover: Floats) -> Floats:
+    return np.asarray(below + (above - below) * cover[..., None], np.float32)
+
+
+def _clouds(rng: np.random.Generator, elevation: Floats, azimuth: Floats) -> Floats:
+    field = noise(rng, 2, 50, fall=2.0)
+    radius = 75 / (np.radians(np.maximum(elevation, 0)) + 0.35)
+    x, y = (np.mod(256 + radius * f(azimuth), TILE) for f in (np.cos, np.sin))
+    clouds = cv2.remap(
+        field,
+        x.astype(np.float32),
+        y.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_WRAP,
+    )
+    return np.asarray(np.clip(0.25 + 0.45 * clouds, 0, 0.9), np.float32)
+
+
+def _outline(rng: np.random.Generator, azimuth: Floats) -> Floats:
+    """A wavy line around the horizon, of about unit height."""
+    waves = np.zeros_like(azimuth)
+    for cycles in (1, 2, 3, 5, 8, 13, 21, 34, 55, 89):
+        waves += rng.normal() / cycles**0.6 * np.sin(cycles * azimuth + rng.uniform(0, 6.3))
+    return 0.6 * waves
