@@ -20,13 +20,15 @@ import pytest
 import yaml
 from test_calibration import scene
 
-from sfa_localization import cli, config
+from sfa_localization import cli
 from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.data.settings import Settings
 from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
+from sfa_localization.simulation.settings import SimulationConfig
 
-GROUPS = {group.__name__: group for group in config.Settings.__subclasses__()}
+GROUPS = {group.__name__: group for group in Settings.__subclasses__()}
 COMMANDS = {command.name: command for command in cli.COMMANDS}
 
 
@@ -413,7 +415,7 @@ def gardens() -> Iterator[None]:
     made: dict[Any, simulation.Garden] = {}
     garden = simulation.Garden
 
-    def again(seed: int, settings: config.SimulationConfig) -> simulation.Garden:
+    def again(seed: int, settings: SimulationConfig) -> simulation.Garden:
         place = (seed, settings.area)
         if place not in made:
             made[place] = garden(seed, settings)

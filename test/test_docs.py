@@ -25,7 +25,9 @@ import pytest
 import yaml
 from filter_drives import Drive
 
-from sfa_localization import cli, config
+from sfa_localization import cli
+from sfa_localization.data.settings import Settings
+from sfa_localization.nodes.settings import EkfNodeConfig
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md')])
@@ -125,7 +127,7 @@ def check_node(name: str, words: list[str]) -> None:
 
 def parameters() -> set[str]:
     """Return the names of all settings, which the nodes' parameters are."""
-    groups = config.Settings.__subclasses__()
+    groups = Settings.__subclasses__()
     return {item.name for group in groups for item in dataclasses.fields(group)} | {'use_sim_time'}
 
 
@@ -207,7 +209,7 @@ def test_robot_localization_finds_a_robot_that_starts_anywhere():
 def test_nav2_uses_our_frames():
     settings = yaml.safe_load((ROOT / 'config/nav2.yaml').read_text('utf-8'))
     navigator = settings['bt_navigator']['ros__parameters']
-    frames = config.EkfNodeConfig()
+    frames = EkfNodeConfig()
     assert navigator['global_frame'] == frames.map_frame
     assert navigator['robot_base_frame'] == frames.base_frame
 

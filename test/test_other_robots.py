@@ -180,7 +180,7 @@ def test_a_late_camera_gives_as_good_a_map(delay, monkeypatch):
     in_time, _ = placed(0.0, 1)
     late, trained = placed(delay, 1)
     assert trained.model.camera_delay_s == pytest.approx(delay, abs=0.05)
-    monkeypatch.setattr(training, 'camera_clock', lambda run: CameraClock())
+    monkeypatch.setattr(training, 'camera_clock', lambda *of_the_drive: CameraClock())
     unaware, ignorant = placed(delay, 1)
     assert ignorant.model.camera_delay_s == 0.0
     assert late < in_time + 0.3 * (unaware - in_time) + 0.01 < unaware
