@@ -19,6 +19,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import (
     CalibrationConfig,
     CameraConfig,
+    LensCalibration,
     PanoramaConfig,
     WatchConfig,
 )
@@ -271,19 +272,8 @@ INSPECT = Command(
 )
 
 
-_MOUNT = (
-    'angle_min',
-    'angle_max',
-    'axis',
-    'mirrored',
-    'mount_roll',
-    'mount_pitch',
-    'mount_yaw',
-)
-
-
 def _configure_calibrate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('images', nargs='*', type=Path, metavar='IMAGE', help='raw pictures')
+    parser.add_argument('images', nargs='*', type=Path, metavar='IMAGE', help='raw images')
     parser.add_argument(
         '--calibration',
         type=Path,
@@ -291,50 +281,54 @@ def _configure_calibrate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--center', type=_by_x, help='COLUMNxROW of the mirror (px); else found')
     parser.add_argument('--radii', type=_by_x, help='INNERxOUTER radius (px); else found')
-    parser.add_argument('--output', type=Path, help='parameter file to write (YAML)')
-    parser.add_argument('--check', type=Path, help='picture to write, to see if all is right (PNG)')
+    parser.add_argument('--output', type=Path, help='calibration file to write (YAML)')
+    parser.add_argument('--check', type=Path, help='image to write, to see if all is right (PNG)')
     _add_settings(parser, CalibrationConfig)
-    _add_settings(parser, CameraConfig, _MOUNT)
+    _add_settings(parser, LensCalibration, ('angle_min', 'angle_max', 'axis', 'mirrored'))
+    _add_settings(parser, CameraConfig, ('mount_rpy',))
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from sfa_localization.camera import calibration
+    from sfa_localization.camera import calibration, calibration_files
+    from sfa_localization.camera.panorama import Unwrapper
 
-    pictures = calibration.read_pictures(arguments.images)
+    images = calibration.read_images(arguments.images)
     circles = None
     if arguments.center or arguments.radii:
-        circles = calibration.given_circles(arguments.center, arguments.radii, pictures)
-    config, known = _settings(CalibrationConfig, arguments), _given(CameraConfig, arguments)
-    camera = calibration.calibrate(pictures, arguments.calibration, circles, config, known)
-    print(calibration.parameters_text(camera), end='')
+        circles = calibration.given_circles(arguments.center, arguments.radii, images)
+    config, known = _settings(CalibrationConfig, arguments), _given(LensCalibration, arguments)
+    lens = calibration.calibrate(images, arguments.calibration, circles, config, known)
+    camera = _settings(CameraConfig, arguments)
+    text = calibration_files.calibration_text(lens, camera.mount_rpy)
+    print(text, end='')
     if arguments.check:
-        if not pictures:
-            raise LocalizationError('--check needs a picture of the camera to draw in')
-        drawn = calibration.check_picture(pictures[0], camera, PanoramaConfig())
-        calibration.write_check(arguments.check, drawn)
+        if not images:
+            raise LocalizationError('--check needs an image of the camera to draw in')
+        unwrapper = Unwrapper(camera, PanoramaConfig(), lens)
+        calibration.write_check(arguments.check, calibration.check_image(images[0], unwrapper))
     if arguments.output:
-        text = calibration.parameters_text(camera)
-        calibration.write_whole(arguments.output, text.encode())
+        calibration.write_calibration(arguments.output, text)
     return 0
 
 
 CALIBRATE = Command(
     'calibrate',
-    'Find the mirror in pictures, or read a calibration file; write camera parameters.',
+    'Find the mirror in images, or read a calibration file; write a calibration file.',
     '  calibrate drive/*.png --check check.png --output camera.yaml\n'
-    '  calibrate picture.png --model fisheye --field-of-view 190 --check check.png\n'
-    '  calibrate picture.png --calibration calib_results.txt --mirrored yes --axis down \\\n'
+    '  calibrate image.png --model fisheye --field-of-view 190 --check check.png\n'
+    '  calibrate image.png --calibration calib_results.txt --mirrored yes --axis down \\\n'
     '      --check check.png --output camera.yaml\n'
     '  calibrate --calibration camchain.yaml --output camera.yaml\n\n'
-    'The check picture shows where FRONT, LEFT, BACK and RIGHT of the robot are taken to be, and\n'
-    'the elevations of the panorama. Turn it right with --mount-yaw, --axis and --mirrored.\n\n'
+    'The check image shows where FRONT, LEFT, BACK and RIGHT of the robot are taken to be, and\n'
+    'the elevations of the panorama. Turn it right with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90),\n'
+    '--axis and --mirrored. omnicam_node takes the file as its parameter calibration_file.\n\n'
     'how to get each model:\n'
     '  mirror    (most exact) Kalibr, omni-radtan; OpenCV omnidir; camodocal, MEI; a fisheye\n'
     '            calibrated so needs --mirrored no --axis up\n'
     '  fisheye   Kalibr, pinhole-equi; OpenCV fisheye; ROS camera_calibration with its\n'
     '            fisheye model; or from the rim alone with --model fisheye\n'
     '  ocam      OCamCalib: export calib_results.txt; a mirror needs --mirrored yes --axis down\n'
-    '  polar     (no calibration) from pictures, --angle-min and --angle-max',
+    '  polar     (no calibration) from images, --angle-min and --angle-max',
     _configure_calibrate,
     _calibrate,
 )

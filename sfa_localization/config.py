@@ -15,7 +15,7 @@ import yaml
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.settings import (
     CameraConfig,
-    OmnicamNodeConfig,
+    CaptureConfig,
     PanoramaConfig,
     WatchConfig,
 )
@@ -25,13 +25,19 @@ from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
-from sfa_localization.nodes.settings import EkfNodeConfig, NodeConfig, SfaNodeConfig
+from sfa_localization.nodes.settings import (
+    EkfNodeConfig,
+    NodeConfig,
+    OmnicamNodeConfig,
+    SfaNodeConfig,
+)
 
 S = TypeVar('S', bound=Settings)
 SECTIONS: dict[str, tuple[type[Settings], ...]] = {
     'omnicam_node': (
         NodeConfig,
         OmnicamNodeConfig,
+        CaptureConfig,
         CameraConfig,
         PanoramaConfig,
     ),

@@ -17,7 +17,7 @@ import numpy as np
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
-from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import ODOMETRY, in_order
 from sfa_localization.data.geometry import Array
@@ -55,7 +55,7 @@ class Observer:
 
     def __init__(self, model: PlaceModel, config: WatchConfig | None = None) -> None:
         self.model = model
-        self.watch = PictureWatch(config)
+        self.watch = ImageWatch(config)
         self._gyro = VisualGyro(model.panorama.clockwise)
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:

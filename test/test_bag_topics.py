@@ -286,7 +286,7 @@ def test_a_run_needs_no_gyro(tmp_path: Path) -> None:
         ({'step': 30, 'data': np.zeros(120, np.uint8)}, 'step is shorter than a row'),
         ({'data': np.zeros(239, np.uint8)}, 'data size is not rows times step'),
         ({'data': np.zeros(0, np.uint8)}, 'data size is not rows times step'),
-        ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty picture'),
+        ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty image'),
         ({'encoding': 'rgb9'}, "unsupported encoding 'rgb9'"),
         ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first picture'),
     ],

@@ -104,8 +104,8 @@ class Outcome:
         return document[section]['ros__parameters']
 
     def camera(self) -> dict[str, Any]:
-        """Return the camera's parameters that were printed."""
-        return yaml.safe_load(self.text)['omnicam_node']['ros__parameters']
+        """Return the calibration that was printed."""
+        return yaml.safe_load(self.text)
 
 
 @dataclass(frozen=True)
@@ -178,6 +178,10 @@ def width(outcome: Outcome) -> float:
 
 def metres(outcome: Outcome) -> float:
     return float(np.hypot(*np.diff(outcome.bag()['truth'].poses[:, :2], axis=0).T).sum())
+
+
+def check_image(outcome: Outcome) -> bytes:
+    return (outcome.folder / 'check.png').read_bytes()
 
 
 def written(name: str) -> Callable[[Outcome, Outcome], bool]:
@@ -351,9 +355,11 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--angle-max': Case('--angle-max 100', lambda a, b: b.camera()['angle_max'] == 100),
         '--axis': Case('--axis up', lambda a, b: b.camera()['axis'] == 'up'),
         '--mirrored': Case('--mirrored no', lambda a, b: b.camera()['mirrored'] == 'no'),
-        '--mount-roll': Case('--mount-roll 5', lambda a, b: b.camera()['mount_roll'] == 5),
-        '--mount-pitch': Case('--mount-pitch 5', lambda a, b: b.camera()['mount_pitch'] == 5),
-        '--mount-yaw': Case('--mount-yaw 90', lambda a, b: b.camera()['mount_yaw'] == 90),
+        '--mount-rpy': Case(
+            '--mount-rpy 0x0x90',
+            lambda a, b: check_image(a) != check_image(b) and '[0.0, 0.0, 90.0]' in b.text,
+            beside='--check {out}/check.png',
+        ),
     },
     'filter': {
         '--config': Case('--config {data}/start.yaml', POSES),

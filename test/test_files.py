@@ -42,7 +42,7 @@ def mark_a_demo(path: Path) -> None:
 
 WRITERS = {
     'arrays of a model or checkpoint': lambda p: place_model.write_arrays(p, {'a': PLACES}),
-    'calibration': lambda p: calibration.write_whole(p, b'camera'),
+    'calibration': lambda p: calibration.write_calibration(p, 'camera'),
     'check picture': lambda p: calibration.write_check(p, PICTURE),
     'parameter file': config_file.write_config,
     'figures of an evaluation': lambda p: evaluation.write_json(p, {'ekf': 1}),

@@ -138,7 +138,7 @@ def test_a_signal_at_any_moment_ends_with_exit_code_0(start, moment, name):
 
 @pytest.mark.parametrize(('node', 'parameter', 'why'), [
     ('sfa_node', 'model:=/nowhere/model.npz', '/nowhere/model.npz'),
-    ('sfa_node', 'dark_level:=-1.0', 'dark_level'),
+    ('sfa_node', 'novelty_limit:=-1.0', 'novelty_limit'),
     ('ekf_node', 'history:=x', 'history'),
     ('ekf_node', 'history:=-3', 'history'),
     ('ekf_node', 'history:=.nan', 'history'),

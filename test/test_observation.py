@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which pictures are believed, and what the filter gets of those that are not."""
+"""Which images are used, and what the filter gets of those that are not."""
 
 import dataclasses
 import math
@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from picture_readers import PictureReader, panorama
 
-from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import ODOMETRY, PICTURE, in_order
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
@@ -19,7 +18,7 @@ from sfa_localization.localizer import Observer, unusable_covariance
 
 
 def test_a_good_picture_is_believed():
-    watch = PictureWatch()
+    watch = ImageWatch()
     assert [watch.judge(panorama(seed=seed)) for seed in range(20)] == [''] * 20
 
 
@@ -29,19 +28,19 @@ def test_a_good_picture_is_believed():
 def test_dark_and_covered_pictures_are_distinguished(level, spread, reason):
     picture = panorama(level=level, spread=spread)
     picture[0] = picture[1]
-    assert reason in PictureWatch().judge(picture)
+    assert reason in ImageWatch().judge(picture)
 
 
 def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
-    watch = PictureWatch(WatchConfig(frozen_pictures=3))
-    found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 2, 2, 1)]
-    assert ['frozen' in text for text in found] == [False, False, True, True, False, False, False]
+    watch = ImageWatch()
+    found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 1, 1, 2, 2, 1)]
+    assert ['frozen' in text for text in found] == [False] * 4 + [True] * 2 + [False] * 3
 
 
 @pytest.mark.parametrize(('novelty', 'fine'), [(0.5, True), (3.0, True), (3.1, False),
                                               (math.nan, False)])  # fmt: skip
 def test_foreign_pictures_are_not_believed(novelty, fine):
-    assert (PictureWatch().judge_novelty(novelty) == '') == fine
+    assert (ImageWatch().judge_novelty(novelty) == '') == fine
 
 
 def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():

@@ -35,15 +35,16 @@ from test_commands import OPTIONS, parser_of
 from sfa_localization import cli
 from sfa_localization.bags.loading import Bag, BagWriter, load_run
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.camera import capture as sources
+from sfa_localization.camera import capture
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import (
     CameraConfig,
-    OmnicamNodeConfig,
+    CaptureConfig,
+    LensCalibration,
     PanoramaConfig,
     WatchConfig,
 )
-from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
@@ -55,7 +56,12 @@ from sfa_localization.metric import learning as metric
 from sfa_localization.metric.learning import learn, positions
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
-from sfa_localization.nodes.settings import EkfNodeConfig, NodeConfig, SfaNodeConfig
+from sfa_localization.nodes.settings import (
+    EkfNodeConfig,
+    NodeConfig,
+    OmnicamNodeConfig,
+    SfaNodeConfig,
+)
 from sfa_localization.training import drive_of, learn_place
 
 GROUPS = {
@@ -76,10 +82,10 @@ class Other:
 # What is observed: numbers, of which some must change.
 
 
-def unwrapped(camera: CameraConfig, panorama: PanoramaConfig) -> Any:
-    """The panorama of a picture of noise."""
-    picture = np.random.default_rng(0).integers(0, 256, (640, 640, 3), np.uint8)
-    return Unwrapper(camera, panorama)(picture)
+def unwrapped(*settings: Any) -> Any:
+    """The panorama of an image of noise; `settings` are those of an Unwrapper."""
+    image = np.random.default_rng(0).integers(0, 256, (640, 640, 3), np.uint8)
+    return Unwrapper(*settings)(image)
 
 
 def of_camera(settings: CameraConfig) -> Any:
@@ -88,6 +94,11 @@ def of_camera(settings: CameraConfig) -> Any:
 
 def of_panorama(settings: PanoramaConfig) -> Any:
     return unwrapped(CameraConfig(), settings)
+
+
+def of_lens(settings: LensCalibration) -> Any:
+    """No parameters of a node, but of a calibration file: each matters as well."""
+    return unwrapped(CameraConfig(), PanoramaConfig(), settings)
 
 
 def of_bag(settings: BagConfig, folder: Path) -> Any:
@@ -245,17 +256,13 @@ def place_network() -> Any:
 
 
 def of_watch(settings: WatchConfig) -> Any:
-    """What is said of dark, covered, repeated and foreign pictures."""
-    watch = PictureWatch(settings)
-    noise = np.random.default_rng(0).normal(0, 1, (12, 48, 3))
-    seen = [watch.judge((m + s * noise).clip(0, 255).astype(np.uint8))
-            for m in (4, 12, 100) for s in (2, 5, 40)]  # fmt: skip
-    same = (100 + 40 * noise).clip(0, 255).astype(np.uint8)
-    return [*seen, *(watch.judge(same) for _ in range(12)), *map(watch.judge_novelty, (2, 4, 7))]
+    """How images of some novelties are judged."""
+    return [*map(ImageWatch(settings).judge_novelty, (2, 4, 7))]
 
 
 OBSERVE: dict[type[Settings], Callable[..., Any]] = {
     CameraConfig: of_camera,
+    LensCalibration: of_lens,
     PanoramaConfig: of_panorama,
     BagConfig: of_bag,
     FilterConfig: of_filter,
@@ -286,6 +293,10 @@ TWO = {'camera_model': 'dual_fisheye', 'fx': 95.0, 'fy': 95.0, 'cx': 160.0, 'sec
        'second_cy': 319.5}  # fmt: skip
 SPECIAL: dict[type[Settings], dict[str, Other]] = {
     CameraConfig: {
+        'mount_rpy': Other((0.0, 0.0, 30.0)),
+        'blind_sectors': Other((10.0, 60.0)),
+    },
+    LensCalibration: {
         'distortion': Other((0.1, 0.0, 0.0, 0.0)),
         'polynomial': Other((-120.0, 0.0, 1e-3), OCAM),
         'affine': Other((1.1, 0.0, 0.0), OCAM),
@@ -298,7 +309,6 @@ SPECIAL: dict[type[Settings], dict[str, Other]] = {
         'second_roll': Other(5.0, TWO),
         'axis': Other('up', {'camera_model': 'fisheye', 'axis': 'down'}),
         'mirrored': Other('no'),
-        'blind_sectors': Other((10.0, 60.0)),
     },
     SegmentConfig: {
         'line_length_min': Other(5.0, STRAIGHT),
@@ -358,7 +368,7 @@ _OMNICAM, _SOURCES = 'test_omnicam_node.py', 'test_sources.py'
 OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
     CameraConfig: {
         'calibration_file': 'test_calibration_files.py::'
-        'test_a_calibration_file_replaces_the_lens_and_keeps_the_mount',
+        'test_a_calibration_file_replaces_the_camera_model',
         'mask_file': 'test_panorama.py::test_a_mask_picture_hides_what_is_black',
     },
     MetricConfig: {
@@ -369,21 +379,16 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'engine': OF_A_COMMAND,
         'layers': 'test_hierarchy.py::test_custom_default_is_the_standard',
     },
-    OmnicamNodeConfig: {
+    CaptureConfig: {
         'source': f'{_OMNICAM}::test_a_folder_of_pictures',
         'source_path': f'{_OMNICAM}::test_a_folder_of_pictures',
+        'silence_timeout': f'{_OMNICAM}::test_a_silent_camera_shows_in_diagnostics',
+        'source_rate': f'{_SOURCES}::test_video',
+        'source_size': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
+    },
+    OmnicamNodeConfig: {
         'image_transport': f'{_OMNICAM}::test_compressed_pictures_in_and_out',
         'frame_id': f'{_OMNICAM}::test_frame_and_quality_of_service_by_parameter',
-        'lazy': f'{_OMNICAM}::test_told_not_to_be_lazy_it_works_unheard',
-        'jpeg_quality': f'{_OMNICAM}::test_compressed_pictures_in_and_out',
-        'silence_timeout': f'{_OMNICAM}::test_a_silent_camera_shows_in_diagnostics',
-        'frozen_timeout': f'{_SOURCES}::test_a_frozen_camera_is_opened_again_until_it_moves',
-        'reopen_min': f'{_SOURCES}::test_pauses_double_up_to_the_longest',
-        'reopen_max': f'{_SOURCES}::test_pauses_double_up_to_the_longest',
-        'source_rate': f'{_SOURCES}::test_video',
-        'source_loop': f'{_SOURCES}::test_again_and_again',
-        'source_width': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
-        'source_height': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
     },
     NodeConfig: {
         'autostart': 'test_nodes_base.py::test_a_node_starts_itself_unless_told_not_to',
@@ -507,18 +512,18 @@ def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
         def set(self, what, value):
             asked[what] = value
 
-    monkeypatch.setattr(sources.cv2, 'VideoCapture', Capture)
+    monkeypatch.setattr(capture.cv2, 'VideoCapture', Capture)
     (tmp_path / 'video0').touch()
-    size = {'source_width': 1280, 'source_height': 720, 'source_rate': 15.0}
-    sources.Device(OmnicamNodeConfig(source_path=str(tmp_path / 'video0'), **size))
+    values = {'source_size': (1280.0, 720.0), 'source_rate': 15.0}
+    capture.Device(CaptureConfig(source_path=str(tmp_path / 'video0'), **values))
     wanted = {
-        sources.cv2.CAP_PROP_FRAME_WIDTH: 1280,
-        sources.cv2.CAP_PROP_FRAME_HEIGHT: 720,
-        sources.cv2.CAP_PROP_FPS: 15.0,
+        capture.cv2.CAP_PROP_FRAME_WIDTH: 1280,
+        capture.cv2.CAP_PROP_FRAME_HEIGHT: 720,
+        capture.cv2.CAP_PROP_FPS: 15.0,
     }
     assert asked.items() >= wanted.items()
     asked.clear()
-    sources.Device(OmnicamNodeConfig(source_path=str(tmp_path / 'video0')))
+    capture.Device(CaptureConfig(source_path=str(tmp_path / 'video0')))
     assert not asked.keys() & wanted.keys(), 'a device keeps its own'
 
 

@@ -59,8 +59,7 @@ ros = pytest.mark.ros
 SEEN = 'sfa/pose_with_covariance'
 NODES = {
     'omnicam': (OmnicamNode, {
-        'camera_model': 'panorama', 'image_width': 0, 'image_height': 0,
-        'width': SIZE.width, 'height': SIZE.height,
+        'camera_model': 'panorama', 'width': SIZE.width, 'height': SIZE.height,
     }),
     'sfa': (SfaNode, {'model': 'model.npz'}),
     'ekf': (EkfNode, {}),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.watch import FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.localizer import UNKNOWN_VARIANCE
@@ -155,23 +156,25 @@ def bad_pictures():
 
 @pytest.mark.parametrize('kind', ['dark', 'covered', 'frozen', 'foreign'])
 def test_an_unusable_picture_says_nothing_and_is_told(bench, models, kind):
-    node = bench.run(SfaNode, model='a.npz', diagnostics_period=0.1, frozen_pictures=3)
+    node = bench.run(SfaNode, model='a.npz', diagnostics_period=0.1)
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     told = bench.listen(DiagnosticArray, '/diagnostics')
     models['a.npz'].novelty = 9.0 if kind == 'foreign' else 0.5
     image = bad_pictures().get(kind, panorama(5))
-    for k in range(3):
+    for k in range(FROZEN_IMAGES):
         bench.publish('panorama', message(image=image, stamp_ns=100 + k))
         assert until(lambda n=k: len(heard) == n + 1)
     covariance = np.reshape(heard[-1].pose.covariance, (6, 6))
     assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE
-    assert len(poses) == (2 if kind == 'frozen' else 0)
+    assert len(poses) == (FROZEN_IMAGES - 1 if kind == 'frozen' else 0)
     assert until(lambda: told and told[-1].status[0].level != b'\x00')
     models['a.npz'].novelty = 0.5
     bench.publish('panorama', message(seed=77, stamp_ns=200))
     assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
-    assert sum(node.monitor('panorama').refused.values()) == (1 if kind == 'frozen' else 3)
+    assert sum(node.monitor('panorama').refused.values()) == (
+        1 if kind == 'frozen' else FROZEN_IMAGES
+    )
 
 
 def test_panoramas_of_another_size_are_refused_with_the_remedy(bench, models):

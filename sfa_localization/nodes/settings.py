@@ -20,6 +20,16 @@ class NodeConfig(Settings):
 
 
 @dataclass(frozen=True, slots=True)
+class OmnicamNodeConfig(Settings):
+    """omnicam_node: camera images in, panoramas out."""
+
+    image_transport: str = setting(
+        'raw', 'which topic to take images from', choices=('raw', 'compressed')
+    )
+    frame_id: str = setting('', "frame of the panoramas; empty: the image's own, or omnicam")
+
+
+@dataclass(frozen=True, slots=True)
 class SfaNodeConfig(Settings):
     """sfa_node: panorama in, slow features and pose out."""
 
