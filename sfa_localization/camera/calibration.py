@@ -93,8 +93,8 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
 
 
 def _best(circles: Sequence[Circle | None]) -> Circle | None:
-    known = [circle for circle in circles if circle is not None]
-    return max(known, key=lambda circle: circle.support, default=None)
+    found = [circle for circle in circles if circle is not None]
+    return max(found, key=lambda circle: circle.support, default=None)
 
 
 def _cues(images: Sequence[Image]) -> list[Array]:
@@ -213,28 +213,28 @@ def calibrate(
     calibration_file: Path | None,
     circles: MirrorCircles | None,
     config: CalibrationConfig,
-    known: Mapping[str, Any],
+    overrides: Mapping[str, Any],
 ) -> LensCalibration:
     """The lens from a calibration file, or from circles, given or to be found.
 
-    With a file, given circles only limit what is visible. `known` holds further fields of
+    With a file, given circles only limit what is visible. `overrides` holds further fields of
     LensCalibration, such as its angles. Raises CameraError when this is not enough.
     """
     if calibration_file is not None:
         calibration = read_calibration(calibration_file)
         limits = _limits(circles) if circles else {}
-        return dataclasses.replace(calibration, **{**limits, **known})
+        return dataclasses.replace(calibration, **{**limits, **overrides})
     if not images:
         raise CameraError('give images of the camera, or --calibration')
     circles = circles or find_circles(images)
     fields = fields_of_circles(circles, (images[0].shape[0], images[0].shape[1]), config)
-    return LensCalibration.from_mapping({**fields, **known}, 'calibration')
+    return LensCalibration.from_mapping({**fields, **overrides}, 'calibration')
 
 
 def fields_of_circles(
     circles: MirrorCircles, size: tuple[int, int], config: CalibrationConfig
 ) -> dict[str, Any]:
-    """Fields of LensCalibration for a camera known by its circles; `size` is rows and columns."""
+    """Fields of LensCalibration of a camera from its circles; `size` is rows and columns."""
     fields: dict[str, Any] = {
         'camera_model': config.model,
         'cx': circles.rim.column,

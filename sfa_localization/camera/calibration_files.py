@@ -131,7 +131,7 @@ def _from_own(content: Mapping[str, Any]) -> dict[str, Any]:
     missing = [name for name in ('cx', 'cy', *_OF_MODEL.get(model, ())) if name not in content]
     if missing and model in _OF_MODEL:
         raise CameraError(f'{", ".join(missing)} missing, which the {model} model needs')
-    LensCalibration.from_mapping(content, 'calibration')  # an unknown name is an error, with advice
+    LensCalibration.from_mapping(content, 'calibration')  # rejects unknown names
     return dict(content)
 
 

@@ -223,7 +223,7 @@ class Feed:
             self._thread.join(timeout=1.0)
 
     def status(self) -> FeedStatus:
-        """How the feed is, as far as its thread knows."""
+        """The status that the feed's thread set last."""
         with self._lock:
             return self._status
 

@@ -62,10 +62,10 @@ class IncreasingCurve:
 
     def inverse(self, y: Array) -> Array:
         """Return x with f(x) = y, NaN beyond the increasing part."""
-        known = np.minimum(y, self._y[-1])
-        x = np.interp(known, self._y, self._x)
+        reachable = np.minimum(y, self._y[-1])
+        x = np.interp(reachable, self._y, self._x)
         for _ in range(_NEWTON_STEPS):
-            x = np.clip(x - (self._f(x) - known) / self._df(x), 0.0, self._x[-1])
+            x = np.clip(x - (self._f(x) - reachable) / self._df(x), 0.0, self._x[-1])
         return np.where(y <= self._y[-1] * (1 + 1e-12), x, np.nan)
 
 
@@ -319,8 +319,8 @@ class CameraModel:
 
     def unproject(self, pixels: Array) -> Array:
         """Unit rays (N, 3) in the robot's axes of pixels (N, 2); NaN where they see nothing."""
-        known = (self._inside(np.asarray(pixels, float)) + 0.5) / self.scale - 0.5
-        rays = self.lens.unproject(self._limited(known))
+        calibrated = (self._inside(np.asarray(pixels, float)) + 0.5) / self.scale - 0.5
+        rays = self.lens.unproject(self._limited(calibrated))
         return np.asarray(_normalized(rays) @ self.rotation.T)
 
     def _limited(self, pixels: Array) -> Array:

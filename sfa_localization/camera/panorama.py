@@ -192,8 +192,8 @@ def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
 
 def read_mask(path: str, size: tuple[int, int]) -> Mask:
     """Read a mask image for images of `size` (rows, columns): True where it is not black."""
-    known = Path(path).is_file()  # else OpenCV would warn on its own
-    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if known else None
+    exists = Path(path).is_file()  # else OpenCV would warn on its own
+    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if exists else None
     if mask is None:
         raise CameraError(f'mask_file {path} is missing or is no image')
     resized = cv2.resize(mask, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
@@ -202,9 +202,9 @@ def read_mask(path: str, size: tuple[int, int]) -> Mask:
 
 def _unmasked(pixels: Array, mask: Mask) -> Mask:
     """Mask (H, W) of the lookups (H, W, 2) whose nearest pixel is True in the mask."""
-    known = np.nan_to_num(pixels, nan=0.0)
-    rows = np.clip(np.rint(known[..., 1]).astype(int), 0, mask.shape[0] - 1)
-    columns = np.clip(np.rint(known[..., 0]).astype(int), 0, mask.shape[1] - 1)
+    finite = np.nan_to_num(pixels, nan=0.0)
+    rows = np.clip(np.rint(finite[..., 1]).astype(int), 0, mask.shape[0] - 1)
+    columns = np.clip(np.rint(finite[..., 0]).astype(int), 0, mask.shape[1] - 1)
     return np.asarray(mask[rows, columns])
 
 
@@ -227,8 +227,8 @@ def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 def _nearest_column(visible: NDArray[np.bool_]) -> NDArray[np.intp]:
     width = len(visible)
-    known = np.flatnonzero(visible)
-    around = np.concatenate([known - width, known, known + width])
+    columns = np.flatnonzero(visible)
+    around = np.concatenate([columns - width, columns, columns + width])
     right = np.searchsorted(around, np.arange(width))
     left = np.maximum(right - 1, 0)
     nearer = np.arange(width) - around[left] < around[right] - np.arange(width)

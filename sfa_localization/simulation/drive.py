@@ -34,9 +34,11 @@ START_NS = 1_700_000_000 * 10**9
 RAW_SIZE = 640, 640  # rows, columns of the simulated mirror's images
 REST_S = 0.5  # at the start and the end of each drive
 ACCELERATION = 1.0  # m/s^2
+TURN_RATE = 0.6  # rad/s, on the spot
 TURN_ACCELERATION = 2.0  # rad/s^2
-SLIP_TIME_S = 2.0  # correlation time: a wet patch of grass at 1 m/s
-LIGHT_TIME_S = 30.0  # correlation time of light and exposure: a cloud passes
+SLIP_TIME_S = 2.0  # correlation time of the wheels' slip: some meters of grass
+GYRO_BIAS_TIME_S = 40.0  # correlation time of the gyroscope's wandering bias
+LIGHT_TIME_S = 30.0  # correlation time of sun, exposure and tone: a cloud passes
 
 Entry = tuple[int, Callable[[], None]]
 
@@ -99,11 +101,11 @@ def _motion(route: Route, config: SimulationConfig) -> tuple[Stamps, Array, Arra
     """Stamps (N,), true twists (N, 2) held since the last stamp, 1 where images are taken (N,)."""
     dt_ns = round(1e9 / config.odometry_rate)
     rest = Motion(np.zeros((1, 2)), images=False)
-    parts = [_increments(motion, config, dt_ns * 1e-9) for motion in [rest, *route, rest]]
+    motions = [rest, *route, rest]
+    parts = [_increments(motion, config, dt_ns * 1e-9) for motion in motions]
     increments = np.concatenate([np.zeros((1, 2)), *parts])
-    driven = zip(parts[1:-1], route, strict=True)
-    wanted = [np.full(len(part), float(motion.images)) for part, motion in driven]
-    imaging = np.concatenate([[0], parts[0][:, 0], *wanted, parts[-1][:, 0]])
+    lengths = [1, *map(len, parts)]
+    imaging = np.repeat([0.0, *(motion.images for motion in motions)], lengths)
     stamps = START_NS + np.arange(len(increments), dtype=np.int64) * dt_ns
     return stamps, increments / (dt_ns * 1e-9), imaging
 
@@ -117,12 +119,12 @@ def _increments(motion: Motion, config: SimulationConfig, dt: float) -> Array:
         return np.diff(np.stack([done, np.interp(done, distance, turn)], -1), axis=0)
     if turn[-1] == 0:
         return np.zeros((round(REST_S / dt), 2))
-    done = np.sign(turn[-1]) * _profile(abs(turn[-1]), config.turn_rate, TURN_ACCELERATION, dt)
+    done = np.sign(turn[-1]) * _profile(abs(turn[-1]), TURN_RATE, TURN_ACCELERATION, dt)
     return np.diff(np.stack([0 * done, done], -1), axis=0)
 
 
 def _profile(distance: float, speed: float, acceleration: float, dt: float) -> Array:
-    """Distance gone (N + 1,) after every time step: speeding up, steady, slowing down."""
+    """Distance covered (N + 1,) after every time step: speeding up, steady, slowing down."""
     speed = min(speed, float(np.sqrt(distance * acceleration)))
     ramp = speed / acceleration
     total = distance / speed + ramp
@@ -130,8 +132,8 @@ def _profile(distance: float, speed: float, acceleration: float, dt: float) -> A
     t = np.linspace(0, total, count + 1)
     rising, falling = np.minimum(t, ramp), np.maximum(t - (total - ramp), 0)
     steady = np.clip(t - ramp, 0, total - 2 * ramp)
-    gone = acceleration * rising**2 / 2 + speed * steady + speed * falling
-    return np.asarray(gone - acceleration * falling**2 / 2)
+    covered = acceleration * rising**2 / 2 + speed * steady + speed * falling
+    return np.asarray(covered - acceleration * falling**2 / 2)
 
 
 def _drifting(truth: Trajectory, twists: Array, config: SimulationConfig) -> SimulationConfig:
@@ -164,7 +166,7 @@ def _measured(
     count = len(twists)
     wheel, gyro = 1 + config.scale_error * rng.standard_normal(2)
     slip = config.slip * wandering(count, dt, SLIP_TIME_S, rng)
-    bias = config.gyro_bias * wandering(count, dt, config.gyro_bias_time, rng)
+    bias = config.gyro_bias * wandering(count, dt, GYRO_BIAS_TIME_S, rng)
     noise = rng.standard_normal((count, 2)) * [config.speed_noise, config.gyro_noise]
     v, omega = twists.T
     measured_v = v * (wheel + slip) + noise[:, 0] * (v != 0)

@@ -36,6 +36,8 @@ STRIP_M = 0.9
 """From the driven area to the nearest plant; the robot's center may reach the area's edge."""
 FENCE_M = 2.3
 """From the driven area to the hedges and fences around it."""
+CAMERA_HEIGHT_M = 0.45
+"""Of the mirror's focus above the lawn."""
 
 GRASS: Tint = (0.07, 0.24, 0.13)
 BARK: Tint = (0.17, 0.25, 0.34)
@@ -367,8 +369,7 @@ class Garden:
 
     def __init__(self, seed: int, config: SimulationConfig | None = None) -> None:
         """Lay out and light the garden. Raises ConfigError when the area is too small."""
-        self._config = config or SimulationConfig()
-        half = _checked_half(self._config.area)
+        half = _checked_half((config or SimulationConfig()).area)
         plot = Plot(half, np.random.default_rng([seed, 0]))
         self.dock = np.array([plot.rng.uniform(-0.5, 0.5) * half[0], 0.3 - half[1], np.pi / 2])
         for part in (lawn, border, bed, buildings):
@@ -389,7 +390,7 @@ class Garden:
     def image(self, pose: Array, view: View, light: Light | None = None) -> Floats:
         """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose (3,)."""
         light = light or Light()
-        position = np.array([pose[0], pose[1], self._config.camera_height])
+        position = np.array([pose[0], pose[1], CAMERA_HEIGHT_M])
         return view.image(self.scene.look(position, float(pose[2]), view.dome, light), light.gain)
 
 

@@ -86,7 +86,7 @@ class Dome:
         return cls(elevations_rad, columns, rays.astype(np.float32))
 
     def turned(self, yaw_rad: float) -> Floats:
-        """The rays (rows, columns, 3) of a robot turned counter-clockwise."""
+        """The rays (rows, columns, 3) of a robot turned counterclockwise."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         matrix = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
         return np.asarray(self.rays @ matrix, np.float32)

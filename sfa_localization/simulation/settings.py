@@ -39,7 +39,6 @@ class SimulationConfig(Settings):
         'none', 'of the images, published below /compressed', choices=('none', 'jpeg', 'png')
     )
     storage: str = setting('mcap', 'storage of the bag', choices=('mcap', 'sqlite3'))
-    camera_height: float = setting(0.45, 'camera above the lawn', unit='m', low=0.1, high=2.0)
     image_noise: float = setting(
         1.5, 'standard deviation of the pixel noise', unit='gray levels', low=0.0, high=50.0
     )
@@ -47,7 +46,6 @@ class SimulationConfig(Settings):
         0.1, 'change of light: 0 none, 1 clouds and exposure at their worst', low=0.0, high=1.0
     )
     speed: float = setting(1.0, 'driving speed', unit='m/s', low=0.05, high=3.0)
-    turn_rate: float = setting(0.6, 'turning speed on the spot', unit='rad/s', low=0.05, high=3.0)
     odometry_rate: float = setting(
         50.0, 'rate of odometry, gyroscope and ground truth', unit='Hz', low=5.0, high=500.0
     )
@@ -80,9 +78,6 @@ class SimulationConfig(Settings):
         unit='rad/s',
         low=0.0,
         high=0.1,
-    )
-    gyro_bias_time: float = setting(
-        40.0, 'correlation time of the gyroscope bias', unit='s', low=0.1, high=1e5
     )
     gyro_noise: float = setting(
         0.005, 'white noise of the yaw rate', unit='rad/s', low=0.0, high=1.0

@@ -166,7 +166,7 @@ def _strip(texture: Floats) -> Image:
 def sky(rng: np.random.Generator) -> Image:
     """Sky with clouds, haze and far hills: BGR (SKY_ROWS, SKY_COLUMNS, 3), highest row first.
 
-    Columns grow counter-clockwise from the world's +x axis.
+    Columns grow counterclockwise from the world's +x axis.
     """
     elevation = np.linspace(SKY_HIGHEST_DEG, SKY_LOWEST_DEG, SKY_ROWS, dtype=np.float32)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False, dtype=np.float32)[None]
