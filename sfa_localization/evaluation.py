@@ -23,7 +23,7 @@ from tqdm import tqdm
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import (
     Array,
     RigidTransform,
@@ -252,5 +252,5 @@ def _supervised(model: PlaceModel, weights: Array, drive: _Drive) -> Trajectory:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, at once or not at all. Raises LocalizationError."""
     text = json.dumps(content, indent=2) + '\n'
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         file.write(text.encode())

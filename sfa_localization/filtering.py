@@ -16,8 +16,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import PICTURE, in_order
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.events import IMAGE, merge_by_stamp
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.pose_filter import PoseFilter, Status
@@ -183,7 +183,7 @@ def _told_variance(positions: Table) -> float:
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:
     """Write `stamp x y z qx qy qz qw` lines, at once or not at all. Raises DataError."""
-    with whole_file(Path(path), DataError) as file:
+    with atomic_write(Path(path), DataError) as file:
         for stamp_ns, (x, y, yaw) in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
             turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
             file.write(f'{_seconds(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n'.encode())
@@ -198,11 +198,13 @@ def _seconds(stamp_ns: int) -> str:
 def _feed(fused: PoseFilter, odometry: Table, positions: Table, shift: int) -> Iterator[int]:
     """Give both tables to the filter in the order of time; yields each odometry stamp, done."""
     pending: int | None = None
-    for stamp_ns, kind, i in in_order(odometry.stamps_ns + shift, positions.stamps_ns + shift):
+    for stamp_ns, kind, i in merge_by_stamp(
+        odometry.stamps_ns + shift, positions.stamps_ns + shift
+    ):
         if pending is not None and stamp_ns > pending:
             yield pending
             pending = None
-        if kind == PICTURE:
+        if kind == IMAGE:
             fused.add_measurement(stamp_ns, *_measurement(positions.columns, i))
         elif not fused.add_odometry(stamp_ns, *_twist(odometry.columns, i)):
             pending = stamp_ns

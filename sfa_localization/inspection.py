@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
-from sfa_localization.bags import messages
+from sfa_localization.bags import decoding
 from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.streams import Stream
+from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
@@ -242,18 +242,18 @@ class _Looks:
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry.partition(':')[0]:
-            stream = self._bag.stream(self._odometry, messages.odometry_of)
+            stream = self._bag.stream(self._odometry, decoding.odometry_of)
             stream.required = False
             return stream
         if name == self._image:
             return self._bag.any_stream(name, self._look)
         if self._bag.topics[name].kind in KINDS['image'].found:
-            return self._bag.any_stream(name, messages.image_of)
+            return self._bag.any_stream(name, decoding.image_of)
         return self._bag.any_stream(name, lambda message: None)
 
     def _look(self, message: Any) -> None:
         """Decode a picture; remember its size, and some pictures themselves."""
-        image = messages.image_of(message)
+        image = decoding.image_of(message)
         seen = sum(self._sizes.values())
         self._sizes[image.shape[:2]] = self._sizes.get(image.shape[:2], 0) + 1
         if seen % self._every == 0 and len(self._samples) < self._wanted:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sfa_localization.bags.loading import load_run
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig

@@ -31,8 +31,10 @@ from bag_formats import (
 )
 from rosbags.rosbag2 import Reader
 
-from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import BagError
 
 

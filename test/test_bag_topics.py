@@ -13,8 +13,10 @@ from bag_formats import PERIOD, pose, stamp
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import TopicNames
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import BagError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

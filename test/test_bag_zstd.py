@@ -15,7 +15,7 @@ from sfa_localization import cli
 from sfa_localization.bags import mcap as bag_mcap
 from sfa_localization.bags import storage as bag_storage
 from sfa_localization.bags import zstd as bag_zstd
-from sfa_localization.bags.loading import Bag
+from sfa_localization.bags.reader import Bag
 
 STANDARD = ('compression.zstd', 'backports.zstd')
 

@@ -21,7 +21,8 @@ import yaml
 from test_calibration import scene
 
 from sfa_localization import cli
-from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.settings import Settings
 from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel

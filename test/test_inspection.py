@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.bags.loading import BagWriter
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
     DUAL_FISHEYE,

@@ -33,8 +33,10 @@ from metric_worlds import (
 from test_commands import OPTIONS, parser_of
 
 from sfa_localization import cli
-from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import BagConfig
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera import capture as sources
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import (

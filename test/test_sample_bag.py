@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sfa_localization.bags.loading import load_run
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.inspection import PANORAMA, inspect
 
 BAGS = Path(__file__).parents[1] / 'bags'

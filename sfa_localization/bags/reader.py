@@ -16,8 +16,8 @@ from typing import Any
 
 from rosbags.interfaces import Qos
 
-from sfa_localization.bags import messages
-from sfa_localization.bags.arrays import (
+from sfa_localization.bags import decoding
+from sfa_localization.bags.motion_arrays import (
     Values,
     poses_stand,
     to_odometry,
@@ -27,7 +27,7 @@ from sfa_localization.bags.arrays import (
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.storage import Channel, Record, inflate_message
-from sfa_localization.bags.streams import StampFilter, Stream, Tally
+from sfa_localization.bags.topic_stream import StampFilter, Stream, Tally
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
@@ -53,13 +53,13 @@ class Kind:
     named: tuple[str, ...]
 
 
-_IMAGES = (messages.IMAGE, messages.COMPRESSED)
+_IMAGES = (decoding.IMAGE, decoding.COMPRESSED)
 KINDS = {
     'image': Kind('pictures', '--image-topic', _IMAGES, _IMAGES),
-    'odometry': Kind('odometry', '--odom-topic', (messages.ODOMETRY,), messages.POSES),
-    'imu': Kind('yaw rates', '--imu-topic', (messages.IMU,), (messages.IMU,)),
+    'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
+    'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'ground_truth': Kind(
-        'true poses', '--ground-truth-topic', messages.STAMPED_POSES, messages.POSES
+        'true poses', '--ground-truth-topic', decoding.STAMPED_POSES, decoding.POSES
     ),
 }
 
@@ -92,7 +92,7 @@ class Bag:
     ) -> None:
         self.path, self.config, self.strict = Path(path), config or BagConfig(), strict
         self._by_header = (stamp_source or self.config.stamp_source) == 'header'
-        self._decode = messages.Decoder()
+        self._decode = decoding.Decoder()
         self._tallies: dict[str, Tally] = {}
         self._recording: Recording | None = None
 
@@ -186,7 +186,7 @@ class Bag:
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and pictures (H, W, 3) BGR, one at a time."""
-        stream = self.stream(self.find('image', topic), messages.image_of)
+        stream = self.stream(self.find('image', topic), decoding.image_of)
         return ((stamp, image) for _, stamp, image in self.read([stream]))
 
     def odometry(self, topic: str = '') -> Odometry:
@@ -220,19 +220,19 @@ class Bag:
 
     def trajectory(self, topic: str = '') -> Trajectory:
         """All poses of a topic, by default the one that holds true poses."""
-        stream = self.stream(self.find('ground_truth', topic), messages.pose_of)
+        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
         return to_trajectory([(stamp, value) for _, stamp, value in self.read([stream])])
 
     def odometry_stream(self, topic: str = '') -> Stream:
         """Stream of (pose, twist and its variances, or None where only poses are told)."""
         name = self.find('odometry', topic)
-        return self.stream(name, messages.odometry_of)
+        return self.stream(name, decoding.odometry_of)
 
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
         topic, _, child_frame = name.partition(':')
-        chooser = messages.TransformChooser(topic, child_frame)
-        is_tf = self.topics[topic].kind == messages.TF
+        chooser = decoding.TransformChooser(topic, child_frame)
+        is_tf = self.topics[topic].kind == decoding.TF
         return self._stream(topic, chooser if is_tf else _whole, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
@@ -290,7 +290,7 @@ class Bag:
             if part is None:
                 stream.tally.leave('tells of other frames')
                 return []
-            stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
+            stamp_ns = decoding.header_stamp(part) if self._by_header else receive_ns
         except MessageError as error:
             stream.tally.skip(str(error))
             return []

@@ -24,7 +24,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores
 
-from sfa_localization.bags.messages import typestore
+from sfa_localization.bags.decoding import typestore
 from sfa_localization.camera.encodings import encode_jpeg, encode_png
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array

@@ -20,7 +20,7 @@ from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CalibrationConfig, CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -390,7 +390,7 @@ def _labelled(strip: Image, panorama: PanoramaConfig) -> Image:
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file that is there whole or not at all. Raises CameraError naming it."""
-    with whole_file(path, CameraError, make_folder=True) as file:
+    with atomic_write(path, CameraError, make_folder=True) as file:
         file.write(data)
 
 

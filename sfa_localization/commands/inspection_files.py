@@ -11,7 +11,7 @@ from typing import Any
 
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.reports.bag import write_contact_sheet, write_path
 
@@ -48,7 +48,7 @@ def _inspected(path: Path, **options: Any) -> BagReport:
 
 def _write_json(reports: Sequence[BagReport], path: Path) -> None:
     text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
-    with whole_file(path, BagError, make_folder=True) as file:
+    with atomic_write(path, BagError, make_folder=True) as file:
         file.write(f'{text}\n'.encode())
 
 

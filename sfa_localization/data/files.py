@@ -15,7 +15,7 @@ from sfa_localization.data.errors import LocalizationError
 
 
 @contextmanager
-def whole_file(
+def atomic_write(
     path: Path, error: type[LocalizationError] = LocalizationError, *, make_folder: bool = False
 ) -> Iterator[IO[bytes]]:
     """Write to a temporary name that becomes `path` in the end, or vanishes after any error.

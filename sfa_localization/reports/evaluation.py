@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure, SubFigure
 
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Stamps, Trajectory
 
@@ -307,11 +307,11 @@ def _number(value: float | None, column: str) -> str:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, at once or not at all. Raises LocalizationError."""
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
 def save_text(path: Path, text: str) -> None:
     """Write a text file, at once or not at all. Raises LocalizationError."""
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         file.write(text.encode())

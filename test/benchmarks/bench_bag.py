@@ -19,7 +19,8 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.writer import BagWriter
 
 START = 1_700_000_000_000_000_000
 STORE = get_typestore(Stores.ROS2_JAZZY)

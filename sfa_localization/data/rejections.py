@@ -13,19 +13,19 @@ MOST = 32
 OTHER = 'other reasons'
 
 
-class ReasonCounter(Counter[str]):
+class RejectionCounter(Counter[str]):
     """Counts by reason: shortened to LONGEST characters, those after the first MOST together."""
 
     def add(self, reason: str, number: int = 1) -> int:
         """Count a reason `number` times; returns how often it, or what it is put to, was met."""
-        key = bounded(reason)
+        key = short_line(reason)
         if key not in self and len(self) >= MOST:
             key = OTHER
         self[key] += number
         return self[key]
 
 
-def bounded(text: str) -> str:
+def short_line(text: str) -> str:
     """One printable line of at most LONGEST characters."""
     # Cut first: what a sender wrote may be very long.
     line = ' '.join(text[: 2 * LONGEST].split())

@@ -15,18 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.bags import messages
-from sfa_localization.bags.arrays import Values, to_trajectory, to_yaw_rate
-from sfa_localization.bags.reader import Bag, Topic
+from sfa_localization.bags import decoding
+from sfa_localization.bags.motion_arrays import Values, to_trajectory, to_yaw_rate
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.streams import Stream
-from sfa_localization.bags.writer import BagWriter
+from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, PanoramaArray, Run, Stamps
-
-__all__ = ['Bag', 'BagWriter', 'PanoramaFile', 'Topic', 'load_run']
 
 logger = logging.getLogger(__name__)
 Unwrap = Callable[[Image], Image]
@@ -126,7 +123,7 @@ class _Loader:
         self._bag = bag
         self._image_topic = bag.find('image', topics.image)
         self._streams = {'odometry': bag.odometry_stream(topics.odometry)}
-        found = [topic for topic in bag.topics.values() if topic.kind == messages.IMU]
+        found = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
         if found and not topics.imu and not any(topic.count for topic in found):
             names = ', '.join(topic.name for topic in found)
             logger.warning('%s: no message on %s: going on without gyroscope', bag.path, names)
@@ -137,7 +134,7 @@ class _Loader:
             self._streams['imu'] = imu
         if want_truth:
             name = bag.find('ground_truth', topics.ground_truth)
-            self._streams['ground_truth'] = bag.stream(name, messages.pose_of)
+            self._streams['ground_truth'] = bag.stream(name, decoding.pose_of)
         self._values: dict[str, Values] = {use: [] for use in self._streams}
 
     def load(self, cache: Path, unwrap: Unwrap | None, progress: Progress | None) -> Run:
@@ -196,7 +193,7 @@ class _Loader:
 
 def _prepared(message: Any, unwrap: Unwrap | None) -> Image:
     """The message's picture as a panorama. Raises LocalizationError."""
-    image = messages.image_of(message)
+    image = decoding.image_of(message)
     if unwrap is None or looks_like_panorama(*image.shape[:2]):
         return image
     return unwrap(image)

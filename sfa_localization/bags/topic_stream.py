@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from sfa_localization.data.errors import BagError, LocalizationError
 from sfa_localization.data.messages import NO_STAMP
-from sfa_localization.data.reasons import ReasonCounter
+from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
 
 
@@ -19,7 +19,7 @@ class Tally:
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
         self._used = 0
-        self._skipped = ReasonCounter()
+        self._skipped = RejectionCounter()
 
     def use(self, number: int = 1) -> None:
         self._used += number
