@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
 from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
@@ -296,7 +297,7 @@ class _Looks:
         stream = next(s for s in self._streams if s.topic == self._odometry.partition(':')[0])
         odometry = self._bag.to_odometry(stream, self._motion)
         stamps = pictures.stamps_ns if pictures else np.zeros(0, np.int64)
-        tolerance = int(self._bag.config.odometry_tolerance * 1e9)
+        tolerance = int(ODOMETRY_TOLERANCE_S * 1e9)
         near = stamps[odometry.trajectory.covers(stamps, tolerance)]
         return Drive(self._odometry, odometry, odometry.trajectory.at(near))
 

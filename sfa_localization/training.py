@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sfa_localization.bags.run_loader import load_run
+from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S, load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -84,6 +84,7 @@ class Recipe:
     segments: SegmentConfig = field(default_factory=SegmentConfig)
     metric: MetricConfig = field(default_factory=MetricConfig)
     heading: HeadingConfig = field(default_factory=HeadingConfig)
+    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +201,7 @@ def read_drive(
             want_truth=want_truth,
             strict=strict,
             config=recipe.bag,
+            odometry_tolerance_s=recipe.odometry_tolerance_s,
         )
 
 
@@ -208,7 +210,7 @@ def as_live(recipe: Recipe, model: PlaceModel) -> Recipe:
 
     Training leaves out pictures far from any odometry; the filter fuses them too.
     """
-    return replace(recipe, panorama=model.panorama, bag=replace(recipe.bag, odometry_tolerance=0.0))
+    return replace(recipe, panorama=model.panorama, odometry_tolerance_s=0.0)
 
 
 def drive_of(run: Run, config: NetworkConfig) -> Drive:

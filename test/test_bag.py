@@ -111,7 +111,7 @@ def test_reading_can_start_later(name: str, tmp_path: Path, messages: list[Messa
 
 def test_stamps_of_reception_can_be_chosen(tmp_path: Path, messages: list[Message]) -> None:
     path = write_version(tmp_path / 'bag', messages, 5)
-    with Bag(path, stamp_source='receive') as bag:
+    with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         assert [at for at, _ in bag.images()] == [stamp(i) + DELAY for i in range(IMAGES)]
 
 
@@ -399,13 +399,13 @@ def test_pictures_without_odometry_are_skipped_and_counted(
 
 
 @pytest.mark.parametrize(('tolerance', 'used'), [(0.05, IMAGES // 2), (0.1, IMAGES - 1)])
-def test_odometry_tolerance_is_a_setting(
+def test_odometry_tolerance_is_an_argument(
     tolerance: float, used: int, tmp_path: Path, messages: list[Message]
 ) -> None:
     even = {stamp(i) + DELAY for i in range(0, IMAGES, 2)}
     sparse = [m for m in messages if m.topic != '/odom' or m.receive_ns in even]
     path = write_version(tmp_path / 'bag', sparse, 5)
-    run = load_run(path, cache=tmp_path, config=BagConfig(odometry_tolerance=tolerance))
+    run = load_run(path, cache=tmp_path, odometry_tolerance_s=tolerance)
     assert len(run.panoramas) == used
 
 
@@ -453,6 +453,6 @@ def test_nothing_is_left_behind_after_an_error(tmp_path: Path) -> None:
         for index in range(3):
             bag.image('/image', stamp(index), image(index), 'camera')
             bag.odometry('/odom', stamp(index + 36_000), pose(index), (1, 0), (0, 0))
-    with pytest.raises(BagError, match=r'none of 3 pictures of /image has odometry within 0\.5 s'):
+    with pytest.raises(BagError, match=r'none of 3 images of /image has odometry within 0\.5 s'):
         load_run(tmp_path / 'bag', cache=tmp_path / 'cache')
     assert list((tmp_path / 'cache').iterdir()) == []

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.run_loader import load_run
-from sfa_localization.bags.settings import TopicNames
+from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import BagError
 
@@ -169,7 +169,7 @@ def test_one_transform_of_several_is_named_by_its_frame(tmp_path: Path) -> None:
         with pytest.raises(BagError, match='base_link, wheel; choose one as /tf:FRAME'):
             bag.trajectory('/tf')
         truth = bag.trajectory('/tf:base_link')
-        assert bag.counts['/tf'].skipped == {'tells of other frames': 1}
+        assert bag.counts['/tf'].skipped == {'transforms of other frames': 1}
     np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
 
 
@@ -290,7 +290,7 @@ def test_a_run_needs_no_gyro(tmp_path: Path) -> None:
         ({'data': np.zeros(0, np.uint8)}, 'data size is not rows times step'),
         ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty picture'),
         ({'encoding': 'rgb9'}, "unsupported encoding 'rgb9'"),
-        ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first picture'),
+        ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first image'),
     ],
 )
 def test_a_faulty_picture_is_skipped_and_counted(
@@ -378,7 +378,7 @@ def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
         pytest.raises(BagError, match=r'6 zero or negative stamp.*stamp_source: receive'),
     ):
         bag.trajectory()
-    with Bag(path, stamp_source='receive') as bag:
+    with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
 
 
@@ -400,7 +400,7 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
                 silent.write(connections[connection.topic], at, raw)
     run = load_run(tmp_path / 'bag', cache=tmp_path / 'cache')
     assert run.yaw_rate is None and len(run.panoramas) == 4
-    assert 'no message on /imu: going on without gyroscope' in caplog.text
+    assert 'no message on /imu: continuing without gyroscope' in caplog.text
     with pytest.raises(BagError, match='/imu'):
         load_run(tmp_path / 'bag', cache=tmp_path / 'cache', topics=TopicNames(imu='/imu'))
 
@@ -430,7 +430,7 @@ def test_a_pose_that_is_never_kept_is_summed_up_from_the_twist(tmp_path: Path) -
     with Bag(path) as bag:
         x = bag.odometry().poses[:, 0]
         assert x == pytest.approx(np.arange(100) * PERIOD * 1e-9)
-        assert bag.problems == ['/odom: the pose never moves; the twist is summed up instead']
+        assert bag.problems == ['/odom: the pose is constant; the twist is integrated instead']
 
 
 # The writer.
@@ -446,7 +446,7 @@ def test_a_bag_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_an_existing_bag_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / 'bag').mkdir()
-    with pytest.raises(BagError, match='bag: exists already'), BagWriter(tmp_path / 'bag'):
+    with pytest.raises(BagError, match='bag: already exists'), BagWriter(tmp_path / 'bag'):
         pass
     with pytest.raises(BagError, match="storage 'tape' is not one of mcap, sqlite3"):
         BagWriter(tmp_path / 'bag', 'tape')
