@@ -414,14 +414,14 @@ def drive_bag(path: Path, pose: Callable[[int], Any], twist: Any, count: int = 1
 
 
 def test_a_pose_and_a_twist_of_different_units_are_refused(tmp_path: Path) -> None:
-    """A pose in centimetres would else be taken for odometry that is reset at every message."""
+    """A pose in centimeters would else be taken for odometry that is reset at every message."""
     step = PERIOD * 1e-9
-    metres = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
-    with Bag(metres) as bag:
+    meters = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
+    with Bag(meters) as bag:
         assert len(bag.odometry().poses) == 100 and bag.problems == []
-    centimetres = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), (10.0, 0.0))
-    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* metres')
-    with refusal, Bag(centimetres) as bag:
+    centimeters = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), (10.0, 0.0))
+    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* meters')
+    with refusal, Bag(centimeters) as bag:
         bag.odometry()
 
 
