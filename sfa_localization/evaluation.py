@@ -121,7 +121,7 @@ def evaluate(
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
-    run = read_drive(bag, cache, recipe, progress, want_truth=True)
+    run = read_drive(bag, cache, recipe, progress, want_truth=True, odometry_tolerance_s=0.0)
     if run.ground_truth is None or len(run.ground_truth) < 2:
         raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
     return run

@@ -84,7 +84,6 @@ class Recipe:
     segments: SegmentConfig = field(default_factory=SegmentConfig)
     metric: MetricConfig = field(default_factory=MetricConfig)
     heading: HeadingConfig = field(default_factory=HeadingConfig)
-    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +183,7 @@ def read_drive(
     *,
     want_truth: bool = False,
     strict: bool = False,
+    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
 ) -> Run:
     """One bag as a run of panoramas, unwrapped by the recipe's camera where they are none yet."""
     with tqdm(desc=f'reading {Path(bag).name}', unit='img', disable=not progress) as bar:
@@ -201,16 +201,17 @@ def read_drive(
             want_truth=want_truth,
             strict=strict,
             config=recipe.bag,
-            odometry_tolerance_s=recipe.odometry_tolerance_s,
+            odometry_tolerance_s=odometry_tolerance_s,
         )
 
 
 def as_live(recipe: Recipe, model: PlaceModel) -> Recipe:
-    """The recipe to read a drive as the nodes get it: the model's panorama, no picture left out.
+    """The recipe to read a drive with the model's panorama, as the nodes do.
 
-    Training leaves out pictures far from any odometry; the filter fuses them too.
+    Read it with `odometry_tolerance_s` 0: training leaves out images far from any odometry, but
+    the filter fuses them too.
     """
-    return replace(recipe, panorama=model.panorama, odometry_tolerance_s=0.0)
+    return replace(recipe, panorama=model.panorama)
 
 
 def drive_of(run: Run, config: NetworkConfig) -> Drive:

@@ -104,7 +104,12 @@ def read_tours(
     for bag in bags:
         with TemporaryDirectory(prefix='sfa_localization_tune_') as cache:
             run = read_drive(
-                bag, Path(cache), as_live(recipe, model), progress, want_truth=want_truth
+                bag,
+                Path(cache),
+                as_live(recipe, model),
+                progress,
+                want_truth=want_truth,
+                odometry_tolerance_s=0.0,
             )
             sight = _sight(run, Observer(model, watch), progress)
             tours.append(Tour(run.odometry, sight, run.ground_truth))
