@@ -54,7 +54,7 @@ def _write_json(reports: Sequence[BagReport], path: Path) -> None:
 
 def _write_pictures(report: BagReport, folder: Path, prefix: str) -> None:
     name = Path(report.path).stem
-    seen, drive = report.pictures, report.drive
+    seen, drive = report.images, report.drive
     if seen is not None:
         title = f'{name}: {seen.topic}, {seen.width}x{seen.height}, {seen.geometry}'
         write_contact_sheet(seen.samples, title, folder / f'{prefix}{name}_pictures.png')
