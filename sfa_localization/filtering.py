@@ -355,9 +355,5 @@ def _number(cell: str) -> Decimal | None:
 
 
 def _float(row: list[str], column: int) -> float:
-    if column >= len(row):
-        return math.nan
-    try:
-        return float(row[column])
-    except ValueError:
-        return math.nan
+    number = _number(row[column]) if column < len(row) else None
+    return math.nan if number is None else float(number)

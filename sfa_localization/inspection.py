@@ -116,8 +116,7 @@ class ImageTopic:
     samples: list[Image]
 
     def as_dict(self) -> dict[str, Any]:
-        size = {'width': self.width, 'height': self.height}
-        return {'topic': self.topic, **size, 'geometry': self.geometry}
+        return {name: getattr(self, name) for name in ('topic', 'width', 'height', 'geometry')}
 
 
 @dataclass
@@ -310,9 +309,7 @@ class _Survey:
 
 
 def _small(image: Image) -> Image:
-    scale = SAMPLE_SIDE / max(image.shape[:2])
-    if scale >= 1:
-        return image.copy()
+    scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 

@@ -248,7 +248,9 @@ def test_a_missing_file_of_several_is_counted(tmp_path: Path, messages: list[Mes
     lost = -(-len(messages) // 12)
     with Bag(path) as bag:
         (problem,) = bag.problems
-        assert problem.endswith(f'bag_3.mcap: is missing with {lost} messages; copy the whole bag')
+        assert problem.endswith(
+            f'bag_3.mcap: is missing with {lost} messages; copy all files of the bag'
+        )
         bag.odometry()
         assert sum(bag.counts['/odom'].skipped.values()) > 0
     with pytest.raises(BagError, match=r'bag_3.mcap: is missing'), Bag(path, strict=True):

@@ -39,7 +39,7 @@ class Decoder:
         self._ros2 = typestore(Stores.ROS2_JAZZY)
         self._ros1 = typestore(Stores.ROS1_NOETIC)
 
-    def knows(self, kind: str, serialization: str) -> bool:
+    def can_decode(self, kind: str, serialization: str) -> bool:
         """Whether messages of this type can be decoded."""
         if serialization == 'ros1':
             return kind in self._ros1.fielddefs

@@ -192,7 +192,9 @@ class McapStorage:
         """Start and end of each chunk and of each series of bare records, by a scan of the file."""
         start = position = len(MAGIC)
         while position + _RECORD.size <= self._size:
-            opcode, end = self._record_at(position)
+            self._file.seek(position)
+            opcode, length = _RECORD.unpack(self._file.read(_RECORD.size))
+            end = position + _RECORD.size + length
             if position > start and (opcode == CHUNK or position - start >= SPAN):
                 yield start, position
                 start = position
@@ -204,12 +206,6 @@ class McapStorage:
             position = end
         if position > start:
             yield start, position
-
-    def _record_at(self, position: int) -> tuple[int, int]:
-        """Opcode and end of the record that starts there."""
-        self._file.seek(position)
-        opcode, length = _RECORD.unpack(self._file.read(_RECORD.size))
-        return opcode, position + _RECORD.size + length
 
     def _index_block(self, offset: int, length: int) -> None:
         first, last = 2**64, -1

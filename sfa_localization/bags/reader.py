@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Qos
@@ -101,12 +100,7 @@ class Bag:
         self._raise_problems()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.recording.close()
         self._recording = None
 
@@ -184,8 +178,6 @@ class Bag:
         )
         return f'it has {shown or "no topics"}: record one, or name one with {wanted.flag}'
 
-    # Streams of values.
-
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
         stream = self.stream(self.find('image', topic), decoding.image_of)
@@ -235,13 +227,13 @@ class Bag:
         topic, _, child_frame = name.partition(':')
         chooser = decoding.TransformChooser(topic, child_frame)
         is_tf = self.topics[topic].kind == decoding.TF
-        return self._stream(topic, chooser if is_tf else _entire_message, convert)
+        return self._stream(topic, chooser if is_tf else lambda message: message, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic of any type, which may be empty; `convert` receives None for unknown types."""
-        stream = self._stream(topic, _entire_message, convert)
+        stream = self._stream(topic, lambda message: message, convert)
         channel = self.recording.channels[topic]
-        stream.opaque = not self._decode.knows(channel.kind, channel.serialization)
+        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
         stream.required = False
         return stream
 
@@ -311,10 +303,6 @@ class Bag:
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
-
-
-def _entire_message(message: Any) -> Any:
-    return message
 
 
 def _plain_name(name: str) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
@@ -51,7 +52,7 @@ class Metadata:
     files: list[str] = field(default_factory=list)
     version: int = NEWEST_METADATA
     channels: list[Channel] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
     file_counts: dict[str, int] = field(default_factory=dict)
 
 
@@ -148,13 +149,13 @@ class Recording:
     def _open_file(self, path: Path) -> None:
         """Open one file, of the format in its first bytes. Raises BagError."""
         try:
-            plain = self._decompressed(path)
-            self.storages.append(_opened(plain, path))
-            self.notes += self.storages[-1].notes
+            storage = open_storage(self._decompressed(path), path)
+            self.storages.append(storage)
+            self.notes += storage.notes
         except FileNotFoundError:
             count = self.metadata.file_counts.get(path.name)
             lost = f' with {count} messages' if count else ''
-            raise BagError(f'{path}: is missing{lost}; copy the whole bag') from None
+            raise BagError(f'{path}: is missing{lost}; copy all files of the bag') from None
         except OSError as error:
             raise BagError(f'{path}: cannot be read: {error.strerror}') from None
 
@@ -191,55 +192,43 @@ def _natural(name: str) -> list[Any]:
     return [(int(part), '') if part.isdigit() else (-1, part) for part in parts]
 
 
-def _opened(plain: Path, path: Path) -> Storage:
-    """Open a file, whose errors name the file it was decompressed from."""
-    try:
-        return open_storage(plain)
-    except BagError as error:
-        raise BagError(str(error).replace(str(plain), str(path))) from None
+def open_storage(plain: Path, path: Path) -> Storage:
+    """Open a bag file by its first bytes; errors name `path`, from which it was decompressed.
 
-
-def open_storage(path: Path) -> Storage:
-    """Open a bag file by its first bytes. Raises BagError, or OSError."""
-    with path.open('rb') as file:
+    Raises BagError, or OSError.
+    """
+    with plain.open('rb') as file:
         start = file.read(max(map(len, READERS)))
     if not start:
         raise BagError(f'{path}: is empty (0 bytes); record it again')
     for magic, reader in READERS.items():
         if start.startswith(magic):
-            return reader(path)  # type: ignore[call-arg]
+            try:
+                return reader(plain)  # type: ignore[call-arg]
+            except BagError as error:
+                raise BagError(str(error).replace(str(plain), str(path))) from None
     raise BagError(f'{path}: is no bag file: its first bytes are not of sqlite3, mcap or ROS 1')
 
 
 def parse_metadata(text: str) -> Metadata:
     """Read metadata.yaml of any version. Raises ValueError when it is malformed."""
     try:
-        tree = load_yaml(text)
-        information = tree['rosbag2_bagfile_information']
-        topics = information['topics_with_message_count']
-        pairs = [(_channel(topic['topic_metadata']), topic['message_count']) for topic in topics]
-        return Metadata(
-            version=int(information['version']),
-            files=[PurePath(one_line(file)).name for file in information['relative_file_paths']],
-            channels=[channel for channel, _ in pairs],
-            counts=_summed([(channel.topic, int(count)) for channel, count in pairs]),
-            file_counts=_file_counts(information.get('files') or []),
+        tree = load_yaml(text)['rosbag2_bagfile_information']
+        metadata = Metadata(
+            version=int(tree['version']),
+            files=[PurePath(one_line(file)).name for file in tree['relative_file_paths']],
+            file_counts={
+                PurePath(str(file['path'])).name: int(file['message_count'])
+                for file in tree.get('files') or []
+            },
         )
+        for entry in tree['topics_with_message_count']:
+            topic = entry['topic_metadata']
+            qos = topic.get('offered_qos_profiles') or ''
+            names = topic['name'], topic['type'], topic['serialization_format']
+            channel = make_channel(*names, qos)
+            metadata.channels.append(channel)
+            metadata.counts[channel.topic] += int(entry['message_count'])
     except (yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(type(error).__name__) from None
-
-
-def _channel(topic: dict[str, Any]) -> Channel:
-    qos = topic.get('offered_qos_profiles') or ''
-    return make_channel(topic['name'], topic['type'], topic['serialization_format'], qos)
-
-
-def _summed(counts: list[tuple[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for topic, count in counts:
-        total[topic] = total.get(topic, 0) + count
-    return total
-
-
-def _file_counts(files: list[dict[str, Any]]) -> dict[str, int]:
-    return {PurePath(str(file['path'])).name: int(file['message_count']) for file in files}
+    return metadata

@@ -42,7 +42,9 @@ class SqliteStorage:
 
     def _connect(self) -> sqlite3.Connection:
         """Open read-only. Unfinished transactions are completed in a copy, never in the bag."""
-        path, logs = self._path, self._pending_logs()
+        path = self._path
+        logs = [path.with_name(path.name + end) for end in ('-wal', '-journal')]
+        logs = [log for log in logs if log.is_file() and log.stat().st_size > 0]
         if logs:
             self._copy = tempfile.TemporaryDirectory(prefix='bag-')
             path = Path(self._copy.name) / self._path.name
@@ -53,10 +55,6 @@ class SqliteStorage:
         access = 'mode=rw' if logs else 'mode=ro&immutable=1'
         uri = f'{path.absolute().as_uri()}?{access}'
         return sqlite3.connect(uri, uri=True, check_same_thread=False)
-
-    def _pending_logs(self) -> list[Path]:
-        logs = [self._path.with_name(self._path.name + end) for end in ('-wal', '-journal')]
-        return [log for log in logs if log.is_file() and log.stat().st_size > 0]
 
     def _or_damaged(self, read: Callable[[], Any], otherwise: Any) -> Any:
         try:

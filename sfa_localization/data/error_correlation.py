@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Correlation of the position errors of neighboring images, learnt together with the map.
+"""Correlation of the position errors of neighboring images, learned together with the map.
 
 Images of one place have similar errors, because the map is wrong there; a filter that took each of
 them as independent would be overconfident. The trainer estimates it from held-out images.
@@ -37,7 +37,7 @@ _MEDIAN_OF_RAYLEIGH = 1.1774
 class ErrorCorrelation:
     """Errors of images d m apart along the path correlate by share * exp(-d / distance_m).
 
-    The defaults are assumed where nothing was learnt. Raises DataError for impossible numbers.
+    The defaults are assumed where nothing was learned. Raises DataError for impossible numbers.
     """
 
     share: float = 0.7

@@ -61,7 +61,7 @@ class RigidTransform:
     yaw_rad: float
 
     def apply(self, points: Array) -> Array:
-        """Transform points (N, 2) in metres."""
+        """Transform points (N, 2) in meters."""
         return np.asarray(points @ rotation(self.yaw_rad).T + [self.x_m, self.y_m])
 
     def apply_yaw(self, yaw_rad: Array) -> Array:

@@ -48,7 +48,7 @@ class Trajectory:
         return np.asarray(inside & close)
 
     def at(self, stamps_ns: Stamps) -> Array:
-        """Poses (M, 3) interpolated along constant twist between neighbours; clamped outside."""
+        """Poses (M, 3) interpolated along constant twist between neighbors; clamped outside."""
         if len(self) == 1:
             return np.repeat(self.poses, len(stamps_ns), axis=0)
         i = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, 'right') - 1, 0, len(self) - 2)

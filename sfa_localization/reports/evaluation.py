@@ -56,7 +56,7 @@ def position_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Arr
 
     Estimates at stamps without ground truth are left out.
     """
-    kept = _within(truth, estimate)
+    kept = truth.covers(estimate.stamps_ns)
     offset = estimate.poses[kept, :2] - truth.at(estimate.stamps_ns[kept])[:, :2]
     return _seconds(truth, estimate.stamps_ns[kept]), np.hypot(offset[:, 0], offset[:, 1])
 
@@ -66,13 +66,9 @@ def heading_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Arra
 
     Estimates without a heading (NaN) or without ground truth are left out.
     """
-    kept = _within(truth, estimate) & np.isfinite(estimate.poses[:, 2])
+    kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
     offset = wrap_angle(estimate.poses[kept, 2] - truth.at(estimate.stamps_ns[kept])[:, 2])
     return _seconds(truth, estimate.stamps_ns[kept]), np.degrees(offset)
-
-
-def _within(truth: Trajectory, estimate: Trajectory) -> Any:
-    return truth.covers(estimate.stamps_ns)
 
 
 def _seconds(truth: Trajectory, stamps_ns: Stamps) -> Array:
@@ -105,7 +101,7 @@ def heading_figure(path: Path, truth: Trajectory, estimate: Trajectory, name: st
     """Draw the true path colored by the absolute heading error (degrees) of one estimate."""
     figure = Figure(figsize=(8.0, 6.6), layout='constrained')
     axes = figure.add_subplot()
-    kept = _within(truth, estimate) & np.isfinite(estimate.poses[:, 2])
+    kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
     places = truth.at(estimate.stamps_ns[kept])[:, :2]
     _, error = heading_errors(truth, estimate)
     top = max(float(np.percentile(np.abs(error), 98)), 1.0) if len(error) else 1.0
@@ -212,7 +208,7 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
     for name, estimate in estimates.items():
         mean = f': {_number(scores[name]["mean"], "mean")} m' if name in scores else ''
         points = estimate.poses[truth.covers(estimate.stamps_ns)]
-        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **_style(name))
+        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **STYLES.get(name, OTHER))
     _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False)
     axes.set_title('Estimated and true paths (mean error)' if scores else 'Paths')
@@ -220,21 +216,17 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
 
 def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*position_errors(truth, estimate), label=_label(name), **_style(name))
+        axes.plot(*position_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
     if estimates:
-        above: dict[str, Any] = {
-            'loc': 'lower left',
-            'bbox_to_anchor': (0.0, 1.0),
-            'frameon': False,
-        }
-        axes.legend(**above, ncols=len(estimates), fontsize='small')
+        above: dict[str, Any] = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0)}
+        axes.legend(**above, frameon=False, ncols=len(estimates), fontsize='small')
 
 
 def _draw_heading_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*heading_errors(truth, estimate), label=_label(name), **_style(name))
+        axes.plot(*heading_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
     axes.axhline(0.0, color='0.4', linewidth=0.8)
     axes.set(xlabel='time (s)', ylabel='heading error (°)', xlim=(0, None))
     axes.grid(alpha=0.3)
@@ -299,10 +291,6 @@ def _frame_view(axes: Axes, points: Array) -> None:
 
 def _label(name: str) -> str:
     return LABELS.get(name, name)
-
-
-def _style(name: str) -> dict[str, Any]:
-    return STYLES.get(name, OTHER)
 
 
 def _number(value: float | None, column: str) -> str:
