@@ -281,7 +281,7 @@ class Bag:
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
             if part is None:
-                stream.tally.leave('transforms of other frames')
+                stream.tally.leave_out('transforms of other frames')
                 return []
             stamp_ns = decoding.header_stamp(part) if self._by_header else receive_ns
         except MessageError as error:
@@ -295,7 +295,7 @@ class Bag:
         if stream.received < expected:
             lost = f'{stream.received} of {expected} messages read'
             self.recording.problems.append(f'{stream.topic}: {lost}')
-            stream.tally.leave('lost in a damaged bag', expected - stream.received)
+            stream.tally.leave_out('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
         if stream.required and count.used == 0:
             raise BagError(f'{self.path}: {stream.topic}: {_reasons(stream.tally.count)}')

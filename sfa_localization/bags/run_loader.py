@@ -173,7 +173,7 @@ class _Loader:
         """The images with odometry near enough on both sides."""
         keep = odometry.trajectory.covers(file.stamps_ns, int(self._tolerance_s * 1e9))
         lost = int(np.count_nonzero(~keep))
-        images.tally.unuse(f'no odometry within {self._tolerance_s:g} s', lost)
+        images.tally.withdraw(f'no odometry within {self._tolerance_s:g} s', lost)
         if not keep.any():
             raise BagError(
                 f'{self._bag.path}: none of {lost} images of {images.topic} has odometry within '

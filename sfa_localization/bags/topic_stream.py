@@ -34,15 +34,15 @@ class Tally:
             raise BagError(f'{self._where}: {reason}; read without --strict to skip such messages')
         self._skipped.add(reason, number)
 
-    def leave(self, reason: str, number: int = 1) -> None:
+    def leave_out(self, reason: str, number: int = 1) -> None:
         """Count messages that are left out although nothing is wrong with them."""
         if number:
             self._skipped.add(reason, number)
 
-    def unuse(self, reason: str, number: int) -> None:
+    def withdraw(self, reason: str, number: int) -> None:
         """Count messages, used so far, as left out."""
         self._used -= number
-        self.leave(reason, number)
+        self.leave_out(reason, number)
 
     @property
     def count(self) -> Count:
