@@ -139,7 +139,7 @@ def test_other_words_in_the_metadata_do_not_empty_a_bag(
         assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
 
 
-def test_fewer_messages_than_told_are_counted_as_lost(
+def test_fewer_messages_than_declared_are_counted_as_lost(
     tmp_path: Path, messages: list[Message]
 ) -> None:
     path = tmp_path / 'bag'
@@ -279,7 +279,7 @@ def test_a_file_without_content_is_one_error(
     assert '\n' not in str(error.value)
 
 
-def test_a_database_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_database_of_something_else_is_rejected(tmp_path: Path) -> None:
     database = sqlite3.connect(tmp_path / 'other.db3')
     database.execute('CREATE TABLE birds(name TEXT)')
     database.commit()
@@ -297,7 +297,7 @@ def test_a_cut_off_ros1_bag_names_the_remedy(tmp_path: Path, messages: list[Mess
 @pytest.mark.parametrize(
     ('path', 'complaint'), [('nowhere', 'no such bag'), ('empty', 'neither metadata.yaml nor')]
 )
-def test_a_path_that_is_no_bag_is_refused(path: str, complaint: str, tmp_path: Path) -> None:
+def test_a_path_that_is_no_bag_is_rejected(path: str, complaint: str, tmp_path: Path) -> None:
     (tmp_path / 'empty').mkdir()
     with pytest.raises(BagError, match=complaint), Bag(tmp_path / path):
         pass
@@ -385,7 +385,7 @@ def test_odd_names_are_opened(name: str, tmp_path: Path, messages: list[Message]
 # Runs.
 
 
-def test_pictures_without_odometry_are_skipped_and_counted(
+def test_images_without_odometry_are_skipped_and_counted(
     tmp_path: Path, messages: list[Message]
 ) -> None:
     late, early = stamp(2), stamp(9)
@@ -427,7 +427,7 @@ def test_one_topic_can_serve_twice(tmp_path: Path, messages: list[Message]) -> N
     np.testing.assert_array_equal(run.ground_truth.poses, run.odometry.poses)
 
 
-def test_pictures_are_unwrapped_when_they_are_no_panoramas(
+def test_images_are_unwrapped_when_they_are_no_panoramas(
     tmp_path: Path, messages: list[Message]
 ) -> None:
     path = write_version(tmp_path / 'bag', messages, 5)
@@ -441,7 +441,7 @@ def test_pictures_are_unwrapped_when_they_are_no_panoramas(
     assert run.panoramas.shape == (2, 20, 3)
 
 
-def test_progress_tells_every_picture(tmp_path: Path, messages: list[Message]) -> None:
+def test_progress_reports_every_image(tmp_path: Path, messages: list[Message]) -> None:
     told: list[tuple[int, int]] = []
     path = write_version(tmp_path / 'bag', messages, 5)
     load_run(path, cache=tmp_path, progress=lambda done, total: told.append((done, total)))

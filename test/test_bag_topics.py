@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag are taken, what their messages mean, and whose stamps are believed."""
+"""Which topics of a bag are used, how their messages are read, and which stamps count."""
 
 import math
 from collections.abc import Callable
@@ -268,7 +268,7 @@ def test_a_leading_slash_may_be_left_out(tmp_path: Path) -> None:
         assert bag.find('odometry', 'odom') == '/odom'
 
 
-def test_an_unknown_serialization_is_refused_by_name(tmp_path: Path) -> None:
+def test_an_unknown_serialization_is_rejected_by_name(tmp_path: Path) -> None:
     path = record(tmp_path / 'bag', poses_of(odometry, '/odom'), serialization='protobuf')
     with Bag(path) as bag, pytest.raises(BagError, match="/odom is serialized as 'protobuf'"):
         bag.odometry()
@@ -293,7 +293,7 @@ def test_a_run_needs_no_gyro(tmp_path: Path) -> None:
         ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first image'),
     ],
 )
-def test_a_faulty_picture_is_skipped_and_counted(
+def test_a_faulty_image_is_skipped_and_counted(
     changes: dict[str, Any], reason: str, tmp_path: Path
 ) -> None:
     entry = ('/camera', stamp(2) + 7, picture(stamp(2) + 7, **changes))
@@ -413,7 +413,7 @@ def drive_bag(path: Path, pose: Callable[[int], Any], twist: Any, count: int = 1
     return path
 
 
-def test_a_pose_and_a_twist_of_different_units_are_refused(tmp_path: Path) -> None:
+def test_a_pose_and_a_twist_of_different_units_are_rejected(tmp_path: Path) -> None:
     """A pose in centimeters would else be taken for odometry that is reset at every message."""
     step = PERIOD * 1e-9
     meters = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
@@ -466,7 +466,7 @@ def test_same_calls_write_same_bytes(storage: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('compressed', 'error'), [(None, 0), ('png', 0), ('jpeg', 12)])
-def test_pictures_are_written_raw_or_compressed(
+def test_images_are_written_raw_or_compressed(
     compressed: str | None, error: int, tmp_path: Path
 ) -> None:
     smooth = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)

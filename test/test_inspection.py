@@ -112,7 +112,7 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
         ({'pictures': 160}, 'm apart: drive slower'),
     ],
 )
-def test_it_tells_why_a_drive_is_not_enough(
+def test_it_gives_the_reason_why_a_drive_is_not_enough(
     options: dict[str, object], reason: str, tmp_path: Path
 ) -> None:
     report = inspect(write(tmp_path / 'bag', **options), config=ENOUGH)
@@ -121,7 +121,7 @@ def test_it_tells_why_a_drive_is_not_enough(
 
 
 @pytest.mark.parametrize('missing', ['/panorama', '/odom'])
-def test_a_missing_topic_is_told_not_raised(missing: str, tmp_path: Path) -> None:
+def test_a_missing_topic_is_reported_not_raised(missing: str, tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         for index in range(3):
             if missing != '/odom':
@@ -170,7 +170,7 @@ def test_ground_within_reach_of_a_square_path() -> None:
     assert covered_share(ring, 1.0) == pytest.approx(1 - 4 / 16, abs=0.03)
 
 
-def test_spacing_ignores_pictures_taken_standing() -> None:
+def test_spacing_ignores_images_taken_standing() -> None:
     places = np.zeros((300, 2))
     places[:100, 0] = 0.3 * np.arange(100)
     places[100:, 0] = places[99, 0]
@@ -197,7 +197,7 @@ def test_a_wide_strip_is_a_panorama() -> None:
     assert guess_geometry(views((200, 400))) == PANORAMA
 
 
-def test_an_ordinary_picture_is_told_as_such() -> None:
+def test_an_ordinary_image_is_recognized() -> None:
     assert guess_geometry(views((240, 320))) == ORDINARY
 
 
@@ -223,7 +223,7 @@ def test_two_circles_are_a_dual_fisheye() -> None:
 # The command.
 
 
-def test_the_command_writes_json_and_pictures(
+def test_the_command_writes_json_and_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, report = write(tmp_path / 'good'), tmp_path / 'report'
