@@ -20,7 +20,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
@@ -169,7 +169,7 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
 
 def write_config(path: Path | str, changes: Mapping[str, Mapping[str, Any]] | None = None) -> None:
     """Write `render(changes)` to a file, at once or not at all. Raises ConfigError."""
-    with whole_file(Path(path), ConfigError) as file:
+    with atomic_write(Path(path), ConfigError) as file:
         file.write(render(changes).encode())
 
 

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import (
     Array,
     RigidTransform,
@@ -121,7 +121,7 @@ def evaluate(
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
-    run = read_drive(bag, cache, recipe, progress, want_truth=True)
+    run = read_drive(bag, cache, recipe, progress, want_truth=True, odometry_tolerance_s=0.0)
     if run.ground_truth is None or len(run.ground_truth) < 2:
         raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
     return run
@@ -252,5 +252,5 @@ def _supervised(model: PlaceModel, weights: Array, drive: _Drive) -> Trajectory:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, at once or not at all. Raises LocalizationError."""
     text = json.dumps(content, indent=2) + '\n'
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         file.write(text.encode())

@@ -19,7 +19,7 @@ from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
@@ -188,7 +188,7 @@ class Localizer:
         published then: it knows nothing of what came later.
         """
         odometry, observations = run.odometry, self.observer.observe_run(run)
-        for stamp_ns, kind, i in in_order(odometry.stamps_ns, run.panoramas.stamps_ns):
+        for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, run.panoramas.stamps_ns):
             if kind == ODOMETRY:
                 v, omega = odometry.twists[i].tolist()
                 noise, pose = odometry.variances[i], odometry.poses[i].tolist()

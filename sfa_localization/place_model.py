@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError, ModelError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
@@ -232,7 +232,7 @@ def _under(arrays: Arrays, prefix: str) -> Arrays:
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write named arrays (N, ...) as .npz, at once or not at all. Raises ModelError."""
     plain: dict[str, Any] = dict(arrays)
-    with whole_file(Path(path), ModelError, make_folder=True) as file:
+    with atomic_write(Path(path), ModelError, make_folder=True) as file:
         np.savez(file, **plain)
 
 

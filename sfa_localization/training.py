@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sfa_localization.bags.loading import load_run
+from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S, load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -183,6 +183,7 @@ def read_drive(
     *,
     want_truth: bool = False,
     strict: bool = False,
+    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
 ) -> Run:
     """One bag as a run of panoramas, unwrapped by the recipe's camera where they are none yet."""
     with tqdm(desc=f'reading {Path(bag).name}', unit='img', disable=not progress) as bar:
@@ -200,15 +201,17 @@ def read_drive(
             want_truth=want_truth,
             strict=strict,
             config=recipe.bag,
+            odometry_tolerance_s=odometry_tolerance_s,
         )
 
 
 def as_live(recipe: Recipe, model: PlaceModel) -> Recipe:
-    """The recipe to read a drive as the nodes get it: the model's panorama, no picture left out.
+    """The recipe to read a drive with the model's panorama, as the nodes do.
 
-    Training leaves out pictures far from any odometry; the filter fuses them too.
+    Read it with `odometry_tolerance_s` 0: training leaves out images far from any odometry, but
+    the filter fuses them too.
     """
-    return replace(recipe, panorama=model.panorama, bag=replace(recipe.bag, odometry_tolerance=0.0))
+    return replace(recipe, panorama=model.panorama)
 
 
 def drive_of(run: Run, config: NetworkConfig) -> Drive:

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Odometry, Run, Stamps, Trajectory
 from sfa_localization.data.settings import Settings, setting
@@ -104,7 +104,12 @@ def read_tours(
     for bag in bags:
         with TemporaryDirectory(prefix='sfa_localization_tune_') as cache:
             run = read_drive(
-                bag, Path(cache), as_live(recipe, model), progress, want_truth=want_truth
+                bag,
+                Path(cache),
+                as_live(recipe, model),
+                progress,
+                want_truth=want_truth,
+                odometry_tolerance_s=0.0,
             )
             sight = _sight(run, Observer(model, watch), progress)
             tours.append(Tour(run.odometry, sight, run.ground_truth))
@@ -214,7 +219,7 @@ def error_cost(tours: Iterable[Tour], config: FilterConfig) -> float:
 def _fuse(fused: PoseFilter, tour: Tour) -> Iterator[Update]:
     """Feed a tour in the order of time; yields the updates."""
     odometry, sight = tour.odometry, tour.sight
-    for stamp_ns, kind, i in in_order(odometry.stamps_ns, sight.stamps_ns):
+    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, sight.stamps_ns):
         if kind == ODOMETRY:
             v, omega = odometry.twists[i]
             pose = odometry.poses[i].tolist()

@@ -20,7 +20,7 @@ import yaml
 from test_calibration import scene
 
 from sfa_localization import cli
-from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
 from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel
@@ -320,19 +320,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--min-pictures': Case('--min-pictures 9999', says('drive until there are 9999')),
         '--max-spacing': Case('--max-spacing 0.1', PRINTED),
         '--reach': Case('--reach 0.2', PRINTED),
-        '--min-covered': Case('--min-covered 0', PRINTED, beside='--reach 0.3'),
-        '--min-directions': Case('--min-directions 6', PRINTED),
-        '--max-lost': Case('--max-lost 0', PRINTED, base='{data}/lossy'),
-        '--max-gap': Case('--max-gap 1', PRINTED, base='{data}/lossy'),
-        '--samples': Case(
-            '--samples 2',
-            lambda a, b: (
-                same([a.code, b.code], [0, 0])
-                and (a.folder / 'r/bag_pictures.png').read_bytes()
-                != (b.folder / 'r/bag_pictures.png').read_bytes()
-            ),
-            beside='--report {out}/r',
-        ),
     },
     'calibrate': {
         '--calibration': Case('--calibration {data}/info.yaml', says('fisheye')),
@@ -546,7 +533,6 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
         'distortion_coefficients: {rows: 1, cols: 4, data: [0.01, 0, 0, 0]}\n'
     )
     write_tables(folder)
-    write_lossy(folder / 'lossy')
     return folder
 
 
@@ -560,18 +546,6 @@ def write_tables(folder: Path) -> None:
     rows = zip(truth.stamps_ns[::5] * 1e-9, *truth.poses[::5].T, strict=True)
     lines = ['stamp_s,x_m,y_m,yaw_rad', *(f'{t:.3f},{x},{y},{yaw}' for t, x, y, yaw in rows)]
     (folder / 'positions.csv').write_text('\n'.join(lines))
-
-
-def write_lossy(path: Path) -> None:
-    """Write a straight drive whose odometry pauses for 1.5 s, and ends before its pictures do."""
-    start = 1_700_000_000 * 10**9
-    with BagWriter(path) as bag:
-        for i in range(400):
-            stamp = start + i * 100_000_000
-            if i < 100 or 115 <= i < 380:
-                pose = np.array([0.1 * i, 0.0, 0.0])
-                bag.odometry('/odom', stamp, pose, np.array([1.0, 0.0]), np.array([1e-4, 1e-4]))
-            bag.image('/panorama', stamp, np.full((8, 80, 3), i % 256, np.uint8), 'camera')
 
 
 def test_every_option_has_a_case_and_every_case_an_option():

@@ -23,7 +23,7 @@ from sfa_localization.commands import inspection_files
 from sfa_localization.commands.settings import DemoConfig
 from sfa_localization.data import files
 from sfa_localization.data.errors import BagError, DataError, LocalizationError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport
 from sfa_localization.reports import bag as report_bag
 from sfa_localization.reports import evaluation as report
@@ -56,7 +56,7 @@ WRITERS = {
 }
 # Who writes otherwise, and why it may.
 OTHERS = {
-    'bags/loading': 'decoded pictures, in a folder that its caller removes',
+    'bags/run_loader': 'decoded pictures, in a folder that its caller removes',
     'bags/storage': 'a decompressed copy, in a temporary folder',
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
@@ -79,7 +79,7 @@ class Failing(io.FileIO):
 
 def test_the_file_is_there_only_in_the_end(tmp_path):
     path = tmp_path / 'new' / 'a.txt'
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         file.write(b'whole')
         assert not path.exists()
     assert path.read_bytes() == b'whole'
@@ -91,7 +91,7 @@ def test_the_file_is_there_only_in_the_end(tmp_path):
 def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path, kind):
     path = tmp_path / 'a.txt'
     path.write_bytes(b'old')
-    with pytest.raises(kind), whole_file(path) as file:
+    with pytest.raises(kind), atomic_write(path) as file:
         file.write(b'half')
         raise kind
     assert path.read_bytes() == b'old'
@@ -101,7 +101,7 @@ def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path, kind):
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     with (
         pytest.raises(DataError, match=r'missing/a\.txt: cannot be written: No such'),
-        whole_file(tmp_path / 'missing' / 'a.txt', DataError),
+        atomic_write(tmp_path / 'missing' / 'a.txt', DataError),
     ):
         raise AssertionError
 

@@ -11,7 +11,7 @@ from picture_readers import PictureReader, panorama
 
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.events import ODOMETRY, PICTURE, in_order
+from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Observer, unusable_covariance
@@ -114,8 +114,8 @@ def test_in_batches_and_one_by_one_pictures_are_judged_alike():
 
 def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp():
     odometry, pictures = np.array([5, 10, 20]), np.array([1, 10, 15, 30])
-    assert list(in_order(odometry, pictures)) == [
-        (1, PICTURE, 0), (5, ODOMETRY, 0), (10, ODOMETRY, 1), (10, PICTURE, 1),
-        (15, PICTURE, 2), (20, ODOMETRY, 2), (30, PICTURE, 3),
+    assert list(merge_by_stamp(odometry, pictures)) == [
+        (1, IMAGE, 0), (5, ODOMETRY, 0), (10, ODOMETRY, 1), (10, IMAGE, 1),
+        (15, IMAGE, 2), (20, ODOMETRY, 2), (30, IMAGE, 3),
     ]  # fmt: skip
-    assert [event[1] for event in in_order(odometry, pictures[:0])] == [ODOMETRY] * 3
+    assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3

@@ -168,7 +168,7 @@ def test_module_imports_only_what_its_room_may(module):
 @pytest.mark.parametrize(
     ('module', 'imported'),
     [
-        (f'{NAME}.metric.phases', f'{NAME}.bags.arrays.to_run'),
+        (f'{NAME}.metric.phases', f'{NAME}.bags.run_loader.load_run'),
         (f'{NAME}.camera.capture', f'{NAME}.nodes.settings.NodeConfig'),
         (f'{NAME}.config', f'{NAME}.nodes.lifecycle.BaseNode'),
         (f'{NAME}.data.run', 'scipy.linalg'),

@@ -154,7 +154,7 @@ from rosbags.interfaces import (  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Image, Imu  # noqa: E402
 
-from sfa_localization.bags.loading import Bag  # noqa: E402
+from sfa_localization.bags.reader import Bag  # noqa: E402
 from sfa_localization.commands.play import SETTLED_S, Player, message_class, play, qos_profile  # noqa: E402
 
 NO_TIME = QosTime(9223372036, 854775807)

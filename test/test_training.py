@@ -10,7 +10,7 @@ import pytest
 from cylinder_worlds import Spheres, panorama_config, recipe, run_in, wander
 
 from sfa_localization import training
-from sfa_localization.bags.loading import BagWriter
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run
 from sfa_localization.features.settings import NetworkConfig

@@ -24,7 +24,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -364,5 +364,5 @@ def write_check(path: Path, image: Image) -> None:
 
 
 def _write_file(path: Path, data: bytes) -> None:
-    with whole_file(path, CameraError, make_folder=True) as file:
+    with atomic_write(path, CameraError, make_folder=True) as file:
         file.write(data)

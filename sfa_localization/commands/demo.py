@@ -19,7 +19,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.commands.demo_nodes import commands, run_live
 from sfa_localization.commands.settings import DemoConfig
 from sfa_localization.data.errors import LocalizationError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import (
     Evaluation,
@@ -94,7 +94,7 @@ def _prepare(out: Path, config: DemoConfig) -> None:
 
 def _mark(marker: Path, config: DemoConfig) -> None:
     """Note what the folder was made with."""
-    with whole_file(marker) as file:
+    with atomic_write(marker) as file:
         file.write(_settings_of(config).encode())
 
 

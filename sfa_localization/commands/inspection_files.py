@@ -11,7 +11,7 @@ from typing import Any
 
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.reports.bag import write_contact_sheet, write_path
 
@@ -48,13 +48,13 @@ def _inspected(path: Path, **options: Any) -> BagReport:
 
 def _write_json(reports: Sequence[BagReport], path: Path) -> None:
     text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
-    with whole_file(path, BagError, make_folder=True) as file:
+    with atomic_write(path, BagError, make_folder=True) as file:
         file.write(f'{text}\n'.encode())
 
 
 def _write_pictures(report: BagReport, folder: Path, prefix: str) -> None:
     name = Path(report.path).stem
-    seen, drive = report.pictures, report.drive
+    seen, drive = report.images, report.drive
     if seen is not None:
         title = f'{name}: {seen.topic}, {seen.width}x{seen.height}, {seen.geometry}'
         write_contact_sheet(seen.samples, title, folder / f'{prefix}{name}_pictures.png')

@@ -36,7 +36,7 @@ from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability
 from rosbags.typesys import Stores
 from rosgraph_msgs.msg import Clock
 
-from sfa_localization.bags.messages import COMPRESSED, IMAGE, ODOMETRY, typestore
+from sfa_localization.bags.decoding import COMPRESSED, IMAGE, ODOMETRY, typestore
 from sfa_localization.bags.reader import Bag, Topic
 from sfa_localization.bags.storage import Record
 from sfa_localization.commands.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace

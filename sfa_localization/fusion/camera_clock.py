@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
@@ -188,7 +188,7 @@ def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float
     """
     finder, seen = CameraClockFinder(), iter(headings)
     rates = _turn_rates(odometry).tolist()
-    for stamp_ns, kind, i in in_order(odometry.stamps_ns, stamps_ns):
+    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):
         if kind == ODOMETRY:
             finder.add_odometry(stamp_ns, rates[i])
         else:

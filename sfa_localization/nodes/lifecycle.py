@@ -24,7 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.reasons import bounded
+from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
 from sfa_localization.nodes import parameters, signals
@@ -200,7 +200,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """
         count = self.monitor(topic).refuse(reason)
         if count == 1 or count % 1000 == 0:
-            self.get_logger().warning(f'{topic}: {bounded(reason)} ({count} so far)')
+            self.get_logger().warning(f'{topic}: {short_line(reason)} ({count} so far)')
         return count
 
     def _defect(self, name: str, error: Exception) -> str:

@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from sfa_localization.data.reasons import ReasonCounter
+from sfa_localization.data.rejections import RejectionCounter
 
 _WINDOW = 500
 
@@ -25,7 +25,7 @@ class Monitor:
     def __init__(self) -> None:
         self.received = 0
         self.used = 0
-        self.refused = ReasonCounter()
+        self.refused = RejectionCounter()
         self.last_received_s: float | None = None
         self._arrivals: deque[float] = deque(maxlen=_WINDOW)
         self._latencies: deque[float] = deque(maxlen=_WINDOW)
