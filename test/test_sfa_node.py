@@ -154,7 +154,7 @@ def bad_pictures():
 
 
 @pytest.mark.parametrize('kind', ['dark', 'covered', 'frozen', 'foreign'])
-def test_an_unusable_image_has_no_pose_and_is_reported(bench, models, kind):
+def test_an_unusable_picture_says_nothing_and_is_told(bench, models, kind):
     node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
