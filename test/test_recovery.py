@@ -10,10 +10,12 @@ import pytest
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.fusion import evidence, recover
 from sfa_localization.fusion.belief import LARGEST_STD_M, Evidence, PoseEvent, Update, capped
+from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.evidence import Agreement, consistent, relocate, remember
 from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.recover import Recovery, displaced, outweighs, shows_heading
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import Level, status_of
 from sfa_localization.fusion.update import Correction, measurement_event
 
 SECOND = 1_000_000_000
@@ -208,7 +210,7 @@ def test_neighbors_that_err_alike_count_as_fewer():
 
 
 def test_what_lies_far_behind_is_forgotten():
-    for std, reach in ((0.1, evidence.REMEMBERED_M), (1.0, evidence.REMEMBERED_STDS)):
+    for std, reach in ((0.1, 6.0), (1.0, 30.0)):
         old = seen_along([(0.0, 0.0), (0.2, 0.0)])
         belief = belief_at(evidence=old)._replace(traveled_m=reach + 0.1)
         assert len(remember(belief, image([0.0, 0.0], std), accepted=False)) == 2
@@ -225,9 +227,35 @@ def test_the_memory_is_bounded_and_its_newer_half_complete():
     for k in range(500):
         belief = belief_at(evidence=kept)._replace(traveled_m=0.001 * k)
         kept = remember(belief, image([k, 0.0]), accepted=False)
-        assert len(kept) <= evidence.CAPACITY
-    newest = [item.position[0] for item in kept[-evidence.CAPACITY // 2 :]]
+        assert len(kept) <= 60
+    newest = [item.position[0] for item in kept[-30:]]
     assert newest == list(range(500 - len(newest), 500))
+
+
+# What the state says.
+
+
+@pytest.mark.parametrize(('memory', 'moved_m', 'level'), [
+    ({'rejected': 5, 'gate_excess': 4.1}, 0.0, Level.LOST),
+    ({'rejected': 5, 'gate_excess': 3.9}, 0.0, Level.DEGRADED),  # LOST_EXCESS
+    ({'rejected': 5, 'gate_excess': 1.1}, 0.6, Level.LOST),
+    ({'rejected': 5, 'gate_excess': 1.1}, 0.4, Level.DEGRADED),  # LOST_DISTANCE_M
+    ({'rejected': 4, 'gate_excess': 9.0}, 9.0, Level.DEGRADED),  # ENOUGH_IMAGES
+    ({'rejected': 2, 'gate_excess': 9.0}, 9.0, Level.LOCALISED),  # FEW_IMAGES
+])  # fmt: skip
+def test_contradictions_make_the_estimate_degraded_then_lost(memory, moved_m, level):
+    belief = belief_at(accepted_ns=SECOND, **memory)
+    belief = belief._replace(traveled_m=moved_m, odometry_ns=SECOND)
+    assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
+
+
+@pytest.mark.parametrize(('silences_s', 'level'), [
+    ((2.9, 0.4), Level.LOCALISED), ((3.1, 0.4), Level.DEGRADED), ((2.9, 0.6), Level.DEGRADED),
+])  # fmt: skip
+def test_silence_makes_the_estimate_degraded(silences_s, level):
+    images_ns, odometry_ns = (round(5e9 - 1e9 * silence_s) for silence_s in silences_s)
+    belief = belief_at(accepted_ns=images_ns)._replace(stamp_ns=5 * SECOND, odometry_ns=odometry_ns)
+    assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
 
 
 # The gate.

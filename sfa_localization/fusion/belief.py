@@ -14,7 +14,7 @@ from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import SIZE, State, Twist
 
 LARGEST_STD_M = 100.0
-"""The standard deviation of the position never exceeds this: beyond, nothing is known anyway."""
+"""The standard deviation of the position never exceeds this: larger than the places mapped."""
 _NO_DOUBT = (0.0, 0.0, 0.0)
 
 
@@ -54,7 +54,7 @@ Event = OdometryEvent | PoseEvent | MeasurementEvent
 class Update(NamedTuple):
     """What became of one measurement.
 
-    `d2` is the squared Mahalanobis distance of the whole innovation, with `threshold` its gate;
+    `d2` is the squared Mahalanobis distance of the full innovation, with `threshold` its gate;
     both NaN where there was nothing to compare with. `innovation` (2,) or (3,) with its covariance.
     """
 

@@ -41,7 +41,7 @@ START_YAW_STD = 0.3
 AGREEING_SHARE = 0.6
 """Share of all remembered images that must agree to start from positions: most, with a margin."""
 AGREEING_PER_ACCEPTED = 3
-"""With fewer agreeing images per accepted one along the way, the estimate is not what is wrong."""
+"""With fewer agreeing images per accepted one on the same path, the estimate is rather right."""
 OBVIOUS_STDS, OBVIOUS_JUMP_M, OBVIOUS_TURN_RAD = 8.0, 1.5, 0.5
 """A displacement larger than both 8 standard deviations of an image and this (m, rad) has no
 other explanation than that the robot was moved; a smaller one may be the map's own error."""

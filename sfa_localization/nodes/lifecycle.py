@@ -3,7 +3,7 @@
 """Base of the nodes: a lifecycle node that starts itself, guards callbacks, reports its health.
 
 A node written on it declares its Settings classes, makes its publishers and subscriptions in
-`setup`, drops what else it holds in `teardown`, and says how it is in `health`.
+`setup`, drops what else it holds in `teardown`, and reports its state in `health`.
 """
 
 from __future__ import annotations
