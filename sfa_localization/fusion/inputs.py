@@ -64,18 +64,15 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
 
     A heading that is not known well enough is left out. DataError says why there is nothing left.
     """
-    given, rows = np.asarray(value, float), np.asarray(covariance, float)
-    if given.shape not in ((2,), (3,)) or rows.shape != (given.size, given.size):
+    given, matrix = np.asarray(value, float), np.asarray(covariance, float)
+    if given.shape not in ((2,), (3,)) or matrix.shape != (given.size, given.size):
         raise DataError('shape is not that of a position or a pose')
     # In plain numbers from here: arrays of two or three cost more than what is done with them.
-    return _read_plain(given.tolist(), rows.tolist(), factor)
-
-
-def _read_plain(value: list[float], rows: list[list[float]], factor: float) -> tuple[Array, Array]:
-    if not (abs(value[0]) <= _LARGEST_COORDINATE and abs(value[1]) <= _LARGEST_COORDINATE):
+    pose, rows = given.tolist(), matrix.tolist()
+    if not (abs(pose[0]) <= _LARGEST_COORDINATE and abs(pose[1]) <= _LARGEST_COORDINATE):
         raise DataError('position is not finite')
-    if len(value) == 3 and not _has_yaw(value[2], rows):
-        value, rows = value[:2], [row[:2] for row in rows[:2]]
+    if len(pose) == 3 and not _has_yaw(pose[2], rows):
+        pose, rows = pose[:2], [row[:2] for row in rows[:2]]
     if not any(map(any, rows)):
         stds = [POSITION_STD, POSITION_STD, _UNKNOWN_YAW_STD][: len(rows)]
         rows = np.diag(np.square(stds)).tolist()
@@ -83,7 +80,7 @@ def _read_plain(value: list[float], rows: list[list[float]], factor: float) -> t
         raise DataError('covariance is not symmetric positive')
     if rows[0][0] >= _LARGEST_VARIANCE or rows[1][1] >= _LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
-    return np.array(value), _conditioned(rows, factor)
+    return np.array(pose), _conditioned(rows, factor)
 
 
 def _has_yaw(yaw: float, rows: list[list[float]]) -> bool:

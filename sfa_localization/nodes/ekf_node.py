@@ -65,14 +65,13 @@ _LEVELS = {
     Level.LOST: DiagnosticStatus.ERROR,
 }
 PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
-"""Time between the poses of ekf/path, and how many it keeps: a quarter of an hour."""
+"""Time between the poses of ekf/path, and how many it keeps: those of 17 minutes."""
 IMAGES_SILENCE = 3.0
 """Images may be silent for so many times silence_timeout: they come less often than odometry."""
 _WATCH_PERIOD_S = 0.2
 _REPEAT_STATE_S = 1.0
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time: less is jitter
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
-_CORRELATION = 'sfa/error_correlation'
 
 
 class EkfNode(LocalizationNode):
@@ -80,10 +79,13 @@ class EkfNode(LocalizationNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('ekf_node', [EkfNodeConfig, FilterConfig], **options)
+        self._jumps: Any = None
+        self._begin()
+
+    def _begin(self) -> None:
         self._config = self.settings(EkfNodeConfig)
         self._filter = PoseFilter(self.settings(FilterConfig))
         self._paused = False
-        self._jumps: Any = None
         self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_ns = 0
         self._frames = self._config.odom_frame, self._config.base_frame
@@ -93,30 +95,16 @@ class EkfNode(LocalizationNode):
         self._last_moved = (0, 0.0)
 
     def setup(self) -> None:
-        self._config = self.settings(EkfNodeConfig)
-        self._filter = PoseFilter(self.settings(FilterConfig))
-        self._paused = False
-        self._path.clear()
-        self._state_level = None
-        self._last_moved = (0, 0.0)
+        self._begin()
         self._make_publishers()
         self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
         self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
-        self.subscribe(
-            Float64,
-            'sfa/camera_delay',
-            self._receive_delay,
-            latched_qos(),
-            while_inactive=True,
-        )
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
-        self.subscribe(
-            Float64MultiArray,
-            _CORRELATION,
-            self._receive_correlation,
-            latched_qos(),
-            while_inactive=True,
-        )
+        for kind, topic, receive in (
+            (Float64, 'sfa/camera_delay', self._receive_delay),
+            (Float64MultiArray, 'sfa/error_correlation', self._receive_correlation),
+        ):
+            self.subscribe(kind, topic, receive, latched_qos(), while_inactive=True)
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(PoseWithCovarianceStamped, topic, self._set_pose, reliable_qos(1))
         self.service(Trigger, '~/reset', self._reset)
