@@ -416,7 +416,6 @@ def _configure_tune(parser: argparse.ArgumentParser) -> None:
 
 def _tune(arguments: argparse.Namespace) -> int:
     from sfa_localization import tuning
-    from sfa_localization.fusion.settings import resolved
     from sfa_localization.place_model import PlaceModel
 
     how, model = _settings(TuneConfig, arguments), PlaceModel.load(arguments.model)
@@ -425,20 +424,21 @@ def _tune(arguments: argparse.Namespace) -> int:
     config = _settings(FilterConfig, arguments, arguments.config)
     watch = _settings(WatchConfig, arguments, arguments.config)
     progress = sys.stderr.isatty()
-    start = resolved(config, model.error_correlation)
-    tours = tuning.read_tours(arguments.bags, model, recipe, how.method == 'grid', progress, watch)
-    best = tuning.tune(tours, start, how, progress)
+    drives = tuning.read_drives(
+        arguments.bags, model, recipe, how.method == 'grid', progress, watch
+    )
+    best = tuning.tune(drives, config, how, progress)
     changes = load_changes(arguments.config) if arguments.config else {}
     found = {
         item.name: getattr(best.config, item.name)
         for item in dataclasses.fields(FilterConfig)
-        if getattr(best.config, item.name) != getattr(start, item.name)
+        if getattr(best.config, item.name) != getattr(config, item.name)
     }
     changes['ekf_node'] = {**changes.get('ekf_node', {}), **found}
     write_config(arguments.output, changes)
     unit = 'm mean error' if how.method == 'grid' else 'negative log-likelihood per component'
     for name, value in found.items():
-        print(f'{name}: {value:.4g} (was {getattr(start, name):.4g})')
+        print(f'{name}: {value:.4g} (was {getattr(config, name):.4g})')
     print(f'{arguments.output}: {best.cost:.4f} {unit}')
     return 0
 

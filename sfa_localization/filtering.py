@@ -20,6 +20,7 @@ from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Stamps, Trajectory, integrate
+from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, Status
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -108,7 +109,7 @@ def run_filter(
     shift = _SECOND_NS - first if first <= 0 else 0
     fused = PoseFilter(config)
     if start is not None:
-        fused.initialise(int(odometry.stamps_ns[0]) + shift, start)
+        fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
     stamps, poses, waiting = [], [], 0
     for stamp_ns in tqdm(_feed(fused, odometry, positions, shift), disable=not progress,
                          total=len(odometry), unit=' rows', desc='filter'):  # fmt: skip
@@ -151,30 +152,26 @@ def position_std_of(odometry: Table, positions: Table) -> float | None:
 def fitting_config(
     odometry: Table, positions: Table, config: FilterConfig
 ) -> tuple[FilterConfig, str]:
-    """The settings for positions that tell no variance, or far too small ones; and what was done.
+    """The settings for positions without variances, or with far too small ones; and what was done.
 
-    Settings that differ from the defaults are the user's, and stay.
+    A `measurement_factor` other than the default is the user's, and stays.
     """
-    if (config.position_std, config.measurement_factor) != _default_noise():
+    if config.measurement_factor != FilterConfig().measurement_factor:
         return config, ''
     found = position_std_of(odometry, positions) if len(positions) else None
     if found is None:
         return config, ''
-    told = math.sqrt(_told_variance(positions))
-    if told == 0:
-        text = f'positions tell no variance: their deviation is taken to be {found:.2f} m'
-        return replace(config, position_std=max(found, config.position_std_floor)), text
-    if found > _UNTRUE * told:
+    claimed = math.sqrt(_told_variance(positions))
+    if claimed == 0:
+        text = f'positions have no variance: their standard deviation is taken to be {found:.2f} m'
+        return replace(config, measurement_factor=(found / POSITION_STD) ** 2), text
+    if found > _UNTRUE * claimed:
         text = (
-            f'positions tell a deviation of {told:.2f} m, but err by {found:.2f} m: taken as such'
+            f'positions claim a standard deviation of {claimed:.2f} m, but err by {found:.2f} m: '
+            'taken as such'
         )
-        return replace(config, measurement_factor=(found / told) ** 2), text
+        return replace(config, measurement_factor=(found / claimed) ** 2), text
     return config, ''
-
-
-def _default_noise() -> tuple[float, float]:
-    default = FilterConfig()
-    return default.position_std, default.measurement_factor
 
 
 def _told_variance(positions: Table) -> float:

@@ -45,8 +45,8 @@ from sfa_localization.features.rotation import Map
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.features.sfa import Solution
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
-from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric import learning as metric_learning
 from sfa_localization.metric.compass import HeadingFit, fit_compass
 from sfa_localization.metric.forecast import nearest_used
@@ -457,10 +457,9 @@ def _learn_heading(
 
 def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrelation:
     """How the errors of pictures that the map had not seen hang together along the drive."""
-    turn_radius = FilterConfig().turn_radius
     ways = [
         np.cumsum(np.abs(np.diff(s.path, prepend=s.path[0])))
-        + turn_radius * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
+        + TURN_RADIUS_M * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
         for s in segments
     ]
     owner = np.repeat(np.arange(len(ways)), [len(way) for way in ways])

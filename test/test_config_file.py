@@ -71,16 +71,17 @@ def test_changes_are_written_and_the_rest_stays(tmp_path):
 
 
 def test_what_is_not_named_is_default_and_ros_names_are_left_alone(tmp_path):
-    path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    history: 3\n    use_sim_time: true\n'
+    path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    speed_std: 3\n'
+                           '    use_sim_time: true\n'
                            "    qos_overrides: {/odom: {subscription: {depth: 3}}}\n")  # fmt: skip
-    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(history=3.0)
+    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(speed_std=3.0)
     assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig()
 
 
 def test_what_is_of_ros_is_written_again(tmp_path):
     """A file that is read, changed and written anew keeps what only ROS knows, and all values."""
     path = saved(tmp_path, '/**:\n  ros__parameters:\n    use_sim_time: true\n    width: 300\n'
-                           'ekf_node:\n  ros__parameters:\n    history: 3\n'
+                           'ekf_node:\n  ros__parameters:\n    speed_std: 3\n'
                            '    slip_per_metre: 1e-3\n'
                            '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n'
                            'omnicam_node:\n  ros__parameters:\n'
@@ -96,7 +97,7 @@ def test_what_is_of_ros_is_written_again(tmp_path):
     assert ekf['use_sim_time'] is omnicam['use_sim_time'] is sfa['use_sim_time'] is True
     assert ekf['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
     assert omnicam['qos_overrides./panorama.publisher.depth'] == 7
-    assert (ekf['slip_per_metre'], type(ekf['history'])) == (1e-3, float), 'as ROS reads them'
+    assert (ekf['slip_per_metre'], type(ekf['speed_std'])) == (1e-3, float), 'as ROS reads them'
     assert (omnicam['width'], training['photometric_seed']) == (300, 7)
     assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
 
@@ -108,21 +109,21 @@ def test_numbers_as_people_write_them(tmp_path):
 
 def test_parameters_of_every_node_are_taken_where_they_fit(tmp_path):
     path = saved(tmp_path, '/**:\n  ros__parameters:\n    autostart: false\n    width: 300\n'
-                           '/ekf_node:\n  ros__parameters:\n    history: 3.0\n')  # fmt: skip
+                           '/ekf_node:\n  ros__parameters:\n    speed_std: 3.0\n')  # fmt: skip
     assert not load_settings(path, 'ekf_node', NodeConfig).autostart
-    assert load_settings(path, 'ekf_node', FilterConfig).history == 3.0
+    assert load_settings(path, 'ekf_node', FilterConfig).speed_std == 3.0
     assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
 
 
 @pytest.mark.parametrize(('text', 'why'), [
     ('ekf_node: [1', 'is not YAML'), ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
     ('efk_node: {}\n', "unknown section 'efk_node'"),
-    ('ekf_node: {history: 3}\n', 'ros__parameters'),
+    ('ekf_node: {speed_std: 3}\n', 'ros__parameters'),
     ('ekf_node: {ros__parameters: 3}\n', 'names and values'),
-    ('ekf_node: {ros__parameters: {histroy: 3}}\n', "did you mean 'history'"),
-    ('ekf_node: {ros__parameters: {history: x}}\n', 'history'),
-    ('ekf_node: {ros__parameters: {history: -1}}\n', 'outside'),
-    ('ekf_node: {ros__parameters: {history: .nan}}\n', 'finite'),
+    ('ekf_node: {ros__parameters: {sped_std: 3}}\n', "did you mean 'speed_std'"),
+    ('ekf_node: {ros__parameters: {speed_std: x}}\n', 'speed_std'),
+    ('ekf_node: {ros__parameters: {speed_std: -1}}\n', 'outside'),
+    ('ekf_node: {ros__parameters: {speed_std: .nan}}\n', 'finite'),
     ('ekf_node: {ros__parameters: {width: 300}}\n', "unknown parameter 'width'"),
     ('/**: {ros__parameters: {nonsense: 1}}\n', "unknown parameter 'nonsense'"),
 ])  # fmt: skip

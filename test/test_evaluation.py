@@ -62,7 +62,11 @@ def test_unusable_pictures_are_not_scored(bag, tmp_path):
 
 def test_tune_leaves_out_the_same_pictures(bag):
     counts = [
-        len(tuning.read_tours([bag], PictureReader(), Recipe(), False, False, watch)[0].sight.poses)
+        len(
+            tuning.read_drives([bag], PictureReader(), Recipe(), False, False, watch)[
+                0
+            ].images.poses
+        )
         for watch in (None, WatchConfig(novelty_limit=1.5))
     ]
     assert counts == [105, 105 - 3]
@@ -81,7 +85,7 @@ def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path,
 
 
 def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(bag, tmp_path, capsys):
-    figures = evaluated(bag, tmp_path, ekf_node={'gate_probability': 0.5})
+    figures = evaluated(bag, tmp_path, ekf_node={'measurement_factor': 0.02})
     out = capsys.readouterr().out
     rejected = figures['counts']['fusion']['measurement: outside the gate']
     assert f'filter: {rejected} times measurement: outside the gate' in out

@@ -45,7 +45,7 @@ def test_foreign_pictures_are_not_believed(novelty, fine):
 
 def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():
     update = PoseFilter().add_measurement(10**9, [0, 0, 0], unusable_covariance())
-    assert not update.accepted and update.reason == 'covariance tells that nothing is known'
+    assert not update.accepted and update.reason == 'covariance means that nothing is known'
 
 
 def test_a_believed_picture_gives_the_models_pose_and_covariance():

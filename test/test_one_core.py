@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Live nodes, `Localizer` and `evaluate` give the same poses, whatever the pictures are like."""
+"""Live nodes, `Localizer` and `evaluate` give the same poses, whatever the images are like."""
 
 import numpy as np
 import pytest

@@ -279,7 +279,7 @@ STRAIGHT = {'segments': 'straight'}
 PAPER = {'solver': 'paper', 'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5,
          'require_certificate': False, 'paper_iterations': 300}  # fmt: skip
 RANDOM = {**PAPER, 'paper_start': 'random'}
-START = {'set_initial_pose': True}
+START = {'initial_pose': (0.0, 0.0, 0.0)}
 POLAR = {'camera_model': 'polar'}
 OCAM = {'camera_model': 'ocam', 'polynomial': (-150.0, 0.0, 1e-3), 'axis': 'down'}
 TWO = {'camera_model': 'dual_fisheye', 'fx': 95.0, 'fy': 95.0, 'cx': 160.0, 'second_cx': 480.0,
@@ -328,15 +328,9 @@ SPECIAL: dict[type[Settings], dict[str, Other]] = {
         'paper_turns': Other(False, PAPER),
     },
     FilterConfig: {
-        'correlated_share': Other(0.2),
-        'decorrelation': Other(0.3),
-        'initial_x': Other(1.0, START),
-        'initial_y': Other(1.0, START),
-        'initial_yaw': Other(1.0, START),
+        'initial_pose': Other((1.0, -1.0, 0.5)),
         'initial_position_std': Other(1.0, START),
         'initial_yaw_std': Other(1.0, START),
-        'largest_std': Other(3.0, {'unknown_speed': 5.0}),
-        'confirm_pictures': Other(6, {'confirm_distance': 0.0}),
     },
     HeadingConfig: {
         'heading_layers': Other((1,)),
@@ -385,15 +379,12 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
     },
     NodeConfig: {
         'autostart': 'test_nodes_base.py::test_a_node_starts_itself_unless_told_not_to',
-        'diagnostics_period': 'test_ekf_node.py::test_diagnostics_tell_rates_latencies_and_counts',
     },
     SfaNodeConfig: {
         'model': 'test_sfa_node.py::test_the_model_changes_while_running_and_a_bad_one_is_refused',
-        'compressed': 'test_sfa_node.py::test_compressed_panoramas_are_taken_too',
-        'camera_timeout': 'test_sfa_node.py::test_waiting_for_pictures_is_told',
-        'map_frame': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
-        'feature_frame': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
-        'novelty_warning': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
+        'image_transport': 'test_sfa_node.py::test_compressed_panoramas_are_taken_too',
+        'silence_timeout': 'test_sfa_node.py::test_waiting_for_images_is_reported',
+        'map_frame': 'test_sfa_node.py::test_the_map_frame_is_a_parameter_and_novelty_is_warned_of',
     },
     EkfNodeConfig: {
         'map_frame': 'test_ekf_node.py::test_frames_are_parameters',
@@ -402,10 +393,7 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'publish_tf': 'test_ekf_node.py::test_frames_are_parameters',
         'transform_tolerance': 'test_ekf_node.py::'
         'test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated',
-        'path_period': 'test_ekf_node.py::test_the_path_is_thinned_and_bounded',
-        'path_length': 'test_ekf_node.py::test_the_path_is_thinned_and_bounded',
-        'odometry_silence': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
-        'picture_silence': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
+        'silence_timeout': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
     },
 }
 

@@ -264,6 +264,4 @@ def test_what_is_known_of_the_errors_travels_with_the_model(model, tmp_path):
 
 def test_the_trainer_fills_it_in_from_what_it_left_out(model):
     assert model.error_correlation != ErrorCorrelation()
-    assert Localizer(model).filter._fusion.config.correlated_share == pytest.approx(
-        model.error_correlation.share
-    )
+    assert Localizer(model).filter.correlation.share == pytest.approx(model.error_correlation.share)

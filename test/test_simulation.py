@@ -269,7 +269,7 @@ def test_exact_twists_lead_to_the_truth_through_the_filter_and_by_sums(garden, r
     assert np.abs(relative(truth, summed)).max() < 1e-3
     assert np.allclose(differences(odometry.stamps_ns, truth)[1:], odometry.twists[1:], atol=1e-6)
     fused = PoseFilter()
-    fused.initialise(int(odometry.stamps_ns[0]), truth[0])
+    fused.set_pose(int(odometry.stamps_ns[0]), truth[0])
     for stamp_ns, twist, pose in zip(odometry.stamps_ns, odometry.twists, truth, strict=True):
         fused.add_odometry(int(stamp_ns), *twist)
         assert np.abs(relative(pose, fused.state.pose)).max() < 1e-3

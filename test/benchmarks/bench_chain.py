@@ -180,7 +180,7 @@ def chain(model_path: Path, model: PlaceModel, folder: Path) -> list[subprocess.
                          f'height:={size.height}', f'elevation_min:={size.elevation_min}',
                          f'elevation_max:={size.elevation_max}'],
         'sfa_node': [f'model:={model_path}'],
-        'ekf_node': ['set_initial_pose:=true'],
+        'ekf_node': ['initial_pose:=[0.0, 0.0, 0.0]'],
     }  # fmt: skip
     code = 'import sys; from sfa_localization.nodes.{} import main; sys.exit(main())'
     return [
