@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
+from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import ODOMETRY, in_order
@@ -33,7 +34,7 @@ from sfa_localization.fusion.pose_filter import PoseFilter, Update
 from sfa_localization.fusion.settings import FilterConfig, resolved
 from sfa_localization.localizer import Observer
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe, as_live, read_drive
+from sfa_localization.training import Recipe
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The grid: factors on the variances of pictures and of odometry."""
@@ -104,7 +105,7 @@ def read_tours(
     for bag in bags:
         with TemporaryDirectory(prefix='sfa_localization_tune_') as cache:
             run = read_drive(
-                bag, Path(cache), as_live(recipe, model), progress, want_truth=want_truth
+                bag, Path(cache), as_live(recipe, model.panorama), progress, want_truth=want_truth
             )
             sight = _sight(run, Observer(model, watch), progress)
             tours.append(Tour(run.odometry, sight, run.ground_truth))
