@@ -56,11 +56,11 @@ WRITERS = {
 }
 # Who writes otherwise, and why it may.
 OTHERS = {
-    'bag': 'decoded pictures, in a folder that its caller removes',
-    'bag_storage': 'a decompressed copy, in a temporary folder',
-    'bag_writer': 'a folder, which is renamed when whole',
-    'files': 'the one writer',
-    'processes': 'what a program prints, while it prints it',
+    'bags/loading': 'decoded pictures, in a folder that its caller removes',
+    'bags/storage': 'a decompressed copy, in a temporary folder',
+    'bags/writer': 'a folder, which is renamed when whole',
+    'data/files': 'the one writer',
+    'commands/processes': 'what a program prints, while it prints it',
     'training': 'the folder of decoded pictures, which it removes',
 }
 
@@ -129,7 +129,8 @@ def test_whoever_writes_files_does_so_through_the_one_writer():
     writers = {'write_text', 'write_bytes', 'imwrite', 'tofile', 'savetxt', 'mkstemp', 'mkdtemp',
                'rename', 'NamedTemporaryFile', 'truncate', 'fdopen'}  # fmt: skip
     found = set()
-    for path in Path(sfa_localization.__file__).parent.rglob('*.py'):
+    package = Path(sfa_localization.__file__).parent
+    for path in package.rglob('*.py'):
         for call in ast.walk(ast.parse(path.read_text('utf-8'))):
             if not isinstance(call, ast.Call):
                 continue
@@ -137,7 +138,7 @@ def test_whoever_writes_files_does_so_through_the_one_writer():
             modes = [a.value for a in call.args if isinstance(a, ast.Constant)]
             opens = name == 'open' and any(m in ('w', 'wb', 'x', 'xb', 'a', 'ab') for m in modes)
             if name in writers or opens:
-                found.add(path.stem)
+                found.add(path.relative_to(package).with_suffix('').as_posix())
     assert found == set(OTHERS)
 
 
