@@ -25,7 +25,6 @@ from tqdm import tqdm
 from sfa_localization.bags.drives import ReadingRecipe, image_cache, read_drives
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings as visual_headings
-from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -45,17 +44,13 @@ from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric import learning as metric_learning
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
-from sfa_localization.metric.learning import MetricResult
+from sfa_localization.metric.learning import MetricResult, correlation_along_drive, learn_metric
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
-
-# Errors of left-out maps are more alike than those of the final map: each bridges a gap.
-_LARGEST_SHARE = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,16 +149,20 @@ def learn_place(
     network: Network, runs: Sequence[Run], recipe: Recipe, progress: bool = False
 ) -> Trained:
     """Steps 3 to 7: metric map, compass and novelty for a trained network. Raises DataError."""
-    total = sum(len(run.panoramas) for run in runs)
-    with tqdm(desc='features of all images', total=total, unit='img', disable=not progress) as bar:
-        layers = compass_layers(len(network.nodes))
-        images = features_of_runs(network, runs, layers, bar.update)
+    images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
-    result = metric_learning.learn(images.slow, segments, recipe.metric, recipe.network.seed)
+    result = learn_metric(images.slow, segments, recipe.metric, recipe.network.seed)
     heading = learn_heading(images, segments, result)
     model = _assemble(network, runs, clocks, recipe, images, segments, result, heading)
     return Trained(model, tuple(runs), images.slow, segments, result, heading)
+
+
+def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> ImageFeatures:
+    """Step 3: what the network outputs for all images."""
+    total, hidden = sum(len(run.panoramas) for run in runs), not progress
+    with tqdm(desc='features of all images', total=total, unit='img', disable=hidden) as bar:
+        return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 
 def _clock_of(run: Run) -> CameraClock:
@@ -221,23 +220,8 @@ def _assemble(
         heading.agreement if heading else None,
         compass_layers(len(network.nodes)) if heading else (),
         {**quality, **(heading.quality if heading else {}), 'camera_delay_s': delays},
-        _error_correlation(segments, result),
+        correlation_along_drive(result, segments, FilterConfig().turn_radius),
     )
-
-
-def _error_correlation(segments: Segments, result: MetricResult) -> ErrorCorrelation:
-    """Correlation, along the drive, of the errors of images that the map was learned without."""
-    turn_radius = FilterConfig().turn_radius
-    driven = [
-        np.cumsum(np.abs(np.diff(s.path, prepend=s.path[0])))
-        + turn_radius * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
-        for s in segments
-    ]
-    owner = np.repeat(np.arange(len(driven)), [len(part) for part in driven])
-    found = ErrorCorrelation.fit(
-        result.left_out, result.left_out_variance, np.concatenate(driven), owner
-    )
-    return ErrorCorrelation(min(found.share, _LARGEST_SHARE), found.distance_m)
 
 
 def _quality(

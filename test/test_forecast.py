@@ -22,7 +22,7 @@ from sfa_localization.metric.forecast import (
     _left_out_errors,
     nearest_used,
 )
-from sfa_localization.metric.learning import learn, positions
+from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds
@@ -47,7 +47,7 @@ def trained(name, noise=0.05):
     features = garden_features(run.poses[:, :2], noise=noise)
     with pytest.MonkeyPatch.context() as patch:
         quick_and_tolerant(patch)
-        return run.poses, segments, features, learn(features, segments, CONFIG)
+        return run.poses, segments, features, learn_metric(features, segments, CONFIG)
 
 
 def quick_and_tolerant(patch):
@@ -112,7 +112,7 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     poses, segments, features, _ = legs()
     misled = poses[:, 0] > 2.5
     noise = 0.6 * np.random.default_rng(1).standard_normal(features.shape)
-    result = learn(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
+    result = learn_metric(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
     images, places = positions(result, segments)
     x, y, error = result.forecast.worst
     assert poses[images[np.hypot(*(places - [x, y]).T).argmin()], 0] > 2.0
@@ -195,7 +195,7 @@ def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length, monk
     parts = folds(stack, 0)
     assert 2 <= len(parts) <= selection.LEFT_OUT_FOLDS
     assert sorted(np.concatenate(parts)) == list(range(len(stack.images)))
-    result = learn(features, segments, CONFIG)
+    result = learn_metric(features, segments, CONFIG)
     assert result.certificate.certified
     assert np.isfinite(result.left_out_error_m)
     assert np.isfinite(result.map.predict(features)[1]).all()

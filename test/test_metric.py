@@ -25,7 +25,7 @@ from sfa_localization.features.agreement import share_within
 from sfa_localization.metric import alternation, learning, paper_solver, selection
 from sfa_localization.metric.alternation import MetricProblem
 from sfa_localization.metric.expansions import MetricMap, Monomials, monomials
-from sfa_localization.metric.learning import headings, learn, positions
+from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
 from sfa_localization.metric.phases import certify
 from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate, schur
@@ -95,7 +95,7 @@ def test_noiseless_data_gives_no_error(mode, monkeypatch):
     make, cutter, config, unused = MODES[mode]
     run = make()
     segments = without(cut(run.odometry, run.stamps_ns, cutter), *unused)
-    result = learn(exact_features(run.poses), segments, config)
+    result = learn_metric(exact_features(run.poses), segments, config)
     truth = in_odometry_frame(run)
     predicted, _ = result.map.predict(exact_features(run.poses))
     assert np.abs(predicted - truth[:, :2]).max() < 1e-9
@@ -113,7 +113,7 @@ def test_noiseless_process_is_exact_up_to_its_interpolation():
     run = curved_drive()
     features = garden_features(run.poses[:, :2])
     segments = cut(run.odometry, run.stamps_ns, ANY)
-    result = learn(features, segments, GP)
+    result = learn_metric(features, segments, GP)
     predicted, _ = result.map.predict(features)
     assert np.abs(predicted - in_odometry_frame(run)[:, :2]).max() < 0.05
     assert result.certificate.certified
@@ -125,7 +125,7 @@ def test_without_ground_truth_it_comes_close_to_regression_on_ground_truth(kind)
     run = noisy_drive(twists, start)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments=kind))
     features = garden_features(run.poses[:, :2], noise=0.05)
-    result = learn(features, segments, GP)
+    result = learn_metric(features, segments, GP)
     unseen = another_drive(run.poses[:, :2])
     seen_from = garden_features(unseen, noise=0.05, seed=9)
     images = result.images
@@ -168,14 +168,14 @@ def noisy_result():
     run = noisy_drive(twists, start, seed=4)
     segments = cut(run.odometry, run.stamps_ns, ANY)
     features = garden_features(run.poses[:, :2], noise=0.05)
-    return run, segments, features, learn(features, segments, GP)
+    return run, segments, features, learn_metric(features, segments, GP)
 
 
 def test_the_gyros_bias_is_found(monkeypatch):
     result = noisy_result()[3]
     assert result.yaw_bias == pytest.approx([1.4e-3], abs=3e-4)
     monkeypatch.setattr(alternation, 'YAW_BIAS_STD', 0.0)
-    blind = learn(*noisy_inputs(), GP)
+    blind = learn_metric(*noisy_inputs(), GP)
     assert blind.yaw_bias == pytest.approx([0.0])
 
 
@@ -196,7 +196,7 @@ def test_the_map_is_the_odometry_frame_at_the_start():
 
 def test_an_anchor_moves_the_start_of_the_map():
     _, segments, features, result = noisy_result()
-    anchored = learn(
+    anchored = learn_metric(
         features,
         segments,
         dataclasses.replace(GP, anchor=(5.0, -2.0, 2.0)),
@@ -226,7 +226,7 @@ def test_the_maps_sway_is_about_as_large_as_the_errors_of_the_positions_it_learn
         run = noisy_drive(twists, start, seed=seed)
         segments = cut(run.odometry, run.stamps_ns, ANY)
         features = garden_features(run.poses[:, :2], noise=0.05)
-        result = learn(features, segments, GP)
+        result = learn_metric(features, segments, GP)
         images, places = positions(result, segments)
         truth = run.poses[images, :2]
         true.append((errors(align(places, truth).apply(places), truth) ** 2).mean())
@@ -257,7 +257,7 @@ def test_left_out_errors_exceed_those_of_the_fit():
 
 def test_the_same_seed_gives_the_same_bytes():
     _, _, _, result = noisy_result()
-    again = learn(*noisy_inputs(), GP)
+    again = learn_metric(*noisy_inputs(), GP)
     for name, array in result.map.to_arrays().items():
         assert array.tobytes() == again.map.to_arrays()[name].tobytes(), name
 
@@ -273,7 +273,7 @@ def test_two_runs_share_one_map():
     parts = [cut(r.odometry, r.stamps_ns, ANY) for r in (one, two)]
     places = np.vstack([one.poses, two.poses])
     segments = join(parts, [0, len(one.poses)])
-    result = learn(garden_features(places[:, :2], noise=0.05), segments, GP)
+    result = learn_metric(garden_features(places[:, :2], noise=0.05), segments, GP)
     images, found = positions(result, segments)
     frame = align(found, places[images, :2])
     assert errors(frame.apply(found), places[images, :2]).mean() < 0.2
@@ -311,9 +311,9 @@ def test_without_any_turn_the_mirror_image_is_admitted_to_be_possible():
     lone = [dataclasses.replace(s, turn_rad=np.nan) for s in segments]
     apart = dataclasses.replace(segments, items=tuple(lone))
     features = exact_features(run.poses)
-    assert learn(features, apart, EXACT).diagnostics.mirror_ambiguous
-    assert not learn(features, segments, EXACT).diagnostics.mirror_ambiguous
-    assert not learn(features, without(segments, *LINKS), EXACT).diagnostics.mirror_ambiguous
+    assert learn_metric(features, apart, EXACT).diagnostics.mirror_ambiguous
+    assert not learn_metric(features, segments, EXACT).diagnostics.mirror_ambiguous
+    assert not learn_metric(features, without(segments, *LINKS), EXACT).diagnostics.mirror_ambiguous
 
 
 def test_a_sheared_grid_is_refused_without_turns_and_right_with_them():
@@ -321,8 +321,8 @@ def test_a_sheared_grid_is_refused_without_turns_and_right_with_them():
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     features = exact_features(run.poses - [3.0, 3.0, 0.0])
     with pytest.raises(DataError, match='three well-spread directions'):
-        learn(features, without(segments, *LINKS), EXACT)
-    result = learn(features, segments, EXACT)
+        learn_metric(features, without(segments, *LINKS), EXACT)
+    result = learn_metric(features, segments, EXACT)
     predicted = result.map.predict(features)[0]
     assert errors(predicted, in_odometry_frame(run)[:, :2]).max() < 1e-6
 
@@ -334,21 +334,21 @@ def test_a_collapsed_drive_is_refused():
     features = exact_features(run.poses)
     for unused in ((), LINKS):
         with pytest.raises(DataError, match='directions'):
-            learn(features, without(segments, *unused), EXACT)
+            learn_metric(features, without(segments, *unused), EXACT)
 
 
 def test_lanes_that_nothing_crosses_are_refused():
     run = drive(lanes(10.0, 1.2, 9))
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='drive across earlier tracks'):
-        learn(exact_features(run.poses - [3.0, 3.0, 0.0]), segments, EXACT)
+        learn_metric(exact_features(run.poses - [3.0, 3.0, 0.0]), segments, EXACT)
 
 
 def test_too_few_segments_are_refused():
     run = drive(np.vstack([straight(5.0), turn(1.0), straight(5.0)]))
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='only 2 segments'):
-        learn(exact_features(run.poses), segments, EXACT)
+        learn_metric(exact_features(run.poses), segments, EXACT)
 
 
 def test_features_that_say_nothing_are_refused():
@@ -356,7 +356,7 @@ def test_features_that_say_nothing_are_refused():
     segments = cut(run.odometry, run.stamps_ns, ANY)
     noise = np.random.default_rng(0).standard_normal((len(run.poses), 5))
     with pytest.raises(DataError, match=r'uncertain|cover|directions|not proven'):
-        learn(noise, without(segments, *LINKS), EXACT)
+        learn_metric(noise, without(segments, *LINKS), EXACT)
 
 
 @pytest.mark.parametrize(
@@ -375,7 +375,7 @@ def test_unusable_features_are_named(spoil, message):
     run = lines_drive()
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match=message):
-        learn(spoil(exact_features(run.poses)), segments, EXACT)
+        learn_metric(spoil(exact_features(run.poses)), segments, EXACT)
 
 
 def test_an_unproven_map_is_rejected(monkeypatch):
@@ -392,7 +392,7 @@ def test_an_unproven_map_is_rejected(monkeypatch):
     run = lines_drive()
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='not proven to be optimal'):
-        learn(exact_features(run.poses), segments, EXACT)
+        learn_metric(exact_features(run.poses), segments, EXACT)
 
 
 @pytest.mark.parametrize('anchor', [(1.0,), (1.0, 2.0, 3.0, 4.0)])
@@ -408,8 +408,8 @@ def test_the_papers_descent_from_odometry_comes_close_and_tells_its_history():
     run = noisy_drive(LINES, LINES_START, bias=0.0)
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     features = exact_features(run.poses)
-    paper = learn(features, segments, dataclasses.replace(EXACT, solver='paper'))
-    best = learn(features, segments, EXACT)
+    paper = learn_metric(features, segments, dataclasses.replace(EXACT, solver='paper'))
+    best = learn_metric(features, segments, EXACT)
     assert len(paper.history) == 1001
     assert paper.history[-1] < paper.history[0]
     off = errors(paper.map.predict(features)[0], best.map.predict(features)[0]).mean()
@@ -428,7 +428,7 @@ def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
     theta = odometry_start(lines, stack.starts)
     mirror = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
     assert lines.cost(mirror) == pytest.approx(lines.cost(theta), rel=1e-9)
-    # Odometry that starts mirrored would lead the descent there; learn() turns it back.
+    # Odometry that starts mirrored would lead the descent there; learn_metric() turns it back.
     flipped = dataclasses.replace(
         segments,
         items=tuple(dataclasses.replace(s, start=s.start * [1, -1, -1]) for s in segments),

@@ -83,7 +83,7 @@ def learn(runs, seed):
     segments = join(parts, [int(offset) for offset in offsets])
     truth = np.concatenate([poses for *_, poses in runs])
     features = garden_features(truth[:, :2], noise=0.02, count=5, world=seed)
-    result = metric.learn(features, segments, QUICK)
+    result = metric.learn_metric(features, segments, QUICK)
     images, places = metric.positions(result, segments)
     return result, images, places, metric.headings(result, segments)[1], truth
 

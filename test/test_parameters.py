@@ -52,7 +52,7 @@ from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric import selection
-from sfa_localization.metric.learning import learn, positions
+from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.nodes.settings import EkfNodeConfig, NodeConfig, SfaNodeConfig
@@ -199,7 +199,7 @@ def of_metric(settings: MetricConfig) -> Any:
     features, segments = garden()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(selection, 'INDUCING_POINTS', 60)
-        result = learn(features, segments, settings)
+        result = learn_metric(features, segments, settings)
     _, places = positions(result, segments)
     return result.map.predict(features), places, result.left_out, result.history
 

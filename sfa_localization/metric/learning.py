@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.features.agreement import needed_factor
@@ -30,6 +31,9 @@ from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.sufficiency import Diagnostics, check, check_amount, diagnose
 
 Indices = NDArray[np.int64]
+
+_LARGEST_SHARE = 0.8
+"""Of the error of an image that its neighbors have too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +79,9 @@ class MetricResult:
         return float(np.hypot(*self.left_out.T).mean())
 
 
-def learn(features: Array, segments: Segments, config: MetricConfig, seed: int = 0) -> MetricResult:
+def learn_metric(
+    features: Array, segments: Segments, config: MetricConfig, seed: int = 0
+) -> MetricResult:
     """Learn meters from slow features (N, K), one row per image of the runs, and segments.
 
     Raises DataError when the features are unusable, when the drive cannot determine a map (the
@@ -152,3 +158,23 @@ def headings(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
     stack = Stack.of(segments)
     own = stack.headings - result.yaw_bias[stack.run[stack.owner]] * stack.times_s
     return stack.images, wrap_angle(result.angles[stack.owner] + own)
+
+
+def correlation_along_drive(
+    result: MetricResult, segments: Segments, turn_radius_m: float
+) -> ErrorCorrelation:
+    """Correlation of the left-out errors of neighboring images, over the distance between them.
+
+    A turn counts as `turn_radius_m` per rad. The share is bounded: errors of left-out maps are
+    more alike than those of the final map, because each bridges a gap.
+    """
+    driven = [
+        np.cumsum(np.abs(np.diff(s.path, prepend=s.path[0])))
+        + turn_radius_m * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
+        for s in segments
+    ]
+    owner = np.repeat(np.arange(len(driven)), [len(part) for part in driven])
+    found = ErrorCorrelation.fit(
+        result.left_out, result.left_out_variance, np.concatenate(driven), owner
+    )
+    return ErrorCorrelation(min(found.share, _LARGEST_SHARE), found.distance_m)
