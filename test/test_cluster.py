@@ -186,7 +186,7 @@ def test_a_failing_shard_stops_the_others(on_disk):
             started.append(shard.start)
         raise DataError('no')
 
-    shards = hierarchy.shards_of([on_disk], **PLAIN)
+    shards = hierarchy.shards_of([on_disk], 0)
     with pytest.raises(DataError, match='no'):
         hierarchy.in_this_process(work, shards, lambda images: None)
     assert len(started) < len(shards)

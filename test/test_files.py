@@ -61,7 +61,7 @@ OTHERS = {
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
     'commands/processes': 'what a program prints, while it prints it',
-    'training': 'the folder of decoded pictures, which it removes',
+    'bags/drives': 'the folder of decoded images, which it removes',
 }
 
 

@@ -69,7 +69,7 @@ def read_drives(
             if _same_recording(run, other):
                 raise DataError(
                     f'{bags[k]}: the same drive as {other.name}: name each drive once, because a '
-                    'part that is left out to check the map must not be known from its copy'
+                    'part that is left out to check the map must not be learned from its copy'
                 )
     if len({run.panoramas.shape for run in runs}) > 1:
         sizes = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)

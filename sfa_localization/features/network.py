@@ -47,7 +47,7 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
-    """The whole network as data.
+    """Sizes of the network; the weights are in `Network`.
 
     `size` is (rows, columns) of the panorama; pixels are averaged in squares of `binning`.
     `normalization` 'panorama' removes the mean and scale of each channel of each image.

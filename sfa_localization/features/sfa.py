@@ -21,7 +21,7 @@ from scipy import linalg
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 
-# Relative variance that sums of float32 products cannot tell from zero.
+# Relative variance that is within the rounding error of sums of float32 products.
 _ROUNDING = 1e-9
 
 

@@ -39,8 +39,8 @@ def angle_covariance(fit: MapFit) -> Array:
 
 def sway(fit: MapFit) -> Complex:
     """Changes (m, r) of the map's weights per standard deviation of the r most uncertain joint
-    changes of the segments' origins and directions, moving the whole map excepted: that is a
-    matter of its frame."""
+    changes of the segments' origins and directions, without a motion of the whole map, which is
+    a matter of its frame."""
     stack, solution, places = fit.stack, fit.solution, fit.places
     origins, directions = _uncertain_segments(fit)
     path = stack.corrected(solution.bias)

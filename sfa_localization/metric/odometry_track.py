@@ -34,8 +34,8 @@ _GYRO_RATIO = 5.0
 # Yaw rates are averaged over this long before they are compared with a threshold.
 _SMOOTHING_S = 0.3
 
-# Columns of the accumulated sums: driven metres, radians turned either way, yaw variance, and
-# the two parts of the moment of time, integral of t dp, that a yaw-rate bias acts on.
+# Columns of the accumulated sums: driven meters, radians turned in either direction, yaw variance,
+# and the two parts of the moment of time, the integral of t dp, on which a yaw-rate bias acts.
 LENGTH, TURNED, YAW_VARIANCE, MOMENT = 0, 1, 2, slice(3, 5)
 
 

@@ -68,7 +68,7 @@ class Lines:
         return cost
 
     def gradient(self, theta: Parameters) -> Parameters:
-        """Equations 2, 3 and 4 (by alpha, o and W), and equation 6 when there are turns."""
+        """By alpha: equation 2, or equation 6 with turns; by o: equation 3; by W: equation 4."""
         lines = len(theta.alpha)
         misfit = self._misfit(theta)
         predicted = self.regressors @ theta.weights - theta.origins[self.line]
@@ -108,7 +108,9 @@ def descend(
     learning_rate: float = LEARNING_RATE,
     momentum: float = MOMENTUM,
 ) -> tuple[Parameters, Array]:
-    """Equations 7 and 8: v_t = gamma v_{t-1} + beta dC/dtheta, theta_t = theta_{t-1} - v_t.
+    """Momentum descent.
+
+    Equation 7, v_t = gamma v_{t-1} + beta dC/dtheta; equation 8, theta_t = theta_{t-1} - v_t.
 
     Returns the parameters and the cost (I,) before each iteration and after the last. Raises
     DataError when the descent diverges.

@@ -14,7 +14,7 @@ one segment to the next, each square weighted by `variance`, that of an image's 
 own:
 
     |z_{n+1} - exp(i turn_n) z_n|^2               signed turns: the second sum of equation 5, which
-                                                  has only cosines and cannot tell left from right
+                                                  has only cosines, the same for left and right
     |o_{n+1} - o_n - z_n displacement_n|^2        displacements: not in the paper
     b^2                                           prior of the biases: not in the paper
 

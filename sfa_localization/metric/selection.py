@@ -27,7 +27,7 @@ RIDGES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 LEFT_OUT_FOLDS = 8
 """Parts of the drive that are left out in turn."""
 LEFT_OUT_LENGTH_M = 10.0
-"""Longest stretch that is left out as a whole: longer gaps say little of a covered area."""
+"""Longest stretch that is left out as a whole: longer gaps do not occur in a covered area."""
 # Counts of slow features that are tried; the paper uses 8.
 _COUNTS = {'gp': (8, 12, 16, 24, 32), 'monomials': (3, 4, 5, 6, 8, 10, 12)}
 # The search, and the comparison, use fewer inducing points than the final map: both rank alike.

@@ -11,7 +11,7 @@ _DELAY_SHOWN_S = 0.02
 
 
 def summary(trained: Trained) -> str:
-    """What a user should know of a training; no ground truth is needed."""
+    """Amount of data, certificate, expected errors, and what was skipped; without ground truth."""
     quality = trained.model.quality
     coverage = quality['coverage']
     worst = quality['worst']
