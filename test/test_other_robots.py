@@ -19,12 +19,19 @@ from sfa_localization.data.run import Odometry, PanoramaArray, YawRate
 from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.metric import learning as metric
+from sfa_localization.metric import selection
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.training import learn_place
 
 QUICK = MetricConfig(metric_map='monomials', slow_features=5)
 CUT = SegmentConfig()
+
+
+@pytest.fixture(autouse=True)
+def one_ridge(monkeypatch):
+    """The features are monomials of the place: no choice is needed."""
+    monkeypatch.setattr(selection, 'RIDGES', (1e-4,))
 
 
 @dataclass(frozen=True)
