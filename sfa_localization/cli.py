@@ -479,10 +479,14 @@ def _recipe(arguments: argparse.Namespace) -> Recipe:
     """The recipe of --config, with the topics and settings that the command line names."""
     from sfa_localization.training import Recipe
 
-    groups = {item.name: type(getattr(Recipe(), item.name)) for item in dataclasses.fields(Recipe)}
-    return Recipe(
-        **{name: _settings(group, arguments, arguments.config) for name, group in groups.items()}
-    )
+    default = Recipe()
+    groups = {item.name: getattr(default, item.name) for item in dataclasses.fields(Recipe)}
+    named: dict[str, Any] = {
+        name: _settings(type(group), arguments, arguments.config)
+        for name, group in groups.items()
+        if isinstance(group, Settings)
+    }
+    return dataclasses.replace(default, **named)
 
 
 def _configure_train(parser: argparse.ArgumentParser) -> None:
@@ -504,6 +508,7 @@ def _configure_train(parser: argparse.ArgumentParser) -> None:
 def _train(arguments: argparse.Namespace) -> int:
     from sfa_localization import training
     from sfa_localization.features.cluster import executor_at
+    from sfa_localization.reports.summary import summary
 
     with executor_at(arguments.dask) as executor:
         trained = training.train(
@@ -515,7 +520,7 @@ def _train(arguments: argparse.Namespace) -> int:
             strict=arguments.strict,
             executor=executor,
         )
-    print(training.summary(trained))
+    print(summary(trained))
     if arguments.report:
         from sfa_localization.reports.training import write_training_report
 

@@ -24,7 +24,7 @@ from sfa_localization.data.files import atomic_write
 from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.nodes.settings import (
     EkfNodeConfig,
     NodeConfig,
@@ -49,7 +49,6 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
         NetworkConfig,
         SegmentConfig,
         MetricConfig,
-        HeadingConfig,
     ),
 }
 """Which settings each section holds; the trainer takes camera and panorama from omnicam_node."""

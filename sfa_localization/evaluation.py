@@ -20,6 +20,7 @@ import numpy as np
 from scipy import linalg
 from tqdm import tqdm
 
+from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
@@ -37,7 +38,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Localizer, Observation
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe, as_live, read_drive
+from sfa_localization.training import Recipe
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
@@ -91,7 +92,7 @@ def evaluate(
     drive itself. Pictures that cannot be believed count as skipped observations. Raises
     BagError or DataError, also when there is no ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model)
+    recipe = as_live(recipe or Recipe(), model.panorama)
     transform, supervised = None, None
     if align_bag is not None:
         with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
+from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
@@ -34,7 +35,7 @@ from sfa_localization.fusion.pose_filter import PoseFilter, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Observer
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe, as_live, read_drive
+from sfa_localization.training import Recipe
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """The grid: factors on the variances of images and of odometry."""
@@ -105,7 +106,7 @@ def read_drives(
             run = read_drive(
                 bag,
                 Path(cache),
-                as_live(recipe, model),
+                as_live(recipe, model.panorama),
                 progress,
                 want_truth=want_truth,
                 odometry_tolerance_s=0.0,

@@ -22,7 +22,9 @@ from test_calibration import scene
 from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
-from sfa_localization.features import cluster
+from sfa_localization.features import cluster, network
+from sfa_localization.features.network import Layer
+from sfa_localization.metric import selection
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
 from sfa_localization.simulation.settings import SimulationConfig
@@ -383,19 +385,17 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--stop-timeout': Case('--stop-timeout 9', noted(('stop_timeout', 9.0))),
     },
 }
-SMALL = """
-    layers: custom
-    binning: 1
-    field_rows: [16]
-    field_columns: [16]
-    stride_rows: [1]
-    stride_columns: [8]
-    linear_dimensions: [16]
-    output_dimensions: [10]
-    heading_layers: [1]
-    gp_length: 3.0
-    gp_noise: 0.01
-    slow_features: """
+SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
+
+
+@pytest.fixture(scope='module', autouse=True)
+def small_network() -> Iterator[None]:
+    """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, 'STANDARD_LAYERS', {'160x16': (1, (SMALL_LAYER,))})
+        patch.setattr(selection, '_SEARCH_POINTS', 60)
+        patch.setattr(selection, 'INDUCING_POINTS', 100)
+        yield
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -497,7 +497,7 @@ def run(name: str, words: str, folder: Path, **places: Any) -> Outcome:
 
 
 @pytest.fixture(scope='module')
-def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
+def data(tmp_path_factory: pytest.TempPathFactory, gardens: None, small_network: None) -> Path:
     """Return a folder with every kind of input, each as small as it may be."""
     folder = tmp_path_factory.mktemp('data')
     world = '--area 6x6 --images panorama --size 160x16 --odometry-rate 10 --images-every 0.3'
@@ -507,9 +507,9 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
     for name, more in drives.items():
         made = run('simulate', f'{{out}}/{name} {world} {more}', folder)
         assert made.code == 0, made.text
-    settings = {'small': f'{SMALL}6', 'fewer': f'{SMALL}4'}
-    for name, text in settings.items():
-        (folder / f'{name}.yaml').write_text(f'training:\n  ros__parameters:{text}\n')
+    for name, count in {'small': 6, 'fewer': 4}.items():
+        text = f'training:\n  ros__parameters:\n    slow_features: {count}\n'
+        (folder / f'{name}.yaml').write_text(text)
     (folder / 'start.yaml').write_text(
         'ekf_node:\n  ros__parameters:\n    initial_pose: [3.0, 0.0, 0.0]\n'
     )

@@ -86,7 +86,7 @@ def test_what_is_of_ros_is_written_again(tmp_path):
                            '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n'
                            'omnicam_node:\n  ros__parameters:\n'
                            '    qos_overrides./panorama.publisher.depth: 7\n'
-                           'training:\n  ros__parameters:\n    photometric_seed: 7\n')  # fmt: skip
+                           'training:\n  ros__parameters:\n    seed: 7\n')  # fmt: skip
     changes = config_file.load_changes(path)
     write_config(tmp_path / 'new.yaml', changes)
     sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
@@ -98,7 +98,7 @@ def test_what_is_of_ros_is_written_again(tmp_path):
     assert ekf['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
     assert omnicam['qos_overrides./panorama.publisher.depth'] == 7
     assert (ekf['slip_per_metre'], type(ekf['speed_std'])) == (1e-3, float), 'as ROS reads them'
-    assert (omnicam['width'], training['photometric_seed']) == (300, 7)
+    assert (omnicam['width'], training['seed']) == (300, 7)
     assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
 
 

@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 
 import sfa_localization
 from sfa_localization import config as config_file
-from sfa_localization import evaluation, filtering, place_model
+from sfa_localization import evaluation, filtering
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera import calibration
 from sfa_localization.commands import inspection_files
 from sfa_localization.commands.settings import DemoConfig
-from sfa_localization.data import files
+from sfa_localization.data import array_files, files
 from sfa_localization.data.errors import BagError, DataError, LocalizationError
 from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport
@@ -41,7 +41,7 @@ def mark_a_demo(path: Path) -> None:
 
 
 WRITERS = {
-    'arrays of a model or checkpoint': lambda p: place_model.write_arrays(p, {'a': PLACES}),
+    'arrays of a model or checkpoint': lambda p: array_files.write_arrays(p, {'a': PLACES}),
     'calibration': lambda p: calibration.write_calibration(p, 'camera'),
     'check picture': lambda p: calibration.write_check(p, PICTURE),
     'parameter file': config_file.write_config,
@@ -61,7 +61,7 @@ OTHERS = {
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
     'commands/processes': 'what a program prints, while it prints it',
-    'training': 'the folder of decoded pictures, which it removes',
+    'bags/drives': 'the folder of decoded images, which it removes',
 }
 
 

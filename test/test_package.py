@@ -54,7 +54,8 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
     'features': ({'data'}, NUMERIC | {'cv2', 'mdp', 'dask', 'distributed'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
-    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'yaml', 'lz4'}),
+    # With tqdm, as bags.drives shows the progress of reading.
+    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'yaml', 'lz4', 'tqdm'}),
     'metric': ({'data', 'features'}, NUMERIC),
     'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'fusion', 'metric', 'place_model'}, {'numpy'}),

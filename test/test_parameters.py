@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, recipe, run_in, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, wander
 from filter_drives import START_NS, Drive
 from metric_worlds import (
     criss_cross,
@@ -49,21 +49,20 @@ from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
-from sfa_localization.features.network_training import architecture_of, train_network
+from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric import learning as metric
-from sfa_localization.metric.learning import learn, positions
+from sfa_localization.metric import selection
+from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.segments import Segments, cut
-from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.nodes.settings import (
     EkfNodeConfig,
     NodeConfig,
     OmnicamNodeConfig,
     SfaNodeConfig,
 )
-from sfa_localization.training import drive_of, learn_place
 
 GROUPS = {
     group.__name__: group
@@ -202,7 +201,9 @@ def garden() -> tuple[Any, Any]:
 def of_metric(settings: MetricConfig) -> Any:
     """The map that is learnt, and how it does on what was left out."""
     features, segments = garden()
-    result = learn(features, segments, settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selection, 'INDUCING_POINTS', 60)
+        result = learn_metric(features, segments, settings)
     _, places = positions(result, segments)
     return result.map.predict(features), places, result.left_out, result.history
 
@@ -220,32 +221,11 @@ def panoramas() -> Run:
 
 
 def of_network(settings: NetworkConfig) -> Any:
-    """What a network makes of the pictures that it was trained on."""
+    """The output of a network for the images that it was trained on."""
     run = panoramas()
-    architecture = architecture_of(settings, run.panoramas.shape[:2])
-    network = train_network(architecture, [drive_of(run, settings)], settings)
+    architecture = dataclasses.replace(PLACE_ARCHITECTURE, normalization=settings.normalization)
+    network = train_network(architecture, [ImageSequence.of(run)], settings.seed)
     return network.maps(run.panoramas.read(0, 10))[-1]
-
-
-def of_heading(settings: HeadingConfig) -> Any:
-    """The headings that are learnt with a small place."""
-    made = recipe()
-    quick = MetricConfig(slow_features=6, gp_length=3.0, gp_noise=0.01, inducing_points=60)
-    made = dataclasses.replace(made, heading=settings, metric=quick)
-    model = learn_place(place_network(), [place_run()], made).model
-    return repr([model.locate(image).yaw for image in place_run().panoramas.read(0, 10)])
-
-
-@cache
-def place_run() -> Run:
-    return run_in(Spheres.about(1), wander(150, 2, hz=4.0), recipe().panorama)
-
-
-@cache
-def place_network() -> Any:
-    made, run = recipe(), place_run()
-    architecture = architecture_of(made.network, run.panoramas.shape[:2])
-    return train_network(architecture, [drive_of(run, made.network)], made.network)
 
 
 def of_watch(settings: WatchConfig) -> Any:
@@ -263,22 +243,11 @@ OBSERVE: dict[type[Settings], Callable[..., Any]] = {
     SegmentConfig: of_segments,
     MetricConfig: of_metric,
     NetworkConfig: of_network,
-    HeadingConfig: of_heading,
 }
 BESIDE: dict[type[Settings], dict[str, Any]] = {
-    MetricConfig: {'slow_features': 6, 'gp_length': 3.0, 'gp_noise': 0.01, 'inducing_points': 60},
-    NetworkConfig: {
-        item.name: getattr(recipe().network, item.name)
-        for item in dataclasses.fields(NetworkConfig)
-    },
+    MetricConfig: {'slow_features': 6},
 }
 """What is set for a whole group, where its default would be slow, or use little of it."""
-ONE_LAYER = {'field_rows': (6,), 'field_columns': (8,), 'stride_rows': (6,), 'stride_columns': (4,),
-             'linear_dimensions': (8,), 'output_dimensions': (6,)}  # fmt: skip
-STRAIGHT = {'segments': 'straight'}
-PAPER = {'solver': 'paper', 'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5,
-         'require_certificate': False, 'paper_iterations': 300}  # fmt: skip
-RANDOM = {**PAPER, 'paper_start': 'random'}
 START = {'initial_pose': (0.0, 0.0, 0.0)}
 POLAR = {'camera_model': 'polar'}
 OCAM = {'camera_model': 'ocam', 'polynomial': (-150.0, 0.0, 1e-3), 'axis': 'down'}
@@ -303,51 +272,11 @@ SPECIAL: dict[type[Settings], dict[str, Other]] = {
         'axis': Other('up', {'camera_model': 'fisheye', 'axis': 'down'}),
         'mirrored': Other('no'),
     },
-    SegmentConfig: {
-        'line_length_min': Other(5.0, STRAIGHT),
-        'line_bend_max': Other(1.0, STRAIGHT),
-        'turn_rate_min': Other(0.02, STRAIGHT),
-        'speed_min': Other(0.6, STRAIGHT),
-        'segment_images_min': Other(12),
-        'image_step_min': Other(0.3),
-        'image_turn_min': Other(90.0),
-    },
-    MetricConfig: {
-        'ridge': Other(1.0, {'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5}),
-        'angle_std_max': Other(0.01),
-        'anchor_x': Other(1.0, {'use_anchor': True}),
-        'anchor_y': Other(1.0, {'use_anchor': True}),
-        'anchor_yaw': Other(1.0, {'use_anchor': True}),
-        'paper_start': Other('random', PAPER),
-        'paper_area_x': Other(32.0, RANDOM),
-        'paper_area_y': Other(32.0, RANDOM),
-        'paper_iterations': Other(200, PAPER),
-        'paper_learning_rate': Other(5e-6, PAPER),
-        'paper_momentum': Other(0.5, PAPER),
-        'paper_change_min': Other(1e3, PAPER),
-        'paper_turns': Other(False, PAPER),
-    },
+    MetricConfig: {'anchor': Other((1.0, 2.0, 0.5))},
     FilterConfig: {
         'initial_pose': Other((1.0, -1.0, 0.5)),
         'initial_position_std': Other(1.0, START),
         'initial_yaw_std': Other(1.0, START),
-    },
-    HeadingConfig: {
-        'heading_layers': Other((1,)),
-        'heading_features': Other(3),
-        'heading_folds': Other(3),
-        'heading_inducing_points': Other(40),
-    },
-    NetworkConfig: {
-        'normalization': Other('panorama'),
-        'binning': Other(2, ONE_LAYER),
-        'field_rows': Other((4, 1, 3)),
-        'field_columns': Other((12, 4, 6)),
-        'stride_rows': Other((2, 3, 1)),
-        'stride_columns': Other((8, 1, 1)),
-        'linear_dimensions': Other((8, 8, 10)),
-        'output_dimensions': Other((6, 6, 6)),
-        'clip': Other(0.5),
     },
 }
 OF_A_COMMAND = 'test_commands.py'
@@ -358,14 +287,7 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'test_a_calibration_file_replaces_the_camera_model',
         'mask_file': 'test_panorama.py::test_a_mask_picture_hides_what_is_black',
     },
-    MetricConfig: {
-        'require_certificate': 'test_parameters.py::'
-        'test_an_unproven_map_is_refused_unless_that_is_allowed',
-    },
-    NetworkConfig: {
-        'engine': OF_A_COMMAND,
-        'layers': 'test_hierarchy.py::test_custom_default_is_the_standard',
-    },
+    NetworkConfig: {'engine': OF_A_COMMAND},
     CaptureConfig: {
         'source': f'{_OMNICAM}::test_a_folder_of_pictures',
         'source_path': f'{_OMNICAM}::test_a_folder_of_pictures',
@@ -506,26 +428,6 @@ def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
     asked.clear()
     capture.Device(CaptureConfig(source_path=str(tmp_path / 'video0')))
     assert not asked.keys() & wanted.keys(), 'a device keeps its own'
-
-
-def test_an_unproven_map_is_refused_unless_that_is_allowed(monkeypatch):
-    """Odometry that contradicts the pictures so is hard to make; the proof is taken away."""
-    features, segments = garden()
-    choose = metric.choose
-
-    def unproven(*args):
-        whole = choose(*args)
-        solution = whole.solution
-        certificate = dataclasses.replace(solution.certificate, eigenvalue=-1.0)
-        return dataclasses.replace(
-            whole, solution=dataclasses.replace(solution, certificate=certificate)
-        )
-
-    monkeypatch.setattr(metric, 'choose', unproven)
-    settings = MetricConfig(**BESIDE[MetricConfig])
-    with pytest.raises(LocalizationError, match='require_certificate: false'):
-        learn(features, segments, settings)
-    learn(features, segments, dataclasses.replace(settings, require_certificate=False))
 
 
 @pytest.mark.parametrize('kind', OBSERVE, ids=lambda kind: kind.__name__)

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
 
+from sfa_localization.data.array_files import read_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric.fast_expansions import FastProcess, fast_map
-from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, read_arrays
+from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 
 @pytest.fixture(scope='module')
