@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check an installed workspace: package, files and executables are found by the ament index."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from sfa_localization.cli import COMMANDS, NODES
 
 NAME = 'sfa_localization'
 SHARED = ('package.xml', 'config/localization.launch.py', 'config/localization.yaml')
-EXECUTABLES = (*(command.name for command in COMMANDS), *NODES)
+EXECUTABLES = (NAME, *COMMANDS, *NODES)
 
 
 def missing() -> list[str]:
@@ -30,9 +31,11 @@ def main() -> int:
     problems = [f'missing: {path}' for path in missing()]
     if prefix not in Path(sfa_localization.__file__).parents:
         problems.append(f'imported from elsewhere: {sfa_localization.__file__}')
-    train = prefix / 'lib' / NAME / 'train'
-    if not problems and subprocess.run([train, '--help'], stdout=subprocess.PIPE).returncode:
-        problems.append(f'{train} --help fails')
+    problems += [f'on the PATH: {path}' for path in map(shutil.which, COMMANDS) if path]
+    folder = prefix / 'lib' / NAME
+    for words in ([folder / 'train', '--help'], [folder / NAME, 'train', '--help']):
+        if not problems and subprocess.run(words, stdout=subprocess.PIPE).returncode:
+            problems.append(f'fails: {" ".join(map(str, words))}')
     print('\n'.join(problems) or f'{prefix}: package, files and executables found')
     return bool(problems)
 

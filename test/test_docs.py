@@ -6,7 +6,6 @@ Commands marked `run:` in the README are run, in test_readme_commands.py; the ot
 here as far as that goes without the ROS 2 command line.
 """
 
-import argparse
 import ast
 import dataclasses
 import json
@@ -32,7 +31,7 @@ from sfa_localization.nodes.settings import EkfNodeConfig
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md')])
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
-COMMANDS = {command.name: command for command in cli.COMMANDS}
+COMMANDS = set(cli.COMMANDS)
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`([a-z_]+ [^`]+)`')
 LINK = re.compile(r'\]\(([^)#\s]+)\)')
@@ -52,7 +51,9 @@ def commands() -> list:
             for block in BLOCK.findall(text)
             for line in block.replace('\\\n', ' ').splitlines()
         ]
-        lines += [code for code in INLINE.findall(text) if code.split()[0] in {*COMMANDS, 'make'}]
+        lines += [
+            code for code in INLINE.findall(text) if code.split()[0] in {'sfa_localization', 'make'}
+        ]
         for line in lines:
             words = shlex.split(line, comments=True)
             if words:
@@ -72,12 +73,12 @@ def check(words: list[str]) -> None:
     elif program == 'make':
         targets = [word for word in rest if '=' not in word]
         subprocess.run(['make', '--dry-run', *targets], cwd=ROOT, check=True, capture_output=True)
-    elif program == 'python' and rest[:2] == ['-m', 'sfa_localization']:
-        check(rest[2:])
+    elif words[:3] == ['python', '-m', 'sfa_localization']:
+        check_command(*words[3:])
+    elif program == 'sfa_localization':
+        check_command(*rest)
     elif program in NODES:
         check_node(program, rest)
-    elif program in COMMANDS:
-        check_arguments(COMMANDS[program], rest)
     else:
         assert program in FOREIGN, f'unknown program {program}'
 
@@ -93,7 +94,7 @@ def check_ros2(words: list[str]) -> None:
         assert {word.partition(':=')[0] for word in rest} <= known
         return
     assert verb == 'run'
-    check([name, *rest])
+    check_command(name, *rest)
 
 
 def launch_arguments(path: Path) -> set[str]:
@@ -106,12 +107,12 @@ def launch_arguments(path: Path) -> set[str]:
     }
 
 
-def check_arguments(command: cli.Command, words: list[str]) -> None:
-    if words in (['...'], ['--help']):
-        return
-    parser = argparse.ArgumentParser(prog=command.name)
-    command.configure(parser)
-    parser.parse_args(words)
+def check_command(name: str, *words: str) -> None:
+    if name in NODES:
+        check_node(name, list(words))
+    elif name != 'COMMAND' and words not in (('...',), ('--help',)):
+        assert name in COMMANDS, f'unknown command {name}'
+        cli.command_parser(name).parse_args(words)
 
 
 def check_node(name: str, words: list[str]) -> None:

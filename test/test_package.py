@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as a whole: who may import what, one version, docstrings, executables."""
 
-import argparse
 import ast
 import re
 import runpy
@@ -76,12 +75,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
         | {'filtering', 'simulation', 'reports', 'nodes', '__init__'},
         {'numpy', 'tqdm', 'rosbags'} | ROS,
     ),
-    'cli': (
-        CORE
-        | {'config', 'place_model', 'training', 'evaluation', 'tuning', 'inspection', 'filtering'}
-        | {'simulation', 'reports', 'commands', '__init__'},
-        {'tqdm'},
-    ),
+    'cli': ({'data', 'commands', 'nodes', '__init__'}, set()),
 }
 # Of these rooms only the settings are taken, not what needs ROS.
 SETTINGS_ONLY = {('config', 'nodes')}
@@ -222,23 +216,61 @@ def test_one_version():
 
 
 @cache
-def setup_arguments() -> dict:
-    """Return what setup.py hands to setuptools."""
+def setup_arguments(command: str = 'bdist_wheel') -> dict:
+    """Return the arguments of setuptools.setup when setup.py runs a command."""
     arguments: dict = {}
-    original, setuptools.setup = setuptools.setup, arguments.update
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(setuptools, 'setup', arguments.update)
+        patch.setattr(sys, 'argv', ['setup.py', command])
         runpy.run_path(str(ROOT / 'setup.py'))
-    finally:
-        setuptools.setup = original
     return arguments
 
 
-def test_every_command_and_node_is_an_executable():
-    scripts = [line.split(' = ') for line in setup_arguments()['entry_points']['console_scripts']]
-    targets = dict(scripts)
-    assert set(targets) == {command.name for command in COMMANDS} | set(NODES)
-    assert {targets[node] for node in NODES} == {f'{NAME}.nodes.entry:{node}' for node in NODES}
-    assert {targets[command.name] for command in COMMANDS} == {f'{NAME}.cli:executable'}
+def executables(command: str) -> dict[str, str]:
+    """Return the installed executables and their entry points."""
+    lines = setup_arguments(command)['entry_points']['console_scripts']
+    return dict(line.split(' = ') for line in lines)
+
+
+@pytest.mark.parametrize('command', ['bdist_wheel', 'editable_wheel', 'dist_info'])
+def test_pip_puts_one_command_and_the_nodes_on_the_path(command):
+    nodes = {node: f'{NAME}.nodes.entry:{node}' for node in NODES}
+    assert executables(command) == {NAME: f'{NAME}.cli:main', **nodes}
+
+
+@pytest.mark.parametrize('command', ['install', 'develop'])
+def test_colcon_installs_every_command_for_ros2_run(command):
+    commands = dict.fromkeys(COMMANDS, f'{NAME}.cli:executable')
+    assert executables(command) == executables('bdist_wheel') | commands
+
+
+def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['/workspace/lib/sfa_localization/config'])
+    assert cli.executable() == 0
+    assert 'ekf_node:' in capsys.readouterr().out
+
+
+def test_every_command_has_its_module():
+    modules = {path.stem for path in (PACKAGE / 'commands').glob('*.py')}
+    assert set(COMMANDS) <= modules
+
+
+def test_the_overview_of_the_commands_imports_none_of_them():
+    code = (
+        'import sys\nfrom sfa_localization import cli\n'
+        'try:\n    cli.main(["--help"])\nexcept SystemExit:\n'
+        '    print([name for name in ("numpy", "cv2", "rclpy") if name in sys.modules])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert all(f'    {name} ' in done.stdout for name in COMMANDS)
+    assert done.stdout.splitlines()[-1] == '[]', done.stderr
+
+
+@pytest.mark.parametrize('words', [[], ['trian'], ['--', 'train']])
+def test_a_wrong_command_ends_with_exit_code_2(words):
+    with pytest.raises(SystemExit) as raised:
+        sys.exit(cli.main(words))
+    assert raised.value.code == 2
 
 
 def test_installed_files_exist():
@@ -325,9 +357,10 @@ def test_docstrings_of_array_functions_tell_shapes(module):
 
 
 def test_commands_show_examples_before_their_options():
-    for command in COMMANDS:
-        assert command.summary and command.example.strip(), command.name
-        assert command.name in command.example, command.name
+    for name, summary in COMMANDS.items():
+        text = cli.command_parser(name).format_help()
+        examples = text[text.index('examples:') : text.index('options:')]
+        assert ' '.join(summary.split()) in ' '.join(text.split()) and f'  {name}' in examples
 
 
 def test_module_runs_as_a_program():
@@ -339,18 +372,18 @@ def test_module_runs_as_a_program():
 
 @pytest.mark.parametrize('package', ['trimesh', 'mdp', 'rclpy'])
 def test_a_missing_optional_package_is_named_with_its_remedy(package, capsys):
-    def run(_arguments):
+    def run():
         raise ModuleNotFoundError(f'No module named {package!r}', name=f'{package}.inner')
 
-    assert cli._guarded(run, argparse.Namespace()) == 1
+    assert cli.guarded(run) == 1
     error = capsys.readouterr().err
     assert error.startswith(f'error: {package} is not installed') and 'pip install' in error
     assert error.count('\n') == 1
 
 
 def test_a_missing_part_of_the_package_is_no_users_error():
-    def run(_arguments):
+    def run():
         raise ModuleNotFoundError('No module named numpy', name='numpy')
 
     with pytest.raises(ModuleNotFoundError):
-        cli._guarded(run, argparse.Namespace())
+        cli.guarded(run)

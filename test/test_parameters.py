@@ -32,7 +32,6 @@ from metric_worlds import (
 )
 from test_commands import OPTIONS, parser_of
 
-from sfa_localization import cli
 from sfa_localization.bags.loading import Bag, BagWriter, load_run
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.camera import capture as sources
@@ -44,6 +43,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.commands.options import destination
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
@@ -421,7 +421,7 @@ def options_of(group: type[Settings]) -> set[str]:
         for option in action.option_strings
         if option in OPTIONS[name]
     }
-    return {f.name for f in dataclasses.fields(group) if cli._dest(group, f.name) in places}
+    return {f.name for f in dataclasses.fields(group) if destination(group, f.name) in places}
 
 
 def parameters() -> list[tuple[str, str]]:

@@ -30,8 +30,15 @@ from bag_formats import (
     write_version,
 )
 
-from sfa_localization.commands.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace
-from sfa_localization.commands.settings import PlayConfig
+from sfa_localization.commands.pace import (
+    FASTER,
+    PAUSE,
+    SLOWER,
+    STEP,
+    Keyboard,
+    Pace,
+    PlayConfig,
+)
 from sfa_localization.data.errors import BagError
 
 DEADLINE_S = 30.0
@@ -155,7 +162,14 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Image, Imu  # noqa: E402
 
 from sfa_localization.bags.loading import Bag  # noqa: E402
-from sfa_localization.commands.play import SETTLED_S, Player, message_class, play, qos_profile  # noqa: E402
+from sfa_localization.commands import bag_player  # noqa: E402
+from sfa_localization.commands.bag_player import (  # noqa: E402
+    SETTLED_S,
+    Player,
+    message_class,
+    play,
+    qos_profile,
+)
 
 NO_TIME = QosTime(9223372036, 854775807)
 ROS = pytest.mark.ros
@@ -283,9 +297,10 @@ def test_every_message_arrives_as_recorded(
 
 @ROS
 def test_the_clock_runs_through_the_bag(
-    context: Any, tmp_path: Path, messages: list[Message]
+    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = PlayConfig(rate=2.0, clock_rate=200.0, wait=20.0)
+    config = PlayConfig(rate=2.0, wait=20.0)
+    monkeypatch.setattr(bag_player, 'CLOCK_RATE_HZ', 200.0)  # the bag is short
     with Listener(context, {**TOPICS, '/clock': Clock}) as listener:
         path = reliable(messages, tmp_path / 'bag')
         play(path, config=config, context=context, clock=True, wait_for=['/imu'])

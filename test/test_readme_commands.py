@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from sfa_localization.bags.reader import Bag
-from sfa_localization.commands.settings import DemoConfig
 from sfa_localization.data.geometry import align
 from sfa_localization.place_model import PlaceModel
 
@@ -35,7 +34,7 @@ def blocks(kind: str, language: str) -> list[str]:
 
 def commands(kind: str) -> list[list[str]]:
     lines = '\n'.join(blocks(kind, 'bash')).splitlines()
-    return [shlex.split(line) for line in lines if line.strip()]
+    return [shlex.split(line.removeprefix('sfa_localization ')) for line in lines if line.strip()]
 
 
 def raw_drive() -> list[str]:
@@ -96,7 +95,7 @@ def test_report_holds_its_pictures(folder):
 @pytest.mark.ros
 def test_nodes_run_as_told(folder, monkeypatch):
     pytest.importorskip('rclpy')
-    from sfa_localization.commands import demo_nodes
+    from sfa_localization.commands import live_nodes
 
     monkeypatch.chdir(folder)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
@@ -108,7 +107,7 @@ def test_nodes_run_as_told(folder, monkeypatch):
         'play': ['--rate', '3'],
     }
     programs = {words[0]: program(words + extra.get(words[0], [])) for words in commands('live')}
-    live = demo_nodes.run_live(programs, folder / 'logs', DemoConfig())
+    live = live_nodes.run_live(programs, folder / 'logs')
     with Bag(folder / 'demo/test') as bag:
         truth, pictures = bag.trajectory(), len(list(bag.images()))
     assert len(live['sfa']) > 0.8 * pictures
