@@ -509,7 +509,7 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
     for name, text in settings.items():
         (folder / f'{name}.yaml').write_text(f'training:\n  ros__parameters:{text}\n')
     (folder / 'start.yaml').write_text(
-        'ekf_node:\n  ros__parameters:\n    set_initial_pose: true\n    initial_x: 3.0\n'
+        'ekf_node:\n  ros__parameters:\n    measurement_factor: 9.0\n'
     )
     (folder / 'robot.yaml').write_text(
         'ekf_node:\n  ros__parameters:\n    use_sim_time: true\n'
