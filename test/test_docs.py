@@ -110,7 +110,7 @@ def launch_arguments(path: Path) -> set[str]:
 def check_command(name: str, *words: str) -> None:
     if name in NODES:
         check_node(name, list(words))
-    elif name != 'COMMAND' and words not in (('...',), ('--help',)):
+    elif name not in ('COMMAND', '--help') and words not in (('...',), ('--help',)):
         assert name in COMMANDS, f'unknown command {name}'
         cli.command_parser(name).parse_args(words)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The package as a whole: who may import what, one version, docstrings, executables."""
+"""The package as a whole: imports between rooms, one version, docstrings, executables."""
 
 import ast
 import re
@@ -41,9 +41,9 @@ ROS = {
     'std_srvs',
     'tf2_msgs',
 }
-# The rooms of the house: which other rooms each may import (its own always), and which packages
-# beyond the standard library. A module belongs to its folder, or is a room of its own; there is no
-# default, so a new one must be entered here, and in the picture of CONTRIBUTING.
+# The rooms: which other rooms each may import (always its own), and which packages beyond the
+# standard library. A module belongs to its folder, or is a room of its own; there is no
+# default, so a new one must be added here, and to the picture and the table of CONTRIBUTING.
 NUMERIC = {'numpy', 'scipy'}
 CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
@@ -77,12 +77,12 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     ),
     'cli': ({'data', 'commands', 'nodes', '__init__'}, set()),
 }
-# Of these rooms only the settings are taken, not what needs ROS.
+# From these rooms only the settings may be imported, which need no ROS.
 SETTINGS_ONLY = {('config', 'nodes')}
 # Never at run time on the robot, nor in anything its nodes import.
 NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'dask', 'tqdm'}
 OWN_NOT_ON_THE_ROBOT = {f'{NAME}.{word}' for word in ('training', 'evaluation', 'simulation')}
-# The standard library's ways to run code that a file brings along.
+# Modules that run code from the files that they read.
 UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
 
 
@@ -180,6 +180,18 @@ def test_a_module_without_a_room_is_found():
 
 def test_every_room_is_there():
     assert set(ROOMS) == {room(module) for module in MODULES}
+
+
+def test_contributing_shows_the_same_rooms_and_arrows():
+    text = (ROOT / 'CONTRIBUTING.md').read_text('utf-8')
+    rows = re.findall(r'^\| `(\w+)` \| ((?:`\w+`(?:, )?)+|nothing) \|$', text, re.MULTILINE)
+    assert {name: set(re.findall(r'`(\w+)`', others)) for name, others in rows} == {
+        name: others for name, (others, _packages) in ROOMS.items()
+    }
+    picture = text.split('```')[1]
+    assert [
+        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', picture)
+    ] == []
 
 
 @pytest.mark.parametrize('module', sorted(MODULES))
@@ -307,8 +319,8 @@ def documented_names() -> frozenset[str]:
     return frozenset(name.split('.')[-1] for name, node in definitions if ast.get_docstring(node))
 
 
-def speaks_for_itself(name: str, node: ast.AST) -> bool:
-    """Tell whether this is a line or two, or one of several with a documented interface."""
+def needs_no_docstring(name: str, node: ast.AST) -> bool:
+    """Return whether this is very short, or implements an interface that is documented."""
     if isinstance(node, ast.ClassDef):
         return False
     short = name.split('.')[-1]
@@ -322,13 +334,13 @@ def test_public_names_have_docstrings(module):
     missing = [
         name
         for name, node in public_definitions(module)
-        if not ast.get_docstring(node) and not speaks_for_itself(name, node)
+        if not ast.get_docstring(node) and not needs_no_docstring(name, node)
     ]
     assert missing == []
 
 
 ARRAY = re.compile(r'\b(Array|NDArray)\b(?! \| float)')
-SAYS_SHAPE = re.compile(
+NAMES_SHAPE = re.compile(
     r'\([^()]*\b[A-Z0-9]\w*\s*(,[^()]*)?\)|picture|image|panorama|pixel|stamp', re.IGNORECASE
 )
 """A shape such as (N, 2), or a word that names an array the whole package shares."""
@@ -337,9 +349,9 @@ SHAPES_BY_NAME = {'pose', 'start', 'dock', 'foot', 'mean', 'covariance', 'matrix
 
 
 @pytest.mark.parametrize('module', sorted(MODULES))
-def test_docstrings_of_array_functions_tell_shapes(module):
-    """Functions that take arrays say, or their class says, what shape these have."""
-    silent = []
+def test_docstrings_of_array_functions_give_shapes(module):
+    """The docstring of a function with array arguments, or of its class, gives their shapes."""
+    missing = []
     tree = dict(public_definitions(module))
     for name, node in tree.items():
         if isinstance(node, ast.ClassDef) or not ast.get_docstring(node):
@@ -350,10 +362,10 @@ def test_docstrings_of_array_functions_tell_shapes(module):
             if a.annotation and a.arg not in SHAPES_BY_NAME
         )
         owner = tree.get(name.rpartition('.')[0])
-        told = ast.get_docstring(node) + (ast.get_docstring(owner) or '' if owner else '')
-        if ARRAY.search(taken) and not SAYS_SHAPE.search(told):
-            silent.append(name)
-    assert silent == []
+        text = ast.get_docstring(node) + (ast.get_docstring(owner) or '' if owner else '')
+        if ARRAY.search(taken) and not NAMES_SHAPE.search(text):
+            missing.append(name)
+    assert missing == []
 
 
 def test_commands_show_examples_before_their_options():
