@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check an installed workspace: package, files and executables are found by the ament index."""
+"""Check an installed workspace: the ament index finds package, files and executables."""
 
 import shutil
 import subprocess
@@ -18,7 +18,7 @@ EXECUTABLES = (NAME, *COMMANDS, *NODES)
 
 
 def missing() -> list[str]:
-    """Return the shared files and executables that are not where ROS 2 looks for them."""
+    """Return the shared files and executables that ROS 2 does not find."""
     prefix, share = Path(get_package_prefix(NAME)), Path(get_package_share_directory(NAME))
     expected = [share / name for name in SHARED]
     expected += [prefix / 'lib' / NAME / name for name in EXECUTABLES]
@@ -26,7 +26,7 @@ def missing() -> list[str]:
 
 
 def main() -> int:
-    """Print what is wrong, return the exit code."""
+    """Print the problems, return the exit code."""
     prefix = Path(get_package_prefix(NAME))
     problems = [f'missing: {path}' for path in missing()]
     if prefix not in Path(sfa_localization.__file__).parents:

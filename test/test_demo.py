@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's own decisions: what it keeps, what it clears, what it must never touch.
+"""The folder of the demo: what is kept, what is cleared, what must never be touched.
 
-The chain it runs is tested in test_demo_nodes.py; the whole of it by `make demo`, which CI runs.
+The nodes are tested in test_demo_nodes.py; the complete demo by `make demo` in CI.
 """
 
 import json
@@ -26,26 +26,26 @@ def fill(out) -> None:
         (out / name).write_text('old')
 
 
-def test_a_folder_of_someone_else_is_left_alone(tmp_path):
+def test_a_foreign_folder_is_not_changed(tmp_path):
     (tmp_path / 'thesis.tex').write_text('ten years of work')
     with pytest.raises(LocalizationError, match='--out'):
         demonstration.prepare_folder(tmp_path, DemoConfig())
     assert [path.name for path in tmp_path.iterdir()] == ['thesis.tex']
 
 
-def test_bags_of_the_same_settings_are_used_again(tmp_path):
+def test_bags_of_the_same_settings_are_reused(tmp_path):
     out = tmp_path / 'new' / 'demo'
     demonstration.prepare_folder(out, DemoConfig(world=3))
     fill(out)
     demonstration.prepare_folder(out, DemoConfig(world=3))
     names = {path.name for path in out.iterdir()}
     assert names == {*OURS, demonstration.MARKER, 'my_notes.txt'}, (
-        'old results must not outlive a failure'
+        'old results must not survive a failure'
     )
 
 
 @pytest.mark.parametrize('changed', [DemoConfig(world=4), DemoConfig(world=3, seed=2)])
-def test_bags_of_other_settings_are_made_anew(tmp_path, changed):
+def test_bags_of_other_settings_are_removed(tmp_path, changed):
     demonstration.prepare_folder(tmp_path, DemoConfig(world=3))
     fill(tmp_path)
     demonstration.prepare_folder(tmp_path, changed)
@@ -54,7 +54,7 @@ def test_bags_of_other_settings_are_made_anew(tmp_path, changed):
 
 
 @pytest.mark.parametrize('name', ['file', 'file/demo'])
-def test_a_folder_that_cannot_be_made_is_named(tmp_path, name):
+def test_a_folder_that_cannot_be_created_is_named(tmp_path, name):
     (tmp_path / 'file').write_text('')
     with pytest.raises(LocalizationError, match='cannot be written'):
         demonstration.prepare_folder(tmp_path / name, DemoConfig())

@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The chain of processes behind the demo: it records, and it ends loudly when a node fails.
+"""The processes of the demo: outputs are recorded, and a failing node is reported.
 
-Stand-in nodes behave in every way a node can; the real ones run in test_end_to_end.py.
+Stand-in nodes fail in every way; the real ones run in test_readme_commands.py.
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ def publish():
         message.pose.pose.orientation.z = math.sin(0.25)
         message.pose.pose.orientation.w = math.cos(0.25)
         message.pose.covariance[35] = math.pi ** 2 / 3 if role == 'sfa_node' else 0.1
-    if behaviour == 'nonsense':
+    if behaviour == 'invalid':
         message.pose.pose.position.x = math.nan
     if behaviour == 'die' and sent == 3:
         sys.exit(7)
@@ -86,7 +86,7 @@ def programs(tmp_path: Path, player_s: float = 4.0, **behaviours: str) -> dict[s
 
 @pytest.fixture(autouse=True)
 def nothing_is_left():
-    """No process, and no environment variable, of the chain outlives a test."""
+    """No process and no environment variable of the chain is left after a test."""
     before, variables = set(psutil.Process().children(recursive=True)), ros_variables()
     yield
     assert set(psutil.Process().children(recursive=True)) <= before
@@ -99,7 +99,7 @@ def ros_variables() -> dict[str, str]:
 
 def test_chain_records_what_the_nodes_publish(tmp_path):
     chain = programs(tmp_path, player_s=1.0)
-    # Nodes that stop talking when the replay is over let the recording end.
+    # The recording ends when the nodes stop publishing after the replay.
     script = Path(chain['sfa_node'][1])
     script.write_text(STAND_IN.replace('sent += 1', 'sent += 1\n    if sent > 40: return'))
     patient = dataclasses.replace(TIMEOUTS, silence_s=20.0)
@@ -136,7 +136,7 @@ def test_a_node_that_dies_during_the_replay_is_named(tmp_path):
 
 def test_a_node_that_publishes_invalid_messages_is_named(tmp_path):
     with pytest.raises(NodeError, match='sfa_node: invalid message on sfa/pose_with_covariance'):
-        live_nodes.run_live(programs(tmp_path, sfa_node='nonsense'), tmp_path / 'logs', TIMEOUTS)
+        live_nodes.run_live(programs(tmp_path, sfa_node='invalid'), tmp_path / 'logs', TIMEOUTS)
 
 
 def test_a_player_that_fails_is_named(tmp_path):
