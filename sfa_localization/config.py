@@ -172,9 +172,7 @@ def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:
     title = (kind.__doc__ or '').strip().splitlines()[0]
     lines = [f'    # --- {title}']
     for item in dataclasses.fields(kind):
-        lines += textwrap.wrap(
-            _described(item), _WIDTH, initial_indent='    # ', subsequent_indent='    # '
-        )
+        lines += [f'    # {line}' for line in textwrap.wrap(_described(item), _WIDTH - 6)]
         lines.append(f'    {item.name}: {_text(changes.get(item.name, item.default))}')
     return '\n'.join(lines) + '\n'
 

@@ -38,7 +38,6 @@ from rosgraph_msgs.msg import Clock
 
 from sfa_localization.bags.messages import COMPRESSED, IMAGE, ODOMETRY, typestore
 from sfa_localization.bags.reader import Bag, Topic
-from sfa_localization.bags.storage import Record
 from sfa_localization.commands.pace import (
     FASTER,
     PAUSE,
@@ -219,7 +218,7 @@ class Player:
     def _play_once(self) -> bool:
         """Publish the bag from its start; False when ROS was shut down."""
         any_played = False
-        for channel, receive_ns, data in self._records():
+        for channel, receive_ns, data in self._bag.messages(self._publishers, self._start_ns):
             if not self._wait_until(receive_ns):
                 return False
             if channel.serialization == 'ros1':
@@ -230,9 +229,6 @@ class Player:
         if not any_played:
             raise BagError(f'{self._bag.path}: nothing to play after {self._config.start_offset} s')
         return True
-
-    def _records(self) -> Iterator[Record]:
-        return self._bag.messages(self._publishers, self._start_ns)
 
     def _wait_until(self, stamp_ns: int) -> bool:
         """Wait until a message is due, handling keys and /clock; False when ROS was shut down."""

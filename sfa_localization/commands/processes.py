@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
 from types import FrameType
 
 from sfa_localization.data.errors import NodeError
@@ -24,7 +24,7 @@ class Processes:
         self._folder = folder
         self._environment = dict(environment)
         self._stop_timeout_s = stop_timeout_s
-        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._running: dict[str, Popen[bytes]] = {}
 
     def __enter__(self) -> Processes:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -39,12 +39,8 @@ class Processes:
     def start(self, name: str, command: Sequence[str]) -> None:
         """Start a program under a unique name."""
         with open(self.log(name), 'wb') as output:
-            self._running[name] = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=self._environment,
+            self._running[name] = Popen(
+                command, stdin=DEVNULL, stdout=output, stderr=STDOUT, env=self._environment
             )
 
     def log(self, name: str) -> Path:
@@ -78,7 +74,7 @@ class Processes:
         for process in alive:
             try:
                 process.wait(self._stop_timeout_s)
-            except subprocess.TimeoutExpired:
+            except TimeoutExpired:
                 continue
 
 
