@@ -107,7 +107,7 @@ def test_a_cut_off_message_is_no_message(cut):
 def test_without_any_the_remedy_is_named(monkeypatch, capsys):
     for name in (*STANDARD, 'zstandard'):
         monkeypatch.setitem(sys.modules, name, None)
-    assert cli._guarded(lambda _arguments: bag_zstd._load_package(), None) == 1
+    assert cli.guarded(bag_zstd._load_package) == 1
     assert 'pip install backports.zstd' in capsys.readouterr().err
 
 

@@ -7,7 +7,7 @@ import contextlib
 import io
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +21,7 @@ from test_calibration import scene
 
 from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
+from sfa_localization.commands.options import given
 from sfa_localization.data.settings import Settings
 from sfa_localization.features import cluster, network
 from sfa_localization.features.network import Layer
@@ -29,21 +30,14 @@ from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
 from sfa_localization.simulation.settings import SimulationConfig
 
-GROUPS = {group.__name__: group for group in Settings.__subclasses__()}
-COMMANDS = {command.name: command for command in cli.COMMANDS}
-
-
-def parser_of(name: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=name)
-    COMMANDS[name].configure(parser)
-    return parser
+parser_of = cli.command_parser
 
 
 def options() -> list[tuple[str, str]]:
     """Return command and name of every option that there is."""
     return [
         (name, action.option_strings[-1])
-        for name in COMMANDS
+        for name in cli.COMMANDS
         for action in parser_of(name)._actions
         if action.option_strings and action.dest != 'help'
     ]
@@ -67,10 +61,11 @@ def test_an_option_reaches_one_group_of_settings_at_most(name, option):
     needed.sort(key=lambda action: bool(action.option_strings))  # BAG before --topics takes it
     words = [word for a in needed for word in [*a.option_strings[:1], *words_for(a)]]
     words += [option, *words_for(meant)]
-    given = parser.parse_args(words)
-    reached = {n: told for n, group in GROUPS.items() if (told := cli._given(group, given))}
+    arguments = parser.parse_args(words)
+    groups = {group.__name__: group for group in Settings.__subclasses__()}
+    reached = {n: found for n, group in groups.items() if (found := given(group, arguments))}
     group, _, setting = meant.dest.partition('.')
-    assert reached == ({group: {setting: vars(given)[meant.dest]}} if setting else {})
+    assert reached == ({group: {setting: vars(arguments)[meant.dest]}} if setting else {})
 
 
 # Each option alone, on small inputs: what a command is given without it, and what comes of it.
@@ -310,7 +305,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['play']),
         '--rate': Case('--rate 500', noted(('rate', 500.0))),
         '--start-offset': Case('--start-offset 10', PRINTED),
-        '--clock-rate': Case('--clock-rate 5', noted(('clock rate', 5.0)), beside='--clock'),
         '--wait': Case('--wait 0.01', noted(('wait', 0.01))),
     },
     'inspect': {
@@ -379,10 +373,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--world': Case('--world 3', noted(('world', 3))),
         '--seed': Case('--seed 4', noted(('seed', 4))),
         '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
-        '--start-timeout': Case('--start-timeout 9', noted(('start_timeout', 9.0))),
-        '--silence-timeout': Case('--silence-timeout 9', noted(('silence_timeout', 9.0))),
-        '--settle-time': Case('--settle-time 9', noted(('settle_time', 9.0))),
-        '--stop-timeout': Case('--stop-timeout 9', noted(('stop_timeout', 9.0))),
     },
 }
 SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
@@ -430,9 +420,9 @@ def watched(name: str, notes: list[Any]) -> Iterator[None]:
 
 def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Note pace and patience; an endless replay ends in its third round."""
-    from sfa_localization.commands import play
+    from sfa_localization.commands import bag_player
 
-    class Player(play.Player):
+    class Player(bag_player.Player):
         rounds = 0
 
         def wait_for_subscribers(self, topics=()):
@@ -446,35 +436,30 @@ def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
                 self._node.context.try_shutdown()
             return super()._play_once()
 
-    class Ticker(play.Ticker):
-        def __init__(self, node, rate):
-            super().__init__(node, rate)
-            notes.append(('clock rate', rate))
-
+    class Ticker(bag_player.Ticker):
         def tick(self, time_ns):
             super().tick(time_ns)
             notes.append('/clock')
 
-    patch.setattr(play, 'Player', Player)
-    patch.setattr(play, 'Ticker', Ticker)
+    patch.setattr(bag_player, 'Player', Player)
+    patch.setattr(bag_player, 'Ticker', Ticker)
 
 
 def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
-    from sfa_localization.commands import demo
+    from sfa_localization.commands import demonstration
 
-    def run_live(programs, logs, settings):
-        notes.extend((item.name, getattr(settings, item.name)) for item in fields(settings))
+    def run_live(programs, logs):
         notes.extend(pair for words in programs.values() for pair in pairwise(words))
 
     def simulated(settings, out, progress):
         notes.extend([('world', settings.world), ('seed', settings.seed)])
 
-    patch.setattr(demo, 'simulate', simulated)
-    patch.setattr(demo, 'train', lambda *_args, **_named: None)
-    patch.setattr(demo, 'run_live', run_live)
-    patch.setattr(demo, '_judged', lambda *_args: (SimpleNamespace(scores={}), 0.0))
-    patch.setattr(demo, '_write_results', lambda *_args: None)
+    patch.setattr(demonstration, 'simulate', simulated)
+    patch.setattr(demonstration, 'train', lambda *_args, **_named: None)
+    patch.setattr(demonstration, 'run_live', run_live)
+    patch.setattr(demonstration, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
+    patch.setattr(demonstration, '_write_results', lambda *_args: None)
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
@@ -511,7 +496,7 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None, small_network:
         text = f'training:\n  ros__parameters:\n    slow_features: {count}\n'
         (folder / f'{name}.yaml').write_text(text)
     (folder / 'start.yaml').write_text(
-        'ekf_node:\n  ros__parameters:\n    initial_pose: [3.0, 0.0, 0.0]\n'
+        'ekf_node:\n  ros__parameters:\n    measurement_factor: 9.0\n'
     )
     (folder / 'robot.yaml').write_text(
         'ekf_node:\n  ros__parameters:\n    use_sim_time: true\n'

@@ -19,8 +19,8 @@ from sfa_localization import evaluation, filtering
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera import calibration
-from sfa_localization.commands import inspection_files
-from sfa_localization.commands.settings import DemoConfig
+from sfa_localization.commands import inspect as inspect_command
+from sfa_localization.commands.demo import DemoConfig
 from sfa_localization.data import array_files, files
 from sfa_localization.data.errors import BagError, DataError, LocalizationError
 from sfa_localization.data.files import atomic_write
@@ -35,9 +35,11 @@ PLACES = np.zeros((5, 3))
 
 def mark_a_demo(path: Path) -> None:
     pytest.importorskip('rclpy')
-    from sfa_localization.commands import demo
+    from sfa_localization.commands import demonstration
 
-    demo._mark(path, DemoConfig())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstration, 'MARKER', path.name)
+        demonstration.prepare_folder(path.parent, DemoConfig())
 
 
 WRITERS = {
@@ -47,7 +49,7 @@ WRITERS = {
     'parameter file': config_file.write_config,
     'figures of an evaluation': lambda p: evaluation.write_json(p, {'ekf': 1}),
     'path of the filter': lambda p: filtering.write_tum(p, np.arange(5), PLACES),
-    'what was inspected': lambda p: inspection_files._write_json([BagReport('bag')], p),
+    'what was inspected': lambda p: inspect_command.write_json(p, [BagReport('bag')]),
     'figure': lambda p: report.save(Figure(), p),
     'text of a report': lambda p: report.save_text(p, 'text'),
     'contact sheet': lambda p: report_bag.write_contact_sheet([PICTURE], 'bag', p),

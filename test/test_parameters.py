@@ -32,7 +32,6 @@ from metric_worlds import (
 )
 from test_commands import OPTIONS, parser_of
 
-from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.writer import BagWriter
@@ -46,6 +45,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.camera.watch import ImageWatch
+from sfa_localization.commands.options import destination
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
@@ -329,7 +329,7 @@ def options_of(group: type[Settings]) -> set[str]:
         for option in action.option_strings
         if option in OPTIONS[name]
     }
-    return {f.name for f in dataclasses.fields(group) if cli._dest(group, f.name) in places}
+    return {f.name for f in dataclasses.fields(group) if destination(group, f.name) in places}
 
 
 def parameters() -> list[tuple[str, str]]:
