@@ -26,16 +26,16 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)
 
-robustness: $(READY)  ## run the tests named in test/README.md: bad input, time, loss, overload
+robustness: $(READY)  ## run the tests of test/README.md: bad input, time, loss, overload
 	$(PY) -m pytest -m robustness $(ARGS)
 
 fuzz: $(READY)  ## read thousands of damaged bags (ARGS='-k messages' for some kinds)
 	FUZZ_EXAMPLES=300 $(PY) -m pytest test/test_bag_fuzz.py $(ARGS)
 
-soak: $(READY)  ## drive the three nodes for an hour at 20x; memory must not grow (ARGS='--seconds 800')
+soak: $(READY)  ## run the three nodes for an hour at 20x; memory must not grow (ARGS='--seconds 800')
 	PYTHONPATH=. $(PY) test/benchmarks/soak.py $(ARGS)
 
-bench: $(READY)  ## compare speeds side by side, to bench.json (ARGS=--quick); the nodes after a demo
+bench: $(READY)  ## compare speeds, write bench.json (ARGS=--quick); with the nodes after a demo
 	PYTHONPATH=. $(PY) test/benchmarks/bench_all.py $(addprefix --model ,$(wildcard demo/model.npz)) $(ARGS)
 
 lint: $(READY)  ## ruff, ruff format, mypy
@@ -43,7 +43,7 @@ lint: $(READY)  ## ruff, ruff format, mypy
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy sfa_localization
 
-format: $(READY)  ## let ruff sort imports and lay out the code
+format: $(READY)  ## sort imports and format the code with ruff
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
@@ -53,6 +53,6 @@ colcon:  ## colcon build and colcon test in a clean environment
 matrix:  ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
 	sh .ci/matrix $(ARGS)
 
-clean:  ## remove what the targets built, but not the environment
+clean:  ## remove build results, but not the environment
 	rm -rf build install log demo .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

@@ -5,6 +5,7 @@
 ``package.xml`` names the same dependencies by their rosdep keys. `make env` installs the extras.
 """
 
+import sys
 from glob import glob
 
 from setuptools import find_packages, setup
@@ -23,6 +24,10 @@ COMMANDS = (
     'demo',
 )
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+# colcon runs `setup.py install` or `develop`, and setup.cfg puts its executables into
+# lib/sfa_localization, for `ros2 run sfa_localization train`. pip builds a wheel instead, whose
+# executables are on the PATH: it gets the nodes and one command, no `train`, `filter` or `config`.
+IN_WORKSPACE = bool({'install', 'develop'} & set(sys.argv))
 BAGS = ('bags', 'bags/sample', 'bags/sample_test')
 
 setup(
@@ -52,7 +57,7 @@ setup(
         'opencv-python-headless>=4.6',
         'filterpy>=1.4.5',
         'rosbags>=0.10.9',
-        # Compressed bags are read by these, not through rosbags; its versions bring different ones.
+        # They read compressed bags, without rosbags, whose versions require different ones.
         'backports.zstd>=1.0; python_version < "3.14"',
         'lz4>=4.0',
         'PyYAML>=5.4',
@@ -65,7 +70,7 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         # The simulated garden of `simulate` and `demo`.
         'simulation': ['trimesh>=4.4', 'embreex>=2.17.7'],
-        # The reference engine of `train`, built from MDP's own nodes.
+        # The reference engine of `train`, made of MDP's nodes.
         'mdp': ['MDP==3.6'],
         # Several processes or machines for `train`.
         'distributed': ['distributed>=2024.1'],
@@ -75,7 +80,8 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            *(f'{command} = {NAME}.cli:executable' for command in COMMANDS),
+            f'{NAME} = {NAME}.cli:main',
+            *(f'{command} = {NAME}.cli:executable' for command in COMMANDS if IN_WORKSPACE),
             *(f'{node} = {NAME}.nodes.entry:{node}' for node in NODES),
         ],
     },

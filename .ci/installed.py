@@ -1,7 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check an installed workspace: package, files and executables are found by the ament index."""
+"""Check an installed workspace: the ament index finds package, files and executables."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,11 +14,11 @@ from sfa_localization.cli import COMMANDS, NODES
 
 NAME = 'sfa_localization'
 SHARED = ('package.xml', 'config/localization.launch.py', 'config/localization.yaml')
-EXECUTABLES = (*(command.name for command in COMMANDS), *NODES)
+EXECUTABLES = (NAME, *COMMANDS, *NODES)
 
 
 def missing() -> list[str]:
-    """Return the shared files and executables that are not where ROS 2 looks for them."""
+    """Return the shared files and executables that ROS 2 does not find."""
     prefix, share = Path(get_package_prefix(NAME)), Path(get_package_share_directory(NAME))
     expected = [share / name for name in SHARED]
     expected += [prefix / 'lib' / NAME / name for name in EXECUTABLES]
@@ -25,14 +26,16 @@ def missing() -> list[str]:
 
 
 def main() -> int:
-    """Print what is wrong, return the exit code."""
+    """Print the problems, return the exit code."""
     prefix = Path(get_package_prefix(NAME))
     problems = [f'missing: {path}' for path in missing()]
     if prefix not in Path(sfa_localization.__file__).parents:
         problems.append(f'imported from elsewhere: {sfa_localization.__file__}')
-    train = prefix / 'lib' / NAME / 'train'
-    if not problems and subprocess.run([train, '--help'], stdout=subprocess.PIPE).returncode:
-        problems.append(f'{train} --help fails')
+    problems += [f'on the PATH: {path}' for path in map(shutil.which, COMMANDS) if path]
+    folder = prefix / 'lib' / NAME
+    for words in ([folder / 'train', '--help'], [folder / NAME, 'train', '--help']):
+        if not problems and subprocess.run(words, stdout=subprocess.PIPE).returncode:
+            problems.append(f'fails: {" ".join(map(str, words))}')
     print('\n'.join(problems) or f'{prefix}: package, files and executables found')
     return bool(problems)
 

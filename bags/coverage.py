@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Draw good and bad drives over one lawn, with what `inspect` says: `python bags/coverage.py`."""
+"""Draw good and bad drives over one lawn, as `inspect` judges them: `python bags/coverage.py`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.inspection import InspectionConfig, area, covered, directions, way
+from sfa_localization.inspection import (
+    MIN_COVERED,
+    MIN_DIRECTIONS,
+    InspectionConfig,
+    covered_share,
+    directions,
+    hull_area,
+    path_length,
+)
 from sfa_localization.simulation.routes import Lawn, coverage
 
 HALF = np.array([8.0, 9.0])
@@ -84,24 +92,24 @@ DRIVES = {
 }
 
 
-def draw(axes: Axes, title: str, places: Array, config: InspectionConfig) -> None:
-    """One drive (N, 2), the ground it covers, and the verdict."""
-    share, ways = covered(places, config.reach), directions(places)
-    enough = share >= config.min_covered and ways >= config.min_directions
+def draw(axes: Axes, title: str, places: Array) -> None:
+    """One drive (N, 2), the ground it covers, and whether it is enough."""
+    share, number = covered_share(places, InspectionConfig().reach), directions(places)
+    enough = share >= MIN_COVERED and number >= MIN_DIRECTIONS
     axes.add_patch(Rectangle(tuple(-HALF), *(2 * HALF), fill=False, color='0.4'))
     axes.plot(*places.T, linewidth=26, color='0.9', solid_joinstyle='round', zorder=0)
     axes.plot(*places.T, linewidth=1.3, color=GOOD if enough else BAD)
     axes.set(aspect='equal', xlim=(-9, 9), ylim=(-10, 10), xticks=[], yticks=[])
     axes.set_title(f'{"good" if enough else "bad"}: {title}', color=GOOD if enough else BAD)
-    told = f'{way(places):.0f} m over {area(places):.0f} m², {share:.0%} covered'
-    axes.set_xlabel(f'{told}, {ways} of 6 directions')
+    covered = f'{path_length(places):.0f} m over {hull_area(places):.0f} m², {share:.0%} covered'
+    axes.set_xlabel(f'{covered}, {number} of 6 directions')
 
 
 def main() -> None:
     """Write coverage.png beside this file."""
     figure = Figure((12, 8.8), layout='constrained')
     for axes, (title, places) in zip(figure.subplots(2, 3).flat, DRIVES.items(), strict=True):
-        draw(axes, title, places, InspectionConfig())
+        draw(axes, title, places)
     FigureCanvasAgg(figure)
     figure.savefig(Path(__file__).with_suffix('.png'), dpi=80, metadata={'Software': None})
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes in one launch: camera picture -> panorama -> pose -> fused pose.
+"""The three nodes in one launch: camera image -> panorama -> pose -> fused pose.
 
 ros2 launch sfa_localization localization.launch.py model:=/path/to/model.npz
 """
@@ -26,7 +26,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
         DeclareLaunchArgument('image', default_value='image_raw', description="camera's topic"),
         DeclareLaunchArgument(
-            'image_transport', default_value='raw', description='raw, or compressed pictures'
+            'image_transport', default_value='raw', description='raw, or compressed images'
         ),
         DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
         DeclareLaunchArgument(
@@ -35,13 +35,13 @@ def generate_launch_description() -> LaunchDescription:
     ]
     image = LaunchConfiguration('image')
     transport = {'image_transport': LaunchConfiguration('image_transport')}
-    pictures = [('image_raw', image), ('image_raw/compressed', [image, '/compressed'])]
+    images = [('image_raw', image), ('image_raw/compressed', [image, '/compressed'])]
     return LaunchDescription(
         [
             *arguments,
             OpaqueFunction(function=_require_config),
             PushROSNamespace(LaunchConfiguration('namespace')),
-            _node('omnicam_node', pictures, transport),
+            _node('omnicam_node', images, transport),
             _node('sfa_node', [], {'model': LaunchConfiguration('model')}),
             _node('ekf_node', [('odom', LaunchConfiguration('odom'))], {}),
         ]

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter file: nodes and trainer read the same YAML, written from the rooms' settings."""
+"""The parameter file: one YAML for nodes and trainer, written from the settings of the rooms."""
 
 from __future__ import annotations
 
@@ -15,23 +15,29 @@ import yaml
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.settings import (
     CameraConfig,
-    OmnicamNodeConfig,
+    CaptureConfig,
     PanoramaConfig,
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
-from sfa_localization.nodes.settings import EkfNodeConfig, NodeConfig, SfaNodeConfig
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.nodes.settings import (
+    EkfNodeConfig,
+    NodeConfig,
+    OmnicamNodeConfig,
+    SfaNodeConfig,
+)
 
 S = TypeVar('S', bound=Settings)
 SECTIONS: dict[str, tuple[type[Settings], ...]] = {
     'omnicam_node': (
         NodeConfig,
         OmnicamNodeConfig,
+        CaptureConfig,
         CameraConfig,
         PanoramaConfig,
     ),
@@ -43,62 +49,60 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
         NetworkConfig,
         SegmentConfig,
         MetricConfig,
-        HeadingConfig,
     ),
 }
-"""Which settings each section holds; the trainer takes camera and panorama from omnicam_node."""
-_EVERY_NODE = '/**'
+"""The settings of each section; the trainer reads camera and panorama from omnicam_node."""
+_ALL_NODES = '/**'
 _KEY = 'ros__parameters'
-_OF_ROS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
-"""Parameters that rclpy declares for every node; they are none of the settings."""
+_ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+"""Parameters that rclpy declares for every node; no settings of this package."""
 _WIDTH = 100
 _HEAD = """\
-# Every parameter of sfa_localization, with its default; all may be left out.
-# The nodes take this file with --ros-args --params-file FILE, the commands with --config FILE.
-# Written from the settings of the code by: python -m sfa_localization config --output FILE
+# Every parameter of sfa_localization, with its default; all are optional.
+# Nodes read this file with --ros-args --params-file FILE, commands with --config FILE.
+# Written from the code by: python -m sfa_localization config --output FILE
 """
 
 
 def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
-    """The settings `kind` from a section of a parameter file; what it does not name is default.
+    """Return the settings `kind` of one section; parameters that it lacks have their defaults.
 
-    Raises ConfigError naming file, section and parameter for whatever cannot be used.
+    Raises ConfigError with file, section and parameter for an invalid file.
     """
-    values = load_section(Path(path), section)
+    parameters = load_section(Path(path), section)
     names = {item.name for item in dataclasses.fields(kind)}
-    given = {name: value for name, value in values.items() if name in names}
-    return kind.from_mapping(given, f'{path}: {section}')
+    own = {name: value for name, value in parameters.items() if name in names}
+    return kind.from_mapping(own, f'{path}: {section}')
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:
-    """Names and values that one section sets, or `/**` where the section has the name.
+    """Return the parameters of one section, and those of `/**` that the section has.
 
-    ROS's own parameters are among them, such as `use_sim_time`: no settings, but the user's will.
-    Raises ConfigError.
+    Parameters of ROS, such as `use_sim_time`, are kept. Raises ConfigError.
     """
     document = _read(path)
     known = {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
     anywhere = {item.name for kinds in SECTIONS.values() for kind in kinds
                 for item in dataclasses.fields(kind)}  # fmt: skip
-    shared = _parameters(document, _EVERY_NODE, path)
+    shared = _parameters(document, _ALL_NODES, path)
     own = {name: value for given in (section, f'/{section}')
            for name, value in _parameters(document, given, path).items()}  # fmt: skip
-    _require_known(shared, anywhere, f'{path}: {_EVERY_NODE}')
+    _require_known(shared, anywhere, f'{path}: {_ALL_NODES}')
     _require_known(own, set(known), f'{path}: {section}')
     return {
         name: _value(known[name], value) if name in known else value
         for name, value in {**shared, **own}.items()
-        if name in known or _of_ros(name)
+        if name in known or _is_of_ros(name)
     }
 
 
-def _of_ros(name: str) -> bool:
-    """Whether ROS has the parameter, given as a tree or by its full name with dots."""
-    return name.partition('.')[0] in _OF_ROS
+def _is_of_ros(name: str) -> bool:
+    """Whether ROS declares the parameter, written as a tree or with dots."""
+    return name.partition('.')[0] in _ROS_PARAMETERS
 
 
 def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
-    """Everything that a parameter file sets, by section, for `render`. Raises ConfigError."""
+    """Return all parameters in a file, by section, as `render` takes them. Raises ConfigError."""
     return {section: load_section(Path(path), section) for section in SECTIONS}
 
 
@@ -114,7 +118,7 @@ def _read(path: Path) -> Mapping[str, Any]:
     if not isinstance(document, dict):
         raise ConfigError(f'{path}: must hold sections such as {", ".join(SECTIONS)}')
     for name in document:
-        if str(name).lstrip('/') not in SECTIONS and name != _EVERY_NODE:
+        if str(name).lstrip('/') not in SECTIONS and name != _ALL_NODES:
             raise ConfigError(f'{path}: unknown section {name!r}; known are {", ".join(SECTIONS)}')
     return document
 
@@ -122,7 +126,9 @@ def _read(path: Path) -> Mapping[str, Any]:
 def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[str, Any]:
     part = document.get(section) or {}
     if not isinstance(part, dict) or (part and set(part) != {_KEY}):
-        raise ConfigError(f'{path}: section {section!r} must hold {_KEY!r}, and all below it')
+        raise ConfigError(
+            f'{path}: section {section!r} must hold {_KEY!r}, and parameters below it'
+        )
     values = part.get(_KEY) or {}
     if not isinstance(values, dict):
         raise ConfigError(f'{path}: {section}.{_KEY} must hold names and values')
@@ -131,12 +137,12 @@ def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[s
 
 def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
     for name in values:
-        if name not in known and not _of_ros(name):
+        if name not in known and not _is_of_ros(name):
             raise ConfigError(f'{where}: unknown parameter {name!r}{nearest(name, known)}')
 
 
 def _value(item: dataclasses.Field[Any], value: Any) -> Any:
-    """YAML 1.1 takes 1e-3 for a text; ROS does not, and neither do people. 3 is as good as 3.0.
+    """Convert as ROS does: for YAML 1.1, 1e-3 is a string; an integer is accepted as a float.
 
     `ros2 param dump` writes an empty list as null.
     """
@@ -151,19 +157,19 @@ def _value(item: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """The parameter file with every default, or with `changes` {section: {name: value}}."""
+    """Return the parameter file: defaults, replaced by `changes` {section: {name: value}}."""
     parts = [_HEAD]
     for section, kinds in SECTIONS.items():
         parts.append(f'{section}:\n  {_KEY}:\n')
         changed = (changes or {}).get(section, {})
         parts += [_group(kind, changed) for kind in kinds]
-        parts.append(_ros_group({n: value for n, value in changed.items() if _of_ros(n)}))
+        parts.append(_ros_group({n: value for n, value in changed.items() if _is_of_ros(n)}))
     return ''.join(parts)
 
 
 def write_config(path: Path | str, changes: Mapping[str, Mapping[str, Any]] | None = None) -> None:
-    """Write `render(changes)` to a file, at once or not at all. Raises ConfigError."""
-    with whole_file(Path(path), ConfigError) as file:
+    """Write `render(changes)` to a file, atomically. Raises ConfigError."""
+    with atomic_write(Path(path), ConfigError) as file:
         file.write(render(changes).encode())
 
 
@@ -171,9 +177,7 @@ def _group(kind: type[Settings], changes: Mapping[str, Any]) -> str:
     title = (kind.__doc__ or '').strip().splitlines()[0]
     lines = [f'    # --- {title}']
     for item in dataclasses.fields(kind):
-        lines += textwrap.wrap(
-            _described(item), _WIDTH, initial_indent='    # ', subsequent_indent='    # '
-        )
+        lines += [f'    # {line}' for line in textwrap.wrap(_described(item), _WIDTH - 6)]
         lines.append(f'    {item.name}: {_text(changes.get(item.name, item.default))}')
     return '\n'.join(lines) + '\n'
 
@@ -182,23 +186,23 @@ def _ros_group(values: Mapping[str, Any]) -> str:
     if not values:
         return ''
     text = yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
-    return textwrap.indent(f'# --- Of ROS itself.\n{text}', '    ')
+    return textwrap.indent(f'# --- Parameters of ROS.\n{text}', '    ')
 
 
 def _described(item: dataclasses.Field[Any]) -> str:
-    """What a parameter means, its unit, its range, and whether it may change at run time."""
+    """Return description, unit and range of a parameter, and whether it may change at run time."""
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
-    told = [f'{meta["doc"]}{unit}']
+    parts = [f'{meta["doc"]}{unit}']
     if meta['choices']:
-        told.append('one of ' + ', '.join(meta['choices']))
+        parts.append('one of ' + ', '.join(meta['choices']))
     if meta['low'] is not None or meta['high'] is not None:
         low = '' if meta['low'] is None else f'{meta["low"]:g}'
         high = '' if meta['high'] is None else f'{meta["high"]:g}'
-        told.append(f'{low}..{high}')
+        parts.append(f'{low}..{high}')
     if meta['live']:
-        told.append('may change while running')
-    return '; '.join(told)
+        parts.append('may change while running')
+    return '; '.join(parts)
 
 
 def _text(value: Any) -> str:
@@ -214,7 +218,7 @@ def _text(value: Any) -> str:
 
 
 def _float(value: float) -> str:
-    """With a point, which YAML 1.1 needs to know a number by."""
+    """Return a float with a decimal point: for YAML 1.1, 1e-3 is a string."""
     text = repr(value)
     if 'e' in text:
         digits, exponent = text.split('e')

@@ -20,10 +20,11 @@ import numpy as np
 from scipy import linalg
 from tqdm import tqdm
 
+from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import (
     Array,
     RigidTransform,
@@ -37,7 +38,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Localizer, Observation
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe, as_live, read_drive
+from sfa_localization.training import Recipe
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
@@ -91,7 +92,7 @@ def evaluate(
     drive itself. Pictures that cannot be believed count as skipped observations. Raises
     BagError or DataError, also when there is no ground truth.
     """
-    recipe = as_live(recipe or Recipe(), model)
+    recipe = as_live(recipe or Recipe(), model.panorama)
     transform, supervised = None, None
     if align_bag is not None:
         with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
@@ -121,7 +122,7 @@ def evaluate(
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
-    run = read_drive(bag, cache, recipe, progress, want_truth=True)
+    run = read_drive(bag, cache, recipe, progress, want_truth=True, odometry_tolerance_s=0.0)
     if run.ground_truth is None or len(run.ground_truth) < 2:
         raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
     return run
@@ -252,5 +253,5 @@ def _supervised(model: PlaceModel, weights: Array, drive: _Drive) -> Trajectory:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, at once or not at all. Raises LocalizationError."""
     text = json.dumps(content, indent=2) + '\n'
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         file.write(text.encode())

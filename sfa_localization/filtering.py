@@ -16,19 +16,23 @@ import numpy as np
 from tqdm import tqdm
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import PICTURE, in_order
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.events import IMAGE, merge_by_stamp
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Stamps, Trajectory, integrate
+from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, Status
 from sfa_localization.fusion.settings import FilterConfig
 
 _NS = Decimal(1_000_000_000)
 _SECOND_NS = 1_000_000_000
 _STRETCH = 20
+"""Positions that are aligned with odometry together: so few that odometry hardly drifts."""
 _UNTRUE = 2.0
+"""A standard deviation that is too small by more than this factor is replaced."""
 _MEDIAN_OF_RAYLEIGH = 1.1774
-# What people call the columns, in lower case; the first is what this package writes.
+"""Median length of a planar vector with unit variance per axis: sqrt(2 ln 2)."""
+# Usual names of the columns, in lower case; the first is the one in the documentation.
 _STAMP = ('stamp_s', 'stamp', 't', 'time', 'time_s', 'timestamp', 'timestamp_s', 'sec', 'seconds')
 _STAMP_NS = ('stamp_ns', 'timestamp_ns', 't_ns', 'time_ns')
 _ODOMETRY = {
@@ -66,7 +70,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Filtered:
-    """Poses (N, 3) at the odometry's stamps (N,), from the start on, and the rows' fate."""
+    """Poses (N, 3) at the stamps (N,) of odometry, from the start on, and counts of the rows."""
 
     stamps_ns: Stamps
     poses: Array
@@ -95,9 +99,9 @@ def run_filter(
     start: Sequence[float] | None = None,
     progress: bool = False,
 ) -> Filtered:
-    """Fuse two tables as a live filter would: each pose knows only what came before it.
+    """Fuse two tables as a live filter would: each pose depends on earlier rows only.
 
-    `start` is x m, y m, yaw rad, where known. Raises DataError when the tables do not overlap.
+    `start` is x m, y m, yaw rad, if known. Raises DataError when the tables do not overlap.
     """
     _require_overlap(odometry, positions)
     # Logs may count from zero, but a stamp of zero means that there is none.
@@ -105,7 +109,7 @@ def run_filter(
     shift = _SECOND_NS - first if first <= 0 else 0
     fused = PoseFilter(config)
     if start is not None:
-        fused.initialise(int(odometry.stamps_ns[0]) + shift, start)
+        fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
     stamps, poses, waiting = [], [], 0
     for stamp_ns in tqdm(_feed(fused, odometry, positions, shift), disable=not progress,
                          total=len(odometry), unit=' rows', desc='filter'):  # fmt: skip
@@ -125,9 +129,9 @@ def run_filter(
 
 
 def position_std_of(odometry: Table, positions: Table) -> float | None:
-    """Deviation of positions that tell none: what is left when odometry is laid through them.
+    """Standard deviation of positions: their residuals after alignment with dead reckoning.
 
-    Stretches of positions are aligned with dead reckoning; None where there are too few.
+    Each _STRETCH of them is aligned on its own; None where there are too few.
     """
     path = integrate(
         odometry.stamps_ns, np.column_stack([odometry.columns[n] for n in ('v', 'omega')])
@@ -136,42 +140,38 @@ def position_std_of(odometry: Table, positions: Table) -> float | None:
         positions.stamps_ns <= odometry.stamps_ns[-1]
     )
     driven = Trajectory(odometry.stamps_ns, path).at(positions.stamps_ns[inside])[:, :2]
-    seen = np.column_stack([positions.columns['x'], positions.columns['y']])[inside]
-    left = []
-    for start in range(0, len(seen) - _STRETCH + 1, _STRETCH):
+    measured = np.column_stack([positions.columns['x'], positions.columns['y']])[inside]
+    residuals = []
+    for start in range(0, len(measured) - _STRETCH + 1, _STRETCH):
         part = slice(start, start + _STRETCH)
-        laid = align(driven[part], seen[part]).apply(driven[part])
-        left.append(float(np.median(np.hypot(*(seen[part] - laid).T))))
-    return float(np.median(left)) / _MEDIAN_OF_RAYLEIGH if left else None
+        aligned = align(driven[part], measured[part]).apply(driven[part])
+        residuals.append(float(np.median(np.hypot(*(measured[part] - aligned).T))))
+    return float(np.median(residuals)) / _MEDIAN_OF_RAYLEIGH if residuals else None
 
 
 def fitting_config(
     odometry: Table, positions: Table, config: FilterConfig
 ) -> tuple[FilterConfig, str]:
-    """The settings for positions that tell no variance, or far too small ones; and what was done.
+    """The settings for positions without variances, or with far too small ones; and what was done.
 
-    Settings that differ from the defaults are the user's, and stay.
+    A `measurement_factor` other than the default is the user's, and stays.
     """
-    if (config.position_std, config.measurement_factor) != _default_noise():
+    if config.measurement_factor != FilterConfig().measurement_factor:
         return config, ''
     found = position_std_of(odometry, positions) if len(positions) else None
     if found is None:
         return config, ''
-    told = math.sqrt(_told_variance(positions))
-    if told == 0:
-        text = f'positions tell no variance: their deviation is taken to be {found:.2f} m'
-        return replace(config, position_std=max(found, config.position_std_floor)), text
-    if found > _UNTRUE * told:
+    claimed = math.sqrt(_told_variance(positions))
+    if claimed == 0:
+        text = f'positions have no variance: their standard deviation is taken to be {found:.2f} m'
+        return replace(config, measurement_factor=(found / POSITION_STD) ** 2), text
+    if found > _UNTRUE * claimed:
         text = (
-            f'positions tell a deviation of {told:.2f} m, but err by {found:.2f} m: taken as such'
+            f'positions claim a standard deviation of {claimed:.2f} m, but err by {found:.2f} m: '
+            'taken as such'
         )
-        return replace(config, measurement_factor=(found / told) ** 2), text
+        return replace(config, measurement_factor=(found / claimed) ** 2), text
     return config, ''
-
-
-def _default_noise() -> tuple[float, float]:
-    default = FilterConfig()
-    return default.position_std, default.measurement_factor
 
 
 def _told_variance(positions: Table) -> float:
@@ -182,8 +182,8 @@ def _told_variance(positions: Table) -> float:
 
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:
-    """Write `stamp x y z qx qy qz qw` lines, at once or not at all. Raises DataError."""
-    with whole_file(Path(path), DataError) as file:
+    """Write `stamp x y z qx qy qz qw` lines, completely or not at all. Raises DataError."""
+    with atomic_write(Path(path), DataError) as file:
         for stamp_ns, (x, y, yaw) in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
             turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
             file.write(f'{_seconds(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n'.encode())
@@ -196,13 +196,15 @@ def _seconds(stamp_ns: int) -> str:
 
 
 def _feed(fused: PoseFilter, odometry: Table, positions: Table, shift: int) -> Iterator[int]:
-    """Give both tables to the filter in the order of time; yields each odometry stamp, done."""
+    """Feed both tables to the filter in order of time; yields each odometry stamp once fused."""
     pending: int | None = None
-    for stamp_ns, kind, i in in_order(odometry.stamps_ns + shift, positions.stamps_ns + shift):
+    for stamp_ns, kind, i in merge_by_stamp(
+        odometry.stamps_ns + shift, positions.stamps_ns + shift
+    ):
         if pending is not None and stamp_ns > pending:
             yield pending
             pending = None
-        if kind == PICTURE:
+        if kind == IMAGE:
             fused.add_measurement(stamp_ns, *_measurement(positions.columns, i))
         elif not fused.add_odometry(stamp_ns, *_twist(odometry.columns, i)):
             pending = stamp_ns
@@ -216,18 +218,18 @@ def _twist(columns: dict[str, Array], i: int) -> tuple[float, float, tuple[float
 
 
 def _measurement(columns: dict[str, Array], i: int) -> tuple[Array, Array]:
-    """Position or pose and its covariance; a variance that is not told is 0, for unknown."""
-    value = np.array([columns['x'][i], columns['y'][i]])
+    """Position or pose and its covariance; a missing variance is 0, for unknown."""
+    position = np.array([columns['x'][i], columns['y'][i]])
     x, y = _cell(columns, 'var_x', i, 0.0), _cell(columns, 'var_y', i, 0.0)
     x, y = (x or y, y or x)
     xy = _cell(columns, 'var_xy', i, 0.0)
     covariance = np.array([[x, xy], [xy, y]]) if x > 0 else np.zeros((2, 2))
     yaw, yaw_variance = _cell(columns, 'yaw', i, math.nan), _cell(columns, 'var_yaw', i, 0.0)
     if not (math.isfinite(yaw) and yaw_variance > 0 and covariance.any()):
-        return value, covariance
+        return position, covariance
     full = np.zeros((3, 3))
     full[:2, :2], full[2, 2] = covariance, yaw_variance
-    return np.append(value, yaw), full
+    return np.append(position, yaw), full
 
 
 def _cell(columns: dict[str, Array], name: str, i: int, missing: float) -> float:
@@ -241,14 +243,11 @@ def _require_overlap(odometry: Table, positions: Table) -> None:
         return
     spans = [(int(t.stamps_ns[0]), int(t.stamps_ns[-1])) for t in (odometry, positions)]
     if spans[0][0] > spans[1][1] or spans[1][0] > spans[0][1]:
-        told = [f'{_seconds(a)} to {_seconds(b)} s' for a, b in spans]
+        ranges = [f'{_seconds(a)} to {_seconds(b)} s' for a, b in spans]
         raise DataError(
-            f'odometry ({told[0]}) and positions ({told[1]}) have no time in common: '
+            f'odometry ({ranges[0]}) and positions ({ranges[1]}) have no time in common: '
             'bring both to one clock'
         )
-
-
-# Reading.
 
 
 def _read_table(path: Path, known: dict[str, tuple[str, ...]], needed: tuple[str, ...]) -> Table:
@@ -260,12 +259,12 @@ def _read_table(path: Path, known: dict[str, tuple[str, ...]], needed: tuple[str
     names, start = _header(rows, known)
     if not names:
         raise DataError(f'{path}: holds no rows; the first line must be stamp_s,{",".join(needed)}')
-    places = _places(path, names, known, needed)
-    return _table(path, rows[start:], places, needed)
+    at = _column_indices(path, names, known, needed)
+    return _table(path, rows[start:], at, needed)
 
 
 def _split(line: str) -> list[str]:
-    """Cells of a row, whatever separates them."""
+    """Cells of a row, separated by comma, semicolon, tab or spaces."""
     for separator in (',', ';', '\t'):
         if separator in line:
             return [
@@ -275,7 +274,7 @@ def _split(line: str) -> list[str]:
 
 
 def _header(rows: list[list[str]], known: dict[str, tuple[str, ...]]) -> tuple[list[str], int]:
-    """Names of the columns and the first row of data; the usual order where there is no header."""
+    """Names of the columns and the first row of data; the documented order without a header."""
     for i, row in enumerate(rows):
         if _number(row[0]) is not None:
             usual = ['stamp_s', *(aliases[0] for aliases in known.values())]
@@ -287,48 +286,46 @@ def _header(rows: list[list[str]], known: dict[str, tuple[str, ...]]) -> tuple[l
     return [], len(rows)
 
 
-def _places(
+def _column_indices(
     path: Path, names: list[str], known: dict[str, tuple[str, ...]], needed: tuple[str, ...]
 ) -> dict[str, int]:
-    """Which column holds what."""
+    """Index of each known column. Raises DataError when a needed one is missing."""
     wanted = {'stamp_s': _STAMP, 'stamp_ns': _STAMP_NS, **known}
-    places = {}
+    at = {}
     for name, aliases in wanted.items():
         found = next((names.index(alias) for alias in aliases if alias in names), None)
         if found is not None:
-            places[name] = found
-    missing = [known[name][0] for name in needed if name not in places]
-    if 'stamp_s' not in places and 'stamp_ns' not in places:
+            at[name] = found
+    missing = [known[name][0] for name in needed if name not in at]
+    if 'stamp_s' not in at and 'stamp_ns' not in at:
         missing.insert(0, 'stamp_s')
     if missing:
         raise DataError(f'{path}: no column {" or ".join(missing)} among {", ".join(names)}')
-    return places
+    return at
 
 
-def _table(
-    path: Path, rows: list[list[str]], places: dict[str, int], needed: tuple[str, ...]
-) -> Table:
+def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[str, ...]) -> Table:
     skipped: Counter[str] = Counter()
-    stamps, values = [], []
-    columns = [name for name in places if not name.startswith('stamp_')]
+    stamps, numbers = [], []
+    columns = [name for name in at if not name.startswith('stamp_')]
     for row in rows:
         if row[0].startswith(('#', '%')):
             continue
-        stamp_ns = _stamp(row, places)
-        cells = [_value(row, places[name]) for name in columns]
+        stamp_ns = _stamp(row, at)
+        cells = [_float(row, at[name]) for name in columns]
         if stamp_ns is None:
             skipped['no stamp'] += 1
         elif not all(math.isfinite(cells[columns.index(name)]) for name in needed):
             skipped['no number'] += 1
         else:
             stamps.append(stamp_ns)
-            values.append(cells)
+            numbers.append(cells)
     if not stamps and skipped:
         raise DataError(f'{path}: none of the {sum(skipped.values())} rows can be used')
     order = np.argsort(np.array(stamps, np.int64), kind='stable')
     if len(order) and np.any(np.diff(order) < 0):
         skipped['(rows out of order, sorted)'] = int(np.sum(np.diff(order) < 0))
-    data = np.reshape(np.array(values, float), (-1, len(columns)))[order]
+    data = np.reshape(np.array(numbers, float), (-1, len(columns)))[order]
     return Table(
         np.array(stamps, np.int64)[order],
         {name: data[:, k] for k, name in enumerate(columns)},
@@ -336,10 +333,10 @@ def _table(
     )
 
 
-def _stamp(row: list[str], places: dict[str, int]) -> int | None:
-    """Nanoseconds, exactly: a double does not hold them."""
-    name = 'stamp_ns' if 'stamp_ns' in places else 'stamp_s'
-    number = _number(row[places[name]]) if places[name] < len(row) else None
+def _stamp(row: list[str], at: dict[str, int]) -> int | None:
+    """Exact nanoseconds, which a float cannot hold; None where the cell is no stamp."""
+    name = 'stamp_ns' if 'stamp_ns' in at else 'stamp_s'
+    number = _number(row[at[name]]) if at[name] < len(row) else None
     if number is None:
         return None
     stamp_ns = int(number if name == 'stamp_ns' else (number * _NS).to_integral_value())
@@ -354,10 +351,6 @@ def _number(cell: str) -> Decimal | None:
     return number if number.is_finite() else None
 
 
-def _value(row: list[str], place: int) -> float:
-    if place >= len(row):
-        return math.nan
-    try:
-        return float(row[place])
-    except ValueError:
-        return math.nan
+def _float(row: list[str], column: int) -> float:
+    number = _number(row[column]) if column < len(row) else None
+    return math.nan if number is None else float(number)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a bag, what is wrong with it, and whether it is enough to train on."""
+"""The contents of a bag, its problems, and whether it is enough to train on."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
-from sfa_localization.bags import messages
+from sfa_localization.bags import decoding
 from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.streams import Stream
+from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
@@ -26,35 +27,45 @@ from sfa_localization.data.settings import Settings, setting
 PANORAMA, OMNIDIRECTIONAL, FISHEYE = 'panorama', 'omnidirectional', 'fisheye'
 DUAL_FISHEYE, ORDINARY = 'dual fisheye', 'ordinary camera'
 SECTORS = 6
+"""Line directions that are distinguished, of 30 degrees each."""
+MIN_DIRECTIONS = 3
+"""Directions a drive needs: with fewer the shape of the map remains ambiguous."""
+MIN_SHARE = 0.05
+"""Share of the path along a direction that counts as driven."""
+MIN_COVERED = 0.65
+"""Share of the area that must be covered: below it whole regions are extrapolated."""
+MAX_LOST = 0.1
+"""Share of images that may lack odometry: more means that recording or clocks are wrong."""
+MAX_GAP_S = 2.0
+"""Longest pause of a topic (s) that is not reported."""
+SAMPLES = 16
+"""Images on the contact sheet: as many as can be seen at once."""
 SAMPLE_SIDE = 640
-STILL_M = 0.02
+"""Longer side of an image on the contact sheet (pixels)."""
+STANDING_M = 0.02
+"""Images nearer to each other than this (m) were taken standing."""
 GRID = 100
+"""Points per axis at which coverage is evaluated: steps of 1 % of the area's extent."""
 DARK = 12.0
+"""Mean gray level of 255 below which an image is dark."""
 
 
 @dataclass(frozen=True, slots=True)
 class InspectionConfig(Settings):
-    """What a drive needs to be enough to train on."""
+    """Requirements on a drive to train on."""
 
-    min_pictures: int = setting(300, 'pictures with odometry', low=1)
+    min_pictures: int = setting(300, 'images with odometry that are needed', low=1)
     max_spacing: float = setting(
-        0.5, 'way between pictures (90th percentile)', unit='m', low=0.01, high=100.0
+        0.5, 'distance between images (90th percentile)', unit='m', low=0.01, high=100.0
     )
     reach: float = setting(
-        1.0, 'ground this near to a picture is covered', unit='m', low=0.01, high=100.0
+        1.0, 'ground this near to an image is covered', unit='m', low=0.01, high=100.0
     )
-    min_covered: float = setting(0.65, 'share of the area that is covered', low=0.0, high=1.0)
-    min_directions: int = setting(3, 'line directions, of six, driven along', low=1, high=6)
-    max_lost: float = setting(0.1, 'share of pictures that cannot be used', low=0.0, high=1.0)
-    max_gap: float = setting(
-        2.0, 'pause of a topic that is worth telling', unit='s', low=0.0, high=1e6
-    )
-    samples: int = setting(16, 'pictures on the contact sheet', low=1, high=400)
 
 
 @dataclass
 class TopicReport:
-    """One topic: `problems` are sentences; stamps are the senders' where they gave one."""
+    """One topic: `problems` are sentences; stamps are those of the sender where it set them."""
 
     name: str
     kind: str
@@ -64,7 +75,7 @@ class TopicReport:
 
     @property
     def rate_hz(self) -> float:
-        """Messages per second, by the median of their distances; 0 for less than two."""
+        """Messages per second, by the median of their intervals; 0 for fewer than two."""
         if len(self.stamps_ns) < 2:
             return 0.0
         return float(1e9 / max(np.median(np.diff(self.stamps_ns)), 1))
@@ -94,8 +105,8 @@ class TopicReport:
 
 
 @dataclass
-class Pictures:
-    """A topic of pictures: size, guessed geometry, and a few of them, spread over the drive."""
+class ImageTopic:
+    """A topic of images: size, guessed geometry, and samples from all over the drive."""
 
     topic: str
     stamps_ns: Stamps
@@ -105,34 +116,33 @@ class Pictures:
     samples: list[Image]
 
     def as_dict(self) -> dict[str, Any]:
-        size = {'width': self.width, 'height': self.height}
-        return {'topic': self.topic, **size, 'geometry': self.geometry}
+        return {name: getattr(self, name) for name in ('topic', 'width', 'height', 'geometry')}
 
 
 @dataclass
-class Drive:
-    """Where the robot went by its odometry, and where pictures were taken."""
+class DrivenPath:
+    """The path of the robot by its odometry, and the poses at which images were taken."""
 
     topic: str
     odometry: Odometry
     places: Array
-    """Poses (M, 3) of the pictures that have odometry."""
+    """Poses (M, 3) of the images that have odometry."""
 
     def as_text(self) -> str:
         """A line for a terminal."""
-        told = self.as_dict()
+        found = self.as_dict()
         return (
-            f'  drive: {told["length_m"]:.0f} m by {told["topic"]}, {told["pictures"]} pictures '
-            f'over {told["area_m2"]:.0f} m2, {told["spacing_m"]:.2f} m apart, '
-            f'along {told["directions"]} of {SECTORS} directions'
+            f'  drive: {found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images '
+            f'over {found["area_m2"]:.0f} m2, {found["spacing_m"]:.2f} m apart, '
+            f'along {found["directions"]} of {SECTORS} directions'
         )
 
     def as_dict(self) -> dict[str, Any]:
         return {
             'topic': self.topic,
-            'length_m': round(way(self.odometry.poses), 2),
+            'length_m': round(path_length(self.odometry.poses), 2),
             'pictures': len(self.places),
-            'area_m2': round(area(self.places), 2),
+            'area_m2': round(hull_area(self.places), 2),
             'spacing_m': round(spacing(self.places), 3),
             'directions': directions(self.places),
         }
@@ -140,9 +150,9 @@ class Drive:
 
 @dataclass
 class BagReport:
-    """All that was found out about a bag; `lacks` tells why it is not enough to train on.
+    """All findings about a bag; `lacks` are the reasons why it is not enough to train on.
 
-    `error` is why it cannot be read at all.
+    `error` is the reason why it cannot be read at all.
     """
 
     path: str
@@ -150,8 +160,8 @@ class BagReport:
     topics: list[TopicReport] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    pictures: Pictures | None = None
-    drive: Drive | None = None
+    images: ImageTopic | None = None
+    drive: DrivenPath | None = None
     lacks: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
@@ -162,7 +172,7 @@ class BagReport:
             'topics': {topic.name: topic.as_dict() for topic in self.topics},
             'problems': self.problems,
             'notes': self.notes,
-            'pictures': self.pictures.as_dict() if self.pictures else None,
+            'pictures': self.images.as_dict() if self.images else None,
             'drive': self.drive.as_dict() if self.drive else None,
             'enough_to_train_on': not (self.lacks or self.error),
             'lacks': self.lacks,
@@ -173,9 +183,9 @@ class BagReport:
         if self.error:
             return f'error: {self.error}'
         lines = [self.path, *(topic.as_text() for topic in self.topics)]
-        if self.pictures is not None:
-            seen = self.pictures
-            lines.append(f'  pictures: {seen.width}x{seen.height}, {seen.geometry}')
+        if self.images is not None:
+            size = f'{self.images.width}x{self.images.height}'
+            lines.append(f'  images: {size}, {self.images.geometry}')
         if self.drive is not None:
             lines.append(self.drive.as_text())
         lines += [f'  problem: {problem}' for problem in self.problems]
@@ -192,7 +202,7 @@ def inspect(
     bag_config: BagConfig | None = None,
     strict: bool = False,
 ) -> BagReport:
-    """Look through a bag once. Raises BagError when nothing in it can be read."""
+    """Read a bag once and report on it. Raises BagError when nothing in it can be read."""
     config, topics = config or InspectionConfig(), topics or TopicNames()
     report = BagReport(str(path))
     with Bag(path, strict=strict, config=bag_config) as bag:
@@ -200,12 +210,12 @@ def inspect(
             _found(bag, kind, name, report)
             for kind, name in (('image', topics.image), ('odometry', topics.odometry))
         )
-        looks = _Looks(bag, image, odometry, config)
-        looks.read()
-        report.topics = looks.topics(config)
+        survey = _Survey(bag, image, odometry)
+        survey.read()
+        report.topics = survey.topics()
         report.problems, report.notes = bag.problems, bag.recording.notes
-        report.pictures = looks.pictures()
-        report.drive = looks.drive(report.pictures)
+        report.images = survey.images()
+        report.drive = survey.drive(report.images)
     report.lacks += lacks(report, config)
     return report
 
@@ -219,10 +229,10 @@ def _found(bag: Bag, kind: str, name: str, report: BagReport) -> str:
         return ''
 
 
-class _Looks:
+class _Survey:
     """One pass over all topics of a bag."""
 
-    def __init__(self, bag: Bag, image: str, odometry: str, config: InspectionConfig) -> None:
+    def __init__(self, bag: Bag, image: str, odometry: str) -> None:
         self._bag, self._image, self._odometry = bag, image, odometry
         self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
         self._motion: list[tuple[int, Any]] = []
@@ -230,8 +240,7 @@ class _Looks:
         self._samples: list[Image] = []
         self._streams: list[Stream] = []
         count = bag.topics[image].count if image else 0
-        self._every = max(count // config.samples, 1)
-        self._wanted = config.samples
+        self._every = max(count // SAMPLES, 1)
 
     def read(self) -> None:
         self._streams = [self._stream(name) for name in self._bag.topics]
@@ -242,109 +251,105 @@ class _Looks:
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry.partition(':')[0]:
-            stream = self._bag.stream(self._odometry, messages.odometry_of)
+            stream = self._bag.stream(self._odometry, decoding.odometry_of)
             stream.required = False
             return stream
         if name == self._image:
-            return self._bag.any_stream(name, self._look)
+            return self._bag.any_stream(name, self._sample)
         if self._bag.topics[name].kind in KINDS['image'].found:
-            return self._bag.any_stream(name, messages.image_of)
+            return self._bag.any_stream(name, decoding.image_of)
         return self._bag.any_stream(name, lambda message: None)
 
-    def _look(self, message: Any) -> None:
-        """Decode a picture; remember its size, and some pictures themselves."""
-        image = messages.image_of(message)
-        seen = sum(self._sizes.values())
+    def _sample(self, message: Any) -> None:
+        """Decode an image; keep its size, and every so often the image itself."""
+        image = decoding.image_of(message)
+        number = sum(self._sizes.values())
         self._sizes[image.shape[:2]] = self._sizes.get(image.shape[:2], 0) + 1
-        if seen % self._every == 0 and len(self._samples) < self._wanted:
+        if number % self._every == 0 and len(self._samples) < SAMPLES:
             self._samples.append(_small(image))
 
-    def topics(self, config: InspectionConfig) -> list[TopicReport]:
+    def topics(self) -> list[TopicReport]:
         reports = []
         for stream in self._streams:
             topic = self._bag.topics[stream.topic]
             stamps = np.array(self._stamps[topic.name], np.int64)
             report = TopicReport(topic.name, topic.kind, topic.count, stamps)
-            report.problems = list(self._problems(stream, report, config))
+            report.problems = list(self._problems(stream, report))
             reports.append(report)
         return reports
 
-    def _problems(
-        self, stream: Stream, report: TopicReport, config: InspectionConfig
-    ) -> Iterator[str]:
+    def _problems(self, stream: Stream, report: TopicReport) -> Iterator[str]:
         for reason, number in stream.tally.count.skipped.items():
             yield f'{number} of {report.count} messages: {reason}'
         if report.count == 0:
             yield 'no messages'
-        if report.largest_gap_s > max(config.max_gap, 5 / max(report.rate_hz, 1e-9)):
+        if report.largest_gap_s > max(MAX_GAP_S, 5 / max(report.rate_hz, 1e-9)):
             yield f'pause of {report.largest_gap_s:.1f} s'
         if stream.topic == self._image and len(self._sizes) > 1:
             sizes = ', '.join(f'{w}x{h}' for h, w in self._sizes)
-            yield f'pictures of several sizes: {sizes}'
+            yield f'images of several sizes: {sizes}'
 
-    def pictures(self) -> Pictures | None:
+    def images(self) -> ImageTopic | None:
         if not self._samples:
             return None
         height, width = max(self._sizes, key=lambda size: self._sizes[size])
         same = [s for s in self._samples if s.shape == self._samples[0].shape]
         stamps = np.array(self._stamps[self._image], np.int64)
-        return Pictures(self._image, stamps, width, height, guess_geometry(same), self._samples)
+        return ImageTopic(self._image, stamps, width, height, guess_geometry(same), self._samples)
 
-    def drive(self, pictures: Pictures | None) -> Drive | None:
+    def drive(self, images: ImageTopic | None) -> DrivenPath | None:
         if not self._motion:
             return None
         stream = next(s for s in self._streams if s.topic == self._odometry.partition(':')[0])
         odometry = self._bag.to_odometry(stream, self._motion)
-        stamps = pictures.stamps_ns if pictures else np.zeros(0, np.int64)
-        tolerance = int(self._bag.config.odometry_tolerance * 1e9)
+        stamps = images.stamps_ns if images else np.zeros(0, np.int64)
+        tolerance = int(ODOMETRY_TOLERANCE_S * 1e9)
         near = stamps[odometry.trajectory.covers(stamps, tolerance)]
-        return Drive(self._odometry, odometry, odometry.trajectory.at(near))
+        return DrivenPath(self._odometry, odometry, odometry.trajectory.at(near))
 
 
 def _small(image: Image) -> Image:
-    scale = SAMPLE_SIDE / max(image.shape[:2])
-    if scale >= 1:
-        return image.copy()
+    scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 def guess_geometry(samples: Sequence[Image]) -> str:
-    """What kind of camera took pictures (H, W, 3) of one size, by their shape and dark parts."""
+    """The kind of camera that took images (H, W, 3) of one size, by shape and dark parts."""
     height, width = samples[0].shape[:2]
     if looks_like_panorama(height, width):
         return PANORAMA
-    grey = np.stack([sample.mean(-1) for sample in samples])
+    gray = np.stack([sample.mean(-1) for sample in samples])
     if abs(width / height - 2) < 0.02:
-        return DUAL_FISHEYE if _dark_corners(grey[:, :, : width // 2]) else PANORAMA
-    if not _dark_corners(grey):
+        return DUAL_FISHEYE if _dark_corners(gray[:, :, : width // 2]) else PANORAMA
+    if not _dark_corners(gray):
         return ORDINARY
-    return OMNIDIRECTIONAL if _still_center(grey) else FISHEYE
+    return OMNIDIRECTIONAL if _is_center_constant(gray) else FISHEYE
 
 
-def _dark_corners(grey: Array) -> bool:
-    """Whether the light falls into a circle: pictures (N, H, W) with black corners."""
-    brightest, side = grey.max(0), max(min(grey.shape[1:]) // 20, 1)
+def _dark_corners(gray: Array) -> bool:
+    """Whether the image is a circle: gray levels (N, H, W) with black corners."""
+    brightest, side = gray.max(0), max(min(gray.shape[1:]) // 20, 1)
     ends = (slice(None, side), slice(-side, None))
     corners = [np.median(brightest[rows, columns]) for rows in ends for columns in ends]
-    return bool(max(corners) < max(DARK, 0.15 * np.median(grey)))
+    return bool(max(corners) < max(DARK, 0.15 * np.median(gray)))
 
 
-def _still_center(grey: Array) -> bool:
-    """Whether the middle shows the camera itself: it changes much less than what is around it."""
-    height, width = grey.shape[1:]
+def _is_center_constant(gray: Array) -> bool:
+    """Whether the center shows the camera itself: it changes much less than its surroundings."""
+    height, width = gray.shape[1:]
     rows, columns = np.mgrid[:height, :width]
     radius = np.hypot(rows - height / 2, columns - width / 2) / (min(height, width) / 2)
-    change = grey.std(0) if len(grey) > 1 else np.abs(grey[0] - grey[0].mean())
+    change = gray.std(0) if len(gray) > 1 else np.abs(gray[0] - gray[0].mean())
     inner, ring = change[radius < 0.12].mean(), change[(radius > 0.4) & (radius < 0.8)].mean()
     return bool(inner < 0.4 * ring)
 
 
-def way(poses: Array) -> float:
-    """Length in metres of the path through poses (N, 3)."""
+def path_length(poses: Array) -> float:
+    """Length in meters of the path through poses (N, >= 2)."""
     return float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
 
 
-def area(places: Array) -> float:
+def hull_area(places: Array) -> float:
     """Area in m2 of the convex hull of places (N, >= 2)."""
     try:
         return float(ConvexHull(places[:, :2]).volume)
@@ -352,7 +357,7 @@ def area(places: Array) -> float:
         return 0.0
 
 
-def covered(places: Array, reach_m: float) -> float:
+def covered_share(places: Array, reach_m: float) -> float:
     """Share of the convex hull of places (N, >= 2) that lies within `reach_m` of one."""
     try:
         hull = Delaunay(places[:, :2])
@@ -367,63 +372,62 @@ def covered(places: Array, reach_m: float) -> float:
 
 
 def spacing(places: Array) -> float:
-    """Way in metres between neighbouring pictures, 90th percentile, of those taken driving."""
+    """Distance in meters of neighboring places (N, >= 2) while driving, 90th percentile."""
     steps = np.hypot(*np.diff(places[:, :2], axis=0).T)
-    steps = steps[steps > STILL_M]
+    steps = steps[steps > STANDING_M]
     return float(np.percentile(steps, 90)) if len(steps) else 0.0
 
 
 def directions(places: Array) -> int:
-    """How many of six line directions (30 degrees each, of 180) hold 5 % of the way or more."""
+    """Number of line directions with MIN_SHARE of the path through places (N, >= 2) or more."""
     steps = np.diff(places[:, :2], axis=0)
     length = np.hypot(steps[:, 0], steps[:, 1])
     angle = np.arctan2(steps[:, 1], steps[:, 0]) % np.pi
     sector = np.minimum(angle / np.pi * SECTORS, SECTORS - 1).astype(int)
     share = np.bincount(sector, length, SECTORS) / max(length.sum(), 1e-9)
-    return int((share >= 0.05).sum())
+    return int((share >= MIN_SHARE).sum())
 
 
 def lacks(report: BagReport, config: InspectionConfig) -> list[str]:
-    """Why a bag is not enough to train on, each with the remedy; nothing when it is."""
-    if report.pictures is None or report.drive is None:
-        return [] if report.lacks else ['neither pictures nor odometry could be read']
-    places, taken = report.drive.places, len(report.pictures.stamps_ns)
+    """The reasons why a bag is not enough to train on, each with the remedy."""
+    if report.images is None or report.drive is None:
+        return [] if report.lacks else ['neither images nor odometry could be read']
+    places = report.drive.places
     return [
-        *_lacks_of_pictures(report.pictures, len(places), taken, config),
+        *_lacks_of_images(report.images, len(places), config),
         *(_lacks_of_drive(places, config) if len(places) > 1 else ()),
     ]
 
 
-def _lacks_of_pictures(
-    pictures: Pictures, used: int, taken: int, config: InspectionConfig
-) -> Iterator[str]:
+def _lacks_of_images(images: ImageTopic, used: int, config: InspectionConfig) -> Iterator[str]:
+    recorded = len(images.stamps_ns)
     if used < config.min_pictures:
-        yield f'{used} pictures with odometry are few: drive until there are {config.min_pictures}'
-    if used < (1 - config.max_lost) * taken:
+        yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
+    if used < (1 - MAX_LOST) * recorded:
         yield (
-            f'{taken - used} of {taken} pictures have no odometry nearby: '
+            f'{recorded - used} of {recorded} images have no odometry nearby: '
             'record both all the time, stamped by one clock'
         )
-    if pictures.geometry == ORDINARY:
-        yield 'the pictures do not look around: an omnidirectional camera is needed'
-    if float(np.mean([sample.mean() for sample in pictures.samples])) < DARK:
-        yield 'the pictures are dark: open the lens or wait for daylight'
+    if images.geometry == ORDINARY:
+        yield 'the images do not show all directions: an omnidirectional camera is needed'
+    if float(np.mean([sample.mean() for sample in images.samples])) < DARK:
+        yield 'the images are dark: open the lens or wait for daylight'
 
 
 def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
-    gap, share = spacing(places), covered(places, config.reach)
-    if way(places) < 1.0:
+    gap, share = spacing(places), covered_share(places, config.reach)
+    if path_length(places) < 1.0:
         yield 'the robot did not move: drive it over the area'
         return
     if gap > config.max_spacing:
-        yield f'pictures are {gap:.2f} m apart: drive slower or record more of them'
-    if share < config.min_covered:
+        yield f'images are {gap:.2f} m apart: drive slower or record more of them'
+    if share < MIN_COVERED:
         yield (
-            f'{share:.0%} of the area lie within {config.reach:g} m of a picture: '
-            'cross what is left out'
+            f'{share:.0%} of the area lie within {config.reach:g} m of an image: '
+            'cross the remaining area'
         )
-    if directions(places) < config.min_directions:
+    if directions(places) < MIN_DIRECTIONS:
         yield (
             f'driven along {directions(places)} of {SECTORS} directions: '
-            'cross the area along, across and diagonally'
+            'cross the area lengthwise, crosswise and diagonally'
         )

@@ -4,8 +4,8 @@
 
 sfa_node holds the `Observer`, ekf_node the `PoseFilter`; a pose with its covariance, and how far
 the images have turned, are all that passes between them. `Localizer` is both in one object, for
-programs without ROS, for evaluation and for tuning: what the filter gets offline is what crosses
-the topic between the nodes.
+programs without ROS, for evaluation and for tuning: the filter receives offline what it receives
+on the topics between the nodes.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
-from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
@@ -28,7 +28,7 @@ from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
 from sfa_localization.place_model import Estimate, PlaceModel
 
 UNKNOWN_VARIANCE = 1e6
-"""Variance, m^2, of the position of an unusable picture: the filter leaves it out."""
+"""Variance, m^2, of the position of an unusable image: the filter leaves it out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +36,10 @@ class Observation:
     """One panorama's measurement of the robot's pose: `pose` and `covariance` reach the filter.
 
     `pose` (3,) is [x m, y m, yaw rad] in the map, yaw 0 where the model has no compass;
-    `covariance` (3, 3) in the same order. `problem` is why the picture cannot be believed, ''
-    when it can; the covariance then says that nothing is known. `estimate` is the model's own.
-    `turned` is the heading (rad, from wherever) that the shifts between the pictures add up to,
-    NaN for a picture that shows nothing: it knows no map, and tells the filter the camera's delay.
+    `covariance` (3, 3) in the same order. `problem` is why the image is unusable, '' when it is
+    usable; the covariance of an unusable one means that nothing is known. `estimate` is the
+    model's own. `turned` is the heading (rad, from any start) that the shifts between the images
+    add up to, NaN for an unusable image: it needs no map, and shows the camera's delay.
     """
 
     stamp_ns: int
@@ -51,11 +51,11 @@ class Observation:
 
 
 class Observer:
-    """Looks at the panoramas of one camera, in the order in which they were taken."""
+    """Judges and locates the panoramas of one camera, in the order in which they were taken."""
 
     def __init__(self, model: PlaceModel, config: WatchConfig | None = None) -> None:
         self.model = model
-        self.watch = PictureWatch(config)
+        self.watch = ImageWatch(config)
         self._gyro = VisualGyro(model.panorama.clockwise)
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
@@ -76,14 +76,14 @@ class Observer:
         ]
 
     def observe_run(self, run: Run) -> Iterator[Observation]:
-        """The same for every picture of a recorded run."""
+        """The same for every image of a recorded run."""
         at = 0
         for batch in run.panoramas.batches(BATCH):
             yield from self.observe_all(run.panoramas.stamps_ns[at : at + len(batch)], batch)
             at += len(batch)
 
     def _judge(self, panorama: Image) -> tuple[str, float]:
-        """The problem of the next picture, and how far it has turned."""
+        """The problem of the next image, and how far the images have turned."""
         problem = self.watch.judge(panorama)
         return problem, np.nan if problem else self._gyro.add(panorama)
 
@@ -100,7 +100,7 @@ class Observer:
         self, stamp_ns: int, estimate: Estimate, problem: str, turned: float
     ) -> Observation:
         if not _is_finite(estimate):
-            problem = problem or 'the model gives no finite estimate for this picture'
+            problem = problem or 'the model gives no finite estimate for this image'
             nothing = unusable_covariance()
             return Observation(stamp_ns, np.zeros(3), nothing, problem, estimate, turned)
         problem = problem or self.watch.judge_novelty(estimate.novelty)
@@ -112,12 +112,12 @@ class Observer:
 
 
 def unusable_covariance() -> Array:
-    """Covariance (3, 3) of [x, y, yaw] of a picture that shows nothing."""
+    """Covariance (3, 3) of [x, y, yaw] of an unusable image."""
     return np.diag([UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_YAW_VARIANCE])
 
 
 def _is_finite(estimate: Estimate) -> bool:
-    """Whether all is known that must be; the yaw may be missing."""
+    """Whether slow features, position and covariance are finite; the yaw may be missing."""
     known = (estimate.slow_features, estimate.position, estimate.covariance)
     return all(bool(np.all(np.isfinite(part))) for part in known)
 
@@ -166,10 +166,10 @@ class Localizer:
         return observation
 
     def add_observation(self, observation: Observation) -> Update:
-        """Fuse what a picture shows."""
-        seen = observation
-        self.filter.add_turned(seen.stamp_ns, seen.turned)
-        return self.filter.add_measurement(seen.stamp_ns, seen.pose, seen.covariance)
+        """Fuse the pose that an image shows."""
+        stamp_ns = observation.stamp_ns
+        self.filter.add_turned(stamp_ns, observation.turned)
+        return self.filter.add_measurement(stamp_ns, observation.pose, observation.covariance)
 
     @property
     def state(self) -> State | None:
@@ -185,10 +185,10 @@ class Localizer:
         """Feed a recorded run in the order of its stamps: (stamp, observation, state at it).
 
         The observation is None at odometry messages. The state is what the nodes would have
-        published then: it knows nothing of what came later.
+        published then: later messages have no part in it.
         """
         odometry, observations = run.odometry, self.observer.observe_run(run)
-        for stamp_ns, kind, i in in_order(odometry.stamps_ns, run.panoramas.stamps_ns):
+        for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, run.panoramas.stamps_ns):
             if kind == ODOMETRY:
                 v, omega = odometry.twists[i].tolist()
                 noise, pose = odometry.variances[i], odometry.poses[i].tolist()

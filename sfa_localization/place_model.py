@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,32 +15,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError, ModelError
-from sfa_localization.data.files import whole_file
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.agreement import Agreement, disagreement
+from sfa_localization.features.image_features import layer_harmonics, slow_features
 from sfa_localization.features.network import Architecture, Layer, Network, Node
 from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.rotation import Map
-from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass, harmonics
+from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.expansions import MetricMap
 from sfa_localization.metric.fast_expansions import Predictor, fast_map
 
 FORMAT = 'sfa_localization place model'
 VERSION = 2
-Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What one panorama tells.
+    """The estimate from one panorama.
 
     `slow_features` (K,); `position` (2,) m and `yaw` rad (NaN without a compass) in the map frame;
     `covariance` (3, 3) of [x, y, yaw], with pi^2 / 3 where yaw is unknown; `novelty` at most 1 for
-    a familiar picture.
+    a familiar image.
     """
 
     slow_features: Array
@@ -53,11 +52,11 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass and novelty, learnt from one place.
+    """Network, metric map, compass and novelty, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
-    figures of merit of the training; `slow_features` and `places` are kept out of it.
-    `error_correlation` says how the errors of neighbouring pictures hang together.
+    figures of merit of the training; `error_correlation` is that of the errors of
+    neighboring images.
     """
 
     network: Network
@@ -78,7 +77,7 @@ class PlaceModel:
 
     @property
     def camera_delay_s(self) -> float:
-        """By how much images of the training drives were stamped late; 0 where unknown."""
+        """Delay of the image stamps in the training drives; 0 where unknown."""
         known = [delay for delay in self.quality.get('camera_delay_s', ()) if delay is not None]
         return float(np.median(known)) if known else 0.0
 
@@ -96,7 +95,7 @@ class PlaceModel:
     def locate_all(self, panoramas: Image) -> list[Estimate]:
         """Estimates of panoramas (T, H, W, 3)."""
         maps = self.network.maps(panoramas)
-        slow = top_features(maps)
+        slow = slow_features(maps)
         novelty = self.novelty.per_layer(maps).max(1)
         spread = disagreement(maps[-1])
         positions, covariances = self._predictor().predict(slow)
@@ -110,7 +109,7 @@ class PlaceModel:
         ]
 
     def _predictor(self) -> Predictor:
-        """The metric map's quickest form, compiled once."""
+        """The metric map's fastest form, compiled once."""
         if not self._fast:
             with one_core():
                 self._fast.append(fast_map(self.metric))
@@ -119,10 +118,10 @@ class PlaceModel:
     def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         if self.compass is None:
             return np.full(len(slow), np.nan), np.full(len(slow), UNKNOWN_YAW_VARIANCE)
-        return self.compass.predict(slow, heading_input(maps, self.heading_layers))
+        return self.compass.predict(slow, layer_harmonics(maps, self.heading_layers))
 
     def save(self, path: Path) -> None:
-        """Write to `path` at once or not at all; the same model gives the same bytes."""
+        """Write to `path` completely or not at all; the same model gives the same bytes."""
         arrays = {**self._arrays(), 'header': np.array(json.dumps(self._header(), sort_keys=True))}
         write_arrays(path, arrays)
 
@@ -202,18 +201,8 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     return Network(architecture, tuple(nodes), tuple(deltas), ranks)
 
 
-def top_features(maps: list[Map]) -> Array:
-    """Slow features (T, K): the top node averaged over all rotations."""
-    return np.asarray(maps[-1].mean((1, 2), dtype=np.float64))
-
-
-def heading_input(maps: list[Map], layers: tuple[int, ...]) -> NDArray[np.complex128]:
-    """Harmonics of the named layers' maps side by side, (T, J)."""
-    return np.concatenate([harmonics(maps[layer]) for layer in layers], axis=1)
-
-
 def _joined(covariances: Array, yaw_variance: Array, novelty: Array) -> Array:
-    """Covariances (T, 3, 3); those of unfamiliar pictures grow with their novelty squared."""
+    """Covariances (T, 3, 3); those of unfamiliar images grow with their novelty squared."""
     inflation = np.maximum(novelty, 1.0) ** 2
     joined = np.zeros((len(covariances), 3, 3))
     joined[:, :2, :2] = covariances * inflation[:, None, None]
@@ -227,28 +216,3 @@ def _prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 def _under(arrays: Arrays, prefix: str) -> Arrays:
     return {name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)}
-
-
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write named arrays (N, ...) as .npz, at once or not at all. Raises ModelError."""
-    plain: dict[str, Any] = dict(arrays)
-    with whole_file(Path(path), ModelError, make_folder=True) as file:
-        np.savez(file, **plain)
-
-
-def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
-    """Arrays of an .npz file whose header names its kind and version. Raises ModelError."""
-    if not path.is_file():
-        raise ModelError(f'{path}: no such file: {remedy}')
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays['header']))
-        found, made = header['format'], header['version']
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
-        raise ModelError(f'{path}: not a {kind} ({type(error).__name__}): {remedy}') from None
-    if found != kind:
-        raise ModelError(f'{path}: a {found}, not a {kind}: {remedy}')
-    if made != version:
-        raise ModelError(f'{path}: version {made}, this software reads {version}: {remedy} again')
-    return arrays

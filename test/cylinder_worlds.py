@@ -12,10 +12,10 @@ import numpy as np
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
 from sfa_localization.features.network import Architecture, Layer
-from sfa_localization.features.network_training import Drive, architecture_of, train_network
+from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.metric.settings import MetricConfig
-from sfa_localization.training import Recipe, Trained, drive_of, learn_place
+from sfa_localization.training import Recipe, Trained, learn_place
 
 SIZE = (12, 48)
 LAYERS = (
@@ -107,23 +107,26 @@ def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str
 PLACE_SIZE = (12, 72)
 COLUMN_STEP = 4
 """Columns of a picture of PLACE_SIZE that are one rotation step."""
+PLACE_ARCHITECTURE = Architecture(
+    PLACE_SIZE,
+    1,
+    'none',
+    (
+        Layer(field=(4, 8), stride=(4, COLUMN_STEP), linear=10, outputs=8),
+        Layer(field=(2, 4), stride=(1, 1), linear=10, outputs=8),
+        Layer(field=(2, 6), stride=(1, 1), linear=12, outputs=8),
+    ),
+)
 
 
 def recipe(clockwise: bool = True) -> Recipe:
     """A small network for pictures of PLACE_SIZE."""
-    network = NetworkConfig(
-        layers='custom',
-        normalization='none',
-        binning=1,
-        field_rows=(4, 2, 2),
-        field_columns=(8, 4, 6),
-        stride_rows=(4, 1, 1),
-        stride_columns=(COLUMN_STEP, 1, 1),
-        linear_dimensions=(10, 10, 12),
-        output_dimensions=(8, 8, 8),
+    return Recipe(
+        panorama=panorama_config(PLACE_SIZE, clockwise),
+        network=NetworkConfig(normalization='none'),
+        metric=MetricConfig(slow_features=6),
+        architecture=PLACE_ARCHITECTURE,
     )
-    panorama = panorama_config(PLACE_SIZE, clockwise)
-    return Recipe(panorama=panorama, network=network, metric=MetricConfig(slow_features=6))
 
 
 @cache
@@ -131,8 +134,7 @@ def place(clockwise: bool = True) -> Trained:
     """A place learnt from a wandering drive of 400 pictures."""
     config = recipe(clockwise)
     run = run_in(Spheres.about(1), wander(400, 2, hz=4.0), config.panorama)
-    architecture = architecture_of(config.network, PLACE_SIZE)
-    network = train_network(architecture, [drive_of(run, config.network)], config.network)
+    network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
     return learn_place(network, [run], config)
 
 
@@ -149,7 +151,7 @@ def visit(clockwise: bool = True) -> Run:
     return run_in(Spheres.about(1), moved, config, 'visit')
 
 
-def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> Drive:
+def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> ImageSequence:
     """Panoramas of a short drive, all neighbors."""
     run = run_in(Spheres.about(seed), wander(count, seed), panorama_config(size))
-    return Drive(run.panoramas, np.ones(count - 1, np.float32))
+    return ImageSequence(run.panoramas, np.ones(count - 1, bool))

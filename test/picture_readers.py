@@ -8,10 +8,10 @@ import math
 import numpy as np
 from filter_drives import Drive
 
-from sfa_localization.bags.loading import BagWriter
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.place_model import Estimate
 
 SIZE = PanoramaConfig(width=64, height=16)
@@ -81,7 +81,7 @@ class Recording:
         return panorama(self.drive.seen[k], k, novelty=2.0 if 63 <= k < 66 else 0.5)
 
     def events(self):
-        yield from in_order(self.drive.stamps_ns[self.kept], self.pictures_ns)
+        yield from merge_by_stamp(self.drive.stamps_ns[self.kept], self.pictures_ns)
 
     def write(self, path):
         drive = self.drive

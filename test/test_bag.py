@@ -31,8 +31,10 @@ from bag_formats import (
 )
 from rosbags.rosbag2 import Reader
 
-from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import BagError
 
 
@@ -109,7 +111,7 @@ def test_reading_can_start_later(name: str, tmp_path: Path, messages: list[Messa
 
 def test_stamps_of_reception_can_be_chosen(tmp_path: Path, messages: list[Message]) -> None:
     path = write_version(tmp_path / 'bag', messages, 5)
-    with Bag(path, stamp_source='receive') as bag:
+    with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         assert [at for at, _ in bag.images()] == [stamp(i) + DELAY for i in range(IMAGES)]
 
 
@@ -137,7 +139,7 @@ def test_other_words_in_the_metadata_do_not_empty_a_bag(
         assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
 
 
-def test_fewer_messages_than_told_are_counted_as_lost(
+def test_fewer_messages_than_declared_are_counted_as_lost(
     tmp_path: Path, messages: list[Message]
 ) -> None:
     path = tmp_path / 'bag'
@@ -246,7 +248,9 @@ def test_a_missing_file_of_several_is_counted(tmp_path: Path, messages: list[Mes
     lost = -(-len(messages) // 12)
     with Bag(path) as bag:
         (problem,) = bag.problems
-        assert problem.endswith(f'bag_3.mcap: is missing with {lost} messages; copy the whole bag')
+        assert problem.endswith(
+            f'bag_3.mcap: is missing with {lost} messages; copy all files of the bag'
+        )
         bag.odometry()
         assert sum(bag.counts['/odom'].skipped.values()) > 0
     with pytest.raises(BagError, match=r'bag_3.mcap: is missing'), Bag(path, strict=True):
@@ -275,7 +279,7 @@ def test_a_file_without_content_is_one_error(
     assert '\n' not in str(error.value)
 
 
-def test_a_database_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_database_of_something_else_is_rejected(tmp_path: Path) -> None:
     database = sqlite3.connect(tmp_path / 'other.db3')
     database.execute('CREATE TABLE birds(name TEXT)')
     database.commit()
@@ -293,7 +297,7 @@ def test_a_cut_off_ros1_bag_names_the_remedy(tmp_path: Path, messages: list[Mess
 @pytest.mark.parametrize(
     ('path', 'complaint'), [('nowhere', 'no such bag'), ('empty', 'neither metadata.yaml nor')]
 )
-def test_a_path_that_is_no_bag_is_refused(path: str, complaint: str, tmp_path: Path) -> None:
+def test_a_path_that_is_no_bag_is_rejected(path: str, complaint: str, tmp_path: Path) -> None:
     (tmp_path / 'empty').mkdir()
     with pytest.raises(BagError, match=complaint), Bag(tmp_path / path):
         pass
@@ -381,7 +385,7 @@ def test_odd_names_are_opened(name: str, tmp_path: Path, messages: list[Message]
 # Runs.
 
 
-def test_pictures_without_odometry_are_skipped_and_counted(
+def test_images_without_odometry_are_skipped_and_counted(
     tmp_path: Path, messages: list[Message]
 ) -> None:
     late, early = stamp(2), stamp(9)
@@ -397,13 +401,13 @@ def test_pictures_without_odometry_are_skipped_and_counted(
 
 
 @pytest.mark.parametrize(('tolerance', 'used'), [(0.05, IMAGES // 2), (0.1, IMAGES - 1)])
-def test_odometry_tolerance_is_a_setting(
+def test_odometry_tolerance_is_an_argument(
     tolerance: float, used: int, tmp_path: Path, messages: list[Message]
 ) -> None:
     even = {stamp(i) + DELAY for i in range(0, IMAGES, 2)}
     sparse = [m for m in messages if m.topic != '/odom' or m.receive_ns in even]
     path = write_version(tmp_path / 'bag', sparse, 5)
-    run = load_run(path, cache=tmp_path, config=BagConfig(odometry_tolerance=tolerance))
+    run = load_run(path, cache=tmp_path, odometry_tolerance_s=tolerance)
     assert len(run.panoramas) == used
 
 
@@ -423,7 +427,7 @@ def test_one_topic_can_serve_twice(tmp_path: Path, messages: list[Message]) -> N
     np.testing.assert_array_equal(run.ground_truth.poses, run.odometry.poses)
 
 
-def test_pictures_are_unwrapped_when_they_are_no_panoramas(
+def test_images_are_unwrapped_when_they_are_no_panoramas(
     tmp_path: Path, messages: list[Message]
 ) -> None:
     path = write_version(tmp_path / 'bag', messages, 5)
@@ -437,7 +441,7 @@ def test_pictures_are_unwrapped_when_they_are_no_panoramas(
     assert run.panoramas.shape == (2, 20, 3)
 
 
-def test_progress_tells_every_picture(tmp_path: Path, messages: list[Message]) -> None:
+def test_progress_reports_every_image(tmp_path: Path, messages: list[Message]) -> None:
     told: list[tuple[int, int]] = []
     path = write_version(tmp_path / 'bag', messages, 5)
     load_run(path, cache=tmp_path, progress=lambda done, total: told.append((done, total)))
@@ -451,6 +455,6 @@ def test_nothing_is_left_behind_after_an_error(tmp_path: Path) -> None:
         for index in range(3):
             bag.image('/image', stamp(index), image(index), 'camera')
             bag.odometry('/odom', stamp(index + 36_000), pose(index), (1, 0), (0, 0))
-    with pytest.raises(BagError, match=r'none of 3 pictures of /image has odometry within 0\.5 s'):
+    with pytest.raises(BagError, match=r'none of 3 images of /image has odometry within 0\.5 s'):
         load_run(tmp_path / 'bag', cache=tmp_path / 'cache')
     assert list((tmp_path / 'cache').iterdir()) == []

@@ -23,8 +23,8 @@ from bag_formats import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.bags.loading import Bag, load_run
-from sfa_localization.bags.reader import KINDS
+from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.inspection import inspect

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag are taken, what their messages mean, and whose stamps are believed."""
+"""Which topics of a bag are used, how their messages are read, and which stamps count."""
 
 import math
 from collections.abc import Callable
@@ -13,8 +13,10 @@ from bag_formats import PERIOD, pose, stamp
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bags.loading import Bag, BagWriter, load_run
-from sfa_localization.bags.settings import TopicNames
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.run_loader import load_run
+from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import BagError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -167,7 +169,7 @@ def test_one_transform_of_several_is_named_by_its_frame(tmp_path: Path) -> None:
         with pytest.raises(BagError, match='base_link, wheel; choose one as /tf:FRAME'):
             bag.trajectory('/tf')
         truth = bag.trajectory('/tf:base_link')
-        assert bag.counts['/tf'].skipped == {'tells of other frames': 1}
+        assert bag.counts['/tf'].skipped == {'transforms of other frames': 1}
     np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
 
 
@@ -266,7 +268,7 @@ def test_a_leading_slash_may_be_left_out(tmp_path: Path) -> None:
         assert bag.find('odometry', 'odom') == '/odom'
 
 
-def test_an_unknown_serialization_is_refused_by_name(tmp_path: Path) -> None:
+def test_an_unknown_serialization_is_rejected_by_name(tmp_path: Path) -> None:
     path = record(tmp_path / 'bag', poses_of(odometry, '/odom'), serialization='protobuf')
     with Bag(path) as bag, pytest.raises(BagError, match="/odom is serialized as 'protobuf'"):
         bag.odometry()
@@ -286,12 +288,12 @@ def test_a_run_needs_no_gyro(tmp_path: Path) -> None:
         ({'step': 30, 'data': np.zeros(120, np.uint8)}, 'step is shorter than a row'),
         ({'data': np.zeros(239, np.uint8)}, 'data size is not rows times step'),
         ({'data': np.zeros(0, np.uint8)}, 'data size is not rows times step'),
-        ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty picture'),
+        ({'height': 0, 'data': np.zeros(0, np.uint8)}, 'empty image'),
         ({'encoding': 'rgb9'}, "unsupported encoding 'rgb9'"),
-        ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first picture'),
+        ({'height': 2, 'data': np.zeros(120, np.uint8)}, 'size is not 20x4 like the first image'),
     ],
 )
-def test_a_faulty_picture_is_skipped_and_counted(
+def test_a_faulty_image_is_skipped_and_counted(
     changes: dict[str, Any], reason: str, tmp_path: Path
 ) -> None:
     entry = ('/camera', stamp(2) + 7, picture(stamp(2) + 7, **changes))
@@ -376,7 +378,7 @@ def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
         pytest.raises(BagError, match=r'6 zero or negative stamp.*stamp_source: receive'),
     ):
         bag.trajectory()
-    with Bag(path, stamp_source='receive') as bag:
+    with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
 
 
@@ -398,7 +400,7 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
                 silent.write(connections[connection.topic], at, raw)
     run = load_run(tmp_path / 'bag', cache=tmp_path / 'cache')
     assert run.yaw_rate is None and len(run.panoramas) == 4
-    assert 'no message on /imu: going on without gyroscope' in caplog.text
+    assert 'no message on /imu: continuing without gyroscope' in caplog.text
     with pytest.raises(BagError, match='/imu'):
         load_run(tmp_path / 'bag', cache=tmp_path / 'cache', topics=TopicNames(imu='/imu'))
 
@@ -411,15 +413,15 @@ def drive_bag(path: Path, pose: Callable[[int], Any], twist: Any, count: int = 1
     return path
 
 
-def test_a_pose_and_a_twist_of_different_units_are_refused(tmp_path: Path) -> None:
-    """A pose in centimetres would else be taken for odometry that is reset at every message."""
+def test_a_pose_and_a_twist_of_different_units_are_rejected(tmp_path: Path) -> None:
+    """A pose in centimeters would else be taken for odometry that is reset at every message."""
     step = PERIOD * 1e-9
-    metres = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
-    with Bag(metres) as bag:
+    meters = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
+    with Bag(meters) as bag:
         assert len(bag.odometry().poses) == 100 and bag.problems == []
-    centimetres = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), (10.0, 0.0))
-    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* metres')
-    with refusal, Bag(centimetres) as bag:
+    centimeters = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), (10.0, 0.0))
+    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* meters')
+    with refusal, Bag(centimeters) as bag:
         bag.odometry()
 
 
@@ -428,7 +430,7 @@ def test_a_pose_that_is_never_kept_is_summed_up_from_the_twist(tmp_path: Path) -
     with Bag(path) as bag:
         x = bag.odometry().poses[:, 0]
         assert x == pytest.approx(np.arange(100) * PERIOD * 1e-9)
-        assert bag.problems == ['/odom: the pose never moves; the twist is summed up instead']
+        assert bag.problems == ['/odom: the pose is constant; the twist is integrated instead']
 
 
 # The writer.
@@ -444,7 +446,7 @@ def test_a_bag_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_an_existing_bag_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / 'bag').mkdir()
-    with pytest.raises(BagError, match='bag: exists already'), BagWriter(tmp_path / 'bag'):
+    with pytest.raises(BagError, match='bag: already exists'), BagWriter(tmp_path / 'bag'):
         pass
     with pytest.raises(BagError, match="storage 'tape' is not one of mcap, sqlite3"):
         BagWriter(tmp_path / 'bag', 'tape')
@@ -464,7 +466,7 @@ def test_same_calls_write_same_bytes(storage: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('compressed', 'error'), [(None, 0), ('png', 0), ('jpeg', 12)])
-def test_pictures_are_written_raw_or_compressed(
+def test_images_are_written_raw_or_compressed(
     compressed: str | None, error: int, tmp_path: Path
 ) -> None:
     smooth = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)

@@ -15,7 +15,7 @@ from sfa_localization import cli
 from sfa_localization.bags import mcap as bag_mcap
 from sfa_localization.bags import storage as bag_storage
 from sfa_localization.bags import zstd as bag_zstd
-from sfa_localization.bags.loading import Bag
+from sfa_localization.bags.reader import Bag
 
 STANDARD = ('compression.zstd', 'backports.zstd')
 
@@ -66,7 +66,7 @@ def only_zstandard(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in STANDARD:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, 'zstandard', module)
-    decompressor, error = bag_zstd._found()
+    decompressor, error = bag_zstd._load_package()
     assert error is OfZstandard.ZstdError
     for user in (bag_mcap, bag_storage):
         monkeypatch.setattr(user, 'decompressor', decompressor)
@@ -107,7 +107,7 @@ def test_a_cut_off_message_is_no_message(cut):
 def test_without_any_the_remedy_is_named(monkeypatch, capsys):
     for name in (*STANDARD, 'zstandard'):
         monkeypatch.setitem(sys.modules, name, None)
-    assert cli._guarded(lambda _arguments: bag_zstd._found(), None) == 1
+    assert cli.guarded(bag_zstd._load_package) == 1
     assert 'pip install backports.zstd' in capsys.readouterr().err
 
 

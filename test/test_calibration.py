@@ -1,16 +1,16 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Finding the mirror, and the command `calibrate` from pictures to a parameter file."""
+"""Finding the mirror, and the command `calibrate` from images to a calibration file."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from sfa_localization import cli
-from sfa_localization.camera.calibration import check_picture, find_circles, given_circles
+from sfa_localization.camera.calibration import check_image, find_circles, given_circles
+from sfa_localization.camera.calibration_files import read_calibration
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import CameraError
@@ -36,18 +36,18 @@ def assert_found(circles, center=CENTER, radii=RADII, atol=1.0):
     np.testing.assert_allclose((hole.column, hole.row, hole.radius), (*center, radii[0]), atol=2.0)
 
 
-def test_one_picture_on_a_dark_background():
+def test_one_image_on_a_dark_background():
     assert_found(find_circles([scene(1)]))
 
 
 def test_a_drive_before_a_bright_still_background():
-    """The surroundings are brighter than the mirror; only change tells them apart."""
+    """The surroundings are brighter than the mirror; only change distinguishes them."""
     still = np.full((480, 640, 1), 200.0)
     still[::8] = 60
     assert_found(find_circles([scene(n, still) for n in range(8)]), atol=3.0)
 
 
-def test_a_rim_that_the_picture_cuts_off():
+def test_a_rim_that_the_image_cuts_off():
     circles = find_circles([scene(1, center=(330.0, 200.0), radii=(42.0, 260.0))])
     np.testing.assert_allclose(
         (circles.rim.column, circles.rim.row, circles.rim.radius), (330, 200, 260), atol=2.0
@@ -58,17 +58,17 @@ def test_a_mirror_without_a_hole():
     assert find_circles([scene(1, radii=(0.0, 200.0))]).hole is None
 
 
-def test_the_same_pictures_give_the_same_circles():
+def test_the_same_images_give_the_same_circles():
     assert find_circles([scene(1)]) == find_circles([scene(1)])
 
 
 @pytest.mark.parametrize('level', [0, 255])
-def test_pictures_without_a_mirror_are_refused(level):
+def test_images_without_a_mirror_are_rejected(level):
     with pytest.raises(CameraError, match='stands out'):
         find_circles([np.full((480, 640, 3), level, np.uint8)])
 
 
-def test_noise_without_a_mirror_is_refused():
+def test_noise_without_a_mirror_is_rejected():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     with pytest.raises(CameraError, match='stands out'):
         find_circles([noise])
@@ -81,22 +81,18 @@ def picture(tmp_path):
     return path
 
 
-def parameters(path):
-    return yaml.safe_load(path.read_text())['omnicam_node']['ros__parameters']
-
-
-def test_from_pictures_to_a_parameter_file(tmp_path, picture, capsys):
+def test_from_images_to_a_calibration_file(tmp_path, picture, capsys):
     output, check = tmp_path / 'made' / 'camera.yaml', tmp_path / 'check.png'
     arguments = ['calibrate', str(picture), '--output', str(output), '--check', str(check)]
     assert cli.main([*arguments, '--angle-min', '70', '--angle-max', '120']) == 0
-    values = parameters(output)
-    assert values['camera_model'] == 'polar'
-    assert (values['image_width'], values['image_height']) == (640, 480)
-    assert values['cx'] == pytest.approx(CENTER[0], abs=1.0)
-    assert values['radius_max'] == pytest.approx(RADII[1], abs=1.0)
-    config = CameraConfig.from_mapping(values, 'test')
-    assert (config.angle_min, config.angle_max) == (70.0, 120.0)
-    result = Unwrapper(config, PanoramaConfig())(scene(1))
+    lens = read_calibration(output)
+    assert lens.camera_model == 'polar'
+    assert (lens.image_width, lens.image_height) == (640, 480)
+    assert lens.cx == pytest.approx(CENTER[0], abs=1.0)
+    assert lens.radius_max == pytest.approx(RADII[1], abs=1.0)
+    assert (lens.angle_min, lens.angle_max) == (70.0, 120.0)
+    camera = CameraConfig(calibration_file=str(output))
+    result = Unwrapper(camera, PanoramaConfig())(scene(1))
     assert result.min() > 30  # no background inside the panorama
     assert 'camera_model: polar' in capsys.readouterr().out
     assert cv2.imread(str(check)).shape[1] == 1200
@@ -107,22 +103,17 @@ def test_a_fisheye_from_its_rim(tmp_path, picture):
     output = tmp_path / 'camera.yaml'
     arguments = ['--model', 'fisheye', '--field-of-view', '200', '--output', str(output)]
     assert cli.main(['calibrate', str(picture), *arguments]) == 0
-    values = parameters(output)
-    assert values['camera_model'] == 'fisheye'
-    assert values['fx'] == pytest.approx(RADII[1] / np.radians(100), rel=0.01)
+    lens = read_calibration(output)
+    assert lens.camera_model == 'fisheye'
+    assert lens.fx == pytest.approx(RADII[1] / np.radians(100), rel=0.01)
 
 
-def test_circles_told_by_hand(tmp_path, picture):
+def test_circles_given_by_hand(tmp_path, picture):
     output = tmp_path / 'camera.yaml'
     arguments = ['--center', '300x200', '--radii', '20x150', '--output', str(output)]
     assert cli.main(['calibrate', str(picture), *arguments]) == 0
-    values = parameters(output)
-    assert [values[name] for name in ('cx', 'cy', 'radius_min', 'radius_max')] == [
-        300.0,
-        200.0,
-        20.0,
-        150.0,
-    ]
+    lens = read_calibration(output)
+    assert (lens.cx, lens.cy, lens.radius_min, lens.radius_max) == (300.0, 200.0, 20.0, 150.0)
 
 
 def test_from_a_calibration_file(tmp_path):
@@ -132,18 +123,20 @@ def test_from_a_calibration_file(tmp_path):
         '  distortion_model: radtan\n  distortion_coeffs: [0.1, 0.01, 0.001, -8.0e-05]\n'
         '  resolution: [752, 480]\n'
     )
-    arguments = ['--calibration', str(known), '--mount-yaw', '90', '--output', str(output)]
+    arguments = ['--calibration', str(known), '--mount-rpy', '0x0x90', '--output', str(output)]
     assert cli.main(['calibrate', *arguments]) == 0
-    config = CameraConfig.from_mapping(parameters(output), 'test')
-    assert (config.camera_model, config.xi, config.mount_yaw) == ('mirror', 0.8, 90.0)
-    assert config.distortion == (0.1, 0.01, 0.001, -8e-05)
-    assert (config.radius_min, config.radius_max) == (0.0, 0.0)
+    lens = read_calibration(output)
+    assert lens == read_calibration(known)
+    assert (lens.camera_model, lens.xi) == ('mirror', 0.8)
+    assert lens.distortion == (0.1, 0.01, 0.001, -8e-05)
+    assert (lens.radius_min, lens.radius_max) == (0.0, 0.0)
+    assert 'mount_rpy: [0.0, 0.0, 90.0]' in output.read_text()
 
 
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
-        ([], 'give pictures'),
+        ([], 'give images'),
         (['missing.png'], 'missing.png'),
         (['notes.txt'], 'notes.txt'),
         (['raw.png', 'small.png'], 'differ in size'),
@@ -160,16 +153,16 @@ def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys
     (tmp_path / 'notes.txt').write_text('no picture')
     output = tmp_path / 'camera.yaml'
     assert cli.main(['calibrate', *arguments, '--output', str(output)]) == 1
-    told = capsys.readouterr().err.strip()
-    assert words in told
-    assert '\n' not in told
+    error = capsys.readouterr().err.strip()
+    assert words in error
+    assert '\n' not in error
     assert not output.exists()
 
 
-def test_the_check_picture_marks_the_directions():
+def test_the_check_image_marks_the_directions():
     """Red spokes leave the center upwards (front) and to the right (left, in a mirror)."""
-    config = CameraConfig()
-    drawn = check_picture(np.zeros((640, 640, 3), np.uint8), config, PanoramaConfig())
+    unwrapper = Unwrapper(CameraConfig(), PanoramaConfig())
+    drawn = check_image(np.zeros((640, 640, 3), np.uint8), unwrapper)
     assert drawn.shape[1] == 1200
     raw = drawn[:640, 280:920].astype(int)
     red = (raw[..., 2] > 150) & (raw[..., 1] < 100)

@@ -8,9 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.camera.calibration_files import read_calibration, with_calibration
+from sfa_localization.camera.calibration_files import (
+    calibration_of,
+    calibration_text,
+    read_calibration,
+)
 from sfa_localization.camera.lenses import make_camera
-from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError
 
 OCAM = """#polynomial coefficients of the direct mapping
@@ -119,23 +123,22 @@ def read(tmp_path, text, name='camera.yaml'):
 
 
 def test_ocam(tmp_path):
-    values = read(tmp_path, OCAM, 'calib_results.txt')
-    assert values == {
-        'camera_model': 'ocam',
-        'polynomial': (-200.0, 0.0, 0.0015, -2e-06),
-        'affine': (0.999, 0.001, -0.002),
-        'cx': 318.5,
-        'cy': 241.5,
-        'image_width': 640,
-        'image_height': 480,
-    }
+    assert read(tmp_path, OCAM, 'calib_results.txt') == LensCalibration(
+        camera_model='ocam',
+        polynomial=(-200.0, 0.0, 0.0015, -2e-06),
+        affine=(0.999, 0.001, -0.002),
+        cx=318.5,
+        cy=241.5,
+        image_width=640,
+        image_height=480,
+        radius_min=0.0,
+        radius_max=0.0,
+    )
 
 
 def test_ocam_camera_by_hand(tmp_path):
     """100 rows below the center: row = c x + cy, column = e x + cx; depth 200 - 15 + 2."""
-    (tmp_path / 'calib_results.txt').write_text(OCAM)
-    config = CameraConfig(calibration_file=str(tmp_path / 'calib_results.txt'))
-    camera = make_camera(config, (480, 640))
+    camera = make_camera(read(tmp_path, OCAM, 'calib_results.txt'), (480, 640))
     pixel = np.array([[318.5 - 0.2, 241.5 + 99.9]])
     expected = np.array([[-100.0, 0.0, 187.0]]) / np.hypot(100, 187)
     np.testing.assert_allclose(camera.unproject(pixel), expected, atol=1e-12)
@@ -143,52 +146,63 @@ def test_ocam_camera_by_hand(tmp_path):
 
 def test_camera_info_of_a_pinhole(tmp_path):
     text = CAMERA_INFO.format(model='plumb_bob', n=5, coefficients=[0.1, 0.2, 0.3, 0.4, 0.0])
-    values = read(tmp_path, text)
-    assert values['camera_model'] == 'mirror'
-    assert values['xi'] == 0.0
-    assert values['mirrored'] == 'no'
-    assert [values[name] for name in ('fx', 'fy', 'cx', 'cy')] == [400.5, 401.5, 320.0, 240.0]
-    assert values['distortion'] == (0.1, 0.2, 0.3, 0.4)
-    assert (values['image_width'], values['image_height']) == (640, 480)
+    lens = read(tmp_path, text)
+    assert lens.camera_model == 'mirror'
+    assert lens.xi == 0.0
+    assert lens.mirrored == 'no'
+    assert [getattr(lens, name) for name in ('fx', 'fy', 'cx', 'cy')] == [
+        400.5,
+        401.5,
+        320.0,
+        240.0,
+    ]
+    assert lens.distortion == (0.1, 0.2, 0.3, 0.4)
+    assert (lens.image_width, lens.image_height) == (640, 480)
 
 
 @pytest.mark.parametrize('model', ['equidistant', 'fisheye'])
 def test_camera_info_of_a_fisheye(tmp_path, model):
     text = CAMERA_INFO.format(model=model, n=4, coefficients=[0.1, 0.2, 0.3, 0.4])
-    values = read(tmp_path, text)
-    assert values['camera_model'] == 'fisheye'
-    assert values['distortion'] == (0.1, 0.2, 0.3, 0.4)
+    lens = read(tmp_path, text)
+    assert lens.camera_model == 'fisheye'
+    assert lens.distortion == (0.1, 0.2, 0.3, 0.4)
 
 
 def test_camera_info_as_echoed(tmp_path):
-    values = read(tmp_path, ECHOED)
-    assert values['camera_model'] == 'fisheye'
-    assert (values['fx'], values['cy'], values['image_height']) == (200.0, 240.0, 480)
+    lens = read(tmp_path, ECHOED)
+    assert lens.camera_model == 'fisheye'
+    assert (lens.fx, lens.cy, lens.image_height) == (200.0, 240.0, 480)
 
 
 def test_kalibr(tmp_path):
     omni = KALIBR.format(model='omni', intrinsics=[0.8, 833, 830, 373, 253], distortion='radtan')
-    values = read(tmp_path, omni)
-    assert values['camera_model'] == 'mirror'
-    assert [values[name] for name in ('xi', 'fx', 'fy', 'cx', 'cy')] == [0.8, 833, 830, 373, 253]
-    assert values['distortion'] == (0.1, 0.01, 0.001, -8e-05)
-    assert (values['image_width'], values['image_height']) == (752, 480)
+    lens = read(tmp_path, omni)
+    assert lens.camera_model == 'mirror'
+    assert [getattr(lens, name) for name in ('xi', 'fx', 'fy', 'cx', 'cy')] == [
+        0.8,
+        833,
+        830,
+        373,
+        253,
+    ]
+    assert lens.distortion == (0.1, 0.01, 0.001, -8e-05)
+    assert (lens.image_width, lens.image_height) == (752, 480)
     equi = KALIBR.format(model='pinhole', intrinsics=[190, 191, 254, 256], distortion='equidistant')
-    values = read(tmp_path, equi)
-    assert values['camera_model'] == 'fisheye'
-    assert values['fy'] == 191
+    lens = read(tmp_path, equi)
+    assert lens.camera_model == 'fisheye'
+    assert lens.fy == 191
 
 
 def test_camodocal(tmp_path):
-    values = read(tmp_path, MEI)
-    assert values['camera_model'] == 'mirror'
-    assert values['xi'] == 1.5
-    assert values['distortion'] == (0.1, 0.2, 0.001, 0.004)
-    assert (values['fx'], values['cx'], values['image_width']) == (700.0, 370.0, 752)
-    values = read(tmp_path, BRANDT)
-    assert values['camera_model'] == 'fisheye'
-    assert values['distortion'] == (0.1, 0.2, 0.3, 0.4)
-    assert (values['fx'], values['fy']) == (200.0, 201.0)
+    lens = read(tmp_path, MEI)
+    assert lens.camera_model == 'mirror'
+    assert lens.xi == 1.5
+    assert lens.distortion == (0.1, 0.2, 0.001, 0.004)
+    assert (lens.fx, lens.cx, lens.image_width) == (700.0, 370.0, 752)
+    lens = read(tmp_path, BRANDT)
+    assert lens.camera_model == 'fisheye'
+    assert lens.distortion == (0.1, 0.2, 0.3, 0.4)
+    assert (lens.fx, lens.fy) == (200.0, 201.0)
 
 
 def test_opencv_file_storage(tmp_path):
@@ -200,22 +214,42 @@ def test_opencv_file_storage(tmp_path):
     storage.write('distortion_coefficients', np.array([[0.1, 1e-5, 0.0, 0.001]]))
     storage.write('xi', np.array([[1.25]]))
     storage.release()
-    values = read_calibration(path)
-    assert values['camera_model'] == 'mirror'
-    assert (values['xi'], values['fx'], values['fy']) == (1.25, 300.0, 301.0)
-    assert values['distortion'] == (0.1, 1e-5, 0.0, 0.001)
+    lens = read_calibration(path)
+    assert lens.camera_model == 'mirror'
+    assert (lens.xi, lens.fx, lens.fy) == (1.25, 300.0, 301.0)
+    assert lens.distortion == (0.1, 1e-5, 0.0, 0.001)
 
 
-def test_a_calibration_file_replaces_the_lens_and_keeps_the_mount(tmp_path):
+def test_a_calibration_file_replaces_the_camera_model(tmp_path):
     path = tmp_path / 'calib_results.txt'
     path.write_text(OCAM)
-    config = with_calibration(
-        CameraConfig(calibration_file=str(path), mount_yaw=12.0, radius_max=200.0)
-    )
-    assert config.camera_model == 'ocam'
-    assert config.calibration_file == ''
-    assert config.mount_yaw == 12.0
-    assert (config.radius_min, config.radius_max) == (0.0, 200.0)
+    config = CameraConfig(calibration_file=str(path), camera_model='panorama')
+    assert calibration_of(config) == read_calibration(path)
+    assert (read_calibration(path).radius_min, read_calibration(path).radius_max) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize('model', ['mirror', 'equirectangular', 'panorama'])
+def test_without_a_calibration_file_the_camera_model_counts(model):
+    assert calibration_of(CameraConfig(camera_model=model)) == LensCalibration(camera_model=model)
+
+
+LENSES = {
+    'mirror': {'distortion': (0.1, 1e-5, 0.0, -2e-6), 'xi': 1.25, 'axis': 'up', 'mirrored': 'no'},
+    'fisheye': {'fx': 190.5, 'fy': 191.0, 'image_width': 1280, 'image_height': 960},
+    'ocam': {'polynomial': (-150.0, 0.0, 1.8e-3, -1e-7), 'affine': (1.001, 0.001, -0.001)},
+    'polar': {'angle_min': 70.0, 'angle_max': 120.0, 'radius_min': 42.0},
+    'dual_fisheye': {'second_cx': 480.0, 'second_cy': 319.5, 'second_roll': 5.0},
+    'panorama': {'mirrored': 'yes'},
+}
+
+
+@pytest.mark.parametrize('model', LENSES)
+def test_what_is_written_is_read_again(tmp_path, model):
+    lens = LensCalibration(camera_model=model, **LENSES[model])
+    path = tmp_path / 'camera.yaml'
+    path.write_text(calibration_text(lens, (0.0, 0.0, 90.0)))
+    assert read_calibration(path) == lens
+    assert 'mount_rpy: [0.0, 0.0, 90.0]' in path.read_text()
 
 
 @pytest.mark.parametrize(
@@ -232,6 +266,10 @@ def test_a_calibration_file_replaces_the_lens_and_keeps_the_mount(tmp_path):
         (KALIBR.format(model='omni', intrinsics=[1, 2], distortion='none'), 'no camera calib'),
         (KALIBR.replace('752', 'x').format(model='omni', intrinsics=[1] * 5, distortion=''), 'x'),
         (MEI.replace('MEI', 'SCARAMUZZA'), 'SCARAMUZZA'),
+        ('camera_model: fisheye\ncx: 1.0\nfx: 2.0', 'cy, fy, distortion missing'),
+        ('camera_model: panorama\nmirored: yes', "did you mean 'mirrored'"),
+        ('camera_model: strange', 'strange'),
+        ('camera_model: panorama\nimage_width: -1', 'image_width'),
         (MEI.replace('gamma1', 'gamma'), 'gamma1'),
     ],
 )

@@ -9,37 +9,33 @@ import numpy as np
 import pytest
 
 from sfa_localization.camera.lenses import MirrorLens, make_camera
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
-from sfa_localization.data.errors import CameraError
+from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
+from sfa_localization.data.errors import CameraError, ConfigError
 
 FORWARD, LEFT, UP = np.eye(3)
 OPEN = {'radius_min': 0.0, 'radius_max': 0.0}
 OCAM = (-157.9, 0.0, 1.83e-3, -1.1e-6, 3.2e-9)
 CAMERAS = {
-    'hyperbolic mirror': CameraConfig(),
-    'parabolic mirror': CameraConfig(xi=1.0, fx=170.0, fy=168.0),
-    'distorted mirror': CameraConfig(distortion=(-0.03, 0.002, 0.001, -0.002), cx=310.0),
-    'beyond one': CameraConfig(xi=1.6, fx=350.0, fy=350.0),
-    'pinhole': CameraConfig(xi=0.0, fx=400.0, fy=400.0, axis='forward', mirrored='no', **OPEN),
-    'equidistant': CameraConfig(camera_model='fisheye', fx=190.0, fy=190.0),
-    'kannala-brandt': CameraConfig(
+    'hyperbolic mirror': LensCalibration(),
+    'parabolic mirror': LensCalibration(xi=1.0, fx=170.0, fy=168.0),
+    'distorted mirror': LensCalibration(distortion=(-0.03, 0.002, 0.001, -0.002), cx=310.0),
+    'beyond one': LensCalibration(xi=1.6, fx=350.0, fy=350.0),
+    'pinhole': LensCalibration(xi=0.0, fx=400.0, fy=400.0, axis='forward', mirrored='no', **OPEN),
+    'equidistant': LensCalibration(camera_model='fisheye', fx=190.0, fy=190.0),
+    'kannala-brandt': LensCalibration(
         camera_model='fisheye', fx=190.0, fy=191.0, distortion=(-0.01, 0.005, -0.003, 0.0004)
     ),
-    'ocam': CameraConfig(
+    'ocam': LensCalibration(
         camera_model='ocam', polynomial=OCAM, affine=(1.01, 0.002, -0.003), cx=322.0, cy=318.0
     ),
-    'polar': CameraConfig(camera_model='polar', radius_min=60.0, radius_max=300.0),
-    'equirectangular': CameraConfig(camera_model='equirectangular'),
-    'dual fisheye': CameraConfig(
+    'polar': LensCalibration(camera_model='polar', radius_min=60.0, radius_max=300.0),
+    'equirectangular': LensCalibration(camera_model='equirectangular'),
+    'dual fisheye': LensCalibration(
         camera_model='dual_fisheye', fx=90.0, fy=90.0, cx=160.0, second_cx=480.0, second_cy=319.5
     ),
-    'panorama': CameraConfig(camera_model='panorama'),
+    'panorama': LensCalibration(camera_model='panorama'),
 }
-TILTED = {'mount_roll': 7.0, 'mount_pitch': -11.0, 'mount_yaw': 130.0}
-
-
-def tilted(config):
-    return CameraConfig(**{name: getattr(config, name) for name in config.__slots__} | TILTED)
+LEVEL, TILTED = (0.0, 0.0, 0.0), (7.0, -11.0, 130.0)
 
 
 def rays(n=4000, seed=3):
@@ -52,18 +48,18 @@ def all_pixels(height, width):
     return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
 
 
-@pytest.mark.parametrize('mount', [lambda config: config, tilted], ids=['level', 'tilted'])
+@pytest.mark.parametrize('mount', [LEVEL, TILTED], ids=['level', 'tilted'])
 @pytest.mark.parametrize('name', CAMERAS)
 class TestRoundTrip:
     def test_ray_to_pixel_to_ray(self, name, mount):
-        camera = make_camera(mount(CAMERAS[name]), (640, 640))
+        camera = make_camera(CAMERAS[name], (640, 640), mount_rpy=mount)
         pixels = camera.project(rays())
         seen = np.isfinite(pixels).all(axis=1)
         assert seen.sum() > 100
         np.testing.assert_allclose(camera.unproject(pixels[seen]), rays()[seen], atol=1e-9)
 
     def test_pixel_to_ray_to_pixel(self, name, mount):
-        camera = make_camera(mount(CAMERAS[name]), (640, 640))
+        camera = make_camera(CAMERAS[name], (640, 640), mount_rpy=mount)
         pixels = all_pixels(640, 640)
         back = camera.unproject(pixels)
         seen = np.isfinite(back).all(axis=1)
@@ -88,7 +84,7 @@ def test_a_seen_pixel_is_in_the_picture_and_within_the_radii(name):
 
 def test_the_mirror_model_by_hand():
     """xi = 0.9, horizontal ray: z = 0, so the radius is f / xi; straight down: the center."""
-    camera = make_camera(CameraConfig(radius_min=0.0), (640, 640))
+    camera = make_camera(LensCalibration(radius_min=0.0), (640, 640))
     expected = [[319.5, 319.5 - 150 / 0.9], [319.5 + 150 / 0.9, 319.5], [319.5, 319.5]]
     np.testing.assert_allclose(camera.project(np.array([FORWARD, LEFT, -UP])), expected)
     slanted = np.array([[np.cos(0.3), 0.0, np.sin(0.3)]])
@@ -129,7 +125,7 @@ def test_a_hyperbolic_mirror_obeys_its_reflection_law():
 
 def test_pinhole_with_distortion_agrees_with_opencv():
     coefficients = (-0.2, 0.05, 0.001, -0.002)
-    config = CameraConfig(
+    config = LensCalibration(
         xi=0.0,
         fx=400.0,
         fy=410.0,
@@ -167,7 +163,7 @@ def test_fisheye_agrees_with_opencv():
 
 def test_ocam_by_hand():
     """At radius 100 on the row axis the ray leans by atan(100 / -f(100))."""
-    config = CameraConfig(camera_model='ocam', polynomial=(-200.0, 0.0, 1e-3), **OPEN)
+    config = LensCalibration(camera_model='ocam', polynomial=(-200.0, 0.0, 1e-3), **OPEN)
     ray = make_camera(config, (640, 640)).unproject(np.array([[319.5, 319.5 - 100.0]]))
     expected = np.array([[100.0, 0.0, 190.0]]) / np.hypot(100, 190)
     np.testing.assert_allclose(ray, expected)
@@ -191,7 +187,7 @@ def test_polar_angles_lie_at_the_radii():
     ],
 )
 def test_where_the_picture_looks(axis, mirrored, right, top, center):
-    config = CameraConfig(
+    config = LensCalibration(
         camera_model='fisheye', fx=100.0, fy=100.0, axis=axis, mirrored=mirrored, **OPEN
     )
     quarter = 100 * np.pi / 2
@@ -202,31 +198,32 @@ def test_where_the_picture_looks(axis, mirrored, right, top, center):
 
 @pytest.mark.parametrize(
     ('mount', 'ray'),
-    [('mount_yaw', LEFT), ('mount_pitch', -UP), ('mount_roll', FORWARD)],
+    [((0.0, 0.0, 90.0), LEFT), ((0.0, 90.0, 0.0), -UP), ((90.0, 0.0, 0.0), FORWARD)],
 )
 def test_mounting_angles_turn_the_forward_axis(mount, ray):
     """A quarter turn: yaw to the left, pitch downwards, roll about the axis itself (REP-103)."""
-    config = CameraConfig(camera_model='equirectangular', **{mount: 90.0})
-    camera = make_camera(config, (200, 400))
+    camera = make_camera(
+        LensCalibration(camera_model='equirectangular'), (200, 400), mount_rpy=mount
+    )
     np.testing.assert_allclose(camera.unproject(np.array([[199.5, 99.5]])), [ray], atol=1e-12)
 
 
 def test_intrinsics_follow_the_size_of_the_picture():
     direction = rays()
-    large = make_camera(CameraConfig(), (640, 640)).project(direction)
-    small = make_camera(CameraConfig(), (320, 320)).project(direction)
+    large = make_camera(LensCalibration(), (640, 640)).project(direction)
+    small = make_camera(LensCalibration(), (320, 320)).project(direction)
     both = np.isfinite(large[:, 0]) & np.isfinite(small[:, 0])
     np.testing.assert_allclose((small[both] + 0.5) * 2 - 0.5, large[both], atol=1e-9)
 
 
 def test_rays_the_mirror_cannot_see_are_nan():
-    camera = make_camera(CameraConfig(), (640, 640))
+    camera = make_camera(LensCalibration(), (640, 640))
     assert np.isnan(camera.project(np.array([UP, -UP, [np.nan, 0, 0], [0, 0, 0]]))).all()
 
 
 def test_distortion_beyond_its_increasing_part_is_not_used():
     """1 + 3 k r^2 = 0 at r = 1 for k = -1/3: a ray at 60 degrees (r = 1.7) must not fold back."""
-    config = CameraConfig(
+    config = LensCalibration(
         xi=0.0,
         fx=100.0,
         fy=100.0,
@@ -257,17 +254,31 @@ def test_distortion_beyond_its_increasing_part_is_not_used():
             (640, 640),
             'increase',
         ),
-        ({'calibration_file': 'nowhere.yaml'}, (640, 640), 'nowhere.yaml'),
     ],
 )
 def test_impossible_cameras_say_what_is_wrong(change, size, words):
     with pytest.raises(CameraError, match=words):
-        camera = make_camera(CameraConfig(**change), size)
+        camera = make_camera(LensCalibration(**change), size)
         camera.project(rays(10))
 
 
 def test_the_panorama_model_uses_the_elevations_of_the_panorama():
     panorama = PanoramaConfig(elevation_min=-10.0, elevation_max=30.0)
-    camera = make_camera(CameraConfig(camera_model='panorama'), (40, 360), panorama)
+    camera = make_camera(LensCalibration(camera_model='panorama'), (40, 360), panorama)
     looks = camera.unproject(np.array([[179.5, -0.5], [179.5, 39.5]]))
     np.testing.assert_allclose(np.degrees(np.arcsin(looks[:, 2])), [30.0, -10.0])
+
+
+def test_roll_comes_first_then_pitch_then_yaw():
+    """Rolled by 90 degrees, the image's right looks down; pitched by 90 then, it looks back."""
+    lens = LensCalibration(camera_model='equirectangular')
+    right = np.array([[299.5, 99.5]])
+    for mount, ray in (((90.0, 0.0, 0.0), -UP), ((90.0, 90.0, 0.0), -FORWARD),
+                       ((90.0, 90.0, 90.0), -LEFT)):  # fmt: skip
+        camera = make_camera(lens, (200, 400), mount_rpy=mount)
+        np.testing.assert_allclose(camera.unproject(right), [ray], atol=1e-12)
+
+
+def test_a_mount_needs_three_angles():
+    with pytest.raises(ConfigError, match='roll, pitch and yaw'):
+        CameraConfig(mount_rpy=(1.0, 2.0))

@@ -17,12 +17,11 @@ from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.features import cluster
 from sfa_localization.features import network_training as hierarchy
-from sfa_localization.features.network_training import Drive, train_network
-from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.network_training import ImageSequence, train_network
 
 distributed = pytest.importorskip('distributed', reason='the extra distributed is not installed')
 
-CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
+PLAIN = {'light_std': 0.0, 'relative_cut': 1e-7}
 
 
 @contextmanager
@@ -46,7 +45,7 @@ def local():
 
 
 @pytest.fixture
-def on_disk(tmp_path, monkeypatch) -> Drive:
+def on_disk(tmp_path, monkeypatch) -> ImageSequence:
     """A drive of 40 pictures in a file, in shards of 4."""
     monkeypatch.setattr(hierarchy, 'SHARD', 4)
     of = drive(40)
@@ -54,7 +53,7 @@ def on_disk(tmp_path, monkeypatch) -> Drive:
     path = tmp_path / 'panoramas.u8'
     path.write_bytes(b'12345678' + images.tobytes())
     mapped = np.memmap(path, np.uint8, 'r', 8, images.shape)
-    return Drive(PanoramaArray(of.panoramas.stamps_ns, mapped), of.scale)
+    return ImageSequence(PanoramaArray(of.panoramas.stamps_ns, mapped), of.joined)
 
 
 def assert_same(one, other, images):
@@ -69,18 +68,18 @@ def test_a_cluster_learns_the_same(local, on_disk):
     told = []
     with cluster.dask_executor(local.scheduler_address) as executor:
         theirs = train_network(
-            ARCHITECTURE, [on_disk], CONFIG, executor=executor, on_shard=told.append
+            ARCHITECTURE, [on_disk], **PLAIN, executor=executor, on_shard=told.append
         )
     assert sum(told) == 6 * 40
     assert_same(
-        train_network(ARCHITECTURE, [on_disk], CONFIG), theirs, on_disk.panoramas.read(0, 40)
+        train_network(ARCHITECTURE, [on_disk], **PLAIN), theirs, on_disk.panoramas.read(0, 40)
     )
 
 
 def test_a_cluster_learns_the_same_bytes_again(local, on_disk):
     with cluster.dask_executor(local.scheduler_address) as executor:
         one, other = (
-            train_network(ARCHITECTURE, [on_disk], CONFIG, executor=executor) for _ in range(2)
+            train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=executor) for _ in range(2)
         )
     assert all(
         a.slow.tobytes() == b.slow.tobytes() for a, b in zip(one.nodes, other.nodes, strict=True)
@@ -114,10 +113,10 @@ def test_a_lost_worker_is_survived(on_disk, tmp_path):
             stages.append(len(shards))
             return executor(Deadly(work, flag) if len(stages) == 2 else work, shards, on_shard)
 
-        theirs = train_network(ARCHITECTURE, [on_disk], CONFIG, executor=dying)
+        theirs = train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=dying)
     assert flag.exists() and len(stages) == 6
     assert_same(
-        train_network(ARCHITECTURE, [on_disk], CONFIG), theirs, on_disk.panoramas.read(0, 40)
+        train_network(ARCHITECTURE, [on_disk], **PLAIN), theirs, on_disk.panoramas.read(0, 40)
     )
 
 
@@ -127,7 +126,7 @@ def test_workers_that_cannot_read_the_pictures(local, on_disk):
         cluster.dask_executor(local.scheduler_address) as executor,
         pytest.raises(DataError, match=r'cannot read .*panoramas\.u8.*folder'),
     ):
-        train_network(ARCHITECTURE, [on_disk], CONFIG, executor=executor)
+        train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=executor)
 
 
 def test_pictures_in_memory_are_refused(local):
@@ -135,7 +134,7 @@ def test_pictures_in_memory_are_refused(local):
         cluster.dask_executor(local.scheduler_address) as executor,
         pytest.raises(DataError, match='in a file'),
     ):
-        train_network(ARCHITECTURE, [drive(8)], CONFIG, executor=executor)
+        train_network(ARCHITECTURE, [drive(8)], **PLAIN, executor=executor)
 
 
 def test_nobody_answers(monkeypatch):
@@ -162,8 +161,8 @@ def test_without_an_address_this_process_trains():
 
 
 def test_a_file_of_panoramas(on_disk):
-    shard = hierarchy.shards_of([on_disk], CONFIG)[2]
-    file = cluster._portable(shard).drive.panoramas
+    shard = hierarchy.shards_of([on_disk], 0)[2]
+    file = cluster._portable(shard).sequence.panoramas
     assert np.array_equal(file.read(5, 9), on_disk.panoramas.read(5, 9))
     assert np.array_equal(np.concatenate(list(file.batches(16))), on_disk.panoramas.read(0, 40))
     assert (len(file), file.shape) == (40, on_disk.panoramas.shape)
@@ -173,7 +172,7 @@ def test_threads_give_the_same_bytes(on_disk, monkeypatch):
     networks = []
     for cores in (1, 3):
         monkeypatch.setattr(hierarchy, '_cores', lambda cores=cores: cores)
-        networks.append(train_network(ARCHITECTURE, [replace(on_disk)], CONFIG))
+        networks.append(train_network(ARCHITECTURE, [replace(on_disk)], **PLAIN))
     for one, other in zip(networks[0].nodes, networks[1].nodes, strict=True):
         assert one.slow.tobytes() == other.slow.tobytes()
 
@@ -187,7 +186,7 @@ def test_a_failing_shard_stops_the_others(on_disk):
             started.append(shard.start)
         raise DataError('no')
 
-    shards = hierarchy.shards_of([on_disk], CONFIG)
+    shards = hierarchy.shards_of([on_disk], 0)
     with pytest.raises(DataError, match='no'):
         hierarchy.in_this_process(work, shards, lambda images: None)
     assert len(started) < len(shards)

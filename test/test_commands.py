@@ -4,11 +4,10 @@
 
 import argparse
 import contextlib
-import copy
 import io
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,28 +20,24 @@ import yaml
 from test_calibration import scene
 
 from sfa_localization import cli
-from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.bags.reader import Bag
+from sfa_localization.commands.options import given
 from sfa_localization.data.settings import Settings
-from sfa_localization.features import cluster
+from sfa_localization.features import cluster, network
+from sfa_localization.features.network import Layer
+from sfa_localization.metric import selection
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
 from sfa_localization.simulation.settings import SimulationConfig
 
-GROUPS = {group.__name__: group for group in Settings.__subclasses__()}
-COMMANDS = {command.name: command for command in cli.COMMANDS}
-
-
-def parser_of(name: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=name)
-    COMMANDS[name].configure(parser)
-    return parser
+parser_of = cli.command_parser
 
 
 def options() -> list[tuple[str, str]]:
     """Return command and name of every option that there is."""
     return [
         (name, action.option_strings[-1])
-        for name in COMMANDS
+        for name in cli.COMMANDS
         for action in parser_of(name)._actions
         if action.option_strings and action.dest != 'help'
     ]
@@ -66,10 +61,11 @@ def test_an_option_reaches_one_group_of_settings_at_most(name, option):
     needed.sort(key=lambda action: bool(action.option_strings))  # BAG before --topics takes it
     words = [word for a in needed for word in [*a.option_strings[:1], *words_for(a)]]
     words += [option, *words_for(meant)]
-    given = parser.parse_args(words)
-    reached = {n: told for n, group in GROUPS.items() if (told := cli._given(group, given))}
+    arguments = parser.parse_args(words)
+    groups = {group.__name__: group for group in Settings.__subclasses__()}
+    reached = {n: found for n, group in groups.items() if (found := given(group, arguments))}
     group, _, setting = meant.dest.partition('.')
-    assert reached == ({group: {setting: vars(given)[meant.dest]}} if setting else {})
+    assert reached == ({group: {setting: vars(arguments)[meant.dest]}} if setting else {})
 
 
 # Each option alone, on small inputs: what a command is given without it, and what comes of it.
@@ -104,8 +100,8 @@ class Outcome:
         return document[section]['ros__parameters']
 
     def camera(self) -> dict[str, Any]:
-        """Return the camera's parameters that were printed."""
-        return yaml.safe_load(self.text)['omnicam_node']['ros__parameters']
+        """Return the calibration that was printed."""
+        return yaml.safe_load(self.text)
 
 
 @dataclass(frozen=True)
@@ -180,6 +176,10 @@ def metres(outcome: Outcome) -> float:
     return float(np.hypot(*np.diff(outcome.bag()['truth'].poses[:, :2], axis=0).T).sum())
 
 
+def check_image(outcome: Outcome) -> bytes:
+    return (outcome.folder / 'check.png').read_bytes()
+
+
 def written(name: str) -> Callable[[Outcome, Outcome], bool]:
     """Only with the option there is such a file, not empty."""
     return lambda a, b: (
@@ -241,11 +241,9 @@ OPTIONS: dict[str, dict[str, Case]] = {
             lambda a, b: b.bag()['topics']['/panorama/compressed'].endswith('CompressedImage'),
         ),
         '--storage': Case('--storage sqlite3', lambda a, b: bool([*b.folder.glob('bag/*.db3')])),
-        '--camera-height': Case('--camera-height 1', of_pictures),
         '--image-noise': Case('--image-noise 0', of_pictures),
         '--illumination': Case('--illumination 1', of_pictures),
         '--speed': Case('--speed 0.5', lambda a, b: seconds(b) > seconds(a) + 2),
-        '--turn-rate': Case('--turn-rate 0.3', lambda a, b: seconds(b) > seconds(a) + 0.5),
         '--odometry-rate': Case(
             '--odometry-rate 20',
             lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns']),
@@ -256,7 +254,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--slip': Case('--slip 0.3', of_wheels),
         '--speed-noise': Case('--speed-noise 0.5', of_wheels),
         '--gyro-bias': Case('--gyro-bias 0.05', of_turns),
-        '--gyro-bias-time': Case('--gyro-bias-time 1', of_turns),
         '--gyro-noise': Case('--gyro-noise 0.1', of_turns),
     },
     'train': {
@@ -308,7 +305,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['play']),
         '--rate': Case('--rate 500', noted(('rate', 500.0))),
         '--start-offset': Case('--start-offset 10', PRINTED),
-        '--clock-rate': Case('--clock-rate 5', noted(('clock rate', 5.0)), beside='--clock'),
         '--wait': Case('--wait 0.01', noted(('wait', 0.01))),
     },
     'inspect': {
@@ -320,19 +316,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--min-pictures': Case('--min-pictures 9999', says('drive until there are 9999')),
         '--max-spacing': Case('--max-spacing 0.1', PRINTED),
         '--reach': Case('--reach 0.2', PRINTED),
-        '--min-covered': Case('--min-covered 0', PRINTED, beside='--reach 0.3'),
-        '--min-directions': Case('--min-directions 6', PRINTED),
-        '--max-lost': Case('--max-lost 0', PRINTED, base='{data}/lossy'),
-        '--max-gap': Case('--max-gap 1', PRINTED, base='{data}/lossy'),
-        '--samples': Case(
-            '--samples 2',
-            lambda a, b: (
-                same([a.code, b.code], [0, 0])
-                and (a.folder / 'r/bag_pictures.png').read_bytes()
-                != (b.folder / 'r/bag_pictures.png').read_bytes()
-            ),
-            beside='--report {out}/r',
-        ),
     },
     'calibrate': {
         '--calibration': Case('--calibration {data}/info.yaml', says('fisheye')),
@@ -351,9 +334,11 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--angle-max': Case('--angle-max 100', lambda a, b: b.camera()['angle_max'] == 100),
         '--axis': Case('--axis up', lambda a, b: b.camera()['axis'] == 'up'),
         '--mirrored': Case('--mirrored no', lambda a, b: b.camera()['mirrored'] == 'no'),
-        '--mount-roll': Case('--mount-roll 5', lambda a, b: b.camera()['mount_roll'] == 5),
-        '--mount-pitch': Case('--mount-pitch 5', lambda a, b: b.camera()['mount_pitch'] == 5),
-        '--mount-yaw': Case('--mount-yaw 90', lambda a, b: b.camera()['mount_yaw'] == 90),
+        '--mount-rpy': Case(
+            '--mount-rpy 0x0x90',
+            lambda a, b: check_image(a) != check_image(b) and '[0.0, 0.0, 90.0]' in b.text,
+            beside='--check {out}/check.png',
+        ),
     },
     'filter': {
         '--config': Case('--config {data}/start.yaml', POSES),
@@ -388,25 +373,19 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--world': Case('--world 3', noted(('world', 3))),
         '--seed': Case('--seed 4', noted(('seed', 4))),
         '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
-        '--start-timeout': Case('--start-timeout 9', noted(('start_timeout', 9.0))),
-        '--silence-timeout': Case('--silence-timeout 9', noted(('silence_timeout', 9.0))),
-        '--settle-time': Case('--settle-time 9', noted(('settle_time', 9.0))),
-        '--stop-timeout': Case('--stop-timeout 9', noted(('stop_timeout', 9.0))),
     },
 }
-SMALL = """
-    layers: custom
-    binning: 1
-    field_rows: [16]
-    field_columns: [16]
-    stride_rows: [1]
-    stride_columns: [8]
-    linear_dimensions: [16]
-    output_dimensions: [10]
-    heading_layers: [1]
-    gp_length: 3.0
-    gp_noise: 0.01
-    slow_features: """
+SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
+
+
+@pytest.fixture(scope='module', autouse=True)
+def small_network() -> Iterator[None]:
+    """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, 'STANDARD_LAYERS', {'160x16': (1, (SMALL_LAYER,))})
+        patch.setattr(selection, '_SEARCH_POINTS', 60)
+        patch.setattr(selection, 'INDUCING_POINTS', 100)
+        yield
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -419,9 +398,7 @@ def gardens() -> Iterator[None]:
         place = (seed, settings.area)
         if place not in made:
             made[place] = garden(seed, settings)
-        found = copy.copy(made[place])
-        found._config = settings
-        return found
+        return made[place]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, 'Garden', again)
@@ -443,9 +420,9 @@ def watched(name: str, notes: list[Any]) -> Iterator[None]:
 
 def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Note pace and patience; an endless replay ends in its third round."""
-    from sfa_localization.commands import play
+    from sfa_localization.commands import bag_player
 
-    class Player(play.Player):
+    class Player(bag_player.Player):
         rounds = 0
 
         def wait_for_subscribers(self, topics=()):
@@ -459,35 +436,30 @@ def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
                 self._node.context.try_shutdown()
             return super()._play_once()
 
-    class Ticker(play.Ticker):
-        def __init__(self, node, rate):
-            super().__init__(node, rate)
-            notes.append(('clock rate', rate))
-
+    class Ticker(bag_player.Ticker):
         def tick(self, time_ns):
             super().tick(time_ns)
             notes.append('/clock')
 
-    patch.setattr(play, 'Player', Player)
-    patch.setattr(play, 'Ticker', Ticker)
+    patch.setattr(bag_player, 'Player', Player)
+    patch.setattr(bag_player, 'Ticker', Ticker)
 
 
 def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
-    from sfa_localization.commands import demo
+    from sfa_localization.commands import demonstration
 
-    def run_live(programs, logs, settings):
-        notes.extend((item.name, getattr(settings, item.name)) for item in fields(settings))
+    def run_live(programs, logs):
         notes.extend(pair for words in programs.values() for pair in pairwise(words))
 
     def simulated(settings, out, progress):
         notes.extend([('world', settings.world), ('seed', settings.seed)])
 
-    patch.setattr(demo, 'simulate', simulated)
-    patch.setattr(demo, 'train', lambda *_args, **_named: None)
-    patch.setattr(demo, 'run_live', run_live)
-    patch.setattr(demo, '_judged', lambda *_args: (SimpleNamespace(scores={}), 0.0))
-    patch.setattr(demo, '_write_results', lambda *_args: None)
+    patch.setattr(demonstration, 'simulate', simulated)
+    patch.setattr(demonstration, 'train', lambda *_args, **_named: None)
+    patch.setattr(demonstration, 'run_live', run_live)
+    patch.setattr(demonstration, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
+    patch.setattr(demonstration, '_write_results', lambda *_args: None)
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
@@ -510,7 +482,7 @@ def run(name: str, words: str, folder: Path, **places: Any) -> Outcome:
 
 
 @pytest.fixture(scope='module')
-def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
+def data(tmp_path_factory: pytest.TempPathFactory, gardens: None, small_network: None) -> Path:
     """Return a folder with every kind of input, each as small as it may be."""
     folder = tmp_path_factory.mktemp('data')
     world = '--area 6x6 --images panorama --size 160x16 --odometry-rate 10 --images-every 0.3'
@@ -520,11 +492,11 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
     for name, more in drives.items():
         made = run('simulate', f'{{out}}/{name} {world} {more}', folder)
         assert made.code == 0, made.text
-    settings = {'small': f'{SMALL}6', 'fewer': f'{SMALL}4'}
-    for name, text in settings.items():
-        (folder / f'{name}.yaml').write_text(f'training:\n  ros__parameters:{text}\n')
+    for name, count in {'small': 6, 'fewer': 4}.items():
+        text = f'training:\n  ros__parameters:\n    slow_features: {count}\n'
+        (folder / f'{name}.yaml').write_text(text)
     (folder / 'start.yaml').write_text(
-        'ekf_node:\n  ros__parameters:\n    set_initial_pose: true\n    initial_x: 3.0\n'
+        'ekf_node:\n  ros__parameters:\n    measurement_factor: 9.0\n'
     )
     (folder / 'robot.yaml').write_text(
         'ekf_node:\n  ros__parameters:\n    use_sim_time: true\n'
@@ -546,7 +518,6 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None) -> Path:
         'distortion_coefficients: {rows: 1, cols: 4, data: [0.01, 0, 0, 0]}\n'
     )
     write_tables(folder)
-    write_lossy(folder / 'lossy')
     return folder
 
 
@@ -560,18 +531,6 @@ def write_tables(folder: Path) -> None:
     rows = zip(truth.stamps_ns[::5] * 1e-9, *truth.poses[::5].T, strict=True)
     lines = ['stamp_s,x_m,y_m,yaw_rad', *(f'{t:.3f},{x},{y},{yaw}' for t, x, y, yaw in rows)]
     (folder / 'positions.csv').write_text('\n'.join(lines))
-
-
-def write_lossy(path: Path) -> None:
-    """Write a straight drive whose odometry pauses for 1.5 s, and ends before its pictures do."""
-    start = 1_700_000_000 * 10**9
-    with BagWriter(path) as bag:
-        for i in range(400):
-            stamp = start + i * 100_000_000
-            if i < 100 or 115 <= i < 380:
-                pose = np.array([0.1 * i, 0.0, 0.0])
-                bag.odometry('/odom', stamp, pose, np.array([1.0, 0.0]), np.array([1e-4, 1e-4]))
-            bag.image('/panorama', stamp, np.full((8, 80, 3), i % 256, np.uint8), 'camera')
 
 
 def test_every_option_has_a_case_and_every_case_an_option():

@@ -28,7 +28,7 @@ def saved(tmp_path, text):
 
 def test_the_shipped_file_is_what_the_settings_say():
     remedy = 'python -m sfa_localization config --output config/localization.yaml'
-    assert SHIPPED.read_text() == render(), f'write it anew: {remedy}'
+    assert SHIPPED.read_text() == render(), f'regenerate it: {remedy}'
 
 
 @pytest.mark.parametrize(('section', 'kind'), EVERY)
@@ -47,7 +47,7 @@ def test_names_of_a_section_do_not_clash_and_all_are_explained(section):
     assert max(map(len, lines)) <= 100
 
 
-def test_units_and_ranges_are_told():
+def test_units_and_ranges_are_written():
     text = render()
     assert '# columns of the panorama [px]; 16..8192\n    width: 600\n' in text
     assert 'may change while running' in text
@@ -70,22 +70,25 @@ def test_changes_are_written_and_the_rest_stays(tmp_path):
     assert config_file.load_changes(path)['ekf_node']['slip_per_metre'] == 1.5e-7
 
 
-def test_what_is_not_named_is_default_and_ros_names_are_left_alone(tmp_path):
-    path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    history: 3\n    use_sim_time: true\n'
-                           "    qos_overrides: {/odom: {subscription: {depth: 3}}}\n")  # fmt: skip
-    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(history=3.0)
+def test_missing_parameters_have_defaults_and_those_of_ros_are_ignored(tmp_path):
+    path = saved(
+        tmp_path,
+        'ekf_node:\n  ros__parameters:\n    lost_std: 3\n    use_sim_time: true\n'
+        '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n',
+    )
+    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(lost_std=3.0)
     assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig()
 
 
-def test_what_is_of_ros_is_written_again(tmp_path):
-    """A file that is read, changed and written anew keeps what only ROS knows, and all values."""
+def test_parameters_of_ros_are_kept(tmp_path):
+    """A file that is read and written again keeps the parameters of ROS, and all others."""
     path = saved(tmp_path, '/**:\n  ros__parameters:\n    use_sim_time: true\n    width: 300\n'
-                           'ekf_node:\n  ros__parameters:\n    history: 3\n'
+                           'ekf_node:\n  ros__parameters:\n    lost_std: 3\n'
                            '    slip_per_metre: 1e-3\n'
                            '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n'
                            'omnicam_node:\n  ros__parameters:\n'
                            '    qos_overrides./panorama.publisher.depth: 7\n'
-                           'training:\n  ros__parameters:\n    photometric_seed: 7\n')  # fmt: skip
+                           'training:\n  ros__parameters:\n    slow_features: 7\n')  # fmt: skip
     changes = config_file.load_changes(path)
     write_config(tmp_path / 'new.yaml', changes)
     sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
@@ -96,37 +99,37 @@ def test_what_is_of_ros_is_written_again(tmp_path):
     assert ekf['use_sim_time'] is omnicam['use_sim_time'] is sfa['use_sim_time'] is True
     assert ekf['qos_overrides'] == {'/odom': {'subscription': {'depth': 3}}}
     assert omnicam['qos_overrides./panorama.publisher.depth'] == 7
-    assert (ekf['slip_per_metre'], type(ekf['history'])) == (1e-3, float), 'as ROS reads them'
-    assert (omnicam['width'], training['photometric_seed']) == (300, 7)
+    assert (ekf['slip_per_metre'], type(ekf['lost_std'])) == (1e-3, float), 'as ROS reads them'
+    assert (omnicam['width'], training['slow_features']) == (300, 7)
     assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
 
 
-def test_numbers_as_people_write_them(tmp_path):
+def test_numbers_without_a_decimal_point(tmp_path):
     path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    slip_per_metre: 1e-3\n')
     assert load_settings(path, 'ekf_node', FilterConfig).slip_per_metre == 1e-3
 
 
-def test_parameters_of_every_node_are_taken_where_they_fit(tmp_path):
+def test_parameters_of_all_nodes_apply_to_the_sections_that_have_them(tmp_path):
     path = saved(tmp_path, '/**:\n  ros__parameters:\n    autostart: false\n    width: 300\n'
-                           '/ekf_node:\n  ros__parameters:\n    history: 3.0\n')  # fmt: skip
+                           '/ekf_node:\n  ros__parameters:\n    lost_std: 3.0\n')  # fmt: skip
     assert not load_settings(path, 'ekf_node', NodeConfig).autostart
-    assert load_settings(path, 'ekf_node', FilterConfig).history == 3.0
+    assert load_settings(path, 'ekf_node', FilterConfig).lost_std == 3.0
     assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
 
 
 @pytest.mark.parametrize(('text', 'why'), [
     ('ekf_node: [1', 'is not YAML'), ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
     ('efk_node: {}\n', "unknown section 'efk_node'"),
-    ('ekf_node: {history: 3}\n', 'ros__parameters'),
+    ('ekf_node: {lost_std: 3}\n', 'ros__parameters'),
     ('ekf_node: {ros__parameters: 3}\n', 'names and values'),
-    ('ekf_node: {ros__parameters: {histroy: 3}}\n', "did you mean 'history'"),
-    ('ekf_node: {ros__parameters: {history: x}}\n', 'history'),
-    ('ekf_node: {ros__parameters: {history: -1}}\n', 'outside'),
-    ('ekf_node: {ros__parameters: {history: .nan}}\n', 'finite'),
+    ('ekf_node: {ros__parameters: {lost_sdt: 3}}\n', "did you mean 'lost_std'"),
+    ('ekf_node: {ros__parameters: {lost_std: x}}\n', 'lost_std'),
+    ('ekf_node: {ros__parameters: {lost_std: -1}}\n', 'outside'),
+    ('ekf_node: {ros__parameters: {lost_std: .nan}}\n', 'finite'),
     ('ekf_node: {ros__parameters: {width: 300}}\n', "unknown parameter 'width'"),
     ('/**: {ros__parameters: {nonsense: 1}}\n', "unknown parameter 'nonsense'"),
 ])  # fmt: skip
-def test_a_wrong_file_is_refused_with_file_and_reason(tmp_path, text, why):
+def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path, text, why):
     path = saved(tmp_path, text)
     with pytest.raises(ConfigError, match=why) as raised:
         load_settings(path, 'ekf_node', FilterConfig)

@@ -9,7 +9,7 @@ import pytest
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.fusion.settings import FilterConfig, resolved
+from sfa_localization.fusion.pose_filter import PoseFilter
 
 
 def made(share, distance, seed=0, step=0.1, stretches=60, length=80):
@@ -74,12 +74,9 @@ def test_numbers_that_cannot_be_are_refused(share, distance):
         ErrorCorrelation(share, distance)
 
 
-def test_the_users_value_wins_over_what_is_known_over_the_default():
-    known = ErrorCorrelation(0.4, 2.0)
-    open_ = resolved(FilterConfig())
-    assert (open_.correlated_share, open_.decorrelation) == (0.7, 1.0)
-    learnt = resolved(FilterConfig(), known)
-    assert (learnt.correlated_share, learnt.decorrelation) == (0.4, 2.0)
-    given = resolved(FilterConfig(correlated_share=0.0, decorrelation=3.0), known)
-    assert (given.correlated_share, given.decorrelation) == (0.0, 3.0)
-    assert resolved(learnt) == learnt
+def test_the_filter_takes_the_models_value_over_the_default():
+    assert PoseFilter().correlation == ErrorCorrelation(0.7, 1.0)
+    fused = PoseFilter(correlation=ErrorCorrelation(0.4, 2.0))
+    assert fused.correlation == ErrorCorrelation(0.4, 2.0)
+    fused.reconfigure(correlation=ErrorCorrelation(0.1, 3.0))
+    assert fused.correlation == ErrorCorrelation(0.1, 3.0)

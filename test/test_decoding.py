@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfa_localization.bags.loading import Bag, BagWriter
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import MessageError
 from sfa_localization.data.messages import (
     read_planar,

@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The chain of processes behind the demo: it records, and it ends loudly when a node fails.
+"""The processes of the demo: outputs are recorded, and a failing node is reported.
 
-Stand-in nodes behave in every way a node can; the real ones run in test_end_to_end.py.
+Stand-in nodes fail in every way; the real ones run in test_readme_commands.py.
 """
 
 import dataclasses
@@ -14,14 +14,13 @@ import numpy as np
 import psutil
 import pytest
 
-from sfa_localization.commands.settings import DemoConfig
 from sfa_localization.data.errors import NodeError
 
 pytest.importorskip('rclpy')
-from sfa_localization.commands import demo_nodes
+from sfa_localization.commands import live_nodes
 
 pytestmark = pytest.mark.ros
-CONFIG = DemoConfig(start_timeout=20.0, silence_timeout=1.0, settle_time=0.3, stop_timeout=3.0)
+TIMEOUTS = live_nodes.Timeouts(start_s=20.0, silence_s=1.0, settle_s=0.3, stop_s=3.0)
 
 STAND_IN = """
 import math, sys, time
@@ -59,7 +58,7 @@ def publish():
         message.pose.pose.orientation.z = math.sin(0.25)
         message.pose.pose.orientation.w = math.cos(0.25)
         message.pose.covariance[35] = math.pi ** 2 / 3 if role == 'sfa_node' else 0.1
-    if behaviour == 'nonsense':
+    if behaviour == 'invalid':
         message.pose.pose.position.x = math.nan
     if behaviour == 'die' and sent == 3:
         sys.exit(7)
@@ -80,14 +79,14 @@ def programs(tmp_path: Path, player_s: float = 4.0, **behaviours: str) -> dict[s
     script.write_text(STAND_IN)
     chain = {
         name: [sys.executable, str(script), name, behaviours.get(name, 'work')]
-        for name in demo_nodes.NODES
+        for name in live_nodes.NODES
     }
     return {**chain, 'play': [sys.executable, '-c', f'import time; time.sleep({player_s})']}
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_left():
-    """No process, and no environment variable, of the chain outlives a test."""
+    """No process and no environment variable of the chain is left after a test."""
     before, variables = set(psutil.Process().children(recursive=True)), ros_variables()
     yield
     assert set(psutil.Process().children(recursive=True)) <= before
@@ -100,11 +99,11 @@ def ros_variables() -> dict[str, str]:
 
 def test_chain_records_what_the_nodes_publish(tmp_path):
     chain = programs(tmp_path, player_s=1.0)
-    # Nodes that stop talking when the replay is over let the recording end.
+    # The recording ends when the nodes stop publishing after the replay.
     script = Path(chain['sfa_node'][1])
     script.write_text(STAND_IN.replace('sent += 1', 'sent += 1\n    if sent > 40: return'))
-    patient = dataclasses.replace(CONFIG, silence_timeout=20.0)
-    live = demo_nodes.run_live(chain, tmp_path / 'logs', patient)
+    patient = dataclasses.replace(TIMEOUTS, silence_s=20.0)
+    live = live_nodes.run_live(chain, tmp_path / 'logs', patient)
     assert set(live) == {'sfa', 'ekf'}
     for trajectory in live.values():
         assert len(trajectory) > 5
@@ -118,29 +117,29 @@ def test_chain_records_what_the_nodes_publish(tmp_path):
 def test_a_node_that_cannot_start_is_named(tmp_path):
     chain = programs(tmp_path, sfa_node='fail')
     with pytest.raises(NodeError, match=r'(?s)^sfa_node ended \(exit code 1\).*no model'):
-        demo_nodes.run_live(chain, tmp_path / 'logs', CONFIG)
+        live_nodes.run_live(chain, tmp_path / 'logs', TIMEOUTS)
 
 
-@pytest.mark.parametrize('name', demo_nodes.NODES)
+@pytest.mark.parametrize('name', live_nodes.NODES)
 def test_a_silent_node_is_named(tmp_path, name):
     chain = programs(tmp_path, **{name: 'silent'})
     with pytest.raises(
-        NodeError, match=f'^{name} is silent: 0 messages on {demo_nodes.OUTPUTS[name]}'
+        NodeError, match=f'^{name} is silent: 0 messages on {live_nodes.OUTPUTS[name]}'
     ):
-        demo_nodes.run_live(chain, tmp_path / 'logs', CONFIG)
+        live_nodes.run_live(chain, tmp_path / 'logs', TIMEOUTS)
 
 
 def test_a_node_that_dies_during_the_replay_is_named(tmp_path):
     with pytest.raises(NodeError, match=r'ekf_node ended \(exit code 7\)'):
-        demo_nodes.run_live(programs(tmp_path, ekf_node='die'), tmp_path / 'logs', CONFIG)
+        live_nodes.run_live(programs(tmp_path, ekf_node='die'), tmp_path / 'logs', TIMEOUTS)
 
 
-def test_a_node_that_publishes_nonsense_is_named(tmp_path):
-    with pytest.raises(NodeError, match='sfa_node published nonsense'):
-        demo_nodes.run_live(programs(tmp_path, sfa_node='nonsense'), tmp_path / 'logs', CONFIG)
+def test_a_node_that_publishes_invalid_messages_is_named(tmp_path):
+    with pytest.raises(NodeError, match='sfa_node: invalid message on sfa/pose_with_covariance'):
+        live_nodes.run_live(programs(tmp_path, sfa_node='invalid'), tmp_path / 'logs', TIMEOUTS)
 
 
 def test_a_player_that_fails_is_named(tmp_path):
     chain = {**programs(tmp_path), 'play': [sys.executable, '-c', 'raise SystemExit("no bag")']}
     with pytest.raises(NodeError, match=r'(?s)play ended.*no bag'):
-        demo_nodes.run_live(chain, tmp_path / 'logs', CONFIG)
+        live_nodes.run_live(chain, tmp_path / 'logs', TIMEOUTS)

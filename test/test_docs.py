@@ -1,12 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the documents say exists: commands, options, executables, topics, parameters, files, links.
+"""The documents name only existing commands, options, executables, topics, parameters and files.
 
-Commands marked `run:` in the README are run, in test_readme_commands.py; the others are checked
-here as far as that goes without the ROS 2 command line.
+Commands marked `run:` in the README are run in test_readme_commands.py; the others are checked
+here, as far as possible without the ROS 2 command line.
 """
 
-import argparse
 import ast
 import dataclasses
 import json
@@ -32,12 +31,12 @@ from sfa_localization.nodes.settings import EkfNodeConfig
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md')])
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
-COMMANDS = {command.name: command for command in cli.COMMANDS}
+COMMANDS = set(cli.COMMANDS)
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`([a-z_]+ [^`]+)`')
 LINK = re.compile(r'\]\(([^)#\s]+)\)')
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
-# Programs of others, whose arguments are theirs to check.
+# Programs of other packages, whose arguments are not checked.
 FOREIGN = {'source', 'colcon', 'rviz2', 'rosdep', 'git', 'cd', 'mkdir', 'pip', 'sudo'}
 OTHER_ROS = {('run', 'robot_localization'), ('launch', 'nav2_bringup'), ('bag', 'record')}
 
@@ -52,7 +51,9 @@ def commands() -> list:
             for block in BLOCK.findall(text)
             for line in block.replace('\\\n', ' ').splitlines()
         ]
-        lines += [code for code in INLINE.findall(text) if code.split()[0] in {*COMMANDS, 'make'}]
+        lines += [
+            code for code in INLINE.findall(text) if code.split()[0] in {'sfa_localization', 'make'}
+        ]
         for line in lines:
             words = shlex.split(line, comments=True)
             if words:
@@ -72,12 +73,12 @@ def check(words: list[str]) -> None:
     elif program == 'make':
         targets = [word for word in rest if '=' not in word]
         subprocess.run(['make', '--dry-run', *targets], cwd=ROOT, check=True, capture_output=True)
-    elif program == 'python' and rest[:2] == ['-m', 'sfa_localization']:
-        check(rest[2:])
+    elif words[:3] == ['python', '-m', 'sfa_localization']:
+        check_command(*words[3:])
+    elif program == 'sfa_localization':
+        check_command(*rest)
     elif program in NODES:
         check_node(program, rest)
-    elif program in COMMANDS:
-        check_arguments(COMMANDS[program], rest)
     else:
         assert program in FOREIGN, f'unknown program {program}'
 
@@ -93,7 +94,7 @@ def check_ros2(words: list[str]) -> None:
         assert {word.partition(':=')[0] for word in rest} <= known
         return
     assert verb == 'run'
-    check([name, *rest])
+    check_command(name, *rest)
 
 
 def launch_arguments(path: Path) -> set[str]:
@@ -106,12 +107,12 @@ def launch_arguments(path: Path) -> set[str]:
     }
 
 
-def check_arguments(command: cli.Command, words: list[str]) -> None:
-    if words in (['...'], ['--help']):
-        return
-    parser = argparse.ArgumentParser(prog=command.name)
-    command.configure(parser)
-    parser.parse_args(words)
+def check_command(name: str, *words: str) -> None:
+    if name in NODES:
+        check_node(name, list(words))
+    elif name not in ('COMMAND', '--help') and words not in (('...',), ('--help',)):
+        assert name in COMMANDS, f'unknown command {name}'
+        cli.command_parser(name).parse_args(words)
 
 
 def check_node(name: str, words: list[str]) -> None:
@@ -144,7 +145,7 @@ def topics() -> set[str]:
 
 
 @pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_links_lead_somewhere(path):
+def test_links_have_a_target(path):
     for target in LINK.findall(path.read_text('utf-8')):
         assert target.startswith('https://') or (path.parent / target).exists(), target
 
@@ -156,7 +157,7 @@ def test_topics_exist(path):
     assert set(TOPIC.findall(path.read_text('utf-8'))) <= topics()
 
 
-def test_foxglove_layout_is_whole_and_its_topics_exist():
+def test_foxglove_layout_is_complete_and_its_topics_exist():
     layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text('utf-8'))
     panels = set(re.findall(r'"([A-Za-z0-9]+![a-z]+)"', json.dumps(layout['layout'])))
     assert panels == set(layout['configById'])
@@ -177,7 +178,7 @@ def test_robot_localization_takes_position_and_heading_of_our_pose():
 
 
 def test_robot_localization_finds_a_robot_that_starts_anywhere():
-    """Its arithmetic, of x, y and yaw: predicted from zero, images that are too far off refused."""
+    """A filter of x, y and yaw: predicted from zero; images that are too far off are rejected."""
     text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
     settings = yaml.safe_load(text)['ekf_filter_node_map']['ros__parameters']
     given = np.reshape(settings.get('initial_estimate_covariance', 1e-9 * np.eye(15)), (15, 15))
@@ -222,14 +223,14 @@ def test_nav2_plans_without_a_map():
     assert window['plugins'] == ['obstacle_layer', 'inflation_layer']
 
 
-class Said:
-    """Stands in for every class of launch: remembers what it was told."""
+class Recorded:
+    """Replaces every class of launch, and records its arguments."""
 
-    def __init__(self, *told, **named):
-        self.told, self.named = told, named
+    def __init__(self, *given, **named):
+        self.given, self.named = given, named
 
     def perform(self, context):
-        return context[self.told[0]]
+        return context[self.given[0]]
 
 
 @pytest.fixture
@@ -246,21 +247,21 @@ def actions(monkeypatch):
     for name, classes in {'launch_ros': [], **names}.items():
         module = types.ModuleType(name)
         for each in classes:
-            setattr(module, each, type(each, (Said,), {}))
+            setattr(module, each, type(each, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
     made = runpy.run_path(str(ROOT / 'config/localization.launch.py'))
-    (actions,) = made['generate_launch_description']().told
+    (actions,) = made['generate_launch_description']().given
     return actions
 
 
 @pytest.fixture
 def launched(actions):
-    """Return what the launch file says of each node."""
+    """Return the arguments of each node in the launch file."""
     return [action.named for action in actions if type(action).__name__ == 'Node']
 
 
 def test_a_missing_parameter_file_stops_the_launch(actions):
-    """Before the nodes: launch_ros itself warns of it, and starts them with every default."""
+    """Before the nodes: launch_ros itself only warns, and starts them with every default."""
     kinds = [type(action).__name__ for action in actions]
     check = actions[kinds.index('OpaqueFunction')].named['function']
     assert kinds.index('OpaqueFunction') < kinds.index('Node')

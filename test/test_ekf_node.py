@@ -10,6 +10,7 @@ from filter_drives import START_NS, Drive
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose
+from sfa_localization.fusion import motion
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -40,7 +41,8 @@ from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
 from sfa_localization.nodes.monitor import steady_s  # noqa: E402
 
-SEEN = 'sfa/pose_with_covariance'
+IMAGE_POSE = 'sfa/pose_with_covariance'
+AT_ORIGIN = [0.0, 0.0, 0.0]
 SPREAD = np.diag([0.04, 0.04, 0.0025])
 NOISY = {'position_std': 0.1, 'yaw_std': 0.03, 'v_std': 0.02, 'omega_std': 0.01}
 
@@ -67,13 +69,13 @@ def picture(drive, k, spread=SPREAD, frame='map'):
 def play(bench, node, drive, events=None):
     """Send a drive and wait until the node has dealt with it."""
     events = drive.events() if events is None else events
-    counts = node.monitor('odom'), node.monitor(SEEN)
+    counts = node.monitor('odom'), node.monitor(IMAGE_POSE)
     for _, kind, index in events:
         before = counts[kind].received
         if kind == 0:
             bench.publish('odom', odometry(drive, index))
         else:
-            bench.publish(SEEN, picture(drive, index))
+            bench.publish(IMAGE_POSE, picture(drive, index))
         # One at a time: the order between topics is then the drive's.
         assert until(lambda b=before, k=kind: counts[k].received > b)
 
@@ -85,10 +87,10 @@ def pose_of(message):
 
 def test_live_is_offline_and_stamps_are_the_inputs(bench):
     drive = Drive(seconds=3, **NOISY)
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(Odometry, 'ekf/odometry')
     poses = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
-    offline = PoseFilter(FilterConfig(set_initial_pose=True))
+    offline = PoseFilter(FilterConfig(initial_pose=(0.0, 0.0, 0.0)))
     play(bench, node, drive)
     assert until(lambda: len(heard) == len(drive.stamps_ns) and len(poses) == len(drive.pictures))
     for event in drive.events():
@@ -109,8 +111,7 @@ def test_live_is_offline_and_stamps_are_the_inputs(bench):
 
 def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, set_initial_pose=True, initial_x=5.0, initial_yaw=2.0,
-                     transform_tolerance=0.25)  # fmt: skip
+    node = bench.run(EkfNode, initial_pose=[5.0, 0.0, 2.0], transform_tolerance=0.25)
     heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
     told = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
@@ -127,7 +128,7 @@ def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench)
 def test_the_transform_is_broadcast_where_tf2_msgs_is_installed(bench):
     tf2_msgs = pytest.importorskip('tf2_msgs.msg')
     drive = Drive(seconds=0.2)
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(tf2_msgs.TFMessage, '/tf')
     play(bench, node, drive)
     assert until(lambda: len(heard) == 10)
@@ -137,7 +138,7 @@ def test_the_transform_is_broadcast_where_tf2_msgs_is_installed(bench):
 def test_the_broadcast_is_the_published_transform(bench, monkeypatch):
     # tf2_msgs is not in the pip wheels: what would go to /tf is caught here instead.
     drive = Drive(seconds=0.2)
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     monkeypatch.setattr(ekf_node, 'TFMessage', lambda transforms: transforms)
     sent = []
     node._tf = type('Publisher', (), {'publish': lambda self, message: sent.append(message)})()
@@ -161,7 +162,7 @@ def test_without_tf2_msgs_the_node_runs_and_says_so(bench, monkeypatch):
 def test_every_measurement_gets_its_verdict(bench):
     drive = Drive(seconds=2, **NOISY)
     drive.seen[10, :2] += 9.0
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(DiagnosticArray, 'ekf/measurement_status')
     play(bench, node, drive)
     assert until(lambda: len(heard) == len(drive.pictures))
@@ -206,7 +207,7 @@ def test_a_pose_in_another_frame_is_refused(bench):
 
 def test_reset_and_pause(bench):
     drive = Drive(seconds=4, **NOISY)
-    node = bench.run(EkfNode, set_initial_pose=False)
+    node = bench.run(EkfNode)
     first = [e for e in drive.events() if e[0] < START_NS + 10**9]
     second = [e for e in drive.events() if 10**9 <= e[0] - START_NS < 2 * 10**9]
     third = [e for e in drive.events() if e[0] - START_NS >= 2 * 10**9]
@@ -221,7 +222,9 @@ def test_reset_and_pause(bench):
     # The estimate goes on by odometry, on every topic.
     assert until(lambda: len(poses) == len([e for e in second if e[1]]))
     assert until(lambda: len(odometries) == len(transforms) == len([e for e in second if not e[1]]))
-    assert until(lambda: node.monitor(SEEN).refused['paused'] == len([e for e in second if e[1]]))
+    assert until(
+        lambda: node.monitor(IMAGE_POSE).refused['paused'] == len([e for e in second if e[1]])
+    )
     assert node._filter.counts['measurement: accepted'] == accepted
     assert 'paused' in ' '.join(node._status().reasons)
     bench.call(SetBool, 'ekf_node/pause', SetBool.Request(data=False))
@@ -254,24 +257,24 @@ def test_a_pause_ends_with_the_configuration(bench):
 def test_a_refused_pose_is_not_used_too(bench):
     drive = Drive(seconds=2, **NOISY)
     drive.seen[10, :2] += 9.0
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(DiagnosticArray, 'ekf/measurement_status')
     play(bench, node, drive)
     count = len(drive.pictures)
     assert until(lambda: len(heard) == count)
-    monitor = node.monitor(SEEN)
+    monitor = node.monitor(IMAGE_POSE)
     assert until(lambda: monitor.used + sum(monitor.refused.values()) == count)
     assert monitor.refused == {'outside the gate': 1}
 
 
 def test_what_senders_write_does_not_fill_the_diagnostics(bench):
-    node = bench.run(EkfNode, diagnostics_period=0.1)
+    node = bench.run(EkfNode)
     told = bench.listen(DiagnosticArray, '/diagnostics')
     for number in range(200):
         message = to_pose_with_covariance([1, 1, 0], SPREAD, 5, f'frame_{number}' + 'x' * 2000)
-        bench.publish(SEEN, message)
-        assert until(lambda n=number: node.monitor(SEEN).received > n)
-    assert until(lambda: sum(node.monitor(SEEN).refused.values()) == 200)
+        bench.publish(IMAGE_POSE, message)
+        assert until(lambda n=number: node.monitor(IMAGE_POSE).received > n)
+    assert until(lambda: sum(node.monitor(IMAGE_POSE).refused.values()) == 200)
     told.clear()
     assert until(lambda: told)
     values = told[-1].status[0].values
@@ -327,12 +330,14 @@ def malformed():
          or setattr(m.header.stamp, 'nanosec', 0)),
         (pose, lambda m: setattr(m.header.stamp, 'sec', 2_000_000_000)),
     ]  # fmt: skip
-    return [('odom' if make is odom else SEEN, broken(make, change)) for make, change in changes]
+    return [
+        ('odom' if make is odom else IMAGE_POSE, broken(make, change)) for make, change in changes
+    ]
 
 
 def test_malformed_messages_are_counted_and_change_nothing(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     odometries = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive)
     assert until(lambda: len(odometries) == len(drive.stamps_ns))
@@ -353,9 +358,9 @@ def test_malformed_messages_are_counted_and_change_nothing(bench):
     assert until(lambda: len(odometries) == len(drive.stamps_ns) + len(again.stamps_ns))
 
 
-def test_diagnostics_tell_rates_latencies_and_counts(bench):
+def test_diagnostics_hold_rates_latencies_and_counts(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, diagnostics_period=0.1)
+    node = bench.run(EkfNode)
     heard = bench.listen(DiagnosticArray, '/diagnostics')
     assert until(lambda: any(m.status[0].level == DiagnosticStatus.WARN for m in heard))
     play(bench, node, drive)
@@ -365,38 +370,38 @@ def test_diagnostics_tell_rates_latencies_and_counts(bench):
 
     assert until(lambda: told().get('odometry: used') == '50')
     values = told()
-    assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localised'
+    assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localized'
     assert values['odom: received'] == '50' and float(values['odom: rate [Hz]']) > 0
     assert float(values['odom: latency p99 [ms]']) >= float(values['odom: latency p50 [ms]']) > 0
-    assert 'measurement: accepted' in values and 'position deviation [m]' in values
+    assert 'measurement: accepted' in values and 'position std [m]' in values
 
 
 def test_silence_is_told_without_any_clock_moving(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, odometry_silence=0.2, picture_silence=0.2)
+    node = bench.run(EkfNode, silence_timeout=0.2)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive)
     assert until(lambda: any(s.data.startswith('DEGRADED: nothing on odom') for s in states))
+    assert until(lambda: any(f'nothing on {IMAGE_POSE}' in s.data for s in states))
 
 
 def test_what_nothing_moves_on_is_lost_in_the_end_by_the_wall_clock(bench):
     """Messages have stopped for good: only the wall clock shows how unsure the pose is by now."""
     drive = Drive(seconds=2, **NOISY)
-    node = bench.run(EkfNode, odometry_silence=0.2, lost_std=0.5, degraded_std=0.4,
-                     coast_time=0.5, odometry_timeout=0.2, unknown_speed=2.0)  # fmt: skip
+    node = bench.run(EkfNode, silence_timeout=0.2, lost_std=0.5, degraded_std=0.4)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive)
     assert until(lambda: states[-1].data.startswith('LOST: position known to'))
     assert node._filter.status.level.name != 'LOST', 'by the stamps of the messages it is not'
-    assert float(node.health()[2]['position deviation [m]']) > 0.5
+    assert float(node.health()[2]['position std [m]']) > 0.5
     further = Drive(seconds=4, **NOISY)
     play(bench, node, further, [e for e in further.events() if e[0] > drive.stamps_ns[-1]])
     assert node._status().level.name != 'LOST'
 
 
-def test_a_pose_that_was_set_before_anything_came_is_waited_with(bench):
-    node = bench.run(EkfNode, odometry_silence=0.1, lost_std=0.5, degraded_std=0.4,
-                     unknown_speed=50.0)  # fmt: skip
+def test_a_pose_set_before_the_first_message_waits_for_it(bench, monkeypatch):
+    monkeypatch.setattr(motion, 'UNKNOWN_SPEED', 50.0)
+    node = bench.run(EkfNode, silence_timeout=0.1, lost_std=0.5, degraded_std=0.4)
     bench.publish('initialpose', to_pose_with_covariance([1, 1, 0], SPREAD, START_NS, 'map'))
     assert until(lambda: node._filter.state is not None)
     since = steady_s()
@@ -405,7 +410,7 @@ def test_a_pose_that_was_set_before_anything_came_is_waited_with(bench):
 
 
 def test_simulated_time_that_steps_back_starts_anew(bench):
-    node = bench.run(EkfNode, use_sim_time=True, set_initial_pose=True)
+    node = bench.run(EkfNode, use_sim_time=True, initial_pose=AT_ORIGIN)
     drive = Drive(seconds=0.5)
     bench.publish('/clock', Clock(clock=Time(nanoseconds=START_NS).to_msg()))
     assert until(lambda: node.get_clock().now().nanoseconds == START_NS)
@@ -416,7 +421,7 @@ def test_simulated_time_that_steps_back_starts_anew(bench):
 
 def test_live_parameters_reach_the_filter_and_keep_the_pose(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     play(bench, node, drive)
     before = node._filter.state.pose
     assert node.set_parameters([Parameter('measurement_factor', value=4.0)])[0].successful
@@ -426,9 +431,10 @@ def test_live_parameters_reach_the_filter_and_keep_the_pose(bench):
     assert not refused.successful and 'degraded_std' in refused.reason
 
 
-def test_the_path_is_thinned_and_bounded(bench):
+def test_the_path_is_thinned_and_bounded(bench, monkeypatch):
+    monkeypatch.setattr(ekf_node, 'PATH_LENGTH', 3)
     drive = Drive(seconds=4, rate_hz=20)
-    node = bench.run(EkfNode, set_initial_pose=True, path_period=0.5, path_length=3)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(Path, 'ekf/path')
     play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
     assert until(lambda: heard and len(heard[-1].poses) == 3)
@@ -461,7 +467,7 @@ def test_overrides_of_quality_of_service_are_taken(bench):
 
 def test_measurements_without_heading_are_taken_as_positions(bench):
     drive = Drive(seconds=1)
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
     spread = np.diag([0.04, 0.04, 0.0])
     message = picture(drive, 5, spread)
@@ -469,11 +475,11 @@ def test_measurements_without_heading_are_taken_as_positions(bench):
     assert told[2, 2] < 1e-5
     message.pose.covariance[35] = 0.0
     message.pose.pose.orientation.z, message.pose.pose.orientation.w = 1.0, 0.0  # 180 deg off
-    bench.publish(SEEN, message)
+    bench.publish(IMAGE_POSE, message)
     assert until(lambda: node._filter.counts['measurement: accepted'] == 1)
 
 
-def test_the_models_knowledge_of_its_errors_is_what_an_offline_filter_uses(bench):
+def test_the_models_error_correlation_is_what_an_offline_filter_uses(bench):
     drive = Drive(seconds=4, **NOISY)
     known = ErrorCorrelation(0.1, 3.0)
     node = bench.run(EkfNode, start=False)
@@ -497,18 +503,18 @@ def test_the_models_knowledge_of_its_errors_is_what_an_offline_filter_uses(bench
 
 
 @pytest.mark.parametrize('numbers', [[], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]])
-def test_knowledge_that_cannot_be_is_refused(bench, numbers):
+def test_a_malformed_error_correlation_is_rejected(bench, numbers):
     node = bench.run(EkfNode)
     message = Float64MultiArray(data=numbers)
     bench.publish('sfa/error_correlation', message, latched_qos())
     assert until(lambda: node.monitor('sfa/error_correlation').received == 1)
-    assert node._filter._fusion.config.correlated_share == 0.7
+    assert node._filter.correlation == ErrorCorrelation()
 
 
 def test_frames_are_parameters(bench):
     """The map's always; those of odometry and robot where the messages leave them empty."""
     frames = {'map_frame': 'garden', 'odom_frame': 'wheels', 'base_frame': 'robot'}
-    node = bench.run(EkfNode, set_initial_pose=True, publish_tf=False, **frames)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, publish_tf=False, **frames)
     assert bench.node.count_publishers('/tf') == 0, 'others may broadcast the transform'
     fused = bench.listen(Odometry, 'ekf/odometry')
     transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
@@ -520,5 +526,5 @@ def test_frames_are_parameters(bench):
     assert (fused[0].header.frame_id, fused[0].child_frame_id) == ('garden', 'robot')
     header, child = transforms[0].header, transforms[0].child_frame_id
     assert (header.frame_id, child) == ('garden', 'wheels')
-    bench.publish(SEEN, picture(drive, 0, frame='garden'))
-    assert until(lambda: node.monitor(SEEN).used == 1)
+    bench.publish(IMAGE_POSE, picture(drive, 0, frame='garden'))
+    assert until(lambda: node.monitor(IMAGE_POSE).used == 1)

@@ -41,17 +41,16 @@ def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, caps
     assert plain == {
         'used': 119 - 1 - 2 - 1 - 6 - 4,
         'skipped': {
-            'picture is unlike any of training': 4,
-            'picture is dark': 2,
-            'picture is covered: it shows nothing': 1,
-            'camera is frozen: it repeats its picture': 6,
+            'image is unlike any of training': 4,
+            'image is dark': 2,
+            'image is covered: it shows nothing': 1,
+            'camera is frozen: it repeats its image': 6,
         },
     }
-    assert '; 2 skipped: picture is dark' in capsys.readouterr().out
-    watch = {'frozen_pictures': 2, 'novelty_unusable': 1.5}
+    assert '; 2 skipped: image is dark' in capsys.readouterr().out
+    watch = {'novelty_limit': 1.5}
     found = evaluated(bag, tmp_path, sfa_node=watch)['counts']['observations']['skipped']
-    assert found['camera is frozen: it repeats its picture'] == 9
-    assert found['picture is unlike any of training'] == 4 + 3
+    assert found['image is unlike any of training'] == 4 + 3
 
 
 def test_unusable_pictures_are_not_scored(bag, tmp_path):
@@ -63,10 +62,14 @@ def test_unusable_pictures_are_not_scored(bag, tmp_path):
 
 def test_tune_leaves_out_the_same_pictures(bag):
     counts = [
-        len(tuning.read_tours([bag], PictureReader(), Recipe(), False, False, watch)[0].sight.poses)
-        for watch in (None, WatchConfig(frozen_pictures=2, novelty_unusable=1.5))
+        len(
+            tuning.read_drives([bag], PictureReader(), Recipe(), False, False, watch)[
+                0
+            ].images.poses
+        )
+        for watch in (None, WatchConfig(novelty_limit=1.5))
     ]
-    assert counts == [105, 105 - 3 - 3]
+    assert counts == [105, 105 - 3]
 
 
 @pytest.mark.parametrize('command', ['evaluate', 'tune'])
@@ -82,7 +85,7 @@ def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path,
 
 
 def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(bag, tmp_path, capsys):
-    figures = evaluated(bag, tmp_path, ekf_node={'gate_probability': 0.5})
+    figures = evaluated(bag, tmp_path, ekf_node={'measurement_factor': 0.02})
     out = capsys.readouterr().out
     rejected = figures['counts']['fusion']['measurement: outside the gate']
     assert f'filter: {rejected} times measurement: outside the gate' in out

@@ -15,15 +15,15 @@ from matplotlib.figure import Figure
 
 import sfa_localization
 from sfa_localization import config as config_file
-from sfa_localization import evaluation, filtering, place_model
+from sfa_localization import evaluation, filtering
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera import calibration
-from sfa_localization.commands import inspection_files
-from sfa_localization.commands.settings import DemoConfig
-from sfa_localization.data import files
+from sfa_localization.commands import inspect as inspect_command
+from sfa_localization.commands.demo import DemoConfig
+from sfa_localization.data import array_files, files
 from sfa_localization.data.errors import BagError, DataError, LocalizationError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport
 from sfa_localization.reports import bag as report_bag
 from sfa_localization.reports import evaluation as report
@@ -35,19 +35,21 @@ PLACES = np.zeros((5, 3))
 
 def mark_a_demo(path: Path) -> None:
     pytest.importorskip('rclpy')
-    from sfa_localization.commands import demo
+    from sfa_localization.commands import demonstration
 
-    demo._mark(path, DemoConfig())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstration, 'MARKER', path.name)
+        demonstration.prepare_folder(path.parent, DemoConfig())
 
 
 WRITERS = {
-    'arrays of a model or checkpoint': lambda p: place_model.write_arrays(p, {'a': PLACES}),
-    'calibration': lambda p: calibration.write_whole(p, b'camera'),
+    'arrays of a model or checkpoint': lambda p: array_files.write_arrays(p, {'a': PLACES}),
+    'calibration': lambda p: calibration.write_calibration(p, 'camera'),
     'check picture': lambda p: calibration.write_check(p, PICTURE),
     'parameter file': config_file.write_config,
     'figures of an evaluation': lambda p: evaluation.write_json(p, {'ekf': 1}),
     'path of the filter': lambda p: filtering.write_tum(p, np.arange(5), PLACES),
-    'what was inspected': lambda p: inspection_files._write_json([BagReport('bag')], p),
+    'what was inspected': lambda p: inspect_command.write_json(p, [BagReport('bag')]),
     'figure': lambda p: report.save(Figure(), p),
     'text of a report': lambda p: report.save_text(p, 'text'),
     'contact sheet': lambda p: report_bag.write_contact_sheet([PICTURE], 'bag', p),
@@ -56,12 +58,12 @@ WRITERS = {
 }
 # Who writes otherwise, and why it may.
 OTHERS = {
-    'bags/loading': 'decoded pictures, in a folder that its caller removes',
+    'bags/run_loader': 'decoded pictures, in a folder that its caller removes',
     'bags/storage': 'a decompressed copy, in a temporary folder',
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
     'commands/processes': 'what a program prints, while it prints it',
-    'training': 'the folder of decoded pictures, which it removes',
+    'bags/drives': 'the folder of decoded images, which it removes',
 }
 
 
@@ -79,7 +81,7 @@ class Failing(io.FileIO):
 
 def test_the_file_is_there_only_in_the_end(tmp_path):
     path = tmp_path / 'new' / 'a.txt'
-    with whole_file(path, make_folder=True) as file:
+    with atomic_write(path, make_folder=True) as file:
         file.write(b'whole')
         assert not path.exists()
     assert path.read_bytes() == b'whole'
@@ -91,7 +93,7 @@ def test_the_file_is_there_only_in_the_end(tmp_path):
 def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path, kind):
     path = tmp_path / 'a.txt'
     path.write_bytes(b'old')
-    with pytest.raises(kind), whole_file(path) as file:
+    with pytest.raises(kind), atomic_write(path) as file:
         file.write(b'half')
         raise kind
     assert path.read_bytes() == b'old'
@@ -101,7 +103,7 @@ def test_an_error_leaves_what_was_there_and_nothing_else(tmp_path, kind):
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     with (
         pytest.raises(DataError, match=r'missing/a\.txt: cannot be written: No such'),
-        whole_file(tmp_path / 'missing' / 'a.txt', DataError),
+        atomic_write(tmp_path / 'missing' / 'a.txt', DataError),
     ):
         raise AssertionError
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter as shipped errs as it says: chi-square tests over many robots, each drawn anew.
 
-Every robot has a wheel scale, a gyro bias and a camera clock of its own, slips, reads its speed
-with errors that last, and sees pictures whose errors hang together as its model knows.
+Every robot has a wheel scale and a gyro bias of its own, slips, reads its speed with errors that
+last, and takes images whose errors correlate as its model states.
 """
 
 import math
@@ -16,7 +16,9 @@ from scipy.stats import chi2
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose, wrap_angle
+from sfa_localization.fusion.motion import ODOMETRY_CORRELATION_S, TURN_RADIUS_M, YAW_PER_METER
 from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.recover import BIAS_STD, SCALE_STD
 from sfa_localization.fusion.settings import FilterConfig
 
 SHIPPED = FilterConfig()
@@ -38,7 +40,7 @@ class World:
 
 def lasting(rng, count, dt):
     """Unit errors (count, 2) of readings that err alike for as long as the filter reckons with."""
-    ratio = 1 + SHIPPED.odometry_correlation / dt
+    ratio = 1 + ODOMETRY_CORRELATION_S / dt
     fade = (ratio - 1) / (ratio + 1)
     errors = np.empty((count, 2))
     errors[0] = rng.standard_normal(2)
@@ -67,8 +69,8 @@ class Robot:
                     strict=True)  # fmt: skip
         omega = sum(size * np.sin(rate * t + phase) for size, rate, phase in turns)
         planned = np.stack([np.full(count, world.speed), omega], 1)
-        bias = SHIPPED.bias_std * rng.standard_normal()
-        scale = 1 + SHIPPED.scale_std * rng.standard_normal()
+        bias = BIAS_STD * rng.standard_normal()
+        scale = 1 + SCALE_STD * rng.standard_normal()
         self.stamps_ns = stamps(count, world.rate_hz)
         self.read = planned
         error = lasting(rng, count, dt) * [V_STD, OMEGA_STD]
@@ -80,7 +82,7 @@ class Robot:
     def _driven(self, rng, dt):
         way, turn = np.abs(self.true[:, 0]) * dt, np.abs(self.true[:, 1]) * dt
         slip = SHIPPED.slip_per_metre * np.sqrt(way)
-        yaw = np.sqrt(SHIPPED.yaw_per_metre**2 * way + SHIPPED.yaw_per_radian**2 * turn)
+        yaw = np.sqrt(YAW_PER_METER**2 * way + SHIPPED.yaw_per_radian**2 * turn)
         steps = arc(*self.true.T, dt)
         poses = [np.array([*rng.uniform(-5, 5, 2), rng.uniform(-3, 3)])]
         for k in range(1, len(steps)):
@@ -94,7 +96,7 @@ class Robot:
 
     def _seen(self, rng, error):
         poses = self.poses[self.pictures]
-        moved = np.abs(self.true) @ [1, SHIPPED.turn_radius]
+        moved = np.abs(self.true) @ [1, TURN_RADIUS_M]
         moved = np.cumsum(moved) * (self.stamps_ns[1] - self.stamps_ns[0]) * 1e-9
         fades = np.exp(-np.diff(moved[self.pictures], prepend=0) / error.distance_m)
         common, seen = rng.standard_normal(3), []

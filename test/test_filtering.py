@@ -197,7 +197,7 @@ def test_the_deviation_of_positions_is_found(tmp_path):
 
 def test_settings_of_the_user_are_not_second_guessed(tmp_path):
     odometry, positions = write_logs(tmp_path, Drive(seconds=30, **NOISY), variance=False)
-    config = FilterConfig(position_std=5.0)
+    config = FilterConfig(measurement_factor=5.0)
     tables = filtering.read_odometry_table(odometry), filtering.read_position_table(positions)
     assert filtering.fitting_config(*tables, config) == (config, '')
 
@@ -213,9 +213,9 @@ def test_headings_in_the_log_are_fused(tmp_path):
 
 
 def test_a_parameter_file_is_obeyed(tmp_path, capsys):
-    (tmp_path / 'c.yaml').write_text('ekf_node:\n  ros__parameters:\n    history: 99999.0\n')
+    (tmp_path / 'c.yaml').write_text('ekf_node:\n  ros__parameters:\n    slip_per_metre: 99999.0\n')
     code, _ = run(tmp_path, Drive(seconds=1), '--config', str(tmp_path / 'c.yaml'))
-    assert code == 1 and 'history' in capsys.readouterr().err
+    assert code == 1 and 'slip_per_metre' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(('odometry', 'positions', 'why'), [

@@ -11,16 +11,24 @@ from metric_worlds import criss_cross, drive, garden_features, grid, lanes, mean
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align
-from sfa_localization.metric.alternation import fit, targets
+from sfa_localization.metric import selection, sufficiency
+from sfa_localization.metric.alternation import MetricProblem
 from sfa_localization.metric.expansions import Process
-from sfa_localization.metric.forecast import REACH_M, Forecast, _beyond, _gap, _Leaver, nearest_used
-from sfa_localization.metric.learning import learn, positions, with_frame
-from sfa_localization.metric.quadratic_form import Links, Stack
+from sfa_localization.metric.forecast import (
+    REACH_M,
+    Forecast,
+    _beyond,
+    _gap,
+    _left_out_errors,
+    nearest_used,
+)
+from sfa_localization.metric.learning import learn_metric, positions
+from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
-CONFIG = MetricConfig(slow_features=12, inducing_points=300, angle_std_max=180.0)
+CONFIG = MetricConfig(slow_features=12)
 DRIVES = {
     'straight legs': criss_cross(30, half=(5.0, 5.0), seed=1, shortest=5.0),
     'other legs': criss_cross(40, half=(6.0, 4.0), seed=2, shortest=5.0),
@@ -37,7 +45,15 @@ def trained(name, noise=0.05):
     run = drive(twists, start=start, bias=1.4e-3, yaw_noise=0.01, speed_noise=0.03, seed=5)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
     features = garden_features(run.poses[:, :2], noise=noise)
-    return run.poses, segments, features, learn(features, segments, CONFIG)
+    with pytest.MonkeyPatch.context() as patch:
+        quick_and_tolerant(patch)
+        return run.poses, segments, features, learn_metric(features, segments, CONFIG)
+
+
+def quick_and_tolerant(patch):
+    """Few inducing points, and directions as uncertain as they may be."""
+    patch.setattr(selection, 'INDUCING_POINTS', 300)
+    patch.setattr(sufficiency, 'ANGLE_STD_MAX_DEG', 180.0)
 
 
 @cache
@@ -47,12 +63,10 @@ def legs():
 
 @cache
 def fitted():
-    """A fit of a small process, and its stack."""
+    """A fit of a small process."""
     _, segments, features, _ = legs()
-    stack = Stack.of(segments)
-    rows = features[stack.images]
-    basis = Process.fit(rows, np.full(12, 0.3), 1e-2, 60)
-    return fit(basis, rows, stack, Links.of(segments, True, True), CONFIG), stack
+    problem = MetricProblem.of(features, segments, CONFIG)
+    return problem.fit(Process.fit(problem.features, np.full(12, 0.3), 1e-2, 60))
 
 
 def between(known, count=1500):
@@ -93,11 +107,12 @@ def test_forecasts_and_ellipses_are_right_on_average():
     assert 0.91 < shares.mean() < 0.985
 
 
-def test_it_is_worst_where_the_images_mislead():
+def test_it_is_worst_where_the_images_mislead(monkeypatch):
+    quick_and_tolerant(monkeypatch)
     poses, segments, features, _ = legs()
     misled = poses[:, 0] > 2.5
     noise = 0.6 * np.random.default_rng(1).standard_normal(features.shape)
-    result = learn(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
+    result = learn_metric(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
     images, places = positions(result, segments)
     x, y, error = result.forecast.worst
     assert poses[images[np.hypot(*(places - [x, y]).T).argmin()], 0] > 2.0
@@ -105,9 +120,9 @@ def test_it_is_worst_where_the_images_mislead():
 
 
 def test_images_left_out_together_are_predicted_as_by_a_map_learnt_without_them():
-    whole, stack = fitted()
+    whole = fitted()
     group = np.array([40, 41, 42, 43, 90])
-    places = targets(whole.solution, stack)
+    places = whole.places
 
     def off(used):
         """Errors of the map learnt from the used images; the drive's own positions stay."""
@@ -116,9 +131,10 @@ def test_images_left_out_together_are_predicted_as_by_a_map_learnt_without_them(
         return places - whole.expanded @ np.linalg.solve(normal, weighted.T @ places)
 
     used = np.ones(len(places))
-    whole = replace(whole, residuals=off(used))
+    residuals, white = off(used), whole.elimination.whitened(whole.expanded).T
     used[group] = 0.0
-    assert _Leaver(whole).error(42, group) == pytest.approx(off(used)[42], rel=1e-5)
+    left_out = _left_out_errors(white[group], whole.weights[group], residuals[group])
+    assert left_out == pytest.approx(off(used)[group], rel=1e-5)
 
 
 def test_points_lie_around_the_drive():
@@ -133,7 +149,9 @@ def test_points_lie_around_the_drive():
 
 def test_the_gap_ends_at_the_same_distances_as_the_point_has():
     ends = np.arange(11) * 0.5 + 0j
-    stack = replace(fitted()[1], owner=np.zeros(11, int), first=np.array([0]), images=np.arange(11))
+    stack = replace(
+        fitted().stack, owner=np.zeros(11, int), first=np.array([0]), images=np.arange(11)
+    )
     rng = np.random.default_rng(1)
     gaps = {tuple(_gap(ends, stack, 5, 0.6, 1.2, rng).tolist()) for _ in range(20)}
     assert gaps == {(3, 4, 5, 6), (4, 5, 6, 7)}
@@ -162,21 +180,22 @@ def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points(
 def test_a_forecast_moves_with_its_map():
     result = legs()[3]
     frame = RigidTransform(1.0, 2.0, -0.5)
-    moved = with_frame(result, frame).forecast
+    moved = result.forecast.moved(frame)
     x, y, error = result.forecast.worst
     assert moved.worst[:2] == pytest.approx(frame.apply(np.array([[x, y]]))[0])
     assert moved.worst[2] == pytest.approx(error)
 
 
 @pytest.mark.parametrize('length', [0.1, 3.0, 10.0, 100.0, 1e4])
-def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length):
+def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length, monkeypatch):
     _, segments, features, _ = legs()
-    config = replace(CONFIG, left_out_length=length)
+    quick_and_tolerant(monkeypatch)
+    monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', length)
     stack = Stack.of(segments)
-    parts = folds(stack, config)
-    assert 2 <= len(parts) <= config.left_out_folds
+    parts = folds(stack, 0)
+    assert 2 <= len(parts) <= selection.LEFT_OUT_FOLDS
     assert sorted(np.concatenate(parts)) == list(range(len(stack.images)))
-    result = learn(features, segments, config)
+    result = learn_metric(features, segments, CONFIG)
     assert result.certificate.certified
     assert np.isfinite(result.left_out_error_m)
     assert np.isfinite(result.map.predict(features)[1]).all()
@@ -184,11 +203,12 @@ def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length):
 
 
 @pytest.mark.parametrize('many', [2, 3, 5])
-def test_few_segments_are_never_left_out_all_at_once(many):
+def test_few_segments_are_never_left_out_all_at_once(many, monkeypatch):
     stack = Stack.of(cut_lanes(many))
+    monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', 1e4)
     for number in (2, 8):
-        config = replace(CONFIG, left_out_length=1e4, left_out_folds=number)
-        assert len(folds(stack, config)) >= 2
+        monkeypatch.setattr(selection, 'LEFT_OUT_FOLDS', number)
+        assert len(folds(stack, 0)) >= 2
 
 
 def cut_lanes(many):
@@ -200,4 +220,4 @@ def cut_lanes(many):
 
 def test_a_single_segment_is_refused():
     with pytest.raises(DataError, match='drive farther'):
-        folds(Stack.of(cut_lanes(1)), CONFIG)
+        folds(Stack.of(cut_lanes(1)), 0)

@@ -10,18 +10,21 @@ from cylinder_worlds import place, visit
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.features.image_features import harmonics
+from sfa_localization.metric import compass_training
 from sfa_localization.metric.compass import (
     UNKNOWN_YAW_VARIANCE,
     Compass,
-    HeadingFit,
-    _kernel,
-    _prior,
-    fit_compass,
-    harmonics,
+    kernel_between,
+    prior_variance,
 )
-from sfa_localization.metric.settings import HeadingConfig
+from sfa_localization.metric.compass_training import CompassFit, fit_compass
 
-CONFIG = HeadingConfig(heading_inducing_points=80)
+
+@pytest.fixture(autouse=True)
+def few_inducing_images(monkeypatch):
+    """Fewer than there are images, so that they matter."""
+    monkeypatch.setattr(compass_training, 'INDUCING_IMAGES', 80)
 
 
 @cache
@@ -37,11 +40,11 @@ def scene(count: int = 240, seed: int = 0):
     return features, own * np.exp(-1j * yaw)[:, None] + noise, yaw
 
 
-def fitted(yaw=None, harmonic=None, config=CONFIG) -> HeadingFit:
+def fitted(yaw=None, harmonic=None) -> CompassFit:
     features, own, true = scene()
     yaw = true if yaw is None else yaw
     harmonic = own if harmonic is None else harmonic
-    return fit_compass(features, harmonic, yaw, np.arange(len(yaw)) // 20 % 6, config)
+    return fit_compass(features, harmonic, yaw, np.arange(len(yaw)) // 20 % 6)
 
 
 def test_harmonics_by_hand():
@@ -59,7 +62,7 @@ def test_harmonics_turn_with_the_columns():
 
 def test_headings_are_learnt():
     fit = fitted()
-    assert np.degrees(np.abs(fit.left_out_error).mean()) < 2
+    assert np.degrees(np.abs(fit.error).mean()) < 2
     features, harmonic, yaw = scene()
     told, variance = fit.compass.predict(features, harmonic)
     assert np.degrees(np.abs(wrap_angle(told - yaw)).max()) < 5
@@ -96,9 +99,9 @@ def test_contrast_does_not_matter():
 
 def test_variance_holds_on_left_out_pictures():
     fit = fitted()
-    within = (np.abs(fit.left_out_error) < 1.96 * fit.left_out_std).mean()
+    within = (np.abs(fit.error) < 1.96 * fit.std).mean()
     assert 0.9 <= within <= 1.0
-    assert np.median(fit.left_out_std) < np.radians(10)
+    assert np.median(fit.std) < np.radians(10)
 
 
 def test_ambiguous_scenes_are_unsure():
@@ -109,7 +112,6 @@ def test_ambiguous_scenes_are_unsure():
         np.repeat(harmonic, 2, axis=0),
         np.stack([yaw, yaw + np.pi], 1).ravel(),
         np.arange(2 * len(yaw)) // 40 % 6,
-        CONFIG,
     )
     _, variance = both.compass.predict(features, harmonic)
     assert np.sqrt(np.median(variance)) > np.radians(60)
@@ -149,9 +151,9 @@ def test_prediction_by_definition():
     features, harmonic, _ = scene()
     compass = fitted().compass
     s, f = compass._scaled(features, harmonic)
-    kernel = _kernel(s, f, compass.features, compass.harmonic, compass.length)
+    kernel = kernel_between(s, f, compass.features, compass.harmonic, compass.length)
     explained = np.einsum('tm,mn,tn->t', kernel, compass.uncertainty, kernel.conj()).real
-    expected = np.maximum(_prior(f) - explained, 0) + compass.noise
+    expected = np.maximum(prior_variance(f) - explained, 0) + compass.noise
     g, variance = compass._field(features, harmonic)
     assert np.allclose(g, kernel @ compass.weights, atol=1e-3)
     assert np.allclose(variance, expected, rtol=0.02)
@@ -174,18 +176,19 @@ def test_arrays_round_trip():
 def test_same_data_same_bytes():
     one, other = fitted(), fitted()
     assert one.compass.weights.tobytes() == other.compass.weights.tobytes()
-    assert one.left_out_error.tobytes() == other.left_out_error.tobytes()
+    assert one.error.tobytes() == other.error.tobytes()
 
 
 @pytest.mark.parametrize(('count', 'folds'), [(19, 6), (0, 6), (100, 1)])
 def test_too_few_labels_are_refused(count, folds):
     features, harmonic, yaw = (part[:count] for part in scene())
     with pytest.raises(DataError, match='too few to learn a compass'):
-        fit_compass(features, harmonic, yaw, np.arange(count) % folds, CONFIG)
+        fit_compass(features, harmonic, yaw, np.arange(count) % folds)
 
 
-def test_no_features_still_tell_heading():
+def test_no_features_still_tell_heading(monkeypatch):
     """Of one place only, the harmonics alone suffice."""
-    fit = fitted(config=HeadingConfig(heading_inducing_points=80, heading_features=0))
-    assert np.isfinite(fit.left_out_error).all()
-    assert np.degrees(np.median(np.abs(fit.left_out_error))) < 30
+    monkeypatch.setattr(compass_training, 'PLACE_FEATURES', 0)
+    fit = fitted()
+    assert np.isfinite(fit.error).all()
+    assert np.degrees(np.median(np.abs(fit.error))) < 30

@@ -7,41 +7,50 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cylinder_worlds import ARCHITECTURE, SIZE, drive
-from test_rotation import assert_equal, brute_force, views
+from test_rotation import added, assert_equal, brute_force, views
 
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.features import network_training as hierarchy
-from sfa_localization.features.network import LAYERS, Network, Node, expand, prepare
+from sfa_localization.features.network import (
+    STANDARD_LAYERS,
+    Network,
+    Node,
+    expand,
+    input_map,
+    standard_architecture,
+)
 from sfa_localization.features.network_training import (
-    Drive,
+    ImageSequence,
     Partial,
     Shard,
-    architecture_of,
     shards_of,
-    stage_statistics,
     train_network,
 )
-from sfa_localization.features.settings import NetworkConfig
-from sfa_localization.features.sfa import solve
+from sfa_localization.features.sfa import Statistics, solve
 
-CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
-
-
-def trained(*drives: Drive, config: NetworkConfig = CONFIG, **options) -> Network:
-    return train_network(ARCHITECTURE, drives, config, **options)
+CUT = 1e-7
+"""Keeps what float64 and float32 agree on, so that both networks have the same directions."""
 
 
-def explicit_network(of: Drive) -> Network:
+def trained(*sequences: ImageSequence, **options) -> Network:
+    return train_network(ARCHITECTURE, sequences, light_std=0.0, relative_cut=CUT, **options)
+
+
+def stage_statistics(partial: Partial, shard: Shard) -> Statistics:
+    return hierarchy.stage_sums(partial, shard).result()
+
+
+def explicit_network(of: ImageSequence) -> Network:
     """Train on every picture really turned, node by node, in float64."""
     turned = sequence_of_pictures(of.panoramas.read(0, len(of.panoramas)))
-    below, nodes = prepare(turned, ARCHITECTURE), []
+    below, nodes = input_map(turned, ARCHITECTURE), []
     for layer, field in zip(ARCHITECTURE.layers, ARCHITECTURE.fields, strict=True):
         seen = views(below, field)
-        linear = solve(brute_force(seen, 12, of.scale), layer.linear, CONFIG.relative_cut)
+        linear = solve(brute_force(seen, 12, of.joined), layer.linear, CUT)
         z = linear.apply(seen)
         expanded = np.moveaxis(expand(np.moveaxis(z, -1, 0)), 0, -1)
-        slow = solve(brute_force(expanded, 12, of.scale), layer.outputs, CONFIG.relative_cut)
+        slow = solve(brute_force(expanded, 12, of.joined), layer.outputs, CUT)
         nodes.append(Node.from_solutions(linear, slow))
         below = np.clip(slow.apply(expanded), -layer.clip, layer.clip).astype(np.float32)
     return Network(ARCHITECTURE, tuple(nodes))
@@ -66,7 +75,7 @@ def correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def test_features_equal_those_of_the_explicit_sequence(broken):
     of = drive(24)
     if broken:
-        of.scale[[7, 15]] = 0
+        of.joined[[7, 15]] = False
     images = of.panoramas.read(0, 24)
     ours, theirs = trained(of).maps(images), explicit_network(of).maps(images)
     for depth, (one, other) in enumerate(zip(ours, theirs, strict=True)):
@@ -84,7 +93,7 @@ def test_every_stage_equals_the_explicit_sequence():
             z = partial.linear.apply(seen)
             seen = np.moveaxis(expand(np.moveaxis(z, -1, 0)), 0, -1)
         assert_equal(
-            stage_statistics(partial, Shard(of, 0, 20)), brute_force(seen, 12, of.scale), 2e-5
+            stage_statistics(partial, Shard(of, 0, 20)), brute_force(seen, 12, of.joined), 2e-5
         )
 
 
@@ -128,7 +137,7 @@ def test_shards_add_up():
     of = drive(12)
     whole = stage_statistics(Partial(ARCHITECTURE), Shard(of, 0, 12))
     parts = [stage_statistics(Partial(ARCHITECTURE), Shard(of, *cut)) for cut in ((0, 5), (5, 12))]
-    assert_equal(parts[0] + parts[1], whole)
+    assert_equal(added(*parts), whole)
 
 
 def test_drives_do_not_touch():
@@ -136,13 +145,13 @@ def test_drives_do_not_touch():
     both = drive(24)
     images, stamps = both.panoramas.images, both.panoramas.stamps_ns
     parts = [
-        Drive(PanoramaArray(stamps[cut], images[cut]), np.ones(11, np.float32))
+        ImageSequence(PanoramaArray(stamps[cut], images[cut]), np.ones(11, bool))
         for cut in (slice(0, 12), slice(12, 24))
     ]
     apart = trained(*parts)
-    joined = np.ones(23, np.float32)
-    joined[11] = 0
-    broken = trained(Drive(both.panoramas, joined))
+    joined = np.ones(23, bool)
+    joined[11] = False
+    broken = trained(ImageSequence(both.panoramas, joined))
     for one, other in zip(apart.maps(images), broken.maps(images), strict=True):
         assert correlations(one, other).min() > 0.99999
     assert not np.allclose(apart.nodes[0].linear, trained(both).nodes[0].linear, atol=1e-4)
@@ -163,69 +172,50 @@ def test_progress_counts_every_picture_in_every_stage():
     assert sum(told) == 6 * 18
 
 
-def test_scale_weighs_the_differences():
-    of = drive(10)
-    uneven = replace(of, scale=np.linspace(0.2, 2, 9).astype(np.float32))
-    images = of.panoramas.read(0, 10)
-    seen = views(prepare(sequence_of_pictures(images), ARCHITECTURE), ARCHITECTURE.fields[0])
-    ours = stage_statistics(Partial(ARCHITECTURE), Shard(uneven, 0, 10))
-    assert_equal(ours, brute_force(seen, 12, uneven.scale))
-
-
 class TestPhotometric:
     """The random light of training pictures."""
 
-    LIT = replace(CONFIG, photometric_std=0.3, photometric_seed=5)
-
-    def lit(self, start: int, stop: int, config: NetworkConfig) -> np.ndarray:
-        of = drive(12)
-        shard = replace(shards_of([of], config)[0], start=start, stop=stop)
+    def lit(self, start: int, stop: int, std: float = 0.3, seed: int = 5) -> np.ndarray:
+        shard = replace(shards_of([drive(12)], seed, std)[0], start=start, stop=stop)
         return np.concatenate([images for images, _ in shard.batches()])
 
     def test_a_picture_is_lit_alike_in_every_shard_and_pass(self):
-        whole = self.lit(0, 12, self.LIT)
-        assert np.array_equal(self.lit(4, 12, self.LIT), whole[4:])
-        assert np.array_equal(self.lit(0, 12, self.LIT), whole)
+        whole = self.lit(0, 12)
+        assert np.array_equal(self.lit(4, 12), whole[4:])
+        assert np.array_equal(self.lit(0, 12), whole)
 
     def test_pictures_are_lit_differently(self):
-        brightness = self.lit(0, 12, self.LIT).mean((1, 2, 3))
-        assert brightness.std() > 3 * self.lit(0, 12, CONFIG).mean((1, 2, 3)).std()
+        brightness = self.lit(0, 12).mean((1, 2, 3))
+        assert brightness.std() > 3 * self.lit(0, 12, std=0.0).mean((1, 2, 3)).std()
 
     def test_another_seed_is_another_light(self):
-        other = replace(self.LIT, photometric_seed=6)
-        assert not np.array_equal(self.lit(0, 12, other), self.lit(0, 12, self.LIT))
+        assert not np.array_equal(self.lit(0, 12, seed=6), self.lit(0, 12))
 
 
 class TestArchitecture:
-    """The network that the configuration asks for."""
+    """The standard network for a size of panorama."""
 
-    @pytest.mark.parametrize('name', LAYERS)
+    @pytest.mark.parametrize('name', STANDARD_LAYERS)
     def test_found_by_size(self, name):
         width, height = map(int, name.split('x'))
-        assert architecture_of(NetworkConfig(), (height, width)).layers == LAYERS[name][1]
+        found = standard_architecture((height, width), 'panorama')
+        assert (found.binning, found.layers) == STANDARD_LAYERS[name]
 
     def test_no_fit_tells_sizes_for_each(self):
-        with pytest.raises(ConfigError, match=r'no standard network fits.*use.*use.*custom'):
-            architecture_of(NetworkConfig(), (61, 601))
-
-    def test_custom_default_is_the_standard(self):
-        custom = architecture_of(NetworkConfig(layers='custom'), (60, 600))
-        assert custom == architecture_of(NetworkConfig(), (60, 600))
-
-    def test_custom_arrays_of_one_length(self):
-        with pytest.raises(ConfigError, match='one per layer'):
-            architecture_of(NetworkConfig(layers='custom', field_rows=(10,)), (60, 600))
+        with pytest.raises(ConfigError, match=r'no standard network fits.*use.*use.*Architecture'):
+            standard_architecture((61, 601), 'panorama')
 
 
 def test_a_single_picture_is_refused():
     of = drive(2)
-    single = Drive(PanoramaArray(of.panoramas.stamps_ns[:1], of.panoramas.read(0, 1)), of.scale[:0])
+    first = PanoramaArray(of.panoramas.stamps_ns[:1], of.panoramas.read(0, 1))
+    single = ImageSequence(first, of.joined[:0])
     with pytest.raises(DataError, match='two consecutive'):
         trained(single)
 
 
 def test_blank_pictures_are_refused():
     images = np.full((5, *SIZE, 3), 99, np.uint8)
-    blank = Drive(PanoramaArray(np.arange(5), images), np.ones(4, np.float32))
+    blank = ImageSequence(PanoramaArray(np.arange(5), images), np.ones(4, bool))
     with pytest.raises(DataError, match='rank'):
         trained(blank)

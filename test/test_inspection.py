@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `inspect` tells of bags: contents, problems, the camera, and whether they suffice."""
+"""Reports of `inspect`: contents, problems, the camera, and whether the drive suffices."""
 
 import json
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfa_localization.bags.loading import BagWriter
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
     DUAL_FISHEYE,
@@ -18,14 +18,15 @@ from sfa_localization.inspection import (
     OMNIDIRECTIONAL,
     ORDINARY,
     PANORAMA,
+    SAMPLES,
     InspectionConfig,
-    area,
-    covered,
+    covered_share,
     directions,
     guess_geometry,
+    hull_area,
     inspect,
+    path_length,
     spacing,
-    way,
 )
 
 START = 1_700_000_000_000_000_000
@@ -93,6 +94,7 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
         'height': 8,
         'geometry': PANORAMA,
     }
+    assert report.images is not None and len(report.images.samples) == SAMPLES
     assert 'enough to train on' in report.as_text()
     assert 'not enough' not in report.as_text()
 
@@ -100,17 +102,17 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('options', 'reason'),
     [
-        ({'pictures': 149}, '149 pictures with odometry are few'),
+        ({'pictures': 149}, '149 images with odometry are few'),
         ({'route': line}, 'driven along 1 of 6 directions'),
-        ({'route': circle}, 'of the area lie within 1 m of a picture'),
+        ({'route': circle}, 'of the area lie within 1 m of an image'),
         ({'route': lambda share: (0.0, 0.0), 'speed': 0.0}, 'the robot did not move'),
-        ({'shape': (48, 64)}, 'the pictures do not look around'),
-        ({'brightness': 4}, 'the pictures are dark'),
-        ({'odometry_until': 0.5}, '299 of 600 pictures have no odometry nearby'),
+        ({'shape': (48, 64)}, 'the images do not show all directions'),
+        ({'brightness': 4}, 'the images are dark'),
+        ({'odometry_until': 0.5}, '299 of 600 images have no odometry nearby'),
         ({'pictures': 160}, 'm apart: drive slower'),
     ],
 )
-def test_it_tells_why_a_drive_is_not_enough(
+def test_it_gives_the_reason_why_a_drive_is_not_enough(
     options: dict[str, object], reason: str, tmp_path: Path
 ) -> None:
     report = inspect(write(tmp_path / 'bag', **options), config=ENOUGH)
@@ -119,7 +121,7 @@ def test_it_tells_why_a_drive_is_not_enough(
 
 
 @pytest.mark.parametrize('missing', ['/panorama', '/odom'])
-def test_a_missing_topic_is_told_not_raised(missing: str, tmp_path: Path) -> None:
+def test_a_missing_topic_is_reported_not_raised(missing: str, tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         for index in range(3):
             if missing != '/odom':
@@ -141,7 +143,7 @@ def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
             bag.image('/panorama', at, np.zeros((8, width, 3), np.uint8), 'camera')
             bag.odometry('/odom', 0 if index == 3 else at, (0, 0, 0), (0, 0), (0, 0))
     problems = {topic.name: topic.problems for topic in inspect(tmp_path / 'bag').topics}
-    assert problems['/panorama'] == ['pause of 10.2 s', 'pictures of several sizes: 80x8, 60x8']
+    assert problems['/panorama'] == ['pause of 10.2 s', 'images of several sizes: 80x8, 60x8']
     assert problems['/odom'] == ['1 of 20 messages: zero or negative stamp', 'pause of 10.2 s']
 
 
@@ -150,12 +152,12 @@ def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
 SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]])
 
 
-def test_way_area_and_directions_of_a_square() -> None:
-    assert way(SQUARE) == 16.0
-    assert area(SQUARE) == pytest.approx(16.0)
+def test_length_area_and_directions_of_a_square() -> None:
+    assert path_length(SQUARE) == 16.0
+    assert hull_area(SQUARE) == pytest.approx(16.0)
     assert directions(SQUARE) == 2
     assert directions(np.array([[0, 0], [5, 0], [0, 0]])) == 1
-    assert area(SQUARE[:2]) == 0.0 and covered(SQUARE[:2], 1.0) == 0.0
+    assert hull_area(SQUARE[:2]) == 0.0 and covered_share(SQUARE[:2], 1.0) == 0.0
 
 
 def test_ground_within_reach_of_a_square_path() -> None:
@@ -165,10 +167,10 @@ def test_ground_within_reach_of_a_square_path() -> None:
         [np.stack(edge, -1) for edge in [(side, zero), (side, four), (zero, side), (four, side)]]
     )
     # All but the inner 2 m x 2 m.
-    assert covered(ring, 1.0) == pytest.approx(1 - 4 / 16, abs=0.03)
+    assert covered_share(ring, 1.0) == pytest.approx(1 - 4 / 16, abs=0.03)
 
 
-def test_spacing_ignores_pictures_taken_standing() -> None:
+def test_spacing_ignores_images_taken_standing() -> None:
     places = np.zeros((300, 2))
     places[:100, 0] = 0.3 * np.arange(100)
     places[100:, 0] = places[99, 0]
@@ -195,7 +197,7 @@ def test_a_wide_strip_is_a_panorama() -> None:
     assert guess_geometry(views((200, 400))) == PANORAMA
 
 
-def test_an_ordinary_picture_is_told_as_such() -> None:
+def test_an_ordinary_image_is_recognized() -> None:
     assert guess_geometry(views((240, 320))) == ORDINARY
 
 
@@ -221,7 +223,7 @@ def test_two_circles_are_a_dual_fisheye() -> None:
 # The command.
 
 
-def test_the_command_writes_json_and_pictures(
+def test_the_command_writes_json_and_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, report = write(tmp_path / 'good'), tmp_path / 'report'

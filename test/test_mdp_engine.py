@@ -5,7 +5,6 @@
 import inspect
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +14,10 @@ from test_hierarchy import correlations
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.features import mdp_engine, mdp_shim
 from sfa_localization.features import network_training as hierarchy
-from sfa_localization.features.network import prepare
+from sfa_localization.features.network import input_map
 from sfa_localization.features.rotation import unfold
-from sfa_localization.features.settings import NetworkConfig
 
-CONFIG = NetworkConfig(relative_cut=1e-7, photometric_std=0.0)
+PLAIN = {'light_std': 0.0, 'relative_cut': 1e-7}
 
 try:
     mdp = mdp_shim.import_mdp()
@@ -30,12 +28,12 @@ except ConfigError as error:
 @pytest.mark.parametrize('relative_cut', [1e-7, 1e-2])
 @pytest.mark.parametrize('broken', [False, True])
 def test_engines_learn_the_same_features(broken, relative_cut):
-    of, config = drive(24), replace(CONFIG, relative_cut=relative_cut)
+    of, options = drive(24), {**PLAIN, 'relative_cut': relative_cut}
     if broken:
-        of.scale[[7, 15]] = 0
+        of.joined[[7, 15]] = False
     images = of.panoramas.read(0, 24)
-    ours = hierarchy.train_network(ARCHITECTURE, [of], config)
-    theirs = mdp_engine.train_network(ARCHITECTURE, [of], config)
+    ours = hierarchy.train_network(ARCHITECTURE, [of], **options)
+    theirs = mdp_engine.train_network(ARCHITECTURE, [of], **options)
     assert ours.ranks == theirs.ranks
     for depth, (one, other) in enumerate(zip(ours.maps(images), theirs.maps(images), strict=True)):
         assert correlations(one, other).min() > 0.9999, f'layer {depth + 1}'
@@ -45,17 +43,17 @@ def test_engines_learn_the_same_features(broken, relative_cut):
 
 def test_the_network_is_the_flow():
     of = drive(12)
-    flow, network = mdp_engine.train_flow(ARCHITECTURE, [of], CONFIG)
+    flow, network = mdp_engine.train_flow(ARCHITECTURE, hierarchy.shards_of([of], 0, 0.0), 1e-7)
     images = of.panoramas.read(3, 5)
-    flat = prepare(images, ARCHITECTURE).reshape(2, -1).astype(float)
+    flat = input_map(images, ARCHITECTURE).reshape(2, -1).astype(float)
     assert np.allclose(flow.execute(flat).reshape(2, 1, 12, 4), network.maps(images)[-1], atol=2e-3)
 
 
 def test_several_drives():
     drives = [drive(10), drive(12, seed=3)]
     images = drives[0].panoramas.read(0, 10)
-    ours = hierarchy.train_network(ARCHITECTURE, drives, CONFIG).maps(images)
-    theirs = mdp_engine.train_network(ARCHITECTURE, drives, CONFIG).maps(images)
+    ours = hierarchy.train_network(ARCHITECTURE, drives, **PLAIN).maps(images)
+    theirs = mdp_engine.train_network(ARCHITECTURE, drives, **PLAIN).maps(images)
     assert correlations(ours[-1], theirs[-1]).min() > 0.9999
 
 
@@ -69,22 +67,15 @@ def test_switchboards_show_what_fields_see(receptive):
 
 def test_progress_counts_every_picture_in_every_pass():
     told = []
-    mdp_engine.train_network(ARCHITECTURE, [drive(6)], CONFIG, on_shard=told.append)
+    mdp_engine.train_network(ARCHITECTURE, [drive(6)], **PLAIN, on_shard=told.append)
     assert sum(told) == 6 * 6
-
-
-def test_only_differences_per_picture():
-    of = drive(6)
-    of.scale[2] = 0.5
-    with pytest.raises(ConfigError, match='set difference'):
-        mdp_engine.train_network(ARCHITECTURE, [of], CONFIG)
 
 
 def test_blank_pictures_are_refused():
     of = drive(6)
     of.panoramas.images[:] = 99
     with pytest.raises(DataError, match='rank'):
-        mdp_engine.train_network(ARCHITECTURE, [of], CONFIG)
+        mdp_engine.train_network(ARCHITECTURE, [of], **PLAIN)
 
 
 def test_shim_leaves_no_patch_behind():
@@ -108,8 +99,8 @@ def test_shim_leaves_no_patch_behind():
 
 
 def test_shim_does_nothing_where_mdp_imports(monkeypatch):
-    monkeypatch.setattr(mdp_shim, '_lent_type_names', lambda: pytest.fail('patched'))
-    monkeypatch.setattr(mdp_shim, '_patient_argspec', lambda: pytest.fail('patched'))
+    monkeypatch.setattr(mdp_shim, '_with_type_names', lambda: pytest.fail('patched'))
+    monkeypatch.setattr(mdp_shim, '_with_lenient_argspec', lambda: pytest.fail('patched'))
     before = inspect.getfullargspec
     assert mdp_shim.import_mdp() is mdp
     assert inspect.getfullargspec is before

@@ -4,19 +4,27 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion import motion
-from sfa_localization.fusion.motion import BIAS, ERROR, OMEGA, SCALE, SIZE, YAW, State, Twist, V
-from sfa_localization.fusion.settings import FilterConfig, resolved
+from sfa_localization.fusion.motion import (
+    BIAS,
+    ERROR,
+    OMEGA,
+    SCALE,
+    SIZE,
+    YAW,
+    MotionNoise,
+    State,
+    Twist,
+    V,
+)
 
-CONFIG = resolved(FilterConfig())
-QUIET = replace(CONFIG, slip_per_metre=0.0, yaw_per_metre=0.0, yaw_per_radian=0.0, bias_walk=0.0,
-                scale_walk=0.0, odometry_correlation=0.0)  # fmt: skip
+NOISE = MotionNoise(slip_per_meter=0.02, yaw_per_radian=0.02, decorrelation_m=1.0)
+SMOOTH = MotionNoise(slip_per_meter=0.0, yaw_per_radian=0.0, decorrelation_m=1.0)
 
 
 def random_mean(rng):
@@ -42,9 +50,9 @@ def differences(function, mean, step=1e-6):
 def test_jacobian_of_driving_is_the_derivative(v, omega):
     mean = random_mean(np.random.default_rng(1))
     twist = Twist(v, omega, 1e-4, 1e-4)
-    step = motion.drive(mean, twist, 0.3, CONFIG)
-    # The picture error's fading depends on the way, but is no derivative worth having.
-    numeric = differences(lambda m: motion.drive(m, twist, 0.3, CONFIG).mean, mean)
+    step = motion.drive(mean, twist, 0.3, NOISE)
+    # The shared error fades with the distance; that derivative is second order and left out.
+    numeric = differences(lambda m: motion.drive(m, twist, 0.3, NOISE).mean, mean)
     assert np.allclose(step.jacobian[:ERROR], numeric[:ERROR], atol=1e-7)
     assert np.allclose(step.jacobian[ERROR:, ERROR:], numeric[ERROR:, ERROR:], atol=1e-7)
 
@@ -54,21 +62,21 @@ def test_jacobian_of_coasting_is_the_derivative(omega):
     mean = random_mean(np.random.default_rng(2))
     mean[V], mean[OMEGA] = 0.8, omega
     twist = Twist(0.8, omega, 1e-4, 1e-4)
-    step = motion.coast(mean, twist, 0.2, CONFIG)
-    numeric = differences(lambda m: motion.coast(m, twist, 0.2, CONFIG).mean, mean)
+    step = motion.coast(mean, twist, 0.2, NOISE)
+    numeric = differences(lambda m: motion.coast(m, twist, 0.2, NOISE).mean, mean)
     assert np.allclose(step.jacobian[:ERROR], numeric[:ERROR], atol=1e-7)
 
 
 def test_a_quarter_circle_is_a_quarter_circle():
     twist = Twist(math.pi / 2, math.pi / 2, 0.0, 0.0)
-    after = motion.drive(np.zeros(SIZE), twist, 1.0, CONFIG).mean
+    after = motion.drive(np.zeros(SIZE), twist, 1.0, NOISE).mean
     assert np.allclose(after[:3], [1.0, 1.0, math.pi / 2], atol=1e-12)
 
 
 def test_the_straight_line_limit_is_continuous():
     mean = np.zeros(SIZE)
     poses = [
-        motion.drive(mean, Twist(2.0, omega, 0.0, 0.0), 0.5, CONFIG)
+        motion.drive(mean, Twist(2.0, omega, 0.0, 0.0), 0.5, NOISE)
         for omega in (0.0, 3.9e-4, 4.1e-4)
     ]
     assert np.allclose(poses[0].mean[:3], [1.0, 0.0, 0.0], atol=0)
@@ -80,35 +88,35 @@ def test_the_straight_line_limit_is_continuous():
 
 
 def test_reversing_drives_backwards():
-    after = motion.drive(np.zeros(SIZE), Twist(-1.0, 0.0, 0.0, 0.0), 2.0, CONFIG).mean
+    after = motion.drive(np.zeros(SIZE), Twist(-1.0, 0.0, 0.0, 0.0), 2.0, NOISE).mean
     assert np.allclose(after[:3], [-2.0, 0.0, 0.0])
 
 
 def test_two_halves_make_the_whole_motion():
     mean = random_mean(np.random.default_rng(3))
     twist = Twist(0.9, 0.4, 1e-4, 1e-4)
-    whole = motion.drive(mean, twist, 0.4, CONFIG).mean
-    half = motion.drive(motion.drive(mean, twist, 0.2, CONFIG).mean, twist, 0.2, CONFIG).mean
+    whole = motion.drive(mean, twist, 0.4, NOISE).mean
+    half = motion.drive(motion.drive(mean, twist, 0.2, NOISE).mean, twist, 0.2, NOISE).mean
     assert np.allclose(whole, half, atol=1e-12)
 
 
 def test_heading_stays_wrapped_across_pi():
     mean = np.zeros(SIZE)
     mean[YAW] = 3.1
-    after = motion.drive(mean, Twist(1.0, 1.0, 0.0, 0.0), 0.2, CONFIG).mean
+    after = motion.drive(mean, Twist(1.0, 1.0, 0.0, 0.0), 0.2, NOISE).mean
     assert after[YAW] == pytest.approx(3.3 - 2 * math.pi)
 
 
 def test_scale_and_bias_correct_the_odometry():
     mean = np.zeros(SIZE)
     mean[SCALE], mean[BIAS] = 0.1, 0.2
-    after = motion.drive(mean, Twist(1.0, 0.2, 0.0, 0.0), 1.0, CONFIG).mean
+    after = motion.drive(mean, Twist(1.0, 0.2, 0.0, 0.0), 1.0, NOISE).mean
     assert np.allclose(after[:5], [1.1, 0.0, 0.0, 1.1, 0.0])
 
 
 def test_a_standing_robot_neither_moves_nor_becomes_less_sure():
     mean = random_mean(np.random.default_rng(4))
-    step = motion.drive(mean, Twist(0.0, 0.0, 1e-2, 1e-2), 10.0, CONFIG)
+    step = motion.drive(mean, Twist(0.0, 0.0, 1e-2, 1e-2), 10.0, NOISE)
     assert np.array_equal(step.mean[:3], mean[:3]) and np.array_equal(step.mean[5:], mean[5:])
     assert not step.noise[:3, :3].any()
 
@@ -116,26 +124,28 @@ def test_a_standing_robot_neither_moves_nor_becomes_less_sure():
 @pytest.mark.parametrize('twist', [Twist(1, 0.3, 4e-4, 1e-4), Twist(-0.2, 0, 1e-2, 1e-2)])
 def test_noise_is_symmetric_and_positive(twist):
     mean = random_mean(np.random.default_rng(5))
-    for step in (motion.drive(mean, twist, 0.02, CONFIG), motion.coast(mean, twist, 0.02, CONFIG),
-                 motion.halt(mean, twist, 1.0, CONFIG)):  # fmt: skip
+    for step in (motion.drive(mean, twist, 0.02, NOISE), motion.coast(mean, twist, 0.02, NOISE),
+                 motion.halt(mean, twist, 1.0, NOISE)):  # fmt: skip
         assert np.allclose(step.noise, step.noise.T)
         assert np.linalg.eigvalsh(step.noise)[0] > -1e-15
 
 
-def test_white_noise_of_the_readings_adds_up_by_hand():
+def test_white_noise_of_the_readings_adds_up_by_hand(monkeypatch):
+    monkeypatch.setattr(motion, 'ODOMETRY_CORRELATION_S', 0.0)
+    monkeypatch.setattr(motion, 'YAW_PER_METER', 0.0)
     # 1 m/s straight on for 1 s: sigma_v^2 dt^2 along, sigma_omega^2 dt^2 of yaw, dt^4/4 across.
-    step = motion.drive(np.zeros(SIZE), Twist(1.0, 0.0, 0.04, 0.09), 1.0, QUIET)
+    step = motion.drive(np.zeros(SIZE), Twist(1.0, 0.0, 0.04, 0.09), 1.0, SMOOTH)
     assert step.noise[0, 0] == pytest.approx(0.04)
     assert step.noise[2, 2] == pytest.approx(0.09)
     assert step.noise[1, 1] == pytest.approx(0.09 / 4)
 
 
-def test_lasting_noise_does_not_average_out_with_the_rate():
-    lasting = replace(CONFIG, slip_per_metre=0.0, yaw_per_metre=0.0, odometry_correlation=0.5)
+def test_lasting_noise_does_not_average_out_with_the_rate(monkeypatch):
+    monkeypatch.setattr(motion, 'ODOMETRY_CORRELATION_S', 0.5)
     spread = []
     for rate in (10, 100):
         total = sum(
-            motion.drive(np.zeros(SIZE), Twist(1.0, 0.0, 0.04, 0.0), 1 / rate, lasting).noise[0, 0]
+            motion.drive(np.zeros(SIZE), Twist(1.0, 0.0, 0.04, 0.0), 1 / rate, SMOOTH).noise[0, 0]
             for _ in range(rate)
         )
         spread.append(total)
@@ -143,10 +153,10 @@ def test_lasting_noise_does_not_average_out_with_the_rate():
     assert spread[1] == pytest.approx(0.04 * (0.5 + 0.01))
 
 
-def test_picture_error_fades_over_the_way_and_keeps_unit_variance():
+def test_the_shared_error_fades_over_the_distance_and_keeps_unit_variance():
     mean = np.zeros(SIZE)
     mean[ERROR:] = 1.0
-    step = motion.drive(mean, Twist(1.0, 0.0, 1e-4, 1e-4), CONFIG.decorrelation, CONFIG)
+    step = motion.drive(mean, Twist(1.0, 0.0, 1e-4, 1e-4), NOISE.decorrelation_m, NOISE)
     assert np.allclose(step.mean[ERROR:], math.exp(-1))
     after = step.jacobian @ np.eye(SIZE) @ step.jacobian.T + step.noise
     assert np.allclose(np.diag(after)[ERROR:], 1.0)

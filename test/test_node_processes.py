@@ -138,10 +138,10 @@ def test_a_signal_at_any_moment_ends_with_exit_code_0(start, moment, name):
 
 @pytest.mark.parametrize(('node', 'parameter', 'why'), [
     ('sfa_node', 'model:=/nowhere/model.npz', '/nowhere/model.npz'),
-    ('sfa_node', 'dark_level:=-1.0', 'dark_level'),
-    ('ekf_node', 'history:=x', 'history'),
-    ('ekf_node', 'history:=-3', 'history'),
-    ('ekf_node', 'history:=.nan', 'history'),
+    ('sfa_node', 'novelty_limit:=-1.0', 'novelty_limit'),
+    ('ekf_node', 'speed_std:=x', 'speed_std'),
+    ('ekf_node', 'speed_std:=-3', 'speed_std'),
+    ('ekf_node', 'speed_std:=.nan', 'speed_std'),
     ('ekf_node', 'degraded_std:=50.0', 'degraded_std'),
 ])  # fmt: skip
 def test_a_wrong_parameter_ends_the_node_with_its_name(start, node, parameter, why):
@@ -152,8 +152,8 @@ def test_a_wrong_parameter_ends_the_node_with_its_name(start, node, parameter, w
 
 
 FILES = {
-    'indented.yaml': 'ekf_node:\n ros__parameters:\n   history: 1.0\n  gate: 2.0\n',
-    'keyless.yaml': 'ekf_node:\n  history: 1.0\n',
+    'indented.yaml': 'ekf_node:\n ros__parameters:\n   speed_std: 1.0\n  gate: 2.0\n',
+    'keyless.yaml': 'ekf_node:\n  speed_std: 1.0\n',
 }
 
 
@@ -162,7 +162,7 @@ FILES = {
     (['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
     (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
     (['-r', 'odom'], "remap rule: '-r odom'"),
-    (['-p', 'history'], "override rule: '-p history'"),
+    (['-p', 'speed_std'], "override rule: '-p speed_std'"),
     (['--nonsense'], '--nonsense'),
 ])  # fmt: skip
 def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arguments, why):

@@ -28,6 +28,7 @@ from std_msgs.msg import Float64, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from sfa_localization.nodes import conversions as convert  # noqa: E402
+from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import LocalizationNode  # noqa: E402
 from sfa_localization.nodes.monitor import Monitor  # noqa: E402
 
@@ -101,7 +102,7 @@ def test_overrides_reach_the_settings_and_an_integer_serves_as_a_real(make):
     [{'gain': 3.0}, {'gain': 3}, {'gain': 'x'}, {'mode': 'c'}, {'count': 0}, {'count': 1.5},
      {'offset': math.nan}, {'corner': ['x']}, {'count': 1, 'gain': 1.5}],
 )  # fmt: skip
-def test_a_wrong_parameter_is_refused_at_start_by_name(make, wrong):
+def test_a_wrong_parameter_is_rejected_at_start_by_name(make, wrong):
     with pytest.raises(ConfigError, match=next(reversed(wrong))):
         knobs(make, **wrong)
 
@@ -133,8 +134,19 @@ def test_a_misspelt_parameter_is_warned_of_with_the_nearest_name(make, monkeypat
         'warning': lambda *a, **k: said.append(a[1])})())  # fmt: skip
     given = {'gian': 0.7, 'zzz': 1, 'use_sim_time': False, 'qos_overrides./in.depth': 3}
     # Another node's: a section `/**` of the parameter file is given to all.
-    knobs(make, history=3.0, **given)
+    knobs(make, publish_tf=False, **given)
     assert said == ["unknown parameter 'gian'; did you mean 'gain'?", "unknown parameter 'zzz'"]
+
+
+def test_a_parameter_of_an_older_version_is_warned_of_with_its_successor(make, monkeypatch):
+    said = []
+    monkeypatch.setattr(EkfNode, 'get_logger', lambda _: type('L', (), {
+        'warning': lambda *a, **k: said.append(a[1])})())  # fmt: skip
+    make(EkfNode, set_initial_pose=True, gate_probability=0.9)
+    assert said == [
+        "unknown parameter 'gate_probability'",
+        "unknown parameter 'set_initial_pose'; did you mean 'initial_pose'?",
+    ]
 
 
 class Echo(LocalizationNode):
@@ -158,7 +170,7 @@ def test_a_node_starts_itself_unless_told_not_to(make):
     assert waiting.start() and not waiting.active
 
 
-def test_refused_messages_and_defects_are_counted_and_end_nothing(make):
+def test_rejected_messages_and_defects_are_counted_and_end_nothing(make):
     node = make(Echo)
     node.start()
     receive = node._guarded('in', node.take)
@@ -197,7 +209,7 @@ class Timed(LocalizationNode):
 def test_a_timer_goes_on_after_an_error_which_is_counted():
     bench = Bench(61)
     try:
-        node = bench.run(Timed, diagnostics_period=0.1)
+        node = bench.run(Timed)
         told = bench.listen(DiagnosticArray, '/diagnostics')
         assert until(lambda: node.calls > 5)
         assert node.monitor('timer tick').refused == {
@@ -206,7 +218,7 @@ def test_a_timer_goes_on_after_an_error_which_is_counted():
         # What the node cannot say of itself is an error, with the counts beside it.
         assert until(lambda: told)
         status = told[-1].status[0]
-        assert status.level == DiagnosticStatus.ERROR and 'cannot be found out' in status.message
+        assert status.level == DiagnosticStatus.ERROR and 'cannot be determined' in status.message
         keys = {value.key for value in status.values}
         assert 'timer tick: refused: internal error: ZeroDivisionError' in keys
         assert until(lambda: len(told) > 2)

@@ -107,5 +107,5 @@ def test_arrays_round_trip():
 
 
 def test_too_few_pictures_are_refused():
-    with pytest.raises(DataError, match='3 pictures are too few'):
+    with pytest.raises(DataError, match='3 images are too few'):
         Familiarity.fit(np.zeros((3, 4)))

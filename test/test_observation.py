@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which pictures are believed, and what the filter gets of those that are not."""
+"""Which images are used, and what the filter gets of those that are not."""
 
 import dataclasses
 import math
@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 from picture_readers import PictureReader, panorama
 
-from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.events import ODOMETRY, PICTURE, in_order
+from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Observer, unusable_covariance
 
 
 def test_a_good_picture_is_believed():
-    watch = PictureWatch()
+    watch = ImageWatch()
     assert [watch.judge(panorama(seed=seed)) for seed in range(20)] == [''] * 20
 
 
@@ -29,24 +28,24 @@ def test_a_good_picture_is_believed():
 def test_dark_and_covered_pictures_are_distinguished(level, spread, reason):
     picture = panorama(level=level, spread=spread)
     picture[0] = picture[1]
-    assert reason in PictureWatch().judge(picture)
+    assert reason in ImageWatch().judge(picture)
 
 
 def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
-    watch = PictureWatch(WatchConfig(frozen_pictures=3))
-    found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 2, 2, 1)]
-    assert ['frozen' in text for text in found] == [False, False, True, True, False, False, False]
+    watch = ImageWatch()
+    found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 1, 1, 2, 2, 1)]
+    assert ['frozen' in text for text in found] == [False] * 4 + [True] * 2 + [False] * 3
 
 
 @pytest.mark.parametrize(('novelty', 'fine'), [(0.5, True), (3.0, True), (3.1, False),
                                               (math.nan, False)])  # fmt: skip
 def test_foreign_pictures_are_not_believed(novelty, fine):
-    assert (PictureWatch().judge_novelty(novelty) == '') == fine
+    assert (ImageWatch().judge_novelty(novelty) == '') == fine
 
 
 def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():
     update = PoseFilter().add_measurement(10**9, [0, 0, 0], unusable_covariance())
-    assert not update.accepted and update.reason == 'covariance tells that nothing is known'
+    assert not update.accepted and update.reason == 'covariance means that nothing is known'
 
 
 def test_a_believed_picture_gives_the_models_pose_and_covariance():
@@ -115,8 +114,8 @@ def test_in_batches_and_one_by_one_pictures_are_judged_alike():
 
 def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp():
     odometry, pictures = np.array([5, 10, 20]), np.array([1, 10, 15, 30])
-    assert list(in_order(odometry, pictures)) == [
-        (1, PICTURE, 0), (5, ODOMETRY, 0), (10, ODOMETRY, 1), (10, PICTURE, 1),
-        (15, PICTURE, 2), (20, ODOMETRY, 2), (30, PICTURE, 3),
+    assert list(merge_by_stamp(odometry, pictures)) == [
+        (1, IMAGE, 0), (5, ODOMETRY, 0), (10, ODOMETRY, 1), (10, IMAGE, 1),
+        (15, IMAGE, 2), (20, ODOMETRY, 2), (30, IMAGE, 3),
     ]  # fmt: skip
-    assert [event[1] for event in in_order(odometry, pictures[:0])] == [ODOMETRY] * 3
+    assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3

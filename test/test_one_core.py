@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Live nodes, `Localizer` and `evaluate` give the same poses, whatever the pictures are like."""
+"""Live nodes, `Localizer` and `evaluate` give the same poses, whatever the images are like."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
 
 SEEN = 'sfa/pose_with_covariance'
 # Settings of sfa_node and ekf_node that are not the defaults, and matter here.
-WATCH = {'frozen_pictures': 3, 'novelty_unusable': 2.5}
+WATCH = {'novelty_limit': 2.5}
 FILTER = {'measurement_factor': 2.0}
 
 
@@ -130,9 +130,9 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeyp
 
     # The pictures were what they are meant to be, and the filter knew where it was.
     assert judged.counts['observations']['skipped'] == {
-        'picture is unlike any of training': 4,
-        'picture is dark': 2,
-        'picture is covered: it shows nothing': 1,
-        'camera is frozen: it repeats its picture': 8,
+        'image is unlike any of training': 4,
+        'image is dark': 2,
+        'image is covered: it shows nothing': 1,
+        'camera is frozen: it repeats its image': 6,
     }
     assert judged.scores['ekf']['p95'] < 0.3

@@ -10,21 +10,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_SIZE, Spheres, recipe, run_in, visit, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, visit, wander
 from metric_worlds import criss_cross, drive, garden_features
 
 from sfa_localization import training
 from sfa_localization.data.geometry import align, compose, wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, YawRate
-from sfa_localization.features.network_training import architecture_of, train_network
+from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.metric import learning as metric
+from sfa_localization.metric import selection
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.training import drive_of, learn_place
+from sfa_localization.training import learn_place
 
-QUICK = MetricConfig(metric_map='monomials', slow_features=5, ridge=1e-4, require_certificate=False)
+QUICK = MetricConfig(metric_map='monomials', slow_features=5)
 CUT = SegmentConfig()
+
+
+@pytest.fixture(autouse=True)
+def one_ridge(monkeypatch):
+    """The features are monomials of the place: no choice is needed."""
+    monkeypatch.setattr(selection, 'RIDGES', (1e-4,))
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,7 @@ def learn(runs, seed):
     segments = join(parts, [int(offset) for offset in offsets])
     truth = np.concatenate([poses for *_, poses in runs])
     features = garden_features(truth[:, :2], noise=0.02, count=5, world=seed)
-    result = metric.learn(features, segments, QUICK)
+    result = metric.learn_metric(features, segments, QUICK)
     images, places = metric.positions(result, segments)
     return result, images, places, metric.headings(result, segments)[1], truth
 
@@ -163,8 +170,7 @@ def placed(delay_s, seed):
         exact.panoramas.stamps_ns + round(delay_s * 1e9), exact.panoramas.images
     )
     run = replace(exact, panoramas=shifted)
-    architecture = architecture_of(config.network, PLACE_SIZE)
-    network = train_network(architecture, [drive_of(run, config.network)], config.network)
+    network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
     trained = learn_place(network, [run], config)
     seen = visit() if seed == 1 else exact
     estimates = trained.model.locate_all(seen.panoramas.read(0, len(seen.panoramas)))

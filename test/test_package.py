@@ -1,8 +1,7 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The package as a whole: who may import what, one version, docstrings, executables."""
+"""The package as a whole: imports between rooms, one version, docstrings, executables."""
 
-import argparse
 import ast
 import re
 import runpy
@@ -42,9 +41,9 @@ ROS = {
     'std_srvs',
     'tf2_msgs',
 }
-# The rooms of the house: which other rooms each may import (its own always), and which packages
-# beyond the standard library. A module belongs to its folder, or is a room of its own; there is no
-# default, so a new one must be entered here, and in the picture of CONTRIBUTING.
+# The rooms: which other rooms each may import (always its own), and which packages beyond the
+# standard library. A module belongs to its folder, or is a room of its own; there is no
+# default, so a new one must be added here, and to the picture and the table of CONTRIBUTING.
 NUMERIC = {'numpy', 'scipy'}
 CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
@@ -54,7 +53,8 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
     'features': ({'data'}, NUMERIC | {'cv2', 'mdp', 'dask', 'distributed'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
-    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'yaml', 'lz4'}),
+    # With tqdm, as bags.drives shows the progress of reading.
+    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'yaml', 'lz4', 'tqdm'}),
     'metric': ({'data', 'features'}, NUMERIC),
     'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'fusion', 'metric', 'place_model'}, {'numpy'}),
@@ -76,19 +76,14 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
         | {'filtering', 'simulation', 'reports', 'nodes', '__init__'},
         {'numpy', 'tqdm', 'rosbags'} | ROS,
     ),
-    'cli': (
-        CORE
-        | {'config', 'place_model', 'training', 'evaluation', 'tuning', 'inspection', 'filtering'}
-        | {'simulation', 'reports', 'commands', '__init__'},
-        {'tqdm'},
-    ),
+    'cli': ({'data', 'commands', 'nodes', '__init__'}, set()),
 }
-# Of these rooms only the settings are taken, not what needs ROS.
+# From these rooms only the settings may be imported, which need no ROS.
 SETTINGS_ONLY = {('config', 'nodes')}
 # Never at run time on the robot, nor in anything its nodes import.
 NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'dask', 'tqdm'}
 OWN_NOT_ON_THE_ROBOT = {f'{NAME}.{word}' for word in ('training', 'evaluation', 'simulation')}
-# The standard library's ways to run code that a file brings along.
+# Modules that run code from the files that they read.
 UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
 
 
@@ -168,7 +163,7 @@ def test_module_imports_only_what_its_room_may(module):
 @pytest.mark.parametrize(
     ('module', 'imported'),
     [
-        (f'{NAME}.metric.phases', f'{NAME}.bags.arrays.to_run'),
+        (f'{NAME}.metric.phases', f'{NAME}.bags.run_loader.load_run'),
         (f'{NAME}.camera.capture', f'{NAME}.nodes.settings.NodeConfig'),
         (f'{NAME}.config', f'{NAME}.nodes.lifecycle.BaseNode'),
         (f'{NAME}.data.run', 'scipy.linalg'),
@@ -186,6 +181,18 @@ def test_a_module_without_a_room_is_found():
 
 def test_every_room_is_there():
     assert set(ROOMS) == {room(module) for module in MODULES}
+
+
+def test_contributing_shows_the_same_rooms_and_arrows():
+    text = (ROOT / 'CONTRIBUTING.md').read_text('utf-8')
+    rows = re.findall(r'^\| `(\w+)` \| ((?:`\w+`(?:, )?)+|nothing) \|$', text, re.MULTILINE)
+    assert {name: set(re.findall(r'`(\w+)`', others)) for name, others in rows} == {
+        name: others for name, (others, _packages) in ROOMS.items()
+    }
+    picture = text.split('```')[1]
+    assert [
+        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', picture)
+    ] == []
 
 
 @pytest.mark.parametrize('module', sorted(MODULES))
@@ -222,23 +229,61 @@ def test_one_version():
 
 
 @cache
-def setup_arguments() -> dict:
-    """Return what setup.py hands to setuptools."""
+def setup_arguments(command: str = 'bdist_wheel') -> dict:
+    """Return the arguments of setuptools.setup when setup.py runs a command."""
     arguments: dict = {}
-    original, setuptools.setup = setuptools.setup, arguments.update
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(setuptools, 'setup', arguments.update)
+        patch.setattr(sys, 'argv', ['setup.py', command])
         runpy.run_path(str(ROOT / 'setup.py'))
-    finally:
-        setuptools.setup = original
     return arguments
 
 
-def test_every_command_and_node_is_an_executable():
-    scripts = [line.split(' = ') for line in setup_arguments()['entry_points']['console_scripts']]
-    targets = dict(scripts)
-    assert set(targets) == {command.name for command in COMMANDS} | set(NODES)
-    assert {targets[node] for node in NODES} == {f'{NAME}.nodes.entry:{node}' for node in NODES}
-    assert {targets[command.name] for command in COMMANDS} == {f'{NAME}.cli:executable'}
+def executables(command: str) -> dict[str, str]:
+    """Return the installed executables and their entry points."""
+    lines = setup_arguments(command)['entry_points']['console_scripts']
+    return dict(line.split(' = ') for line in lines)
+
+
+@pytest.mark.parametrize('command', ['bdist_wheel', 'editable_wheel', 'dist_info'])
+def test_pip_puts_one_command_and_the_nodes_on_the_path(command):
+    nodes = {node: f'{NAME}.nodes.entry:{node}' for node in NODES}
+    assert executables(command) == {NAME: f'{NAME}.cli:main', **nodes}
+
+
+@pytest.mark.parametrize('command', ['install', 'develop'])
+def test_colcon_installs_every_command_for_ros2_run(command):
+    commands = dict.fromkeys(COMMANDS, f'{NAME}.cli:executable')
+    assert executables(command) == executables('bdist_wheel') | commands
+
+
+def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['/workspace/lib/sfa_localization/config'])
+    assert cli.executable() == 0
+    assert 'ekf_node:' in capsys.readouterr().out
+
+
+def test_every_command_has_its_module():
+    modules = {path.stem for path in (PACKAGE / 'commands').glob('*.py')}
+    assert set(COMMANDS) <= modules
+
+
+def test_the_overview_of_the_commands_imports_none_of_them():
+    code = (
+        'import sys\nfrom sfa_localization import cli\n'
+        'try:\n    cli.main(["--help"])\nexcept SystemExit:\n'
+        '    print([name for name in ("numpy", "cv2", "rclpy") if name in sys.modules])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert all(f'    {name} ' in done.stdout for name in COMMANDS)
+    assert done.stdout.splitlines()[-1] == '[]', done.stderr
+
+
+@pytest.mark.parametrize('words', [[], ['trian'], ['--', 'train']])
+def test_a_wrong_command_ends_with_exit_code_2(words):
+    with pytest.raises(SystemExit) as raised:
+        sys.exit(cli.main(words))
+    assert raised.value.code == 2
 
 
 def test_installed_files_exist():
@@ -275,8 +320,8 @@ def documented_names() -> frozenset[str]:
     return frozenset(name.split('.')[-1] for name, node in definitions if ast.get_docstring(node))
 
 
-def speaks_for_itself(name: str, node: ast.AST) -> bool:
-    """Tell whether this is a line or two, or one of several with a documented interface."""
+def needs_no_docstring(name: str, node: ast.AST) -> bool:
+    """Return whether this is very short, or implements an interface that is documented."""
     if isinstance(node, ast.ClassDef):
         return False
     short = name.split('.')[-1]
@@ -290,13 +335,13 @@ def test_public_names_have_docstrings(module):
     missing = [
         name
         for name, node in public_definitions(module)
-        if not ast.get_docstring(node) and not speaks_for_itself(name, node)
+        if not ast.get_docstring(node) and not needs_no_docstring(name, node)
     ]
     assert missing == []
 
 
 ARRAY = re.compile(r'\b(Array|NDArray)\b(?! \| float)')
-SAYS_SHAPE = re.compile(
+NAMES_SHAPE = re.compile(
     r'\([^()]*\b[A-Z0-9]\w*\s*(,[^()]*)?\)|picture|image|panorama|pixel|stamp', re.IGNORECASE
 )
 """A shape such as (N, 2), or a word that names an array the whole package shares."""
@@ -305,9 +350,9 @@ SHAPES_BY_NAME = {'pose', 'start', 'dock', 'foot', 'mean', 'covariance', 'matrix
 
 
 @pytest.mark.parametrize('module', sorted(MODULES))
-def test_docstrings_of_array_functions_tell_shapes(module):
-    """Functions that take arrays say, or their class says, what shape these have."""
-    silent = []
+def test_docstrings_of_array_functions_give_shapes(module):
+    """The docstring of a function with array arguments, or of its class, gives their shapes."""
+    missing = []
     tree = dict(public_definitions(module))
     for name, node in tree.items():
         if isinstance(node, ast.ClassDef) or not ast.get_docstring(node):
@@ -318,16 +363,17 @@ def test_docstrings_of_array_functions_tell_shapes(module):
             if a.annotation and a.arg not in SHAPES_BY_NAME
         )
         owner = tree.get(name.rpartition('.')[0])
-        told = ast.get_docstring(node) + (ast.get_docstring(owner) or '' if owner else '')
-        if ARRAY.search(taken) and not SAYS_SHAPE.search(told):
-            silent.append(name)
-    assert silent == []
+        text = ast.get_docstring(node) + (ast.get_docstring(owner) or '' if owner else '')
+        if ARRAY.search(taken) and not NAMES_SHAPE.search(text):
+            missing.append(name)
+    assert missing == []
 
 
 def test_commands_show_examples_before_their_options():
-    for command in COMMANDS:
-        assert command.summary and command.example.strip(), command.name
-        assert command.name in command.example, command.name
+    for name, summary in COMMANDS.items():
+        text = cli.command_parser(name).format_help()
+        examples = text[text.index('examples:') : text.index('options:')]
+        assert ' '.join(summary.split()) in ' '.join(text.split()) and f'  {name}' in examples
 
 
 def test_module_runs_as_a_program():
@@ -339,18 +385,18 @@ def test_module_runs_as_a_program():
 
 @pytest.mark.parametrize('package', ['trimesh', 'mdp', 'rclpy'])
 def test_a_missing_optional_package_is_named_with_its_remedy(package, capsys):
-    def run(_arguments):
+    def run():
         raise ModuleNotFoundError(f'No module named {package!r}', name=f'{package}.inner')
 
-    assert cli._guarded(run, argparse.Namespace()) == 1
+    assert cli.guarded(run) == 1
     error = capsys.readouterr().err
     assert error.startswith(f'error: {package} is not installed') and 'pip install' in error
     assert error.count('\n') == 1
 
 
 def test_a_missing_part_of_the_package_is_no_users_error():
-    def run(_arguments):
+    def run():
         raise ModuleNotFoundError('No module named numpy', name='numpy')
 
     with pytest.raises(ModuleNotFoundError):
-        cli._guarded(run, argparse.Namespace())
+        cli.guarded(run)

@@ -15,31 +15,31 @@ from sfa_localization.camera.panorama import (
     Unwrapper,
     _in_sectors,
     looks_like_panorama,
-    nearest_seen,
+    nearest_visible,
     normalized,
     panorama_rays,
 )
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 
 SIZE = (400, 400)
 SMALL = PanoramaConfig(width=180, height=24)
-CAMERAS = {
-    'mirror': CameraConfig(),
-    'fisheye': CameraConfig(camera_model='fisheye', fx=150.0, fy=150.0, radius_min=0.0),
-    'polar': CameraConfig(camera_model='polar', radius_min=100.0, radius_max=310.0),
-    'ocam': CameraConfig(camera_model='ocam', polynomial=(-150.0, 0.0, 1.9e-3), radius_min=0.0),
-    'equirectangular': CameraConfig(camera_model='equirectangular'),
-    'dual': CameraConfig(
+LENSES = {
+    'mirror': LensCalibration(),
+    'fisheye': LensCalibration(camera_model='fisheye', fx=150.0, fy=150.0, radius_min=0.0),
+    'polar': LensCalibration(camera_model='polar', radius_min=100.0, radius_max=310.0),
+    'ocam': LensCalibration(camera_model='ocam', polynomial=(-150.0, 0.0, 1.9e-3), radius_min=0.0),
+    'equirectangular': LensCalibration(camera_model='equirectangular'),
+    'dual': LensCalibration(
         camera_model='dual_fisheye', fx=95.0, fy=95.0, cx=160.0, second_cx=480.0, second_cy=319.5
     ),
 }
 
 
-def picture_of(scene, config, size=SIZE):
+def picture_of(scene, lens=LENSES['mirror'], size=SIZE, mount_rpy=(0.0, 0.0, 0.0)):
     """What the camera sees of a scene: a function of rays (N, 3) to BGR (N, 3)."""
     rows, columns = np.mgrid[0 : size[0], 0 : size[1]]
-    rays = make_camera(config, size).unproject(
+    rays = make_camera(lens, size, mount_rpy=mount_rpy).unproject(
         np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
     )
     seen = np.isfinite(rays[:, 0])
@@ -74,14 +74,14 @@ def test_panorama_conventions():
     np.testing.assert_allclose(turned[0, 0, 1], -panorama_rays(PanoramaConfig(width=360))[0, 0, 1])
 
 
-@pytest.mark.parametrize('name', CAMERAS)
+@pytest.mark.parametrize('name', LENSES)
 @pytest.mark.parametrize('clockwise', [True, False])
 def test_every_camera_gives_the_same_panorama(name, clockwise):
     panorama = dataclasses.replace(SMALL, clockwise=clockwise)
-    config = dataclasses.replace(CAMERAS[name], mount_yaw=37.0, mount_pitch=2.0, mount_roll=-3.0)
-    unwrapper = Unwrapper(config, panorama)
-    result = unwrapper(picture_of(smooth, config))
-    seen = unwrapper.seen(SIZE)
+    mount = (-3.0, 2.0, 37.0)
+    unwrapper = Unwrapper(CameraConfig(mount_rpy=mount), panorama, LENSES[name])
+    result = unwrapper(picture_of(smooth, LENSES[name], mount_rpy=mount))
+    seen = unwrapper.visible(SIZE)
     assert result.shape == (24, 180, 3)
     assert result.dtype == np.uint8
     assert seen.mean() > 0.85
@@ -89,26 +89,26 @@ def test_every_camera_gives_the_same_panorama(name, clockwise):
     assert psnr(result[seen], direct(smooth, panorama)[seen]) > 34
 
 
-@pytest.mark.parametrize('name', CAMERAS)
+@pytest.mark.parametrize('name', LENSES)
 def test_a_turn_of_the_camera_is_a_shift_of_columns(name):
     """The same picture, from a camera turned by 10 columns, moves to the left in azimuth."""
-    config = CAMERAS[name]
-    picture = picture_of(smooth, config)
-    turned = dataclasses.replace(config, mount_yaw=10 * 360.0 / SMALL.width)
-    straight, shifted = (Unwrapper(camera, SMALL)(picture) for camera in (config, turned))
+    picture = picture_of(smooth, LENSES[name])
+    straight, shifted = (
+        Unwrapper(CameraConfig(mount_rpy=(0.0, 0.0, yaw)), SMALL, LENSES[name])(picture)
+        for yaw in (0.0, 10 * 360.0 / SMALL.width)
+    )
     np.testing.assert_allclose(shifted, np.roll(straight, -10, axis=1), atol=2)
 
 
-@pytest.mark.parametrize('name', CAMERAS)
+@pytest.mark.parametrize('name', LENSES)
 def test_vertical_edges_become_straight_columns(name):
     def poles(rays):
         angle = np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))
         return np.repeat(np.where(angle[:, None] % 60 < 30, 220, 30), 3, axis=1)
 
-    config = CAMERAS[name]
-    unwrapper = Unwrapper(config, SMALL)
-    bright = unwrapper(picture_of(poles, config))[..., 0] > 125
-    seen = unwrapper.seen(SIZE)
+    unwrapper = Unwrapper(CameraConfig(), SMALL, LENSES[name])
+    bright = unwrapper(picture_of(poles, LENSES[name]))[..., 0] > 125
+    seen = unwrapper.visible(SIZE)
     columns = np.arange(SMALL.width)
     azimuth = -(columns + 0.5 - SMALL.width / 2) * 360 / SMALL.width
     away_from_edges = np.abs((azimuth % 30) - 15) < 12
@@ -118,17 +118,16 @@ def test_vertical_edges_become_straight_columns(name):
     np.testing.assert_array_equal(bright[checked], expected[checked])
 
 
-@pytest.mark.parametrize('name', CAMERAS)
+@pytest.mark.parametrize('name', LENSES)
 def test_the_horizon_becomes_a_straight_row(name):
     panorama = PanoramaConfig(width=180, height=20, elevation_min=-10, elevation_max=10)
-    config = CAMERAS[name]
 
     def sky(rays):
         return np.repeat(np.where(rays[:, 2:] > 0, 220, 30), 3, axis=1)
 
-    unwrapper = Unwrapper(config, panorama)
-    bright = unwrapper(picture_of(sky, config))[..., 0] > 125
-    seen = unwrapper.seen(SIZE)
+    unwrapper = Unwrapper(CameraConfig(), panorama, LENSES[name])
+    bright = unwrapper(picture_of(sky, LENSES[name]))[..., 0] > 125
+    seen = unwrapper.visible(SIZE)
     assert bright[:9][seen[:9]].all()
     assert not bright[11:][seen[11:]].any()
 
@@ -136,7 +135,7 @@ def test_the_horizon_becomes_a_straight_row(name):
 def test_a_synthetic_ring_in_polar_becomes_a_row():
     picture = np.zeros((400, 400, 3), np.uint8)
     cv2.circle(picture, (190, 210), 100, (255, 255, 255), 4)
-    config = CameraConfig(
+    lens = LensCalibration(
         camera_model='polar',
         cx=190.0,
         cy=210.0,
@@ -148,7 +147,7 @@ def test_a_synthetic_ring_in_polar_becomes_a_row():
         image_height=0,
     )
     panorama = PanoramaConfig(width=300, height=50, elevation_min=-10.0, elevation_max=20.0)
-    result = Unwrapper(config, panorama)(picture)[..., 0].astype(float)
+    result = Unwrapper(CameraConfig(), panorama, lens)(picture)[..., 0].astype(float)
     rows = (result * np.arange(50)[:, None]).sum(0) / result.sum(0)
     np.testing.assert_allclose(rows, 24.5, atol=0.4)  # radius 100 is half way: 5 degrees
 
@@ -168,27 +167,28 @@ class TestPanoramaInput:
         assert psnr(result[:, 2:-2], direct(smooth, big)[:, 2:-2]) > 40
 
     def test_is_turned_and_reversed_to_the_convention(self):
-        config = CameraConfig(camera_model='panorama', mount_yaw=90.0)
+        config = CameraConfig(camera_model='panorama', mount_rpy=(0.0, 0.0, 90.0))
         turned = Unwrapper(config, SMALL)(self.picture())
         plain = Unwrapper(CameraConfig(camera_model='panorama'), SMALL)(self.picture())
         np.testing.assert_array_equal(turned, np.roll(plain, -45, axis=1))
-        mirrored = CameraConfig(camera_model='panorama', mirrored='yes')
-        np.testing.assert_array_equal(Unwrapper(mirrored, SMALL)(self.picture()), plain[:, ::-1])
+        mirrored = LensCalibration(camera_model='panorama', mirrored='yes')
+        result = Unwrapper(CameraConfig(), SMALL, mirrored)(self.picture())
+        np.testing.assert_array_equal(result, plain[:, ::-1])
         other = dataclasses.replace(SMALL, clockwise=False)
         result = Unwrapper(CameraConfig(camera_model='panorama'), other)(self.picture())
         assert psnr(result, direct(smooth, other)) > 40
 
     def test_a_tilted_one_is_levelled(self):
-        config = CameraConfig(camera_model='panorama', mount_roll=3.0)
+        config = CameraConfig(camera_model='panorama', mount_rpy=(3.0, 0.0, 0.0))
         unwrapper = Unwrapper(config, PanoramaConfig(width=360, height=48))
-        picture = picture_of(smooth, config, (48, 360))
-        seen = unwrapper.seen((48, 360))
+        picture = picture_of(smooth, unwrapper.calibration, (48, 360), config.mount_rpy)
+        seen = unwrapper.visible((48, 360))
         expected = direct(smooth, unwrapper.panorama)
         assert 0.8 < seen.mean() < 1.0
         assert psnr(unwrapper(picture)[seen], expected[seen]) > 35
 
     def test_any_other_camera_only_resizes_it(self):
-        turned = CameraConfig(mount_yaw=90.0)
+        turned = CameraConfig(mount_rpy=(0.0, 0.0, 90.0))
         result = Unwrapper(turned, SMALL)(self.picture())
         assert psnr(result, direct(smooth, SMALL)) > 40
 
@@ -228,8 +228,8 @@ class TestMasks:
     def test_a_blind_sector_repeats_its_neighbors(self):
         config = CameraConfig(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
         unwrapper, plain = Unwrapper(config, SMALL), Unwrapper(CameraConfig(), SMALL)
-        picture = picture_of(smooth, CameraConfig())
-        seen = unwrapper.seen(SIZE)
+        picture = picture_of(smooth)
+        seen = unwrapper.visible(SIZE)
         np.testing.assert_array_equal(
             seen.all(axis=0), ~np.isin(np.arange(180), [*range(5), *range(175, 180)])
         )
@@ -243,7 +243,7 @@ class TestMasks:
         mask[: SIZE[0] // 2] = 0  # the upper half of the picture looks forward
         path = tmp_path / 'mask.png'
         cv2.imwrite(str(path), mask)
-        seen = Unwrapper(CameraConfig(mask_file=str(path)), SMALL).seen(SIZE)
+        seen = Unwrapper(CameraConfig(mask_file=str(path)), SMALL).visible(SIZE)
         assert not seen[:, 46:134].any()
         assert seen[:, :44].all()
         assert seen[:, 136:].all()
@@ -251,21 +251,21 @@ class TestMasks:
     def test_a_mask_follows_the_size_of_the_picture(self, tmp_path):
         path = tmp_path / 'mask.png'
         cv2.imwrite(str(path), np.vstack([np.zeros((50, 100)), np.full((50, 100), 255)]))
-        seen = Unwrapper(CameraConfig(mask_file=str(path)), SMALL).seen(SIZE)
+        seen = Unwrapper(CameraConfig(mask_file=str(path)), SMALL).visible(SIZE)
         assert 0.48 < seen.mean() < 0.52
 
     def test_what_is_outside_the_picture_is_filled(self):
-        config = CameraConfig(cx=200.0)
-        unwrapper = Unwrapper(config, SMALL)
-        result = unwrapper(picture_of(lambda rays: 0 * rays + 200, config))
-        assert 0.5 < unwrapper.seen(SIZE).mean() < 0.95
+        lens = LensCalibration(cx=200.0)
+        unwrapper = Unwrapper(CameraConfig(), SMALL, lens)
+        result = unwrapper(picture_of(lambda rays: 0 * rays + 200, lens))
+        assert 0.5 < unwrapper.visible(SIZE).mean() < 0.95
         assert (result == 200).all()
 
     def test_rows_beyond_the_camera_repeat_the_last_seen(self):
         panorama = PanoramaConfig(width=90, height=40, elevation_min=-10.0, elevation_max=60.0)
         unwrapper = Unwrapper(CameraConfig(), panorama)
-        result = unwrapper(picture_of(smooth, CameraConfig()))
-        seen = unwrapper.seen(SIZE)
+        result = unwrapper(picture_of(smooth))
+        seen = unwrapper.visible(SIZE)
         first = int(np.argmax(seen.all(axis=1)))
         assert first > 5
         assert not seen[: first - 1].any()
@@ -278,7 +278,6 @@ class TestMasks:
             (CameraConfig(mask_file='nowhere.png'), 'nowhere.png'),
             (CameraConfig(blind_sectors=(0.0, 359.999)), 'sees no part'),
             (CameraConfig(blind_sectors=(-180.0, 180.0)), 'sees no part'),
-            (CameraConfig(radius_max=45.0), 'sees no part'),
         ],
     )
     def test_impossible_masks_say_what_is_wrong(self, config, words):
@@ -287,9 +286,9 @@ class TestMasks:
             Unwrapper(config, panorama)(np.zeros((*SIZE, 3), np.uint8))
 
 
-def test_the_nearest_seen_pixel_goes_around_the_back():
-    seen = np.array([[0, 1, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0]], bool)
-    rows, columns = nearest_seen(seen)
+def test_the_nearest_visible_pixel_goes_around_the_back():
+    visible = np.array([[0, 1, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0]], bool)
+    rows, columns = nearest_visible(visible)
     assert rows.tolist() == [[0] * 6, [0] * 6]
     assert columns[0].tolist()[:2] == [1, 1] or columns[0, 0] == 5
     assert columns[0, [1, 2, 4, 5]].tolist() == [1, 1, 5, 5]
@@ -317,24 +316,13 @@ def test_an_empty_range_of_elevations_is_refused():
         panorama_rays(PanoramaConfig(elevation_min=10.0, elevation_max=10.0))
 
 
-def test_pictures_of_several_sizes_and_supersampling():
-    unwrapper = Unwrapper(CameraConfig(supersampling=3), SMALL)
+def test_images_of_several_sizes():
+    unwrapper = Unwrapper(CameraConfig(), SMALL)
     expected = direct(smooth, SMALL)
     for size in ((400, 400), (320, 320), (400, 400), (200, 200), (100, 100), (120, 120)):
-        result = unwrapper(picture_of(smooth, CameraConfig(), size))
+        result = unwrapper(picture_of(smooth, size=size))
         assert psnr(result, expected) > 35
-        assert unwrapper.seen(size).shape == (24, 180)
-
-
-def test_supersampling_reduces_aliasing():
-    def stripes(rays):
-        azimuth = np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))
-        return np.repeat(np.where(azimuth[:, None] % 3 < 1.5, 255, 0), 3, axis=1)
-
-    coarse = PanoramaConfig(width=70, height=10)  # 5 degrees a column: stripes must blur to grey
-    picture = picture_of(stripes, CameraConfig())
-    spread = [Unwrapper(CameraConfig(supersampling=n), coarse)(picture).std() for n in (1, 4)]
-    assert spread[1] < 0.6 * spread[0]
+        assert unwrapper.visible(size).shape == (24, 180)
 
 
 class TestNormalization:
@@ -370,6 +358,6 @@ class TestNormalization:
 
     def test_works_in_the_unwrapper(self):
         config = CameraConfig(normalization='exposure')
-        result = Unwrapper(config, SMALL)(picture_of(smooth, CameraConfig()) // 3)
+        result = Unwrapper(config, SMALL)(picture_of(smooth) // 3)
         grey = cv2.cvtColor(result, cv2.COLOR_BGR2GRAY)
         assert 105 < grey.mean() < 115

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, recipe, run_in, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, wander
 from filter_drives import START_NS, Drive
 from metric_worlds import (
     criss_cross,
@@ -32,31 +32,37 @@ from metric_worlds import (
 )
 from test_commands import OPTIONS, parser_of
 
-from sfa_localization import cli
-from sfa_localization.bags.loading import Bag, BagWriter, load_run
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.camera import capture as sources
+from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera import capture
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import (
     CameraConfig,
-    OmnicamNodeConfig,
+    CaptureConfig,
+    LensCalibration,
     PanoramaConfig,
     WatchConfig,
 )
-from sfa_localization.camera.watch import PictureWatch
+from sfa_localization.camera.watch import ImageWatch
+from sfa_localization.commands.options import destination
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
-from sfa_localization.features.network_training import architecture_of, train_network
+from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric import learning as metric
-from sfa_localization.metric.learning import learn, positions
+from sfa_localization.metric import selection
+from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.segments import Segments, cut
-from sfa_localization.metric.settings import HeadingConfig, MetricConfig, SegmentConfig
-from sfa_localization.nodes.settings import EkfNodeConfig, NodeConfig, SfaNodeConfig
-from sfa_localization.training import drive_of, learn_place
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.nodes.settings import (
+    EkfNodeConfig,
+    NodeConfig,
+    OmnicamNodeConfig,
+    SfaNodeConfig,
+)
 
 GROUPS = {
     group.__name__: group
@@ -76,10 +82,10 @@ class Other:
 # What is observed: numbers, of which some must change.
 
 
-def unwrapped(camera: CameraConfig, panorama: PanoramaConfig) -> Any:
-    """The panorama of a picture of noise."""
-    picture = np.random.default_rng(0).integers(0, 256, (640, 640, 3), np.uint8)
-    return Unwrapper(camera, panorama)(picture)
+def unwrapped(*settings: Any) -> Any:
+    """The panorama of an image of noise; `settings` are those of an Unwrapper."""
+    image = np.random.default_rng(0).integers(0, 256, (640, 640, 3), np.uint8)
+    return Unwrapper(*settings)(image)
 
 
 def of_camera(settings: CameraConfig) -> Any:
@@ -90,22 +96,19 @@ def of_panorama(settings: PanoramaConfig) -> Any:
     return unwrapped(CameraConfig(), settings)
 
 
+def of_lens(settings: LensCalibration) -> Any:
+    """No parameters of a node, but of a calibration file: each matters as well."""
+    return unwrapped(CameraConfig(), PanoramaConfig(), settings)
+
+
 def of_bag(settings: BagConfig, folder: Path) -> Any:
-    """A run from a bag with a pause of the odometry, a jump in it, and one picture's odd clock."""
-    start, tenth = 1_700_000_000 * 10**9, 10**8
+    """Stamps of the images of a bag that were received later than they were taken."""
     with BagWriter(folder / 'bag') as bag:
-        for i in range(100):
-            stamp = start + i * tenth
-            if not 40 < i < 55:
-                pose = np.array([0.1 * i + 3.0 * (i > 70), 0.0, 0.0])
-                bag.odometry('/odom', stamp, pose, np.array([1.0, 0.0]), np.array([1e-4, 1e-4]))
-            odd = stamp + 15 * 10**9 if i == 20 else stamp
-            picture = bag._raw_image(bag._header(odd, 'camera'), np.full((8, 80, 3), i, np.uint8))
-            bag.message('/panorama', stamp, picture)
+        for stamp_ns in range(START_NS, START_NS + 10**9, 10**8):
+            image = bag._raw_image(bag._header(stamp_ns, 'camera'), np.zeros((8, 80, 3), np.uint8))
+            bag.message('/panorama', stamp_ns + 5_000_000, image)
     with Bag(folder / 'bag', config=settings) as bag:
-        clocks = [stamp for stamp, _ in bag.images()]
-    run = load_run(folder / 'bag', cache=folder, config=settings)
-    return run.panoramas.stamps_ns, run.odometry.poses, clocks
+        return [stamp for stamp, _ in bag.images()]
 
 
 def of_filter(settings: FilterConfig) -> Any:
@@ -198,7 +201,9 @@ def garden() -> tuple[Any, Any]:
 def of_metric(settings: MetricConfig) -> Any:
     """The map that is learnt, and how it does on what was left out."""
     features, segments = garden()
-    result = learn(features, segments, settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selection, 'INDUCING_POINTS', 60)
+        result = learn_metric(features, segments, settings)
     _, places = positions(result, segments)
     return result.map.predict(features), places, result.left_out, result.history
 
@@ -216,46 +221,21 @@ def panoramas() -> Run:
 
 
 def of_network(settings: NetworkConfig) -> Any:
-    """What a network makes of the pictures that it was trained on."""
+    """The output of a network for the images that it was trained on."""
     run = panoramas()
-    architecture = architecture_of(settings, run.panoramas.shape[:2])
-    network = train_network(architecture, [drive_of(run, settings)], settings)
+    architecture = dataclasses.replace(PLACE_ARCHITECTURE, normalization=settings.normalization)
+    network = train_network(architecture, [ImageSequence.of(run)], settings.seed)
     return network.maps(run.panoramas.read(0, 10))[-1]
 
 
-def of_heading(settings: HeadingConfig) -> Any:
-    """The headings that are learnt with a small place."""
-    made = recipe()
-    quick = MetricConfig(slow_features=6, gp_length=3.0, gp_noise=0.01, inducing_points=60)
-    made = dataclasses.replace(made, heading=settings, metric=quick)
-    model = learn_place(place_network(), [place_run()], made).model
-    return repr([model.locate(image).yaw for image in place_run().panoramas.read(0, 10)])
-
-
-@cache
-def place_run() -> Run:
-    return run_in(Spheres.about(1), wander(150, 2, hz=4.0), recipe().panorama)
-
-
-@cache
-def place_network() -> Any:
-    made, run = recipe(), place_run()
-    architecture = architecture_of(made.network, run.panoramas.shape[:2])
-    return train_network(architecture, [drive_of(run, made.network)], made.network)
-
-
 def of_watch(settings: WatchConfig) -> Any:
-    """What is said of dark, covered, repeated and foreign pictures."""
-    watch = PictureWatch(settings)
-    noise = np.random.default_rng(0).normal(0, 1, (12, 48, 3))
-    seen = [watch.judge((m + s * noise).clip(0, 255).astype(np.uint8))
-            for m in (4, 12, 100) for s in (2, 5, 40)]  # fmt: skip
-    same = (100 + 40 * noise).clip(0, 255).astype(np.uint8)
-    return [*seen, *(watch.judge(same) for _ in range(12)), *map(watch.judge_novelty, (2, 4, 7))]
+    """How images of some novelties are judged."""
+    return [*map(ImageWatch(settings).judge_novelty, (2, 4, 7))]
 
 
 OBSERVE: dict[type[Settings], Callable[..., Any]] = {
     CameraConfig: of_camera,
+    LensCalibration: of_lens,
     PanoramaConfig: of_panorama,
     BagConfig: of_bag,
     FilterConfig: of_filter,
@@ -263,29 +243,22 @@ OBSERVE: dict[type[Settings], Callable[..., Any]] = {
     SegmentConfig: of_segments,
     MetricConfig: of_metric,
     NetworkConfig: of_network,
-    HeadingConfig: of_heading,
 }
 BESIDE: dict[type[Settings], dict[str, Any]] = {
-    MetricConfig: {'slow_features': 6, 'gp_length': 3.0, 'gp_noise': 0.01, 'inducing_points': 60},
-    NetworkConfig: {
-        item.name: getattr(recipe().network, item.name)
-        for item in dataclasses.fields(NetworkConfig)
-    },
+    MetricConfig: {'slow_features': 6},
 }
 """What is set for a whole group, where its default would be slow, or use little of it."""
-ONE_LAYER = {'field_rows': (6,), 'field_columns': (8,), 'stride_rows': (6,), 'stride_columns': (4,),
-             'linear_dimensions': (8,), 'output_dimensions': (6,)}  # fmt: skip
-STRAIGHT = {'segments': 'straight'}
-PAPER = {'solver': 'paper', 'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5,
-         'require_certificate': False, 'paper_iterations': 300}  # fmt: skip
-RANDOM = {**PAPER, 'paper_start': 'random'}
-START = {'set_initial_pose': True}
+START = {'initial_pose': (0.0, 0.0, 0.0)}
 POLAR = {'camera_model': 'polar'}
 OCAM = {'camera_model': 'ocam', 'polynomial': (-150.0, 0.0, 1e-3), 'axis': 'down'}
 TWO = {'camera_model': 'dual_fisheye', 'fx': 95.0, 'fy': 95.0, 'cx': 160.0, 'second_cx': 480.0,
        'second_cy': 319.5}  # fmt: skip
 SPECIAL: dict[type[Settings], dict[str, Other]] = {
     CameraConfig: {
+        'mount_rpy': Other((0.0, 0.0, 30.0)),
+        'blind_sectors': Other((10.0, 60.0)),
+    },
+    LensCalibration: {
         'distortion': Other((0.1, 0.0, 0.0, 0.0)),
         'polynomial': Other((-120.0, 0.0, 1e-3), OCAM),
         'affine': Other((1.1, 0.0, 0.0), OCAM),
@@ -298,59 +271,12 @@ SPECIAL: dict[type[Settings], dict[str, Other]] = {
         'second_roll': Other(5.0, TWO),
         'axis': Other('up', {'camera_model': 'fisheye', 'axis': 'down'}),
         'mirrored': Other('no'),
-        'blind_sectors': Other((10.0, 60.0)),
     },
-    SegmentConfig: {
-        'line_length_min': Other(5.0, STRAIGHT),
-        'line_bend_max': Other(1.0, STRAIGHT),
-        'turn_rate_min': Other(0.02, STRAIGHT),
-        'speed_min': Other(0.6, STRAIGHT),
-        'segment_images_min': Other(12),
-        'image_step_min': Other(0.3),
-        'image_turn_min': Other(90.0),
-    },
-    MetricConfig: {
-        'ridge': Other(1.0, {'metric_map': 'monomials', 'ridge': 1e-3, 'slow_features': 5}),
-        'angle_std_max': Other(0.01),
-        'anchor_x': Other(1.0, {'use_anchor': True}),
-        'anchor_y': Other(1.0, {'use_anchor': True}),
-        'anchor_yaw': Other(1.0, {'use_anchor': True}),
-        'paper_start': Other('random', PAPER),
-        'paper_area_x': Other(32.0, RANDOM),
-        'paper_area_y': Other(32.0, RANDOM),
-        'paper_iterations': Other(200, PAPER),
-        'paper_learning_rate': Other(5e-6, PAPER),
-        'paper_momentum': Other(0.5, PAPER),
-        'paper_change_min': Other(1e3, PAPER),
-        'paper_turns': Other(False, PAPER),
-    },
+    MetricConfig: {'anchor': Other((1.0, 2.0, 0.5))},
     FilterConfig: {
-        'correlated_share': Other(0.2),
-        'decorrelation': Other(0.3),
-        'initial_x': Other(1.0, START),
-        'initial_y': Other(1.0, START),
-        'initial_yaw': Other(1.0, START),
+        'initial_pose': Other((1.0, -1.0, 0.5)),
         'initial_position_std': Other(1.0, START),
         'initial_yaw_std': Other(1.0, START),
-        'largest_std': Other(3.0, {'unknown_speed': 5.0}),
-        'confirm_pictures': Other(6, {'confirm_distance': 0.0}),
-    },
-    HeadingConfig: {
-        'heading_layers': Other((1,)),
-        'heading_features': Other(3),
-        'heading_folds': Other(3),
-        'heading_inducing_points': Other(40),
-    },
-    NetworkConfig: {
-        'normalization': Other('panorama'),
-        'binning': Other(2, ONE_LAYER),
-        'field_rows': Other((4, 1, 3)),
-        'field_columns': Other((12, 4, 6)),
-        'stride_rows': Other((2, 3, 1)),
-        'stride_columns': Other((8, 1, 1)),
-        'linear_dimensions': Other((8, 8, 10)),
-        'output_dimensions': Other((6, 6, 6)),
-        'clip': Other(0.5),
     },
 }
 OF_A_COMMAND = 'test_commands.py'
@@ -358,44 +284,29 @@ _OMNICAM, _SOURCES = 'test_omnicam_node.py', 'test_sources.py'
 OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
     CameraConfig: {
         'calibration_file': 'test_calibration_files.py::'
-        'test_a_calibration_file_replaces_the_lens_and_keeps_the_mount',
+        'test_a_calibration_file_replaces_the_camera_model',
         'mask_file': 'test_panorama.py::test_a_mask_picture_hides_what_is_black',
     },
-    MetricConfig: {
-        'require_certificate': 'test_parameters.py::'
-        'test_an_unproven_map_is_refused_unless_that_is_allowed',
-    },
-    NetworkConfig: {
-        'engine': OF_A_COMMAND,
-        'layers': 'test_hierarchy.py::test_custom_default_is_the_standard',
-    },
-    OmnicamNodeConfig: {
+    NetworkConfig: {'engine': OF_A_COMMAND},
+    CaptureConfig: {
         'source': f'{_OMNICAM}::test_a_folder_of_pictures',
         'source_path': f'{_OMNICAM}::test_a_folder_of_pictures',
+        'silence_timeout': f'{_OMNICAM}::test_a_silent_camera_shows_in_diagnostics',
+        'source_rate': f'{_SOURCES}::test_video',
+        'source_size': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
+    },
+    OmnicamNodeConfig: {
         'image_transport': f'{_OMNICAM}::test_compressed_pictures_in_and_out',
         'frame_id': f'{_OMNICAM}::test_frame_and_quality_of_service_by_parameter',
-        'lazy': f'{_OMNICAM}::test_told_not_to_be_lazy_it_works_unheard',
-        'jpeg_quality': f'{_OMNICAM}::test_compressed_pictures_in_and_out',
-        'silence_timeout': f'{_OMNICAM}::test_a_silent_camera_shows_in_diagnostics',
-        'frozen_timeout': f'{_SOURCES}::test_a_frozen_camera_is_opened_again_until_it_moves',
-        'reopen_min': f'{_SOURCES}::test_pauses_double_up_to_the_longest',
-        'reopen_max': f'{_SOURCES}::test_pauses_double_up_to_the_longest',
-        'source_rate': f'{_SOURCES}::test_video',
-        'source_loop': f'{_SOURCES}::test_again_and_again',
-        'source_width': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
-        'source_height': 'test_parameters.py::test_a_device_is_asked_for_a_size_and_a_rate',
     },
     NodeConfig: {
         'autostart': 'test_nodes_base.py::test_a_node_starts_itself_unless_told_not_to',
-        'diagnostics_period': 'test_ekf_node.py::test_diagnostics_tell_rates_latencies_and_counts',
     },
     SfaNodeConfig: {
         'model': 'test_sfa_node.py::test_the_model_changes_while_running_and_a_bad_one_is_refused',
-        'compressed': 'test_sfa_node.py::test_compressed_panoramas_are_taken_too',
-        'camera_timeout': 'test_sfa_node.py::test_waiting_for_pictures_is_told',
-        'map_frame': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
-        'feature_frame': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
-        'novelty_warning': 'test_sfa_node.py::test_frames_and_the_warning_are_parameters',
+        'image_transport': 'test_sfa_node.py::test_compressed_panoramas_are_taken_too',
+        'silence_timeout': 'test_sfa_node.py::test_waiting_for_images_is_reported',
+        'map_frame': 'test_sfa_node.py::test_the_map_frame_is_a_parameter_and_novelty_is_warned_of',
     },
     EkfNodeConfig: {
         'map_frame': 'test_ekf_node.py::test_frames_are_parameters',
@@ -404,10 +315,7 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'publish_tf': 'test_ekf_node.py::test_frames_are_parameters',
         'transform_tolerance': 'test_ekf_node.py::'
         'test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated',
-        'path_period': 'test_ekf_node.py::test_the_path_is_thinned_and_bounded',
-        'path_length': 'test_ekf_node.py::test_the_path_is_thinned_and_bounded',
-        'odometry_silence': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
-        'picture_silence': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
+        'silence_timeout': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
     },
 }
 
@@ -421,7 +329,7 @@ def options_of(group: type[Settings]) -> set[str]:
         for option in action.option_strings
         if option in OPTIONS[name]
     }
-    return {f.name for f in dataclasses.fields(group) if cli._dest(group, f.name) in places}
+    return {f.name for f in dataclasses.fields(group) if destination(group, f.name) in places}
 
 
 def parameters() -> list[tuple[str, str]]:
@@ -507,39 +415,19 @@ def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
         def set(self, what, value):
             asked[what] = value
 
-    monkeypatch.setattr(sources.cv2, 'VideoCapture', Capture)
+    monkeypatch.setattr(capture.cv2, 'VideoCapture', Capture)
     (tmp_path / 'video0').touch()
-    size = {'source_width': 1280, 'source_height': 720, 'source_rate': 15.0}
-    sources.Device(OmnicamNodeConfig(source_path=str(tmp_path / 'video0'), **size))
+    values = {'source_size': (1280.0, 720.0), 'source_rate': 15.0}
+    capture.Device(CaptureConfig(source_path=str(tmp_path / 'video0'), **values))
     wanted = {
-        sources.cv2.CAP_PROP_FRAME_WIDTH: 1280,
-        sources.cv2.CAP_PROP_FRAME_HEIGHT: 720,
-        sources.cv2.CAP_PROP_FPS: 15.0,
+        capture.cv2.CAP_PROP_FRAME_WIDTH: 1280,
+        capture.cv2.CAP_PROP_FRAME_HEIGHT: 720,
+        capture.cv2.CAP_PROP_FPS: 15.0,
     }
     assert asked.items() >= wanted.items()
     asked.clear()
-    sources.Device(OmnicamNodeConfig(source_path=str(tmp_path / 'video0')))
+    capture.Device(CaptureConfig(source_path=str(tmp_path / 'video0')))
     assert not asked.keys() & wanted.keys(), 'a device keeps its own'
-
-
-def test_an_unproven_map_is_refused_unless_that_is_allowed(monkeypatch):
-    """Odometry that contradicts the pictures so is hard to make; the proof is taken away."""
-    features, segments = garden()
-    choose = metric.choose
-
-    def unproven(*args):
-        whole = choose(*args)
-        solution = whole.solution
-        certificate = dataclasses.replace(solution.certificate, eigenvalue=-1.0)
-        return dataclasses.replace(
-            whole, solution=dataclasses.replace(solution, certificate=certificate)
-        )
-
-    monkeypatch.setattr(metric, 'choose', unproven)
-    settings = MetricConfig(**BESIDE[MetricConfig])
-    with pytest.raises(LocalizationError, match='require_certificate: false'):
-        learn(features, segments, settings)
-    learn(features, segments, dataclasses.replace(settings, require_certificate=False))
 
 
 @pytest.mark.parametrize('kind', OBSERVE, ids=lambda kind: kind.__name__)

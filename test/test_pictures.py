@@ -157,7 +157,7 @@ def test_a_compressed_mosaic_is_demosaiced():
     ('data', 'format', 'reason'),
     [
         (b'', 'jpeg', 'empty'),
-        (b'hello, not a picture', 'jpeg', 'not a picture file'),
+        (b'hello, not a picture', 'jpeg', 'not an image file'),
         (b'\xff\xd8\xff\xe0', 'jpeg', 'truncated'),
         (b'1234', '16UC1; compressedDepth', 'depth'),
     ],

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
 
+from sfa_localization.data.array_files import read_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric.fast_expansions import FastProcess, fast_map
-from sfa_localization.place_model import FORMAT, VERSION, PlaceModel, read_arrays
+from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 
 @pytest.fixture(scope='module')
@@ -264,6 +265,4 @@ def test_what_is_known_of_the_errors_travels_with_the_model(model, tmp_path):
 
 def test_the_trainer_fills_it_in_from_what_it_left_out(model):
     assert model.error_correlation != ErrorCorrelation()
-    assert Localizer(model).filter._fusion.config.correlated_share == pytest.approx(
-        model.error_correlation.share
-    )
+    assert Localizer(model).filter.correlation.share == pytest.approx(model.error_correlation.share)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay: the pace and the keys by themselves, then whole bags through real subscribers."""
+"""Replay: pace and keys alone, then whole bags through real subscribers."""
 
 import math
 import os
@@ -30,8 +30,15 @@ from bag_formats import (
     write_version,
 )
 
-from sfa_localization.commands.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace
-from sfa_localization.commands.settings import PlayConfig
+from sfa_localization.commands.pace import (
+    FASTER,
+    PAUSE,
+    SLOWER,
+    STEP,
+    Keyboard,
+    Pace,
+    PlayConfig,
+)
 from sfa_localization.data.errors import BagError
 
 DEADLINE_S = 30.0
@@ -57,7 +64,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 class Seconds:
-    """A clock that is set by hand."""
+    """A clock set by the test."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -77,7 +84,7 @@ def test_the_pace_follows_the_clock_at_its_rate() -> None:
     assert pace.delay(7_000_000_000) == 1.5
 
 
-def test_a_paused_pace_stands_still_and_goes_on_from_there() -> None:
+def test_a_paused_pace_stands_still_and_continues_from_there() -> None:
     clock = Seconds()
     pace = Pace(0, 1.0, clock)
     clock.now += 1.0
@@ -154,8 +161,15 @@ from rosbags.interfaces import (  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Image, Imu  # noqa: E402
 
-from sfa_localization.bags.loading import Bag  # noqa: E402
-from sfa_localization.commands.play import SETTLED_S, Player, message_class, play, qos_profile  # noqa: E402
+from sfa_localization.bags.reader import Bag  # noqa: E402
+from sfa_localization.commands import bag_player  # noqa: E402
+from sfa_localization.commands.bag_player import (  # noqa: E402
+    SETTLED_S,
+    Player,
+    message_class,
+    play,
+    qos_profile,
+)
 
 NO_TIME = QosTime(9223372036, 854775807)
 ROS = pytest.mark.ros
@@ -219,7 +233,7 @@ def test_types_are_found_where_installed() -> None:
 
 @pytest.fixture
 def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Return an initialized context of its own."""
+    """Return an initialized context."""
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     context = rclpy.Context()
     options = rclpy.signals.SignalHandlerOptions.NO
@@ -229,7 +243,7 @@ def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 class Listener:
-    """Subscribes and keeps what it hears, spinning in a thread."""
+    """Subscribes and keeps all messages, spinning in a thread."""
 
     def __init__(self, context: Any, topics: dict[str, Any]) -> None:
         self.node = rclpy.create_node('listener', context=context)
@@ -283,9 +297,10 @@ def test_every_message_arrives_as_recorded(
 
 @ROS
 def test_the_clock_runs_through_the_bag(
-    context: Any, tmp_path: Path, messages: list[Message]
+    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = PlayConfig(rate=2.0, clock_rate=200.0, wait=20.0)
+    config = PlayConfig(rate=2.0, wait=20.0)
+    monkeypatch.setattr(bag_player, 'CLOCK_RATE_HZ', 200.0)  # the bag is short
     with Listener(context, {**TOPICS, '/clock': Clock}) as listener:
         path = reliable(messages, tmp_path / 'bag')
         play(path, config=config, context=context, clock=True, wait_for=['/imu'])
@@ -296,7 +311,7 @@ def test_the_clock_runs_through_the_bag(
 
 
 @ROS
-def test_it_starts_where_told(context: Any, tmp_path: Path, messages: list[Message]) -> None:
+def test_it_starts_at_the_offset(context: Any, tmp_path: Path, messages: list[Message]) -> None:
     config = PlayConfig(rate=20.0, start_offset=0.55, wait=0.0)
     path = reliable(messages, tmp_path / 'bag')
     played = play(path, config=config, context=context)
@@ -337,7 +352,7 @@ def test_types_that_are_not_installed_are_named_and_skipped(
 def test_a_late_subscriber_of_images_misses_none(
     context: Any, tmp_path: Path, messages: list[Message]
 ) -> None:
-    """The odometry's has been there for long: the chain starts one node after another."""
+    """The subscriber of odometry was there long before: nodes start one after another."""
     path, played = reliable(messages, tmp_path / 'bag'), []
     with Listener(context, {'/odom': Odometry}):
         thread = threading.Thread(
@@ -352,7 +367,7 @@ def test_a_late_subscriber_of_images_misses_none(
 
 
 @ROS
-def test_it_plays_for_nobody_after_the_wait(
+def test_it_plays_without_subscribers_after_the_wait(
     context: Any, tmp_path: Path, messages: list[Message]
 ) -> None:
     path = reliable(messages, tmp_path / 'bag')

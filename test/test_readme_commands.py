@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The README's commands, run in its order: from a recording to the three live nodes.
+"""The commands of the README, run in its order: from a recording to the three live nodes.
 
-They are taken from the text, and run as they stand; only the replay is faster than real time.
+They are read from the text and run unchanged; only the replay is faster than real time.
 """
 
 import json
@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 
 from sfa_localization.bags.reader import Bag
-from sfa_localization.commands.settings import DemoConfig
 from sfa_localization.data.geometry import align
 from sfa_localization.place_model import PlaceModel
 
@@ -35,11 +34,11 @@ def blocks(kind: str, language: str) -> list[str]:
 
 def commands(kind: str) -> list[list[str]]:
     lines = '\n'.join(blocks(kind, 'bash')).splitlines()
-    return [shlex.split(line) for line in lines if line.strip()]
+    return [shlex.split(line.removeprefix('sfa_localization ')) for line in lines if line.strip()]
 
 
 def raw_drive() -> list[str]:
-    """Return the command that made the sample's second drive, but with the mirror's pictures."""
+    """Return the command that made the sample's second drive, but with raw images of the mirror."""
     text = (ROOT / 'bags/README.md').read_text('utf-8').replace('\\\n', ' ')
     (line,) = (line for line in text.splitlines() if 'simulate bags/sample_test' in line)
     words = shlex.split(line.partition('-m sfa_localization ')[2])
@@ -47,12 +46,12 @@ def raw_drive() -> list[str]:
 
 
 def program(words: list[str]) -> list[str]:
-    """Return what the shell would run, with this interpreter and without an installed package."""
+    """Return the command line with this interpreter and without an installed package."""
     return [sys.executable, '-m', 'sfa_localization', *words]
 
 
 def complete(words: list[str], folder: Path) -> None:
-    """Run a command to its end, in a folder."""
+    """Run a command in a folder, until it ends."""
     done = subprocess.run(
         program(words),
         cwd=folder,
@@ -65,7 +64,7 @@ def complete(words: list[str], folder: Path) -> None:
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory) -> Path:
-    """A folder like a clone, in which all commands that need no ROS were run, in order."""
+    """A folder like a clone, in which all commands without ROS have been run, in order."""
     folder = tmp_path_factory.mktemp('newcomer')
     (folder / 'bags').symlink_to(ROOT / 'bags')
     for words in commands('offline'):
@@ -88,15 +87,15 @@ def test_results_beat_odometry_and_the_mean_position(folder):
     assert errors['ekf'] < errors['sfa'] < 0.3 * mean_position
 
 
-def test_report_holds_its_pictures(folder):
+def test_report_contains_its_figures(folder):
     names = {path.name for path in (folder / 'report').iterdir()}
     assert {'trajectories.png', 'errors.png', 'firing_maps.png', 'report.md'} <= names
 
 
 @pytest.mark.ros
-def test_nodes_run_as_told(folder, monkeypatch):
+def test_nodes_run_as_described(folder, monkeypatch):
     pytest.importorskip('rclpy')
-    from sfa_localization.commands import demo_nodes
+    from sfa_localization.commands import live_nodes
 
     monkeypatch.chdir(folder)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
@@ -108,7 +107,7 @@ def test_nodes_run_as_told(folder, monkeypatch):
         'play': ['--rate', '3'],
     }
     programs = {words[0]: program(words + extra.get(words[0], [])) for words in commands('live')}
-    live = demo_nodes.run_live(programs, folder / 'logs', DemoConfig())
+    live = live_nodes.run_live(programs, folder / 'logs')
     with Bag(folder / 'demo/test') as bag:
         truth, pictures = bag.trajectory(), len(list(bag.images()))
     assert len(live['sfa']) > 0.8 * pictures

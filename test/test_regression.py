@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sfa_localization.data.errors import DataError, ModelError
-from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.metric.expansions import (
     MetricMap,
     Monomials,
@@ -118,15 +117,6 @@ def test_covariances_are_symmetric_and_positive(metric_map):
     covariances = metric_map.predict(FEATURES)[1]
     assert np.array_equal(covariances, covariances.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(covariances).min() >= 2.0 * 0.1**2
-
-
-def test_moving_the_map_moves_positions_and_turns_covariances(metric_map):
-    frame = RigidTransform(3.0, -1.0, 0.7)
-    before, spread_before = metric_map.predict(FEATURES)
-    after, spread_after = metric_map.moved(frame).predict(FEATURES)
-    assert np.allclose(after, frame.apply(before), atol=1e-9)
-    turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
-    assert np.allclose(spread_after, turn @ spread_before @ turn.T, atol=1e-9)
 
 
 def test_too_few_features_are_named(metric_map):

@@ -70,7 +70,7 @@ def test_heading_table_leaves_out_estimates_without_heading(scores):
     assert lines[2].split('|')[2].strip() == '1.23'
 
 
-def test_report_writes_whole_pictures_and_nothing_else(tmp_path, truth, scores):
+def test_report_writes_whole_figures_and_nothing_else(tmp_path, truth, scores):
     folder = tmp_path / 'new' / 'report'
     positions = np.random.default_rng(0).uniform(0, 10, (50, 2))
     features = np.column_stack([positions / 5 - 1, positions[:, 0] / 5 - 1])
@@ -101,7 +101,7 @@ def test_path_is_drawn_in_its_colour_and_to_scale(tmp_path, truth):
     assert np.ptp(rows[upper]) > 100
 
 
-def test_failed_picture_leaves_nothing(tmp_path, truth, monkeypatch):
+def test_failed_figure_leaves_nothing(tmp_path, truth, monkeypatch):
     def full_disk(_figure, file, **_options):
         file.write(b'half a picture')
         raise OSError(28, 'No space left on device')

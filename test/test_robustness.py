@@ -17,7 +17,7 @@ from robustness import TABLE, robustness_table
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.pose_filter import HISTORY_S
 from sfa_localization.place_model import Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
@@ -59,8 +59,7 @@ ros = pytest.mark.ros
 SEEN = 'sfa/pose_with_covariance'
 NODES = {
     'omnicam': (OmnicamNode, {
-        'camera_model': 'panorama', 'image_width': 0, 'image_height': 0,
-        'width': SIZE.width, 'height': SIZE.height,
+        'camera_model': 'panorama', 'width': SIZE.width, 'height': SIZE.height,
     }),
     'sfa': (SfaNode, {'model': 'model.npz'}),
     'ekf': (EkfNode, {}),
@@ -151,7 +150,7 @@ NOISY = {'position_std': 0.1, 'yaw_std': 0.03, 'v_std': 0.02, 'omega_std': 0.01}
 
 def replay(bench, drive, events, together):
     """Play to a new ekf_node, waiting after every `together` messages; its filter and outputs."""
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=[0.0, 0.0, 0.0])
     heard = []
     listener = bench.node.create_subscription(Odometry, 'ekf/odometry', heard.append, 1000)
     assert until(lambda: bench.node.count_publishers('ekf/odometry') == 1)
@@ -228,7 +227,7 @@ def test_of_panoramas_that_come_too_fast_the_newest_is_located(bench, model):
 
 @ros
 def test_of_odometry_that_comes_too_fast_the_newest_is_used(bench):
-    node = bench.run(EkfNode, set_initial_pose=True)
+    node = bench.run(EkfNode, initial_pose=[0.0, 0.0, 0.0])
     bench.publish('odom', standing(START_NS))
     assert until(lambda: node.monitor('odom').used == 1)
     with held_up(bench):
@@ -238,7 +237,7 @@ def test_of_odometry_that_comes_too_fast_the_newest_is_used(bench):
     assert until(lambda: node._filter.state.stamp_ns == last)
     assert node.monitor('odom').received <= 102, 'older ones were dropped'
     assert math.isfinite(node._filter.state.position_std)
-    assert len(node._filter._history) <= FilterConfig().history * 50 + 100
+    assert len(node._filter._history) <= HISTORY_S * 50 + 100
 
 
 @contextlib.contextmanager

@@ -24,6 +24,7 @@ FIELDS = (
     Field(3, 8, 1),
     Field(1, 1, 1),
 )
+JOINED, BROKEN = np.ones(5, bool), np.array([True, False, True, False, True])
 
 
 def maps(seed: int, count: int, rows: int = 5, columns: int = 12, channels: int = 3) -> np.ndarray:
@@ -51,12 +52,12 @@ def views(of: np.ndarray, field: Field) -> np.ndarray:
     return np.stack(seen, 1).reshape(t, -1, columns, seen[0].shape[-1])
 
 
-def brute_force(signals: np.ndarray, rotations: int, scale: np.ndarray) -> Statistics:
+def brute_force(signals: np.ndarray, rotations: int, joined: np.ndarray) -> Statistics:
     """Sums over nodes of an explicit sequence (T * R, rows, nodes, D), divided by R."""
     d = signals.shape[-1]
     per_node = signals.reshape(len(signals), -1, d)
     weight = np.ones(len(signals) - 1)
-    weight[rotations - 1 :: rotations] = scale
+    weight[rotations - 1 :: rotations] = joined
     difference = np.diff(per_node, axis=0) * weight[:, None, None]
     samples, steps = per_node.reshape(-1, d), difference.reshape(-1, d)
     counted = float((weight > 0).sum()) * per_node.shape[1]
@@ -70,6 +71,11 @@ def brute_force(signals: np.ndarray, rotations: int, scale: np.ndarray) -> Stati
     )
 
 
+def added(one: Statistics, other: Statistics) -> Statistics:
+    """Statistics of both signals, with a break between them."""
+    return Statistics(*(getattr(one, name) + getattr(other, name) for name in Statistics.__slots__))
+
+
 def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) -> None:
     assert ours.weight == pytest.approx(theirs.weight, rel=1e-12)
     assert ours.steps == pytest.approx(theirs.steps, rel=1e-12)
@@ -78,49 +84,44 @@ def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) 
         assert np.abs(a - b).max() < tolerance * np.abs(b).max(), name
 
 
-def field_statistics(of, field, scale, batch=1000):
+def field_statistics(of, field, joined, batch=1000):
     sums = FieldStatistics(field, of.shape[2], field.rows * of.shape[3])
-    return fed(sums, of, scale, batch)
+    return fed(sums, of, joined, batch)
 
 
-def sample_statistics(of, scale, batch=1000):
+def sample_statistics(of, joined, batch=1000):
     signals = of.transpose(3, 0, 1, 2).copy()
-    return fed(SampleStatistics(of.shape[2], of.shape[-1]), signals, scale, batch, axis=1)
+    return fed(SampleStatistics(of.shape[2], of.shape[-1]), signals, joined, batch, axis=1)
 
 
-def fed(sums, of, scale, batch, axis=0):
-    scale = np.concatenate([[9], scale])
+def fed(sums, of, joined, batch, axis=0):
+    joined = np.concatenate([[True], joined])
     cuts = range(batch, of.shape[axis], batch)
-    for maps, part in zip(np.split(of, cuts, axis), np.split(scale, cuts), strict=True):
-        sums.add(maps, part.astype(np.float32))
+    for maps, part in zip(np.split(of, cuts, axis), np.split(joined, cuts), strict=True):
+        sums.add(maps, part.astype(bool))
     return sums.result()
 
 
 @pytest.mark.parametrize('field', FIELDS)
-@pytest.mark.parametrize('scale', ['paper', 'uneven', 'broken'])
-def test_fields_equal_brute_force(field, scale):
-    of, scales = maps(1, 6), scale_of(scale)
+@pytest.mark.parametrize('joined', [JOINED, BROKEN])
+def test_fields_equal_brute_force(field, joined):
+    of = maps(1, 6)
     explicit = views(sequence(of), field)
-    assert_equal(field_statistics(of, field, scales), brute_force(explicit, 12, scales))
+    assert_equal(field_statistics(of, field, joined), brute_force(explicit, 12, joined))
 
 
-@pytest.mark.parametrize('scale', ['paper', 'uneven', 'broken'])
-def test_samples_equal_brute_force(scale):
-    of, scales = maps(2, 6), scale_of(scale)
+@pytest.mark.parametrize('joined', [JOINED, BROKEN])
+def test_samples_equal_brute_force(joined):
+    of = maps(2, 6)
     explicit = sequence(of).astype(np.float64)
-    assert_equal(sample_statistics(of, scales), brute_force(explicit, 12, scales))
-
-
-def scale_of(kind: str) -> np.ndarray:
-    scales = {'paper': [1] * 5, 'uneven': [1, 0.5, 2, 1.7, 0.3], 'broken': [1, 0, 1, 0, 0.5]}
-    return np.array(scales[kind], np.float32)
+    assert_equal(sample_statistics(of, joined), brute_force(explicit, 12, joined))
 
 
 def test_paper_sized_field_equals_brute_force():
     """60 rotations, fields of 14 columns."""
-    of, field, scale = maps(3, 2, 3, 60, 4), Field(2, 14, 1), np.ones(1, np.float32)
+    of, field, joined = maps(3, 2, 3, 60, 4), Field(2, 14, 1), np.ones(1, bool)
     assert_equal(
-        field_statistics(of, field, scale), brute_force(views(sequence(of), field), 60, scale)
+        field_statistics(of, field, joined), brute_force(views(sequence(of), field), 60, joined)
     )
 
 
@@ -128,47 +129,44 @@ def test_paper_sized_field_equals_brute_force():
 @settings(max_examples=25, deadline=None)
 def test_batches_equal_the_whole(batch, broken, seed):
     of, field = maps(seed, 9), Field(2, 3, 1, spacing=2)
-    scale = np.ones(8, np.float32)
-    scale[broken] = 0
-    assert_equal(field_statistics(of, field, scale, batch), field_statistics(of, field, scale))
-    assert_equal(sample_statistics(of, scale, batch), sample_statistics(of, scale))
+    joined = np.arange(8) != broken
+    assert_equal(field_statistics(of, field, joined, batch), field_statistics(of, field, joined))
+    assert_equal(sample_statistics(of, joined, batch), sample_statistics(of, joined))
 
 
 def test_a_break_equals_two_drives():
     of, field = maps(4, 9), FIELDS[0]
-    broken = np.array([1, 1, 1, 0, 1, 1, 1, 1], np.float32)
     halves = [
-        field_statistics(part, field, np.ones(len(part) - 1, np.float32))
-        for part in (of[:4], of[4:])
+        field_statistics(part, field, np.ones(len(part) - 1, bool)) for part in (of[:4], of[4:])
     ]
-    assert_equal(field_statistics(of, field, broken), halves[0] + halves[1])
+    assert_equal(field_statistics(of, field, np.arange(8) != 3), added(*halves))
 
 
 def test_merging_with_a_lead_equals_the_whole():
-    of, field, scale = maps(4, 9), FIELDS[1], np.linspace(0.5, 2, 8).astype(np.float32)
+    of, field, joined = maps(4, 9), FIELDS[1], np.arange(8) % 3 != 1
     for whole, make, part in (
         (
-            field_statistics(of, field, scale),
+            field_statistics(of, field, joined),
             lambda: FieldStatistics(field, 12, 6),
             lambda start, stop: of[start:stop],
         ),
         (
-            sample_statistics(of, scale),
+            sample_statistics(of, joined),
             lambda: SampleStatistics(12, 3),
             lambda start, stop: of[start:stop].transpose(3, 0, 1, 2).copy(),
         ),
     ):
         first, second = make(), make()
-        first.add(part(0, 5), np.concatenate([[0], scale[:4]]).astype(np.float32))
+        first.add(part(0, 5), np.concatenate([[False], joined[:4]]))
         second.lead(part(4, 5))
-        second.add(part(5, 9), scale[4:])
+        second.add(part(5, 9), joined[4:])
         first.merge(second)
         assert_equal(first.result(), whole)
 
 
 def test_a_single_picture_turns_but_does_not_move():
     of, field = maps(5, 1), FIELDS[0]
-    none = np.zeros(0, np.float32)
+    none = np.zeros(0, bool)
     explicit = brute_force(views(sequence(of), field), 12, none)
     assert_equal(field_statistics(of, field, none), explicit)
     assert_equal(sample_statistics(of, none), brute_force(sequence(of), 12, none))

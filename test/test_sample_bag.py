@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sfa_localization.bags.loading import load_run
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.inspection import PANORAMA, inspect
 
 BAGS = Path(__file__).parents[1] / 'bags'
@@ -15,28 +15,28 @@ README = (BAGS / 'README.md').read_text(encoding='utf-8')
 LIMIT_BYTES = 8_000_000
 
 
-def told(name: str) -> tuple[int, int]:
-    """Return the pictures and the odometry messages that the README's table tells of a bag."""
+def listed(name: str) -> tuple[int, int]:
+    """Return the images and the odometry messages of a bag in the table of the README."""
     row = re.search(rf'^\| `{name}` .*\| (\d+) \| (\d+) each \|$', README, re.MULTILINE)
     assert row
     return int(row[1]), int(row[2])
 
 
 @pytest.mark.parametrize(('name', 'enough'), [('sample', True), ('sample_test', False)])
-def test_the_sample_holds_what_is_told(name: str, enough: bool, tmp_path: Path) -> None:
-    pictures, others = told(name)
+def test_the_sample_holds_what_its_readme_lists(name: str, enough: bool, tmp_path: Path) -> None:
+    images, others = listed(name)
     report = inspect(BAGS / name, strict=True)
     assert {topic.name: topic.count for topic in report.topics} == {
-        '/panorama/compressed': pictures,
+        '/panorama/compressed': images,
         '/odom': others,
         '/imu': others,
         '/ground_truth': others,
     }
     assert not any(topic.problems for topic in report.topics) and report.problems == []
-    assert report.pictures is not None and report.pictures.geometry == PANORAMA
+    assert report.images is not None and report.images.geometry == PANORAMA
     assert (report.lacks == []) is enough
     run = load_run(BAGS / name, cache=tmp_path, want_truth=True, strict=True)
-    assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == pictures
+    assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == images
 
 
 def test_the_samples_are_small() -> None:

@@ -11,7 +11,8 @@ from metric_worlds import criss_cross, drive, meander, stand, straight, turn
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Trajectory, YawRate
-from sfa_localization.metric.segments import assignment, cut, join
+from sfa_localization.metric import segments as segments_module
+from sfa_localization.metric.segments import PIECE_LENGTH_M, assignment, cut, join
 from sfa_localization.metric.settings import SegmentConfig
 
 ANY = SegmentConfig()
@@ -65,15 +66,16 @@ def test_pieces_of_a_curved_drive_follow_the_truth():
     twists, start = meander(60.0, seed=3)
     run = drive(twists, start=start)
     segments = cut(run.odometry, run.stamps_ns, ANY)
-    assert all(s.length_m <= ANY.piece_length + 1e-6 for s in segments)
+    assert all(s.length_m <= PIECE_LENGTH_M + 1e-6 for s in segments)
     assert segments.images.used == len(run.stamps_ns)
     check_segments(segments, run.poses)
 
 
-def test_pieces_bounded_by_error_are_shorter():
+def test_pieces_bounded_by_error_are_shorter(monkeypatch):
     run = drive(meander(60.0)[0])
     loose = cut(run.odometry, run.stamps_ns, ANY)
-    tight = cut(run.odometry, run.stamps_ns, dataclasses.replace(ANY, piece_std=0.04))
+    monkeypatch.setattr(segments_module, 'PIECE_STD_M', 0.04)
+    tight = cut(run.odometry, run.stamps_ns, ANY)
     assert len(tight) > len(loose)
 
 
@@ -112,7 +114,7 @@ def test_an_odometry_reset_breaks_the_drive():
     segments = cut(odometry, run.stamps_ns, ANY)
     assert segments.odometry.skipped == {'resets': 1}
     assert sum(not s.linked for s in segments) == 2
-    assert all(np.abs(s.path).max() <= ANY.piece_length + 1e-6 for s in segments)
+    assert all(np.abs(s.path).max() <= PIECE_LENGTH_M + 1e-6 for s in segments)
 
 
 def test_a_pause_of_the_odometry_breaks_the_drive_and_its_pictures_are_counted():
@@ -190,18 +192,16 @@ def test_a_stretch_without_pictures_splits_but_keeps_the_link():
     check_segments(segments, run.poses[keep])
 
 
-def test_message_variances_rule_over_the_configured_noise():
+def test_message_variances_rule_over_the_configured_noise(monkeypatch):
+    monkeypatch.setattr(segments_module, 'PIECE_STD_M', 10.0)
     run = drive(straight(12.0))
     told = dataclasses.replace(run.odometry, variances=np.full((601, 2), 4.0))
-    ours = cut(run.odometry, run.stamps_ns, STRAIGHT_TWO)[0].turn_variance
-    theirs = cut(told, run.stamps_ns, STRAIGHT_TWO)[0].turn_variance
+    ours = cut(run.odometry, run.stamps_ns, ANY)[0].turn_variance
+    theirs = cut(told, run.stamps_ns, ANY)[0].turn_variance
     # 4 rad^2/s^2 per message of 0.02 s: 4 * 0.02^2 rad^2 each, over the messages between.
     between = 3.0 * 50
     assert theirs == pytest.approx(4.0 * 0.02**2 * between, rel=0.1)
     assert ours < theirs / 100
-
-
-STRAIGHT_TWO = SegmentConfig(piece_length=3.0, piece_std=10.0)
 
 
 def test_joined_runs_keep_their_pictures_apart():

@@ -1,14 +1,12 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Slow feature analysis recovers slow sources; its statistics stream and merge."""
+"""Slow feature analysis recovers slow sources."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.features.sfa import Statistics, StreamingSFA, solve
+from sfa_localization.features.sfa import Statistics, solve
 
 PERIODS = (400.0, 130.0, 47.0, 9.0)
 
@@ -24,8 +22,14 @@ def mixed(seed: int = 0) -> np.ndarray:
     return sources() @ rng.normal(size=(4, 4)) + rng.normal(size=4)
 
 
-def fitted(x: np.ndarray, outputs: int, **options: float):
-    return StreamingSFA(outputs, **options).partial_fit(x).fit()
+def statistics(x: np.ndarray) -> Statistics:
+    """The sums over a signal (N, D)."""
+    dx = np.diff(x, axis=0)
+    return Statistics(len(x), x.sum(0, dtype=np.float64), x.T @ x, len(dx), dx.T @ dx)
+
+
+def fitted(x: np.ndarray, outputs: int, relative_cut: float = 1e-7):
+    return solve(statistics(x), outputs, relative_cut)
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -49,77 +53,6 @@ def test_delta_value_of_a_sinusoid():
     # <ds^2> of sqrt(2) sin(w t) is 2 (1 - cos w).
     expected = 2 * (1 - np.cos(2 * np.pi / np.array(PERIODS)))
     assert np.allclose(fitted(mixed(), 4).delta, expected, rtol=0.01)
-
-
-def test_statistics_by_hand():
-    s = StreamingSFA(1).partial_fit(np.array([[1.0, 0.0], [2.0, 1.0], [4.0, -1.0]])).statistics
-    assert s is not None and (s.weight, s.steps) == (3, 2)
-    assert np.array_equal(s.total, [7, 0])
-    assert np.array_equal(s.second, [[21, -2], [-2, 2]])
-    assert np.array_equal(s.difference, [[5, -3], [-3, 5]])
-
-
-def same(a: Statistics | None, b: Statistics | None) -> None:
-    assert a is not None and b is not None
-    assert (a.weight, a.steps) == (b.weight, b.steps)
-    for one, other in zip(
-        (a.total, a.second, a.difference), (b.total, b.second, b.difference), strict=True
-    ):
-        assert np.allclose(one, other, rtol=1e-10, atol=1e-10)
-
-
-@given(st.lists(st.integers(0, 40), max_size=4), st.integers(0, 100))
-@settings(max_examples=30, deadline=None)
-def test_chunks_equal_the_whole(cuts, seed):
-    x = np.random.default_rng(seed).normal(size=(40, 3))
-    streamed = StreamingSFA(1)
-    for chunk in np.split(x, sorted(cuts)):
-        streamed.partial_fit(chunk)
-    same(streamed.statistics, StreamingSFA(1).partial_fit(x).statistics)
-
-
-def test_chunks_with_times_equal_the_whole():
-    rng = np.random.default_rng(5)
-    x, time = rng.normal(size=(40, 3)), rng.uniform(0.1, 2, 40).cumsum()
-    streamed = StreamingSFA(1)
-    for start in range(0, 40, 7):
-        streamed.partial_fit(x[start : start + 7], time[start : start + 7])
-    same(streamed.statistics, StreamingSFA(1).partial_fit(x, time).statistics)
-
-
-def test_no_difference_across_runs():
-    x = np.random.default_rng(0).normal(size=(30, 2))
-    broken = StreamingSFA(1).partial_fit(x[:12]).end_run().partial_fit(x[12:] + 1000)
-    assert broken.statistics is not None
-    assert broken.statistics.steps == 28
-    assert np.abs(broken.statistics.difference).max() < 1000
-
-
-def test_merging_equals_runs_in_a_row():
-    x = np.random.default_rng(1).normal(size=(30, 3))
-    merged = StreamingSFA(2).partial_fit(x[:12]).merge(StreamingSFA(2).partial_fit(x[12:]))
-    in_a_row = StreamingSFA(2).partial_fit(x[:12]).end_run().partial_fit(x[12:])
-    same(merged.statistics, in_a_row.statistics)
-    assert np.allclose(merged.fit().weights, in_a_row.fit().weights)
-
-
-def test_merging_into_an_empty_estimator():
-    x = np.random.default_rng(1).normal(size=(30, 3))
-    assert StreamingSFA(1).merge(StreamingSFA(1).partial_fit(x)).fit().rank == 3
-
-
-def test_real_time_steps_undo_uneven_sampling():
-    # Sampled unevenly, ds/dt of a sinusoid keeps its size: Delta = w^2 for unit variance.
-    rng = np.random.default_rng(2)
-    time = rng.uniform(0.2, 1.8, 20000).cumsum()
-    x = np.sin(time[:, None] * np.array([0.02, 0.3])) @ rng.normal(size=(2, 2))
-    solution = StreamingSFA(2).partial_fit(x, time).fit()
-    assert np.allclose(solution.delta, np.array([0.02, 0.3]) ** 2, rtol=0.05)
-
-
-def test_times_must_increase():
-    with pytest.raises(DataError, match='must increase'):
-        StreamingSFA(1).partial_fit(np.zeros((3, 2)), np.array([0.0, 1.0, 1.0]))
 
 
 def test_signs_are_deterministic():
@@ -163,31 +96,7 @@ class TestRankDeficiency:
         assert fitted(x, 4, relative_cut=0.1).rank == 4
 
 
-@pytest.mark.parametrize(
-    ('x', 'told'),
-    [
-        (np.zeros(5), 'shape'),
-        (np.full((5, 2), np.nan), 'finite'),
-        (np.full((5, 2), np.inf), 'finite'),
-    ],
-)
-def test_bad_signals_are_refused(x, told):
-    with pytest.raises(DataError, match=told):
-        StreamingSFA(1).partial_fit(x)
-
-
-def test_other_dimensions_are_refused():
-    sfa = StreamingSFA(1).partial_fit(np.zeros((3, 2)))
-    with pytest.raises(DataError, match='expected 2 dimensions, got 3'):
-        sfa.partial_fit(np.zeros((3, 3)))
-    with pytest.raises(DataError, match='cannot merge'):
-        Statistics.empty(2) + Statistics.empty(3)
-
-
-def test_too_little_signal_is_refused():
-    with pytest.raises(DataError, match='no signal'):
-        StreamingSFA(1).fit()
+@pytest.mark.parametrize('count', [0, 1])
+def test_too_little_signal_is_refused(count):
     with pytest.raises(DataError, match='two consecutive'):
-        StreamingSFA(1).partial_fit(np.zeros((1, 2))).fit()
-    with pytest.raises(DataError, match='two consecutive'):
-        solve(Statistics.empty(2), 1)
+        fitted(np.zeros((count, 2)), 1)

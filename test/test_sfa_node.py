@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.watch import FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.localizer import UNKNOWN_VARIANCE
@@ -43,7 +44,7 @@ from sfa_localization.nodes.conversions import (  # noqa: E402
     to_info,
 )
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
-from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
+from sfa_localization.nodes.sfa_node import NOVELTY_WARNING, SfaNode  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
@@ -139,7 +140,7 @@ def test_without_heading_the_yaw_variance_is_large(bench, models):
 
 
 def test_compressed_panoramas_are_taken_too(bench, models):
-    bench.run(SfaNode, model='a.npz', compressed=True)
+    bench.run(SfaNode, model='a.npz', image_transport='compressed')
     heard = bench.listen(PoseStamped, 'sfa/pose')
     bench.publish('panorama/compressed', to_compressed(panorama(), 7, 'omnicam', 90))
     assert until(lambda: heard) and read_stamp(heard[0].header.stamp) == 7
@@ -155,23 +156,25 @@ def bad_pictures():
 
 @pytest.mark.parametrize('kind', ['dark', 'covered', 'frozen', 'foreign'])
 def test_an_unusable_picture_says_nothing_and_is_told(bench, models, kind):
-    node = bench.run(SfaNode, model='a.npz', diagnostics_period=0.1, frozen_pictures=3)
+    node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     told = bench.listen(DiagnosticArray, '/diagnostics')
     models['a.npz'].novelty = 9.0 if kind == 'foreign' else 0.5
     image = bad_pictures().get(kind, panorama(5))
-    for k in range(3):
+    for k in range(FROZEN_IMAGES):
         bench.publish('panorama', message(image=image, stamp_ns=100 + k))
         assert until(lambda n=k: len(heard) == n + 1)
     covariance = np.reshape(heard[-1].pose.covariance, (6, 6))
     assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE
-    assert len(poses) == (2 if kind == 'frozen' else 0)
+    assert len(poses) == (FROZEN_IMAGES - 1 if kind == 'frozen' else 0)
     assert until(lambda: told and told[-1].status[0].level != b'\x00')
     models['a.npz'].novelty = 0.5
     bench.publish('panorama', message(seed=77, stamp_ns=200))
     assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
-    assert sum(node.monitor('panorama').refused.values()) == (1 if kind == 'frozen' else 3)
+    assert sum(node.monitor('panorama').refused.values()) == (
+        1 if kind == 'frozen' else FROZEN_IMAGES
+    )
 
 
 def test_panoramas_of_another_size_are_refused_with_the_remedy(bench, models):
@@ -215,7 +218,7 @@ def test_malformed_pictures_are_counted_and_end_nothing(bench, models):
 
 
 def test_malformed_compressed_pictures_too(bench, models):
-    node = bench.run(SfaNode, model='a.npz', compressed=True)
+    node = bench.run(SfaNode, model='a.npz', image_transport='compressed')
     for count, data in enumerate((b'', b'no picture', bytes(100)), 1):
         broken = CompressedImage(format='jpeg', data=data)
         broken.header.stamp.sec = 1
@@ -262,12 +265,12 @@ def test_a_missing_model_is_named_with_the_remedy(bench, models, model, why):
     assert why in node.failure and 'train' in node.failure
 
 
-def test_waiting_for_pictures_is_told(bench, models):
-    bench.run(SfaNode, model='a.npz', diagnostics_period=0.1, camera_timeout=0.2)
+def test_waiting_for_images_is_reported(bench, models):
+    bench.run(SfaNode, model='a.npz', silence_timeout=0.2)
     told = bench.listen(DiagnosticArray, '/diagnostics')
-    assert until(lambda: told and 'waiting for pictures' in told[-1].status[0].message)
+    assert until(lambda: told and 'waiting for images' in told[-1].status[0].message)
     bench.publish('panorama', message())
-    assert until(lambda: 'no picture on panorama for' in told[-1].status[0].message)
+    assert until(lambda: 'no image on panorama for' in told[-1].status[0].message)
 
 
 # What the node says is what it does, in any state.
@@ -275,7 +278,7 @@ def test_waiting_for_pictures_is_told(bench, models):
 
 @pytest.mark.parametrize('state', ['unconfigured', 'inactive', 'active'])
 def test_a_model_is_checked_in_every_state_and_the_one_reported_is_in_use(bench, models, state):
-    node = bench.run(SfaNode, start=False, model='a.npz', diagnostics_period=0.1)
+    node = bench.run(SfaNode, start=False, model='a.npz')
     if state != 'unconfigured':
         node.trigger_configure()
     if state == 'active':
@@ -316,7 +319,7 @@ def declare(bench, **changes):
     {'elevation_min': -20.0}, {'elevation_max': 30.0}, {'clockwise': False},
 ])  # fmt: skip
 def test_panoramas_declared_to_show_something_else_are_refused(bench, models, changes):
-    node = bench.run(SfaNode, model='a.npz', diagnostics_period=0.1)
+    node = bench.run(SfaNode, model='a.npz')
     told = bench.listen(DiagnosticArray, '/diagnostics')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     declare(bench, **changes)
@@ -358,7 +361,7 @@ def test_that_nobody_declares_the_panorama_is_said_once(bench, models, monkeypat
     for count in (1, 2, 3):
         bench.publish('panorama', message(seed=count))
         assert until(lambda n=count: len(heard) == n)
-    assert len(said) == 1 and 'nobody declares' in said[0] and '-12 to 24 deg' in said[0]
+    assert len(said) == 1 and 'nobody publishes' in said[0] and '-12 to 24 deg' in said[0]
 
 
 def test_a_declaration_that_cannot_be_read_is_counted(bench, models):
@@ -370,15 +373,17 @@ def test_a_declaration_that_cannot_be_read_is_counted(bench, models):
     assert until(lambda: heard)
 
 
-def test_frames_and_the_warning_are_parameters(bench, models):
-    frames = {'map_frame': 'garden', 'feature_frame': 'slow'}
-    node = bench.run(SfaNode, model='a.npz', novelty_warning=1.0, **frames)
+def test_the_map_frame_is_a_parameter_and_novelty_is_warned_of(bench, models):
+    node = bench.run(SfaNode, model='a.npz', map_frame='garden')
     features = bench.listen(PoseStamped, 'sfa/slow_feature_pose')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-    models['a.npz'].novelty = 1.2
+    models['a.npz'].novelty = NOVELTY_WARNING + 0.1
     bench.publish('panorama', message())
     assert until(lambda: features and poses and uncertain)
-    assert features[0].header.frame_id == 'slow'
+    assert features[0].header.frame_id == 'slow_feature_space'
     assert poses[0].header.frame_id == uncertain[0].header.frame_id == 'garden'
-    assert until(lambda: 'unlike' in node.health()[1]), 'by default 1.2 is not worth a warning'
+    assert until(lambda: 'unlike' in node.health()[1])
+    models['a.npz'].novelty = NOVELTY_WARNING - 0.1
+    bench.publish('panorama', message(seed=2))
+    assert until(lambda: node.health()[1] == 'locating')

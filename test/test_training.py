@@ -10,20 +10,29 @@ import pytest
 from cylinder_worlds import Spheres, panorama_config, recipe, run_in, wander
 
 from sfa_localization import training
-from sfa_localization.bags.loading import BagWriter
+from sfa_localization.bags.drives import read_drive
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run
-from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features import checkpoint as checkpoints
+from sfa_localization.features import image_features
+from sfa_localization.features.network_training import ImageSequence
+from sfa_localization.metric import compass_training
 from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe, drive_of, read_drive, summary, train
+from sfa_localization.reports.summary import summary
+from sfa_localization.training import Recipe, train
 
 PICTURES = 160
-NETWORK = replace(recipe().network, linear_dimensions=(6, 6, 8), output_dimensions=(6, 6, 6))
+ARCHITECTURE = replace(
+    recipe().architecture,
+    layers=tuple(
+        replace(layer, linear=linear, outputs=6)
+        for layer, linear in zip(recipe().architecture.layers, (6, 6, 8), strict=True)
+    ),
+)
 RECIPE = replace(
-    recipe(),
-    network=NETWORK,
-    metric=replace(recipe().metric, slow_features=4, gp_length=2.0, gp_noise=0.01),
+    recipe(), architecture=ARCHITECTURE, metric=replace(recipe().metric, slow_features=4)
 )
 
 
@@ -63,7 +72,7 @@ class Cut(Exception):
 def cut_off(bag: Path, output: Path, stages: int, error: BaseException) -> None:
     """Train until `stages` stages are finished, and be cut off there."""
     with pytest.MonkeyPatch.context() as patch:
-        write, done = training._Checkpoint.write, []
+        write, done = checkpoints.Checkpoint.write, []
 
         def write_then_fail(self, partial):
             write(self, partial)
@@ -71,7 +80,7 @@ def cut_off(bag: Path, output: Path, stages: int, error: BaseException) -> None:
             if len(done) == stages:
                 raise error
 
-        patch.setattr(training._Checkpoint, 'write', write_then_fail)
+        patch.setattr(checkpoints.Checkpoint, 'write', write_then_fail)
         with pytest.raises(type(error)):
             train([bag], output, RECIPE)
 
@@ -92,27 +101,27 @@ def test_it_says_what_error_to_expect_and_where_it_is_worst(bag, tmp_path):
     assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
 
 
-def test_without_a_heading_it_expects_none(bag, tmp_path):
-    recipe = replace(RECIPE, heading=replace(RECIPE.heading, learn_heading=False))
-    trained = train([bag], tmp_path / 'model.npz', recipe)
+def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(image_features, 'SAMPLES', 15)
+    trained = train([bag], tmp_path / 'model.npz', RECIPE)
+    assert 'too few to learn a compass' in caplog.text
     assert not trained.model.has_heading
     assert 'expected_yaw_error_deg' not in trained.model.quality
     assert 'heading' not in summary(trained)
 
 
 def test_a_heading_from_some_of_the_images_only(bag, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, '_SAMPLES', 97)
-    learn_heading = training._learn_heading
+    monkeypatch.setattr(image_features, 'SAMPLES', 97)
 
-    def of_the_first_half(views, *rest):
-        half = views.sampled < PICTURES / 2
-        return learn_heading(
-            replace(views, sampled=views.sampled[half], harmonic=views.harmonic[half]), *rest
+    def of_the_first_half(images, *rest):
+        half = images.sampled < PICTURES / 2
+        return compass_training.learn_heading(
+            replace(images, sampled=images.sampled[half], harmonic=images.harmonic[half]), *rest
         )
 
-    monkeypatch.setattr(training, '_learn_heading', of_the_first_half)
+    monkeypatch.setattr(training, 'learn_heading', of_the_first_half)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
-    assert trained.heading_images.max() < PICTURES / 2
+    assert trained.heading.images.max() < PICTURES / 2
     assert 0.0 < trained.model.quality['expected_yaw_error_deg'] < 180.0
 
 
@@ -148,7 +157,9 @@ def test_resuming_gives_the_same_bytes(bag, whole, tmp_path, stages, error):
 def test_resuming_leaves_out_finished_stages(bag, tmp_path, monkeypatch):
     cut_off(bag, tmp_path / 'model.npz', 4, Cut())
     stages = []
-    monkeypatch.setattr(training._Checkpoint, 'write', lambda self, partial: stages.append(partial))
+    monkeypatch.setattr(
+        checkpoints.Checkpoint, 'write', lambda self, partial: stages.append(partial)
+    )
     train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
     assert len(stages) == 2
 
@@ -156,7 +167,9 @@ def test_resuming_leaves_out_finished_stages(bag, tmp_path, monkeypatch):
 def test_without_resume_it_starts_anew(bag, tmp_path, monkeypatch):
     cut_off(bag, tmp_path / 'model.npz', 4, Cut())
     stages = []
-    monkeypatch.setattr(training._Checkpoint, 'write', lambda self, partial: stages.append(partial))
+    monkeypatch.setattr(
+        checkpoints.Checkpoint, 'write', lambda self, partial: stages.append(partial)
+    )
     train([bag], tmp_path / 'model.npz', RECIPE)
     assert len(stages) == 6
 
@@ -177,7 +190,7 @@ def test_a_killed_training_s_pictures_are_cleared(bag, tmp_path):
 @pytest.mark.parametrize('other', ['recipe', 'bag'])
 def test_a_checkpoint_of_something_else_is_refused(bag, tmp_path, other):
     cut_off(bag, tmp_path / 'model.npz', 2, Cut())
-    changed = replace(RECIPE, network=replace(NETWORK, relative_cut=1e-5))
+    changed = replace(RECIPE, network=replace(RECIPE.network, seed=5))
     bags = [write_bag(tmp_path / 'other', seed=8)] if other == 'bag' else [bag]
     with pytest.raises(ModelError, match='other bags or parameters: train without --resume'):
         train(bags, tmp_path / 'model.npz', changed if other == 'recipe' else RECIPE, resume=True)
@@ -195,9 +208,10 @@ def test_a_damaged_checkpoint_is_refused(bag, tmp_path):
 def test_after_an_error_no_model_is_left(bag, tmp_path, late, monkeypatch):
     if late:
         monkeypatch.setattr(training, 'learn_place', _fail)
-    network = NETWORK if late else replace(NETWORK, linear_dimensions=(6, 6))
+    wrong = replace(ARCHITECTURE, size=(12, 36))
+    recipe = RECIPE if late else replace(RECIPE, architecture=wrong)
     with pytest.raises(LocalizationError):
-        train([bag], tmp_path / 'model.npz', replace(RECIPE, network=network))
+        train([bag], tmp_path / 'model.npz', recipe)
     assert 'model.npz' not in names(tmp_path)
     assert not any('cache' in name for name in names(tmp_path))
 
@@ -229,7 +243,7 @@ def test_an_output_that_cannot_be(bag, tmp_path):
 def test_the_mdp_engine_learns_the_same_place(bag, tmp_path):
     pytest.importorskip('future', reason='the extra mdp is not installed')
     ours = train([bag], tmp_path / 'ours.npz', RECIPE)
-    config = replace(RECIPE, network=replace(NETWORK, engine='mdp'))
+    config = replace(RECIPE, network=replace(RECIPE.network, engine='mdp'))
     theirs = train([bag], tmp_path / 'theirs.npz', config)
     for a, b in zip(ours.features.T, theirs.features.T, strict=True):
         assert abs(np.corrcoef(a, b)[0, 1]) > 0.999
@@ -248,8 +262,8 @@ def test_two_bags_are_two_drives(bag, tmp_path):
     assert len(trained.runs) == 2 and len(trained.features) == 2 * PICTURES
 
 
-class TestDrive:
-    """Which pictures are neighbors, and how far apart."""
+class TestNeighbors:
+    """Which images are neighbors."""
 
     def run(self, x_m: list[float], seconds: list[float]) -> Run:
         stamps = (np.array(seconds) * 1e9).astype(np.int64)
@@ -259,28 +273,15 @@ class TestDrive:
         odometry = Odometry(stamps, poses, np.zeros((len(stamps), 2)), np.zeros((len(stamps), 2)))
         return Run('run', PanoramaArray(stamps, images), odometry, counts={'images': Count()})
 
-    def scale(self, run: Run, **config) -> list[float]:
-        return drive_of(run, NetworkConfig(**config)).scale.tolist()
+    def joined(self, run: Run) -> list[bool]:
+        return ImageSequence.of(run).joined.tolist()
 
-    def test_every_picture_counts_the_same(self):
-        run = self.run([0, 0.1, 0.4, 0.5], [0, 1, 2, 3])
-        assert self.scale(run) == [1, 1, 1]
+    def test_close_images_are_neighbors(self):
+        assert self.joined(self.run([0, 0.1, 0.4, 0.5], [0, 1, 2, 3])) == [True] * 3
 
     def test_pauses_and_jumps_are_breaks(self):
         run = self.run([0, 0.1, 0.2, 3.0, 3.1], [0, 1, 9, 10, 11])
-        assert self.scale(run, break_time=5.0, break_distance=2.0) == [1, 0, 0, 1]
-
-    def test_per_metre(self):
-        run = self.run([0, 0.1, 0.3, 0.4], [0, 1, 2, 3])
-        assert np.allclose(self.scale(run, difference='distance'), [1, 0.5, 1])
-
-    def test_per_second(self):
-        run = self.run([0, 0.1, 0.2, 0.3], [0, 1, 2, 6])
-        assert np.allclose(self.scale(run, difference='time'), [1, 1, 0.25])
-
-    def test_a_robot_that_hardly_moves_counts_little(self):
-        run = self.run([0, 0.1, 0.2, 0.2], [0, 1, 2, 3])
-        assert np.allclose(self.scale(run, difference='distance'), [1, 1, 5])
+        assert self.joined(run) == [True, False, False, True]
 
 
 def test_a_drive_is_streamed_from_the_cache(bag, tmp_path):

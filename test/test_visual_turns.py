@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
-from sfa_localization.bags.loading import load_run
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate

@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read a recorded drive: any ROS 1 or ROS 2 bag as pictures, odometry, yaw rates and poses.
+"""Read a recorded drive: any ROS 1 or ROS 2 bag as images, odometry, yaw rates and poses.
 
-Nothing is lost in silence: what a bag says it holds is compared with what was read, and every
+Nothing is lost silently: the message counts of the bag are compared with what was read, and every
 message that is not used is counted with its reason. Bags are never written to.
 """
 
@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Qos
 
-from sfa_localization.bags import messages
-from sfa_localization.bags.arrays import (
-    Values,
-    poses_stand,
+from sfa_localization.bags import decoding
+from sfa_localization.bags.motion_arrays import (
+    StampedValues,
+    is_pose_constant,
     to_odometry,
     to_trajectory,
     to_yaw_rate,
@@ -27,22 +26,24 @@ from sfa_localization.bags.arrays import (
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.storage import Channel, Record, inflate_message
-from sfa_localization.bags.streams import StampFilter, Stream, Tally
+from sfa_localization.bags.topic_stream import Stream, Tally
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
 
 SERIALIZATIONS = ('cdr', 'ros1')
-MAX_SHOWN = 8
-# More resets of the odometry than this are none: pose and twist are of different units.
+MOST_TOPICS = 8
+"""Topics that an error message lists."""
 _RESETS_MIN, _RESETS_SHARE = 20, 0.01
-COMPRESSED_START = b'\x28'
-"""First byte of zstd data; no CDR message begins so."""
+"""More resets than both the number and the share of messages mean that pose and twist disagree all
+along, as with different units; single restarts of an odometry node stay far below."""
+ZSTD_START = b'\x28'
+"""First byte of zstd data; no CDR message starts with it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What a topic is wanted for: its name in errors, its flag, the types that can serve.
+    """The use of a topic: its title in errors, its command line flag, the types that can serve.
 
     `found` are the types by which it is found, `named` those accepted when it is named.
     """
@@ -53,20 +54,20 @@ class Kind:
     named: tuple[str, ...]
 
 
-_IMAGES = (messages.IMAGE, messages.COMPRESSED)
+_IMAGES = (decoding.IMAGE, decoding.COMPRESSED)
 KINDS = {
-    'image': Kind('pictures', '--image-topic', _IMAGES, _IMAGES),
-    'odometry': Kind('odometry', '--odom-topic', (messages.ODOMETRY,), messages.POSES),
-    'imu': Kind('yaw rates', '--imu-topic', (messages.IMU,), (messages.IMU,)),
+    'image': Kind('images', '--image-topic', _IMAGES, _IMAGES),
+    'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
+    'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
     'ground_truth': Kind(
-        'true poses', '--ground-truth-topic', messages.STAMPED_POSES, messages.POSES
+        'true poses', '--ground-truth-topic', decoding.STAMPED_POSES, decoding.POSES
     ),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a bag; `count` is the larger of what its metadata and its files tell."""
+    """A topic of a bag; `count` is the larger of the counts in its metadata and in its files."""
 
     name: str
     kind: str
@@ -78,8 +79,7 @@ class Topic:
 class Bag:
     """Context manager over one bag: a folder, or a single .db3, .mcap or .bag file.
 
-    `strict` refuses damaged bags and messages instead of counting what is lost of them.
-    `stamp_source` is 'header' or 'receive' (None: as in `config`). Raises BagError.
+    `strict` raises for damaged bags and messages instead of counting the losses. Raises BagError.
     """
 
     def __init__(
@@ -87,32 +87,26 @@ class Bag:
         path: Path | str,
         *,
         strict: bool = False,
-        stamp_source: str | None = None,
         config: BagConfig | None = None,
     ) -> None:
-        self.path, self.config, self.strict = Path(path), config or BagConfig(), strict
-        self._by_header = (stamp_source or self.config.stamp_source) == 'header'
-        self._decode = messages.Decoder()
+        self.path, self.strict = Path(path), strict
+        self._by_header = (config or BagConfig()).stamp_source == 'header'
+        self._decode = decoding.Decoder()
         self._tallies: dict[str, Tally] = {}
         self._recording: Recording | None = None
 
     def __enter__(self) -> Bag:
         self._recording = Recording(self.path)
-        self._refuse_problems()
+        self._raise_problems()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.recording.close()
         self._recording = None
 
     @property
     def recording(self) -> Recording:
-        """The files beneath. Raises BagError outside the `with` block."""
+        """The open files. Raises BagError outside the `with` block."""
         if self._recording is None:
             raise BagError(f'{self.path}: is not open; use it in a with statement')
         return self._recording
@@ -129,12 +123,12 @@ class Bag:
 
     @property
     def counts(self) -> dict[str, Count]:
-        """What became of the messages of each topic read so far."""
+        """Used and rejected messages of each topic read so far."""
         return {topic: tally.count for topic, tally in self._tallies.items()}
 
     @property
     def problems(self) -> list[str]:
-        """What was found damaged or missing so far."""
+        """Damage and losses found so far."""
         return self.recording.all_problems()
 
     def find(self, kind: str, topic: str = '') -> str:
@@ -177,40 +171,40 @@ class Bag:
                        f'only cdr can be read: record it so')  # fmt: skip
 
     def _contents(self, wanted: Kind) -> str:
-        """What the bag has instead, and the remedy."""
+        """The topics that the bag has, and the remedy."""
         kinds = [f'{t.name} ({t.kind.rsplit("/", 1)[-1]}, {t.count})' for t in self.topics.values()]
-        shown = ', '.join(sorted(kinds)[:MAX_SHOWN]) + (', ...' if len(kinds) > MAX_SHOWN else '')
+        shown = ', '.join(sorted(kinds)[:MOST_TOPICS]) + (
+            ', ...' if len(kinds) > MOST_TOPICS else ''
+        )
         return f'it has {shown or "no topics"}: record one, or name one with {wanted.flag}'
 
-    # Streams of values.
-
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
-        """Stamps and pictures (H, W, 3) BGR, one at a time."""
-        stream = self.stream(self.find('image', topic), messages.image_of)
+        """Stamps and images (H, W, 3) BGR, one at a time."""
+        stream = self.stream(self.find('image', topic), decoding.image_of)
         return ((stamp, image) for _, stamp, image in self.read([stream]))
 
     def odometry(self, topic: str = '') -> Odometry:
-        """All odometry; of a topic that tells poses only, twists are their differences."""
+        """All odometry; of a topic with poses only, twists are their differences."""
         stream = self.odometry_stream(topic)
         return self.to_odometry(stream, [(stamp, value) for _, stamp, value in self.read([stream])])
 
-    def to_odometry(self, stream: Stream, values: Values) -> Odometry:
+    def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
         """Odometry of a stream's values; a reset is joined, and noted as a problem."""
-        odometry, resets = to_odometry(values, self.config.odometry_jump)
+        odometry, resets = to_odometry(values)
         if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
             raise BagError(
                 f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
-                f'{len(values)} messages: are both in metres, radians and seconds?'
+                f'{len(values)} messages: are both in meters, radians and seconds?'
             )
-        if poses_stand(odometry):
-            text = f'{stream.topic}: the pose never moves; the twist is summed up instead'
+        if is_pose_constant(odometry):
+            text = f'{stream.topic}: the pose is constant; the twist is integrated instead'
             self.recording.problems.append(text)
             poses = integrate(odometry.stamps_ns, odometry.twists)
             odometry = replace(odometry, poses=poses)
         if resets:
             text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
             self.recording.problems.append(text)
-            self._refuse_problems()
+            self._raise_problems()
         return odometry
 
     def yaw_rate(self, topic: str = '') -> YawRate:
@@ -219,27 +213,27 @@ class Bag:
         return to_yaw_rate([(stamp, value) for _, stamp, value in self.read([stream])])
 
     def trajectory(self, topic: str = '') -> Trajectory:
-        """All poses of a topic, by default the one that holds true poses."""
-        stream = self.stream(self.find('ground_truth', topic), messages.pose_of)
+        """All poses of a topic, by default of the true poses."""
+        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
         return to_trajectory([(stamp, value) for _, stamp, value in self.read([stream])])
 
     def odometry_stream(self, topic: str = '') -> Stream:
-        """Stream of (pose, twist and its variances, or None where only poses are told)."""
+        """Stream of (pose, twist and its variances; None of a type without twists)."""
         name = self.find('odometry', topic)
-        return self.stream(name, messages.odometry_of)
+        return self.stream(name, decoding.odometry_of)
 
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
         topic, _, child_frame = name.partition(':')
-        chooser = messages.TransformChooser(topic, child_frame)
-        is_tf = self.topics[topic].kind == messages.TF
-        return self._stream(topic, chooser if is_tf else _whole, convert)
+        chooser = decoding.TransformChooser(topic, child_frame)
+        is_tf = self.topics[topic].kind == decoding.TF
+        return self._stream(topic, chooser if is_tf else lambda message: message, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
-        """A topic of any type, which may well be empty; `convert` gets None of unknown types."""
-        stream = self._stream(topic, _whole, convert)
+        """A topic of any type, which may be empty; `convert` receives None for unknown types."""
+        stream = self._stream(topic, lambda message: message, convert)
         channel = self.recording.channels[topic]
-        stream.opaque = not self._decode.knows(channel.kind, channel.serialization)
+        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
         stream.required = False
         return stream
 
@@ -247,13 +241,12 @@ class Bag:
         self, topic: str, select: Callable[[Any], Any], convert: Callable[[Any], Any]
     ) -> Stream:
         self._tallies[topic] = tally = Tally(f'{self.path}: {topic}', self.strict)
-        stamps = StampFilter(int(self.config.clock_jump * 1e9), tally)
-        return Stream(topic, select, convert, stamps, tally)
+        return Stream(topic, select, convert, tally)
 
     def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
         """Read the streams' topics in one pass: stream, stamp in ns, value.
 
-        Raises BagError when a topic gives nothing usable, or in strict reading on any loss.
+        Raises BagError when a topic has no usable message, or in strict reading on any loss.
         """
         streams = list(streams)
         by_topic = {
@@ -271,7 +264,7 @@ class Bag:
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
         """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
         for record in self.recording.messages(set(topics), start_ns):
-            if record[2][:1] != COMPRESSED_START:
+            if record[2][:1] != ZSTD_START:
                 yield record
                 continue
             try:
@@ -279,8 +272,8 @@ class Bag:
             except BagError as error:
                 self.recording.problems.append(f'{record[0].topic}: {error}')
 
-    def _pushed(self, stream: Stream, record: Record) -> Values:
-        """Stamps and values that a message gives its stream."""
+    def _pushed(self, stream: Stream, record: Record) -> StampedValues:
+        """Stamps and values that the stream yields after one more message."""
         channel, receive_ns, data = record
         stream.received += 1
         if stream.opaque:
@@ -288,32 +281,28 @@ class Bag:
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
             if part is None:
-                stream.tally.leave('tells of other frames')
+                stream.tally.leave_out('transforms of other frames')
                 return []
-            stamp_ns = messages.header_stamp(part) if self._by_header else receive_ns
+            stamp_ns = decoding.header_stamp(part) if self._by_header else receive_ns
         except MessageError as error:
             stream.tally.skip(str(error))
             return []
         return stream.push(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part)
 
     def _check_complete(self, stream: Stream) -> None:
-        """Compare what was read with what is said to be there; nothing usable is an error."""
+        """Compare the messages read with the bag's own count; no usable message is an error."""
         expected, count = self.topics[stream.topic].count, stream.tally.count
         if stream.received < expected:
             lost = f'{stream.received} of {expected} messages read'
             self.recording.problems.append(f'{stream.topic}: {lost}')
-            stream.tally.leave('lost in a damaged bag', expected - stream.received)
-        self._refuse_problems()
+            stream.tally.leave_out('lost in a damaged bag', expected - stream.received)
+        self._raise_problems()
         if stream.required and count.used == 0:
             raise BagError(f'{self.path}: {stream.topic}: {_reasons(stream.tally.count)}')
 
-    def _refuse_problems(self) -> None:
+    def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
-
-
-def _whole(message: Any) -> Any:
-    return message
 
 
 def _plain_name(name: str) -> str:

@@ -1,11 +1,18 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as it lies on disk: its files, its metadata, and what each of them says it holds."""
+"""A bag on disk: its files, its metadata, and the message counts of both.
+
+Not the directory reader of rosbags (0.11.9), because it rejects a bag when one of its files is
+missing or its metadata is damaged or newer, opens no compressed file without metadata, and reads
+0 of 145 messages, without an error, when metadata and file spell a type differently
+(test_bag.py::test_other_words_in_the_metadata_do_not_empty_a_bag).
+"""
 
 from __future__ import annotations
 
 import re
 import tempfile
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
@@ -40,20 +47,20 @@ READERS: dict[bytes, type[Storage]] = {
 
 @dataclass
 class Metadata:
-    """What metadata.yaml tells, of any version: files, channels, messages per topic."""
+    """The content of metadata.yaml of any version: files, channels, messages per topic."""
 
     files: list[str] = field(default_factory=list)
     version: int = NEWEST_METADATA
     channels: list[Channel] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
     file_counts: dict[str, int] = field(default_factory=dict)
 
 
 class Recording:
     """The files of a bag opened as one; `path` is a folder, a single file or a metadata.yaml.
 
-    `channels` are by topic, `declared` and `stored` the messages per topic as told by the
-    metadata and by the files, `problems` what is damaged, `notes` what is only unusual.
+    `channels` are by topic, `declared` and `stored` the messages per topic by the metadata and by
+    the files, `problems` the damage, `notes` unusual findings.
     """
 
     def __init__(self, path: Path) -> None:
@@ -83,7 +90,7 @@ class Recording:
         return [*self.problems, *(text for storage in self.storages for text in storage.problems)]
 
     def stored(self, topic: str) -> int:
-        """Messages of a topic as the files tell."""
+        """Messages of a topic by the count of the files."""
         return sum(storage.counts.get(topic, 0) for storage in self.storages)
 
     def messages(self, topics: Collection[str], start_ns: int = 0) -> Iterator[Record]:
@@ -95,8 +102,6 @@ class Recording:
     def start_ns(self) -> int:
         """Reception of the first message."""
         return min(storage.start_ns for storage in self.storages)
-
-    # What belongs to the bag.
 
     def _read_metadata(self) -> Metadata:
         if not self.path.exists():
@@ -124,7 +129,7 @@ class Recording:
         except OSError as error:
             raise BagError(f'{self.path}: cannot be read: {error.strerror}') from None
         if not names:
-            raise BagError(f'{self.path}: no bag: it has neither {METADATA} nor .db3, .mcap, .bag')
+            raise BagError(f'{self.path}: no bag: neither {METADATA} nor .db3, .mcap, .bag')
         return Metadata(sorted(names, key=_natural))
 
     def _open_files(self) -> None:
@@ -142,19 +147,19 @@ class Recording:
             self.storages.sort(key=lambda storage: storage.start_ns)
 
     def _open_file(self, path: Path) -> None:
-        """Open one file by what its first bytes say it is. Raises BagError."""
+        """Open one file, of the format in its first bytes. Raises BagError."""
         try:
-            plain = self._plain(path)
-            self.storages.append(_opened(plain, path))
-            self.notes += self.storages[-1].notes
+            storage = open_storage(self._decompressed(path), path)
+            self.storages.append(storage)
+            self.notes += storage.notes
         except FileNotFoundError:
             count = self.metadata.file_counts.get(path.name)
             lost = f' with {count} messages' if count else ''
-            raise BagError(f'{path}: is missing{lost}; copy the whole bag') from None
+            raise BagError(f'{path}: is missing{lost}; copy all files of the bag') from None
         except OSError as error:
             raise BagError(f'{path}: cannot be read: {error.strerror}') from None
 
-    def _plain(self, path: Path) -> Path:
+    def _decompressed(self, path: Path) -> Path:
         """The file itself, or a decompressed copy of it."""
         with path.open('rb') as file:
             if file.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
@@ -162,85 +167,68 @@ class Recording:
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix='bag-')
         target = Path(self._folder.name) / path.stem
-        trouble = inflate_file(path, target)
-        if trouble:
-            self.problems.append(f'{path.name}: {trouble}')
+        damage = inflate_file(path, target)
+        if damage:
+            self.problems.append(f'{path.name}: {damage}')
         return target
 
     def _merge_channels(self) -> dict[str, Channel]:
-        """One channel per topic: the files' word counts, the metadata fills in."""
+        """One channel per topic: by the files, completed by the metadata."""
         merged = {channel.topic: channel for channel in self.metadata.channels}
         for storage in self.storages:
             for channel in storage.channels:
-                told = merged.get(channel.topic)
-                if told is not None and told.kind and told.kind != channel.kind:
-                    text = f'{channel.topic} is {told.kind} in one place, {channel.kind} in another'
+                known = merged.get(channel.topic)
+                if known is not None and known.kind and known.kind != channel.kind:
+                    text = f'{channel.topic} is {known.kind} and elsewhere {channel.kind}'
                     self.notes.append(text)
-                merged[channel.topic] = _completed(channel, told)
+                qos = known.qos if known is not None and not channel.qos else channel.qos
+                merged[channel.topic] = channel._replace(qos=qos)
         return merged
 
 
-def _completed(channel: Channel, told: Channel | None) -> Channel:
-    if told is None or channel.qos:
-        return channel
-    return channel._replace(qos=told.qos)
-
-
 def _natural(name: str) -> list[Any]:
-    """Sorting key that puts bag_10 behind bag_2."""
+    """Sorting key that puts bag_10 after bag_2."""
     parts = re.split(r'(\d+)', name)
     return [(int(part), '') if part.isdigit() else (-1, part) for part in parts]
 
 
-def _opened(plain: Path, path: Path) -> Storage:
-    """Open a file, whose errors name the file it was decompressed from."""
-    try:
-        return open_storage(plain)
-    except BagError as error:
-        raise BagError(str(error).replace(str(plain), str(path))) from None
+def open_storage(plain: Path, path: Path) -> Storage:
+    """Open a bag file by its first bytes; errors name `path`, from which it was decompressed.
 
-
-def open_storage(path: Path) -> Storage:
-    """Open a bag file by its first bytes. Raises BagError, or OSError."""
-    with path.open('rb') as file:
+    Raises BagError, or OSError.
+    """
+    with plain.open('rb') as file:
         start = file.read(max(map(len, READERS)))
     if not start:
         raise BagError(f'{path}: is empty (0 bytes); record it again')
     for magic, reader in READERS.items():
         if start.startswith(magic):
-            return reader(path)  # type: ignore[call-arg]
-    raise BagError(f'{path}: is no bag file: neither sqlite3, mcap nor ROS 1 by its first bytes')
+            try:
+                return reader(plain)  # type: ignore[call-arg]
+            except BagError as error:
+                raise BagError(str(error).replace(str(plain), str(path))) from None
+    raise BagError(f'{path}: is no bag file: its first bytes are not of sqlite3, mcap or ROS 1')
 
 
 def parse_metadata(text: str) -> Metadata:
-    """Read metadata.yaml of any version. Raises ValueError when it does not make sense."""
+    """Read metadata.yaml of any version. Raises ValueError when it is malformed."""
     try:
-        tree = load_yaml(text)
-        information = tree['rosbag2_bagfile_information']
-        topics = information['topics_with_message_count']
-        pairs = [(_channel(topic['topic_metadata']), topic['message_count']) for topic in topics]
-        return Metadata(
-            version=int(information['version']),
-            files=[PurePath(one_line(file)).name for file in information['relative_file_paths']],
-            channels=[channel for channel, _ in pairs],
-            counts=_summed([(channel.topic, int(count)) for channel, count in pairs]),
-            file_counts=_file_counts(information.get('files') or []),
+        tree = load_yaml(text)['rosbag2_bagfile_information']
+        metadata = Metadata(
+            version=int(tree['version']),
+            files=[PurePath(one_line(file)).name for file in tree['relative_file_paths']],
+            file_counts={
+                PurePath(str(file['path'])).name: int(file['message_count'])
+                for file in tree.get('files') or []
+            },
         )
+        for entry in tree['topics_with_message_count']:
+            topic = entry['topic_metadata']
+            qos = topic.get('offered_qos_profiles') or ''
+            names = topic['name'], topic['type'], topic['serialization_format']
+            channel = make_channel(*names, qos)
+            metadata.channels.append(channel)
+            metadata.counts[channel.topic] += int(entry['message_count'])
     except (yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(type(error).__name__) from None
-
-
-def _channel(topic: dict[str, Any]) -> Channel:
-    qos = topic.get('offered_qos_profiles') or ''
-    return make_channel(topic['name'], topic['type'], topic['serialization_format'], qos)
-
-
-def _summed(counts: list[tuple[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for topic, count in counts:
-        total[topic] = total.get(topic, 0) + count
-    return total
-
-
-def _file_counts(files: list[dict[str, Any]]) -> dict[str, int]:
-    return {PurePath(str(file['path'])).name: int(file['message_count']) for file in files}
+    return metadata

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bag files of ROS 1 (format 2.0)."""
+"""Bag files of ROS 1 (format 2.0), read by rosbags."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from sfa_localization.data.settings import Settings, setting
 class TopicNames(Settings):
     """Topics of a bag; an empty name is found by its type. Of /tf, name '/tf:CHILD_FRAME'."""
 
-    image: str = setting('', 'pictures: Image or CompressedImage')
+    image: str = setting('', 'images: Image or CompressedImage')
     odometry: str = setting('', 'wheel odometry: Odometry, or any pose when named')
     imu: str = setting('', 'yaw rate: Imu')
     ground_truth: str = setting('', 'true poses, read for evaluation only')
@@ -25,13 +25,4 @@ class BagConfig(Settings):
 
     stamp_source: str = setting(
         'header', 'time of a message: its header or its reception', choices=('header', 'receive')
-    )
-    odometry_tolerance: float = setting(
-        0.5, 'pictures farther from an odometry message are skipped', unit='s', low=0.0, high=60.0
-    )
-    clock_jump: float = setting(
-        10.0, 'a stamp off by more, against reception, is a jump', unit='s', low=0.1, high=1e6
-    )
-    odometry_jump: float = setting(
-        2.0, 'odometry that moves this far beyond its twist was reset', unit='m', low=0.1, high=1e3
     )

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What every kind of bag file offers the reader, and the parts they share."""
+"""The interface of a bag file of any format, and the parts that the formats share."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ except ImportError:  # PyYAML was built without libyaml
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 PIECE = 1 << 20
+"""Bytes that are decompressed at a time."""
 
 
 class Channel(NamedTuple):
-    """Where messages of one topic come from: message type, wire format and offered QoS."""
+    """The source of the messages of one topic: message type, wire format and offered QoS."""
 
     topic: str
     kind: str
@@ -38,12 +39,12 @@ Record = tuple[Channel, int, bytes]
 
 
 def one_line(text: object) -> str:
-    """Text of a bag, perhaps damaged, fit to be shown in one line."""
+    """Text of a bag, perhaps damaged, as one printable line."""
     return ''.join(c if c.isprintable() else '?' for c in str(text))
 
 
 def make_channel(topic: object, kind: object, serialization: object, qos: Any) -> Channel:
-    """A channel from what a file tells."""
+    """A channel from the fields of a file."""
     return Channel(
         one_line(topic), message_type(one_line(kind)), one_line(serialization), offered_qos(qos)
     )
@@ -54,12 +55,12 @@ class Storage(Protocol):
 
     channels: list[Channel]
     counts: dict[str, int]
-    """Messages per topic as the file itself tells; a topic is absent where it cannot tell."""
+    """Messages per topic by the index of the file; without a topic whose count is unknown."""
     start_ns: int
     problems: list[str]
-    """What was found damaged so far; reading may add to it."""
+    """Damage found so far; reading may add to it."""
     notes: list[str]
-    """What is unusual, but no damage."""
+    """Unusual findings that are no damage."""
 
     def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
         """Messages of the topics received at or after `start_ns`, in order of reception."""
@@ -69,21 +70,21 @@ class Storage(Protocol):
 
 
 def message_type(name: str) -> str:
-    """Full name of a message type: older recorders leave the middle 'msg' out."""
+    """Full name of a message type: older recorders leave out the 'msg' in the middle."""
     parts = name.split('/')
     return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else name
 
 
 def load_yaml(text: str) -> Any:
-    """Plain data from YAML, by libyaml where PyYAML has it. Raises yaml.YAMLError."""
+    """Plain data from YAML, by libyaml where PyYAML was built with it. Raises yaml.YAMLError."""
     return yaml.load(text, Loader=YamlLoader)
 
 
 def offered_qos(profiles: Any) -> tuple[Qos, ...]:
-    """QoS profiles from the text or list that a recorder left; none where it is unreadable."""
+    """QoS profiles from the text or list of a recorder; none where it is unreadable."""
     try:
         return tuple(parse_qos(load_yaml(profiles) if isinstance(profiles, str) else profiles))
-    except Exception:  # foreign text; a bag is not refused for its QoS
+    except Exception:  # foreign text; a bag is not rejected because of its QoS
         return ()
 
 
@@ -102,7 +103,7 @@ def inflate_message(data: bytes) -> bytes:
 
 
 def inflate_file(source: Path, target: Path) -> str:
-    """Decompress a file; return what is wrong with it ('' when whole). Raises OSError."""
+    """Decompress a file; return its damage ('' when there is none). Raises OSError."""
     with source.open('rb') as packed, target.open('wb') as plain:
         return _inflate(packed, plain)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a rosbag2: pictures, odometry, yaw rates and poses as the messages a robot records."""
+"""Write a rosbag2: images, odometry, yaw rates and poses as the messages a robot records."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores
 
-from sfa_localization.bags.messages import typestore
+from sfa_localization.bags.decoding import typestore
 from sfa_localization.camera.encodings import encode_jpeg, encode_png
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
@@ -62,7 +62,7 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         if self.path.exists():
-            raise BagError(f'{self.path}: exists already; name another bag or remove it')
+            raise BagError(f'{self.path}: already exists; name another bag or remove it')
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = Path(tempfile.mkdtemp(prefix='.bag-', dir=self.path.parent))
@@ -88,14 +88,14 @@ class BagWriter:
             if kind is None:
                 (self._folder / self.path.name).rename(self.path)
         except Exception as failure:
-            # What ended the block is the cause; that the rest could not be written follows.
+            # The error that ended the block is the cause; a failed write only follows from it.
             if kind is None:
                 raise self._unwritable(failure) from None
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _unwritable(self, error: Exception) -> BagError:
-        """The error to raise instead of one of the file system's, or of a database's many."""
+        """The error to raise instead of one of the file system or of the database."""
         why = error.strerror if isinstance(error, OSError) else str(error)
         return BagError(f'{self.path}: cannot be written: {why or type(error).__name__}')
 
@@ -108,7 +108,7 @@ class BagWriter:
         compressed: str | None = None,
         quality: int = 90,
     ) -> None:
-        """Write a BGR picture (H, W, 3) as Image, or as CompressedImage ('jpeg' or 'png')."""
+        """Write a BGR image (H, W, 3) as Image, or as CompressedImage ('jpeg' or 'png')."""
         header = self._header(stamp_ns, frame_id)
         if compressed is not None:
             data = _encoded(image, compressed, quality)
@@ -238,13 +238,12 @@ def _open_writer(path: Path, storage: str) -> Writer:
 
 
 def _encoded(image: Image, kind: str, quality: int) -> NDArray[np.uint8]:
-    """A picture's file bytes (N,)."""
+    """The bytes (N,) of an image file."""
     data = encode_jpeg(image, quality) if kind == 'jpeg' else encode_png(image)
     return np.frombuffer(data, np.uint8)
 
 
 def _diagonal(entries: dict[int, float], size: int) -> Array:
-    values = np.zeros(size)
-    for index, value in entries.items():
-        values[index] = value
-    return values
+    matrix = np.zeros(size)
+    matrix[list(entries)] = list(entries.values())
+    return matrix

@@ -1,9 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Finding the mirror in pictures, and camera parameters as a file with a picture to check them."""
+"""Calibration of a camera from the circles in its images, and an image to check the result."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,28 +12,33 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from sfa_localization.camera.calibration_files import read_calibration
 from sfa_localization.camera.encodings import decode_compressed, encode_png
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import CalibrationConfig, CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import (
+    CalibrationConfig,
+    LensCalibration,
+    PanoramaConfig,
+)
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
-_RAYS = 360
-_TOLERANCE_PX = 2.0
-_TRIALS = 400
-_ENOUGH_TO_TELL_MOTION = 3  # pictures
+_RAYS = 360  # directions from the center in which edges are looked for
+_TOLERANCE_PX = (
+    2.0  # from an edge to the circle that it supports: a blurred edge may lie this far off
+)
+_TRIALS = 400  # random circles; enough to find the rim among two thirds of wrong edges
+_ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A circle in a picture: column and row of its center and radius in pixels.
+    """A circle in an image: column and row of its center and radius in pixels.
 
     `support` is the share of the directions around it in which an edge lies on it.
     """
@@ -51,35 +57,35 @@ class MirrorCircles:
     hole: Circle | None
 
 
-def read_pictures(paths: Sequence[Path]) -> list[Image]:
-    """Read pictures of one camera. Raises CameraError naming the file that is unusable."""
-    pictures = []
+def read_images(paths: Sequence[Path]) -> list[Image]:
+    """Read images of one camera. Raises CameraError naming the file that is unusable."""
+    images = []
     for path in paths:
         try:
-            pictures.append(decode_compressed(path.read_bytes()))
+            images.append(decode_compressed(path.read_bytes()))
         except OSError as error:
             raise CameraError(f'{path}: {error.strerror or error}') from None
         except CameraError as error:
             raise CameraError(f'{path}: {error}') from None
-        if pictures[-1].shape != pictures[0].shape:
-            raise CameraError(f'{path} and {paths[0]} differ in size: give pictures of one camera')
-    return pictures
+        if images[-1].shape != images[0].shape:
+            raise CameraError(f'{path} and {paths[0]} differ in size: give images of one camera')
+    return images
 
 
-def find_circles(pictures: Sequence[Image], seed: int = 0) -> MirrorCircles:
-    """Find the rim of the mirror, and its hole, in pictures (H, W, 3) of one size.
+def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
+    """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
-    The rim is where, coming from outside, the picture first becomes bright or, with several
-    pictures taken while driving, first changes: what stands out better. The hole likewise, coming
+    The rim is where, coming from outside, the image first becomes bright or, with several
+    images taken while driving, first changes: what stands out better. The hole likewise, coming
     from the center. Raises CameraError when no circle stands out.
     """
     rng = np.random.default_rng(seed)
-    cues = [(cue, _threshold(cue)) for cue in _cues(pictures)]
+    cues = [(cue, _threshold(cue)) for cue in _cues(images)]
     rims = [_find_rim(cue, threshold, rng) for cue, threshold in cues]
     rim = _best(rims)
     if rim is None:
         raise CameraError(
-            'no mirror or fisheye stands out: take several pictures while driving in good light, '
+            'no mirror or fisheye stands out: take several images while driving in good light, '
             'or give --center and --radii'
         )
     holes = [_find_hole(cue, rim, threshold, rng) for cue, threshold in cues]
@@ -87,24 +93,24 @@ def find_circles(pictures: Sequence[Image], seed: int = 0) -> MirrorCircles:
 
 
 def _best(circles: Sequence[Circle | None]) -> Circle | None:
-    known = [circle for circle in circles if circle is not None]
-    return max(known, key=lambda circle: circle.support, default=None)
+    found = [circle for circle in circles if circle is not None]
+    return max(found, key=lambda circle: circle.support, default=None)
 
 
-def _cues(pictures: Sequence[Image]) -> list[Array]:
-    """What tells the mirror from its surroundings (H, W), 0..255: brightness, and change."""
-    stack = [cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in pictures]
-    grey = np.stack([cv2.GaussianBlur(picture, (0, 0), 1.0) for picture in stack]).astype(float)
-    brightness = np.asarray(grey.mean(axis=0))
-    if len(pictures) < _ENOUGH_TO_TELL_MOTION:
+def _cues(images: Sequence[Image]) -> list[Array]:
+    """What distinguishes the mirror from its surroundings (H, W), 0..255: brightness, change."""
+    stack = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]
+    gray = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in stack]).astype(float)
+    brightness = np.asarray(gray.mean(axis=0))
+    if len(images) < _ENOUGH_FOR_MOTION:
         return [brightness]
-    change = cv2.GaussianBlur(grey.std(axis=0), (0, 0), 2.0)
+    change = cv2.GaussianBlur(gray.std(axis=0), (0, 0), 2.0)
     scaled = np.clip(change * 255 / max(float(np.quantile(change, 0.95)), 1e-9), 0, 255)
     return [brightness, np.asarray(scaled)]
 
 
 def _threshold(cue: Array) -> float:
-    """A little above the darkness around the mirror, as the darker side of Otsu's split tells."""
+    """A little above the darkness around the mirror, judged by the darker side of Otsu's split."""
     coarse = np.clip(cue, 0, 255).astype(np.uint8)
     split, _ = cv2.threshold(coarse, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     dark, bright = cue[cue <= split], cue[cue > split]
@@ -130,14 +136,16 @@ def _middle(bright: NDArray[np.bool_]) -> Array | None:
     return np.array([x + (w - 1) / 2, y + (h - 1) / 2])
 
 
-def _edges(cue: Array, start: Array, threshold: float, outermost: bool, reach: float = 0) -> Array:
+def _edges(
+    cue: Array, start: Array, threshold: float, outermost: bool, reach_px: float = 0.0
+) -> Array:
     """Points (N, 2) where the cue crosses the threshold along rays from `start`; N <= rays.
 
-    The outermost crossing, or the innermost one. A ray that has none within `reach` pixels (or in
-    the picture), or still is bright at its border, gives no point.
+    The outermost crossing, or the innermost one. A ray that has none within `reach_px` (or in
+    the image), or still is bright at its border, gives no point.
     """
     height, width = cue.shape
-    longest = reach or float(np.hypot(height, width))
+    longest = reach_px or float(np.hypot(height, width))
     radii = np.arange(0.0, longest, 0.25)
     angles = np.arange(_RAYS) * 2 * np.pi / _RAYS
     columns = start[0] + radii * np.cos(angles)[:, None]
@@ -163,14 +171,14 @@ def _fit_circle(points: Array, rng: np.random.Generator) -> Circle | None:
     best = np.zeros(len(points), bool)
     for _ in range(_TRIALS):
         circle = _least_squares(points[rng.choice(len(points), 3, replace=False)])
-        agree = _off(points, circle) < _TOLERANCE_PX
+        agree = _distances(points, circle) < _TOLERANCE_PX
         if agree.sum() > best.sum():
             best = agree
     for _ in range(3):
         if best.sum() < 3:
             return None
         circle = _least_squares(points[best])
-        best = _off(points, circle) < _TOLERANCE_PX
+        best = _distances(points, circle) < _TOLERANCE_PX
     return Circle(float(circle[0]), float(circle[1]), float(circle[2]), float(best.sum() / _RAYS))
 
 
@@ -183,7 +191,7 @@ def _least_squares(points: Array) -> Array:
     return np.array([a + origin[0], b + origin[1], np.sqrt(max(c + a**2 + b**2, 0.0))])
 
 
-def _off(points: Array, circle: Array) -> Array:
+def _distances(points: Array, circle: Array) -> Array:
     return np.asarray(np.abs(np.hypot(*(points - circle[:2]).T) - circle[2]))
 
 
@@ -192,7 +200,7 @@ def _find_hole(
 ) -> Circle | None:
     """The dark or unchanging disc about the rim's center, if there is one."""
     center = np.array([rim.column, rim.row])
-    points = _edges(cue, center, threshold, outermost=False, reach=0.6 * rim.radius)
+    points = _edges(cue, center, threshold, outermost=False, reach_px=0.6 * rim.radius)
     hole = _fit_circle(points, rng)
     if hole is None or hole.support < 0.4:
         return None
@@ -200,10 +208,33 @@ def _find_hole(
     return hole if off_center < 0.1 * rim.radius else None
 
 
-def camera_of_circles(
+def calibrate(
+    images: Sequence[Image],
+    calibration_file: Path | None,
+    circles: MirrorCircles | None,
+    config: CalibrationConfig,
+    overrides: Mapping[str, Any],
+) -> LensCalibration:
+    """The lens from a calibration file, or from circles, given or to be found.
+
+    With a file, given circles only limit what is visible. `overrides` holds further fields of
+    LensCalibration, such as its angles. Raises CameraError when this is not enough.
+    """
+    if calibration_file is not None:
+        calibration = read_calibration(calibration_file)
+        limits = _limits(circles) if circles else {}
+        return dataclasses.replace(calibration, **{**limits, **overrides})
+    if not images:
+        raise CameraError('give images of the camera, or --calibration')
+    circles = circles or find_circles(images)
+    fields = fields_of_circles(circles, (images[0].shape[0], images[0].shape[1]), config)
+    return LensCalibration.from_mapping({**fields, **overrides}, 'calibration')
+
+
+def fields_of_circles(
     circles: MirrorCircles, size: tuple[int, int], config: CalibrationConfig
 ) -> dict[str, Any]:
-    """Fields of CameraConfig for a camera known by its circles; `size` is rows and columns."""
+    """Fields of LensCalibration of a camera from its circles; `size` is rows and columns."""
     fields: dict[str, Any] = {
         'camera_model': config.model,
         'cx': circles.rim.column,
@@ -212,38 +243,14 @@ def camera_of_circles(
         'image_height': size[0],
         **_limits(circles),
     }
-    if config.model == 'polar' and circles.hole is None:
+    if config.model == 'fisheye':
+        focal = float(circles.rim.radius / np.radians(config.field_of_view / 2))
+        return {**fields, 'fx': focal, 'fy': focal, 'radius_min': 0.0}
+    if circles.hole is None:
         raise CameraError(
             'no inner circle was found, which the polar model needs: give --center and --radii'
         )
-    if config.model == 'polar':
-        return fields
-    focal = float(circles.rim.radius / np.radians(config.field_of_view / 2))
-    return {**fields, 'fx': focal, 'fy': focal, 'radius_min': 0.0}
-
-
-def calibrate(
-    pictures: Sequence[Image],
-    calibration: Path | None,
-    circles: MirrorCircles | None,
-    config: CalibrationConfig,
-    known: Mapping[str, Any],
-) -> CameraConfig:
-    """Camera parameters from a calibration file, or from circles, given or to be found.
-
-    With a file, given circles only limit what is seen. `known` holds further fields of
-    CameraConfig, such as its angles and how it is mounted. Raises CameraError when this does not
-    tell enough.
-    """
-    if calibration is None:
-        if not pictures:
-            raise CameraError('give pictures of the camera, or --calibration')
-        circles = circles or find_circles(pictures)
-        fields = camera_of_circles(circles, (pictures[0].shape[0], pictures[0].shape[1]), config)
-    else:
-        fields = {'radius_min': 0.0, 'radius_max': 0.0, **read_calibration(calibration)}
-        fields.update(_limits(circles) if circles else {})
-    return CameraConfig.from_mapping({**fields, **known}, str(calibration or 'calibration'))
+    return fields
 
 
 def _limits(circles: MirrorCircles) -> dict[str, float]:
@@ -252,16 +259,16 @@ def _limits(circles: MirrorCircles) -> dict[str, float]:
 
 
 def given_circles(
-    center: Sequence[float] | None, radii: Sequence[float] | None, pictures: Sequence[Image] = ()
+    center: Sequence[float] | None, radii: Sequence[float] | None, images: Sequence[Image] = ()
 ) -> MirrorCircles:
-    """Circles told by the user: center as column, row, and radii as hole, rim, in pixels.
+    """Circles given by the user: center as column, row, and radii as hole, rim, in pixels.
 
-    What is not told is found in the pictures (H, W, 3). Raises CameraError.
+    What is not given is found in the images (H, W, 3). Raises CameraError.
     """
     if center is None or radii is None:
-        if not pictures:
-            raise CameraError('without pictures, give both --center and --radii')
-        found = find_circles(pictures)
+        if not images:
+            raise CameraError('without images, give both --center and --radii')
+        found = find_circles(images)
         center = center or (found.rim.column, found.rim.row)
         radii = radii or (found.hole.radius if found.hole else 0.0, found.rim.radius)
     if len(center) != 2 or len(radii) != 2 or not 0 <= radii[0] < radii[1]:
@@ -271,62 +278,31 @@ def given_circles(
     return MirrorCircles(Circle(column, row, radii[1], 1.0), hole)
 
 
-_OF_EVERY_CAMERA = (
-    *('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min', 'radius_max'),
-    *('axis', 'mirrored', 'mount_roll', 'mount_pitch', 'mount_yaw'),
-)
-_OF_MODEL = {
-    'mirror': ('fx', 'fy', 'xi', 'distortion'),
-    'fisheye': ('fx', 'fy', 'distortion'),
-    'ocam': ('polynomial', 'affine'),
-    'polar': ('angle_min', 'angle_max'),
-}
-
-
-def parameters_text(camera: CameraConfig) -> str:
-    """The camera as a ROS parameter file: every parameter that its model uses."""
-    names = _OF_EVERY_CAMERA + _OF_MODEL[camera.camera_model]
-    lines = [f'    {name}: {_as_yaml(getattr(camera, name))}' for name in names]
-    return '\n'.join([_PARAMETERS_HEAD, *lines, ''])
-
-
-_PARAMETERS_HEAD = """\
-# Camera of the omnicam node: merge into your parameter file, or pass it with
-# --ros-args --params-file.
-omnicam_node:
-  ros__parameters:"""
-
-
-def _as_yaml(value: Any) -> str:
-    plain = list(value) if isinstance(value, tuple) else value
-    text = str(yaml.safe_dump(plain, default_flow_style=True, width=10_000))
-    return text.removesuffix('...\n').strip()
-
-
 _GREEN, _RED, _WHITE = (80, 220, 80), (60, 60, 255), (255, 255, 255)
+_CHECK_WIDTH = 1200  # px, at least; small images are framed, so that labels of the strip fit
 
 
-def check_picture(picture: Image, camera: CameraConfig, panorama: PanoramaConfig) -> Image:
-    """The raw picture with its directions and elevations drawn in, above its panorama."""
-    raw = _annotated(picture, camera, panorama)
-    unwrapped = Unwrapper(camera, panorama)(picture)
-    width = max(raw.shape[1], 1200)
-    factor = width / unwrapped.shape[1]
-    size = (width, max(round(unwrapped.shape[0] * factor), 1))
-    resized = cv2.resize(unwrapped, size, interpolation=cv2.INTER_LINEAR)
-    strip = _labelled(np.asarray(resized, np.uint8), panorama)
-    side = (width - raw.shape[1]) // 2
-    rest = width - raw.shape[1] - side
-    framed = cv2.copyMakeBorder(raw, 0, 0, side, rest, cv2.BORDER_CONSTANT)
+def check_image(image: Image, unwrapper: Unwrapper) -> Image:
+    """The raw image with its directions and elevations drawn in, above its panorama."""
+    raw = _annotated(image, unwrapper)
+    unwrapped = unwrapper(image)
+    width = max(raw.shape[1], _CHECK_WIDTH)
+    size = (width, max(round(unwrapped.shape[0] * width / unwrapped.shape[1]), 1))
+    strip = np.asarray(cv2.resize(unwrapped, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+    _label(strip, unwrapper.panorama)
+    left = (width - raw.shape[1]) // 2
+    right = width - raw.shape[1] - left
+    framed = cv2.copyMakeBorder(raw, 0, 0, left, right, cv2.BORDER_CONSTANT)
     return np.vstack([np.asarray(framed, np.uint8), strip])
 
 
-def _annotated(picture: Image, camera: CameraConfig, panorama: PanoramaConfig) -> Image:
-    drawn = picture.copy()
-    model = make_camera(camera, (picture.shape[0], picture.shape[1]), panorama)
-    turn = np.radians(45.0 + np.arange(0, 361, 1.0))
+def _annotated(image: Image, unwrapper: Unwrapper) -> Image:
+    drawn, panorama = image.copy(), unwrapper.panorama
+    size = (image.shape[0], image.shape[1])
+    model = make_camera(unwrapper.calibration, size, panorama, unwrapper.camera.mount_rpy)
+    circle = np.radians(45.0 + np.arange(0, 361, 1.0))
     for elevation in (panorama.elevation_min, 0.0, panorama.elevation_max):
-        ring = model.project(_rays(turn, np.radians(elevation)))
+        ring = model.project(_rays(circle, np.radians(elevation)))
         _draw(drawn, ring, _GREEN, f'{elevation:+g} deg')
     heights = np.radians(np.linspace(panorama.elevation_min, panorama.elevation_max, 50))
     for name, azimuth in (('FRONT', 0.0), ('LEFT', 90.0), ('BACK', 180.0), ('RIGHT', 270.0)):
@@ -342,58 +318,51 @@ def _rays(azimuth: Any, elevation: Any) -> Array:
 
 
 def _draw(drawn: Image, line: Array, color: tuple[int, int, int], name: str) -> None:
-    """Draw the seen parts of a line (N, 2) and its name at its end."""
-    seen = np.asarray(np.isfinite(line).all(axis=1))
-    for run in np.split(np.arange(len(line)), np.flatnonzero(np.diff(seen)) + 1):
-        if seen[run[0]]:
-            points = np.rint(line[run]).astype(np.int32).reshape(-1, 1, 2)
+    """Draw the visible parts of a line (N, 2) and its name at its end."""
+    visible = np.asarray(np.isfinite(line).all(axis=1))
+    for part in np.split(np.arange(len(line)), np.flatnonzero(np.diff(visible)) + 1):
+        if visible[part[0]]:
+            points = np.rint(line[part]).astype(np.int32).reshape(-1, 1, 2)
             cv2.polylines(drawn, [points], False, color, 1, cv2.LINE_AA)
-    if seen.any():
-        _write(drawn, name, line[np.flatnonzero(seen)[-1]], color)
+    if visible.any():
+        _write(drawn, name, line[np.flatnonzero(visible)[-1]], color)
 
 
 def _write(drawn: Image, text: str, place: Array, color: tuple[int, int, int]) -> None:
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    (width, height), _ = cv2.getTextSize(text, font, 0.5, 1)
     limit = np.array([drawn.shape[1] - width - 2, drawn.shape[0] - 4])
     column, row = np.clip(np.rint(place).astype(int), [2, height + 2], np.maximum(limit, 2))
-    for ink, thickness in (((0, 0, 0), 3), (color, 1)):
-        cv2.putText(
-            drawn,
-            text,
-            (int(column), int(row)),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.5,
-            ink,
-            thickness,
-            cv2.LINE_AA,
-        )
+    for ink, thickness in (((0, 0, 0), 3), (color, 1)):  # a black outline keeps it readable
+        start = (int(column), int(row))
+        cv2.putText(drawn, text, start, font, 0.5, ink, thickness, cv2.LINE_AA)
 
 
-def _labelled(strip: Image, panorama: PanoramaConfig) -> Image:
-    """The panorama with its directions and its horizon."""
+def _label(strip: Image, panorama: PanoramaConfig) -> None:
+    """Draw the directions and the horizon into a panorama."""
     height, width = strip.shape[:2]
-    sides = (
-        ('BACK', 'LEFT', 'FRONT', 'RIGHT')
-        if panorama.clockwise
-        else ('BACK', 'RIGHT', 'FRONT', 'LEFT')
-    )
+    left_to_right = ('BACK', 'LEFT', 'FRONT', 'RIGHT')
+    sides = left_to_right if panorama.clockwise else ('BACK', 'RIGHT', 'FRONT', 'LEFT')
     span = panorama.elevation_max - panorama.elevation_min
     horizon = panorama.elevation_max / span * height - 0.5
     if 0 <= horizon < height:
         cv2.line(strip, (0, round(horizon)), (width, round(horizon)), _GREEN, 1)
-    for place, name in enumerate(sides):
-        column = place * width // 4
+    for quarter, name in enumerate(sides):
+        column = quarter * width // 4
         cv2.line(strip, (column, 0), (column, height), _RED, 1)
         _write(strip, name, np.array([column + 4, height - 6]), _WHITE)
-    return strip
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that is there whole or not at all. Raises CameraError naming it."""
-    with whole_file(path, CameraError, make_folder=True) as file:
+def write_calibration(path: Path, text: str) -> None:
+    """Write a calibration file, whole or not at all. Raises CameraError naming it."""
+    _write_file(path, text.encode())
+
+
+def write_check(path: Path, image: Image) -> None:
+    """Write an image (H, W, 3) as PNG. Raises CameraError naming the file."""
+    _write_file(path, encode_png(image))
+
+
+def _write_file(path: Path, data: bytes) -> None:
+    with atomic_write(path, CameraError, make_folder=True) as file:
         file.write(data)
-
-
-def write_check(path: Path, picture: Image) -> None:
-    """Write a picture as PNG. Raises CameraError naming the file."""
-    write_whole(path, encode_png(picture))

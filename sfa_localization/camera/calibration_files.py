@@ -1,50 +1,66 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration files of other tools, read into camera parameters.
+"""Calibration files: the package's own, and those of other tools.
 
-Known are: camera_info as YAML (also as printed by ``ros2 topic echo``), what OpenCV's FileStorage
-writes (pinhole, fisheye, omnidir), Kalibr's camchain, camodocal's MEI and KANNALA_BRANDT, and
-OCamCalib's calib_results.txt.
+The package's own is YAML with the fields of `LensCalibration`. Of other tools: camera_info as YAML
+(also as printed by ``ros2 topic echo``), what OpenCV's FileStorage writes (pinhole, fisheye,
+omnidir), Kalibr's camchain, camodocal's MEI and KANNALA_BRANDT, and OCamCalib's calib_results.txt.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError, ConfigError
 
-_KNOWN = 'known are camera_info, OpenCV, Kalibr and camodocal YAML and OCamCalib calib_results.txt'
+_KNOWN = (
+    'known are camera_info, OpenCV, Kalibr and camodocal YAML, OCamCalib calib_results.txt, and '
+    'what the command calibrate writes'
+)
 _PLUMB_BOB = ('', 'none', 'plumb_bob', 'radtan', 'rational_polynomial')
 _FISHEYE = ('equidistant', 'equi', 'fisheye', 'kannala_brandt')
+_OF_EVERY_CAMERA = (
+    *('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min', 'radius_max'),
+    *('axis', 'mirrored'),
+)
+_OF_MODEL = {
+    'mirror': ('fx', 'fy', 'xi', 'distortion'),
+    'fisheye': ('fx', 'fy', 'distortion'),
+    'ocam': ('polynomial', 'affine'),
+    'polar': ('angle_min', 'angle_max'),
+    'dual_fisheye': ('fx', 'fy', 'distortion', 'second_cx', 'second_cy', 'second_roll'),
+}
+_HEAD = """\
+# Calibration of an omnidirectional camera; parameters of omnicam_node that go with it:
+#   calibration_file: name of this file
+#   mount_rpy: {mount_rpy}
+"""
 
 
-def with_calibration(config: CameraConfig) -> CameraConfig:
-    """Return the parameters with those of `calibration_file`, where one is named, filled in.
-
-    Radii left at their defaults, which are those of the simulated mirror, then limit nothing.
-    """
-    if not config.calibration_file:
-        return config
-    values = read_calibration(Path(config.calibration_file))
-    defaults = CameraConfig()
-    for name in ('radius_min', 'radius_max'):
-        if getattr(config, name) == getattr(defaults, name):
-            values.setdefault(name, 0.0)
-    try:
-        return dataclasses.replace(config, calibration_file='', **values)
-    except ConfigError as error:
-        raise CameraError(f'{config.calibration_file}: {error}') from None
+def calibration_of(camera: CameraConfig) -> LensCalibration:
+    """The lens that the camera's parameters name: its calibration_file, or its camera_model."""
+    if camera.calibration_file:
+        return read_calibration(Path(camera.calibration_file))
+    return LensCalibration(camera_model=camera.camera_model)
 
 
-def read_calibration(path: Path) -> dict[str, Any]:
-    """Read a calibration file into fields of CameraConfig.
+def calibration_text(calibration: LensCalibration, mount_rpy: Sequence[float]) -> str:
+    """The package's own calibration file (YAML): every field that the camera model uses."""
+    names = _OF_EVERY_CAMERA + _OF_MODEL.get(calibration.camera_model, ())
+    fields = {name: getattr(calibration, name) for name in names}
+    plain = {n: list(value) if isinstance(value, tuple) else value for n, value in fields.items()}
+    text = _HEAD.format(mount_rpy=list(mount_rpy))
+    return text + str(yaml.safe_dump(plain, sort_keys=False))
+
+
+def read_calibration(path: Path) -> LensCalibration:
+    """Read a calibration file; radii that it does not name limit nothing.
 
     Raises CameraError naming the file when it is missing, of an unknown kind, or of a camera
     model that is not supported.
@@ -54,10 +70,11 @@ def read_calibration(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise CameraError(f'{path}: {error.strerror or error}') from None
     try:
-        return _from_yaml(text) if path.suffix.lower() != '.txt' else _from_ocam(text)
+        fields = _from_yaml(text) if path.suffix.lower() != '.txt' else _from_ocam(text)
+        return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **fields})
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise CameraError(f'{path}: no camera calibration ({error}); {_KNOWN}') from None
-    except CameraError as error:
+    except (CameraError, ConfigError) as error:
         raise CameraError(f'{path}: {error}') from None
 
 
@@ -99,11 +116,23 @@ def _from_yaml(text: str) -> dict[str, Any]:
         raise CameraError(f'not valid YAML; {_KNOWN}') from None
     if not isinstance(content, Mapping):
         raise CameraError(f'no camera calibration; {_KNOWN}')
+    if 'camera_model' in content:
+        return _from_own(content)
     if 'cam0' in content:
         return _from_kalibr(content['cam0'])
     if 'model_type' in content:
         return _from_camodocal(content)
     return _from_matrix(content)
+
+
+def _from_own(content: Mapping[str, Any]) -> dict[str, Any]:
+    """What `calibration_text` wrote, or a person in its place."""
+    model = content['camera_model']
+    missing = [name for name in ('cx', 'cy', *_OF_MODEL.get(model, ())) if name not in content]
+    if missing and model in _OF_MODEL:
+        raise CameraError(f'{", ".join(missing)} missing, which the {model} model needs')
+    LensCalibration.from_mapping(content, 'calibration')  # rejects unknown names
+    return dict(content)
 
 
 def _from_kalibr(camera: Mapping[str, Any]) -> dict[str, Any]:
@@ -139,7 +168,7 @@ def _from_camodocal(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _from_matrix(content: Mapping[str, Any]) -> dict[str, Any]:
-    """camera_info and OpenCV: a camera matrix, coefficients, and in some way the kind of them."""
+    """camera_info and OpenCV: a camera matrix, coefficients, and a name for their model."""
     matrix = _numbers(_first(content, 'camera_matrix', 'K', 'k', 'cameraMatrix', 'intrinsics'))
     if len(matrix) != 9:
         raise CameraError(f'the camera matrix has {len(matrix)} numbers, not 9')
@@ -170,7 +199,7 @@ def _lens(
     xi: float = 0.0,
     has_mirror: bool = False,
 ) -> dict[str, Any]:
-    """Fields of a lens with focal = [fx, fy, cx, cy]; `kind` names the distortion."""
+    """Fields of a lens with focal = [fx, fy, cx, cy]; `kind` is the name of the distortion."""
     lens = dict(zip(('fx', 'fy', 'cx', 'cy'), focal, strict=True))
     coefficients = tuple((distortion + [0.0] * 4)[:4]) if any(distortion) else ()
     if any(distortion[4:]):

@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures from a V4L2 device, a video file or a folder, and a watch over the camera.
+"""Images from a V4L2 device, a video file or a folder, and a watch over the camera.
 
-A camera that disconnects, goes silent or repeats its last picture is closed and opened again,
+A camera that disconnects, goes silent or repeats its last image is closed and opened again,
 with pauses that double. Knows nothing of ROS; time is the steady clock's.
 """
 
@@ -20,43 +20,45 @@ import cv2
 import numpy as np
 
 from sfa_localization.camera.encodings import decode_compressed
-from sfa_localization.camera.settings import OmnicamNodeConfig
+from sfa_localization.camera.settings import CaptureConfig
+from sfa_localization.camera.watch import FROZEN_S, FrozenWatch
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.run import Image
 
 logger = logging.getLogger(__name__)
 
 _SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.ppm', '.pgm', '.tif', '.tiff', '.webp')
-_USUAL_RATE = 10.0
+_USUAL_RATE_HZ = 10.0  # of a folder, and of a video that names none
 _OPENING_S = 10.0  # devices may take so long
-_IDLE_PAUSE_S = 0.02
-_SAMPLES = 32  # rows, and as densely columns, that are compared to find a repeated picture
+_IDLE_PAUSE_S = 0.02  # between questions whether images are wanted: shorter than a frame
+_REOPEN_FIRST_S = 0.5  # pause before a source is reopened: a USB camera needs it to come back
+_REOPEN_LONGEST_S = 30.0  # pauses double up to this, so that a camera is found soon after repair
 
 
 class Capture(Protocol):
-    """An opened source of pictures."""
+    """An opened source of images."""
 
     live: bool
     """Whether it goes on by itself: a device, as opposed to files."""
 
     def read(self) -> Image | None:
-        """The next picture (H, W, 3) uint8 BGR; None at the end of files.
+        """The next image (H, W, 3) uint8 BGR; None at the end of files.
 
         Blocks until there is one. Raises CameraError when there will be no more, or when one
-        picture of several is unusable.
+        image of several is unusable.
         """
 
     def close(self) -> None:
         """Let go of the device or file."""
 
 
-def opener(config: OmnicamNodeConfig) -> Callable[[], Capture]:
-    """What opens the source named by the parameters; raises CameraError where none is named."""
+def opener(config: CaptureConfig) -> Callable[[], Capture]:
+    """A function that opens the source of the parameters. Raises CameraError without a source."""
     if config.source == 'topic':
-        raise CameraError('pictures from a topic need no source to be opened')
+        raise CameraError('images from a topic need no source to be opened')
     if not config.source_path:
-        raise CameraError(f'source_path is empty: name the {config.source} to take pictures from')
-    kinds: dict[str, Callable[[OmnicamNodeConfig], Capture]] = {
+        raise CameraError(f'source_path is empty: name the {config.source} to take images from')
+    kinds: dict[str, Callable[[CaptureConfig], Capture]] = {
         'device': Device,
         'video': Video,
         'folder': Folder,
@@ -69,7 +71,7 @@ class Device:
 
     live = True
 
-    def __init__(self, config: OmnicamNodeConfig) -> None:
+    def __init__(self, config: CaptureConfig) -> None:
         self._path = path = config.source_path
         if not path.isdigit() and not Path(path).exists():
             raise CameraError(f'device {path} is not there')
@@ -77,19 +79,17 @@ class Device:
         if not self._capture.isOpened():
             raise CameraError(f'device {path} cannot be opened: is it there, and not in use?')
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        for prop, value in (
-            (cv2.CAP_PROP_FRAME_WIDTH, config.source_width),
-            (cv2.CAP_PROP_FRAME_HEIGHT, config.source_height),
-            (cv2.CAP_PROP_FPS, config.source_rate),
-        ):
-            if value:
-                self._capture.set(prop, value)
+        if config.source_size:
+            self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.source_size[0])
+            self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.source_size[1])
+        if config.source_rate:
+            self._capture.set(cv2.CAP_PROP_FPS, config.source_rate)
 
     def read(self) -> Image | None:
-        done, picture = self._capture.read()
-        if not done or picture is None:
+        done, image = self._capture.read()
+        if not done or image is None:
             raise Lost(f'device {self._path} is disconnected')
-        return _bgr(picture)
+        return _bgr(image)
 
     def close(self) -> None:
         self._capture.release()
@@ -100,7 +100,7 @@ class Lost(CameraError):
 
 
 class _Pacer:
-    """Waits so that pictures come at a rate; a reader that is late does not catch up."""
+    """Waits so that images come at a rate; a reader that is late does not catch up."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period = 1.0 / rate_hz
@@ -118,87 +118,57 @@ class Video:
 
     live = False
 
-    def __init__(self, config: OmnicamNodeConfig) -> None:
-        self._path, self._loop = config.source_path, config.source_loop
+    def __init__(self, config: CaptureConfig) -> None:
+        self._path = config.source_path
         self._capture = cv2.VideoCapture(self._path)
         if not Path(self._path).is_file() or not self._capture.isOpened():
             raise CameraError(f'video {self._path} is missing, or of a kind OpenCV cannot read')
         own = self._capture.get(cv2.CAP_PROP_FPS)
-        self._pacer = _Pacer(config.source_rate or (own if 0.1 < own < 1000 else _USUAL_RATE))
+        self._pacer = _Pacer(config.source_rate or (own if 0.1 < own < 1000 else _USUAL_RATE_HZ))
 
     def read(self) -> Image | None:
         self._pacer.wait()
-        done, picture = self._capture.read()
-        if not done and self._loop:
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
-            done, picture = self._capture.read()
-        return _bgr(picture) if done else None
+        done, image = self._capture.read()
+        return _bgr(image) if done else None
 
     def close(self) -> None:
         self._capture.release()
 
 
 class Folder:
-    """The pictures of a folder in the order of their names."""
+    """The images of a folder in the order of their names."""
 
     live = False
 
-    def __init__(self, config: OmnicamNodeConfig) -> None:
+    def __init__(self, config: CaptureConfig) -> None:
         folder = Path(config.source_path)
         if not folder.is_dir():
             raise CameraError(f'folder {folder} is missing')
-        self._files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
-        if not self._files:
-            raise CameraError(f'folder {folder} holds no pictures ({" ".join(_SUFFIXES)})')
-        self._next, self._loop = 0, config.source_loop
-        self._pacer = _Pacer(config.source_rate or _USUAL_RATE)
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+        if not files:
+            raise CameraError(f'folder {folder} holds no images ({" ".join(_SUFFIXES)})')
+        self._files = iter(files)
+        self._pacer = _Pacer(config.source_rate or _USUAL_RATE_HZ)
 
     def read(self) -> Image | None:
-        if self._next == len(self._files):
-            if not self._loop:
-                return None
-            self._next = 0
-        path = self._files[self._next]
-        self._next += 1
+        path = next(self._files, None)
+        if path is None:
+            return None
         self._pacer.wait()
         try:
             return decode_compressed(path.read_bytes())
         except (CameraError, OSError) as error:
-            raise CameraError(f'picture {path.name}: {error}') from None
+            raise CameraError(f'image {path.name}: {error}') from None
 
     def close(self) -> None:
-        self._next = 0
+        """Nothing is open between two images."""
 
 
-def _bgr(picture: Any) -> Image:
-    """What OpenCV captured as BGR: some devices deliver grey."""
-    if picture.ndim == 2 or picture.shape[2] == 1:
-        picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
-    return np.asarray(picture, np.uint8)
-
-
-class FrozenWatch:
-    """Tells for how long the pictures have been equal."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._sample: Image | None = None
-        self._since = 0.0
-        self._repeats = 0
-
-    def see(self, picture: Image) -> bool:
-        """Note a picture; True when it differs from the last one."""
-        step = max(min(picture.shape[:2]) // _SAMPLES, 1)
-        sample = picture[::step, ::step]
-        if self._sample is not None and np.array_equal(sample, self._sample):
-            self._repeats += 1
-            return False
-        self._sample, self._since, self._repeats = sample.copy(), self._clock(), 0
-        return True
-
-    def frozen_for_s(self) -> float:
-        """Seconds since the last picture that was new; 0 while there are no repetitions."""
-        return self._clock() - self._since if self._repeats > 1 else 0.0
+def _bgr(image: Any) -> Image:
+    """What OpenCV captured as BGR: some devices deliver gray."""
+    if image.ndim == 2 or image.shape[2] == 1:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    return np.asarray(image, np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +186,7 @@ class FeedStatus:
 class Feed:
     """Reads a capture in a thread of its own and opens it again when it fails.
 
-    `deliver` takes each picture and `refuse` the reason why one is unusable, both in that thread.
+    `deliver` takes each image and `reject` the reason why one is unusable, both in that thread.
     Files wait while `wanted` returns False. `check` must be called now and then from elsewhere:
     only there a read that never returns can be noticed.
     """
@@ -225,25 +195,25 @@ class Feed:
         self,
         open_capture: Callable[[], Capture],
         deliver: Callable[[Image], None],
-        config: OmnicamNodeConfig,
-        refuse: Callable[[str], None] = lambda reason: None,
+        config: CaptureConfig,
+        reject: Callable[[str], None] = lambda reason: None,
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:
         self.config = config
         self._open, self._deliver = open_capture, deliver
-        self._refuse, self._wanted = refuse, wanted
+        self._reject, self._wanted = reject, wanted
         self._lock = threading.Lock()
         self._stopped = threading.Event()
         self._generation = 0
         self._status = FeedStatus()
         self._defect = ''
-        self._pause_s = config.reopen_min
+        self._pause_s = _REOPEN_FIRST_S
         self._deadline_s = np.inf  # when a read or an opening in progress counts as hanging
         self._frozen = FrozenWatch()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Open the source and deliver pictures until `stop`."""
+        """Open the source and deliver images until `stop`."""
         self._begin(pause=False)
 
     def stop(self) -> None:
@@ -253,7 +223,7 @@ class Feed:
             self._thread.join(timeout=1.0)
 
     def status(self) -> FeedStatus:
-        """How the feed is, as far as its thread knows."""
+        """The status that the feed's thread set last."""
         with self._lock:
             return self._status
 
@@ -276,7 +246,7 @@ class Feed:
         with self._lock:
             self._status = FeedStatus('lost', problem, self._status.lost + 1)
 
-    def _tell(self, state: str) -> None:
+    def _set_state(self, state: str) -> None:
         with self._lock:
             self._status = FeedStatus(state, '', self._status.lost)
 
@@ -298,11 +268,11 @@ class Feed:
             self._back_off()
 
     def _problem(self, error: Exception) -> str:
-        """What went wrong; what is no trouble of a camera is a defect, and is shown as one."""
+        """What went wrong; an error that no camera causes is a defect, and logged as one."""
         if isinstance(error, (CameraError, cv2.error, OSError)):
             return str(error)
         text = f'internal error: {type(error).__name__}'
-        self._refuse(text)
+        self._reject(text)
         if text != self._defect:
             self._defect = text
             logger.error('%s', text, exc_info=error)
@@ -310,17 +280,17 @@ class Feed:
 
     def _back_off(self) -> None:
         self._deadline_s = np.inf
-        pause, self._pause_s = self._pause_s, min(2 * self._pause_s, self.config.reopen_max)
+        pause, self._pause_s = self._pause_s, min(2 * self._pause_s, _REOPEN_LONGEST_S)
         self._stopped.wait(pause)
 
-    def _expect(self, within_s: float) -> None:
-        self._deadline_s = time.monotonic() + within_s
+    def _expect_within(self, seconds: float) -> None:
+        self._deadline_s = time.monotonic() + seconds
 
     def _read_all(self, generation: int) -> None:
         """Open, and read to the end; raises CameraError when the source has to be opened again."""
-        self._expect(_OPENING_S + self.config.silence_timeout)
+        self._expect_within(_OPENING_S + self.config.silence_timeout)
         if self.status().state == 'new':
-            self._tell('opening')
+            self._set_state('opening')
         capture = self._open()
         try:
             while self._is_current(generation) and self._read_one(capture, generation):
@@ -329,37 +299,36 @@ class Feed:
             capture.close()
 
     def _read_one(self, capture: Capture, generation: int) -> bool:
-        """Deliver one picture; False at the end."""
-        self._expect(self.config.silence_timeout if capture.live else np.inf)
+        """Deliver one image; False at the end."""
+        self._expect_within(self.config.silence_timeout if capture.live else np.inf)
         if not capture.live and not self._wanted():
             return not self._stopped.wait(_IDLE_PAUSE_S)
         try:
-            picture = capture.read()
+            image = capture.read()
         except Lost:
             raise
         except CameraError as error:
-            self._refuse(str(error))
+            self._reject(str(error))
             return True
-        return self._is_current(generation) and self._accept(picture, capture.live)
+        return self._is_current(generation) and self._accept(image, capture.live)
 
-    def _accept(self, picture: Image | None, live: bool) -> bool:
-        if picture is None:
+    def _accept(self, image: Image | None, live: bool) -> bool:
+        if image is None:
             self._deadline_s = np.inf
-            self._tell('ended')
+            self._set_state('ended')
             return False
         if live:
-            self._require_new(picture)
+            self._require_new(image)
         elif self.status().state != 'running':
-            self._tell('running')
-        self._deliver(picture)
+            self._set_state('running')
+        self._deliver(image)
         return True
 
-    def _require_new(self, picture: Image) -> None:
-        """Raise Lost when the device repeats its last picture, also when it was opened again."""
-        if self._frozen.see(picture):
+    def _require_new(self, image: Image) -> None:
+        """Raise Lost when the device repeats its last image, also when it was opened again."""
+        if self._frozen.add(image):
             if self.status().state == 'running':
-                self._pause_s = self.config.reopen_min
-            self._tell('running')
-        limit = self.config.frozen_timeout
-        if 0.0 < limit < self._frozen.frozen_for_s():
-            raise Lost(f'the last picture has been repeated for {limit:g} s')
+                self._pause_s = _REOPEN_FIRST_S
+            self._set_state('running')
+        if self._frozen.frozen_for_s():
+            raise Lost(f'the last image has been repeated for {FROZEN_S:g} s')

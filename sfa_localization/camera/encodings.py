@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Picture data as cameras and bags deliver it, to and from BGR uint8 arrays (H, W, 3).
+"""Image data as cameras and bags deliver it, to and from BGR uint8 arrays (H, W, 3).
 
-The encodings are those of ``sensor_msgs/image_encodings``. 16-bit pictures keep their upper 8
-bits, an alpha channel is dropped, grey becomes three equal channels.
+The encodings are those of ``sensor_msgs/image_encodings``. 16-bit images keep their upper 8
+bits, an alpha channel is dropped, gray becomes three equal channels.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class _Layout:
     channels: int
     depth: int = 1
     code: int | None = None
-    rows: tuple[int, int] = (1, 1)  # rows of data per row of picture, as a fraction
+    rows: tuple[int, int] = (1, 1)  # rows of data per row of image, as a fraction
 
 
 _GREY, _RGB, _BGRA, _RGBA = (
@@ -82,7 +82,7 @@ def decode_image(
     encoding: str,
     is_bigendian: bool = False,
 ) -> Image:
-    """Decode raw picture data, as in ``sensor_msgs/Image``, to BGR (height, width, 3) uint8.
+    """Decode raw image data, as in ``sensor_msgs/Image``, to BGR (height, width, 3) uint8.
 
     `data` is any buffer of bytes, `step` the bytes from one row to the next. The result may be
     a read-only view of `data`. Raises CameraError with the reason in a few words.
@@ -91,7 +91,7 @@ def decode_image(
     if layout is None:
         raise CameraError(f'unsupported encoding {encoding!r}')
     if height <= 0 or width <= 0:
-        raise CameraError('empty picture')
+        raise CameraError('empty image')
     rows = _rows(data, height * layout.rows[0] // layout.rows[1], step)
     return _to_bgr(_pixels(rows, width, layout, is_bigendian), layout)
 
@@ -126,25 +126,25 @@ def _to_bgr(pixels: NDArray[np.uint8], layout: _Layout) -> Image:
 
 
 def _checked(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call OpenCV; its complaint becomes a CameraError."""
+    """Call OpenCV; its error becomes a CameraError."""
     try:
         return function(*arguments)
     except cv2.error as error:
-        raise CameraError(f'unusable picture data ({error.err})') from None
+        raise CameraError(f'unusable image data ({error.err})') from None
 
 
 def decode_compressed(data: Any, format: str = '') -> Image:
     """Decode a JPEG, PNG or other file that OpenCV reads to BGR (H, W, 3) uint8.
 
     `format` is that of ``sensor_msgs/CompressedImage``; it matters only for a Bayer mosaic that
-    was compressed as it is. A truncated JPEG is refused, for OpenCV would fill it with grey.
+    was compressed as it is. A truncated JPEG is rejected, because OpenCV would fill it with gray.
     Raises CameraError with the reason in a few words.
     """
     if 'compresseddepth' in format.lower():
-        raise CameraError('a depth picture is no camera picture')
+        raise CameraError('a depth image is no camera image')
     buffer = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
     if buffer.size == 0:
-        raise CameraError('empty picture')
+        raise CameraError('empty image')
     if _is_truncated_jpeg(buffer):
         raise CameraError('truncated JPEG')
     original, _, packed = format.lower().partition(';')
@@ -160,10 +160,10 @@ def _is_truncated_jpeg(buffer: NDArray[np.uint8]) -> bool:
 
 
 def _decoded(buffer: NDArray[np.uint8], flags: int) -> Image:
-    picture = _checked(cv2.imdecode, buffer, flags)
-    if picture is None:
-        raise CameraError('not a picture file that OpenCV reads')
-    return np.asarray(picture)
+    image = _checked(cv2.imdecode, buffer, flags)
+    if image is None:
+        raise CameraError('not an image file that OpenCV reads')
+    return np.asarray(image)
 
 
 def _demosaiced(buffer: NDArray[np.uint8], encoding: str) -> Image:
@@ -174,24 +174,24 @@ def _demosaiced(buffer: NDArray[np.uint8], encoding: str) -> Image:
 
 
 def encode_jpeg(image: Image, quality: int) -> bytes:
-    """Encode a BGR picture (H, W, 3) as JPEG of `quality` 1..100."""
+    """Encode a BGR image (H, W, 3) as JPEG of `quality` 1..100."""
     return _encoded('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
 
 
 def encode_png(image: Image) -> bytes:
-    """Encode a BGR picture (H, W, 3) as PNG, without loss."""
+    """Encode a BGR image (H, W, 3) as PNG, without loss."""
     return _encoded('.png', image, [])
 
 
 def _encoded(suffix: str, image: Image, options: list[int]) -> bytes:
     done, buffer = _checked(cv2.imencode, suffix, image, options)
     if not done:
-        raise CameraError(f'a picture of shape {image.shape} cannot be written as {suffix}')
+        raise CameraError(f'an image of shape {image.shape} cannot be written as {suffix}')
     return bytes(buffer.tobytes())
 
 
 def read_raw(message: Any) -> Image:
-    """Picture (H, W, 3) uint8 BGR of an Image."""
+    """Image (H, W, 3) uint8 BGR of an Image."""
     try:
         return decode_image(
             message.data,
@@ -206,7 +206,7 @@ def read_raw(message: Any) -> Image:
 
 
 def read_compressed(message: Any) -> Image:
-    """Picture (H, W, 3) uint8 BGR of a CompressedImage."""
+    """Image (H, W, 3) uint8 BGR of a CompressedImage."""
     try:
         return decode_compressed(message.data, message.format)
     except CameraError as error:

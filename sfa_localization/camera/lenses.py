@@ -3,26 +3,26 @@
 """Omnidirectional camera models with one interface: ray to pixel, and pixel to ray.
 
 A lens maps between rays (N, 3) of its optical frame (x along columns, y along rows, z along the
-axis into the scene) and pixels (N, 2) as column, row of the calibrated picture, pixel centers at
+axis into the scene) and pixels (N, 2) as column, row of the calibrated image, pixel centers at
 integers. What a lens cannot see is NaN. `CameraModel` mounts a lens on the robot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from scipy.spatial.transform import Rotation
 
-from sfa_localization.camera.calibration_files import with_calibration
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
 
-_SAMPLES = 2048  # of a curve that is to be inverted, before Newton's method
+_SAMPLES = 2048  # of a curve that is inverted, before Newton's method
 _NEWTON_STEPS = 3
 
 
@@ -34,7 +34,7 @@ class Lens(Protocol):
         """Column and row that radii are measured from; None where there is no such point."""
 
     def project(self, rays: Array) -> Array:
-        """Pixels (N, 2) of unit rays (N, 3); NaN where not seen."""
+        """Pixels (N, 2) of unit rays (N, 3); NaN where not visible."""
 
     def unproject(self, pixels: Array) -> Array:
         """Unit rays (N, 3) of pixels (N, 2); NaN where a pixel sees nothing."""
@@ -62,10 +62,10 @@ class IncreasingCurve:
 
     def inverse(self, y: Array) -> Array:
         """Return x with f(x) = y, NaN beyond the increasing part."""
-        known = np.minimum(y, self._y[-1])
-        x = np.interp(known, self._y, self._x)
+        reachable = np.minimum(y, self._y[-1])
+        x = np.interp(reachable, self._y, self._x)
         for _ in range(_NEWTON_STEPS):
-            x = np.clip(x - (self._f(x) - known) / self._df(x), 0.0, self._x[-1])
+            x = np.clip(x - (self._f(x) - reachable) / self._df(x), 0.0, self._x[-1])
         return np.where(y <= self._y[-1] * (1 + 1e-12), x, np.nan)
 
 
@@ -115,8 +115,8 @@ class MirrorLens:
     def project(self, rays: Array) -> Array:
         depth = rays[:, 2] + self.xi
         # Beyond this cone the sphere's far side would be seen a second time.
-        seen = rays[:, 2] > -(self.xi if self.xi <= 1.0 else 1.0 / self.xi)
-        plane = rays[:, :2] / np.where(seen & (depth > 1e-9), depth, np.nan)[:, None]
+        visible = rays[:, 2] > -(self.xi if self.xi <= 1.0 else 1.0 / self.xi)
+        plane = rays[:, :2] / np.where(visible & (depth > 1e-9), depth, np.nan)[:, None]
         return np.asarray(self.focal * self._distorted(plane) + self.center)
 
     def unproject(self, pixels: Array) -> Array:
@@ -247,7 +247,7 @@ class PolarLens:
 
 @dataclass(frozen=True)
 class CylinderLens:
-    """A picture linear in azimuth and elevation: equirectangular, or a panorama.
+    """An image linear in azimuth and elevation: equirectangular, or a panorama.
 
     The center column looks along the axis, columns grow to the right. Elevations in radians of
     the lower and upper edge; size as columns, rows.
@@ -275,7 +275,7 @@ class CylinderLens:
 
 @dataclass(frozen=True)
 class DualFisheyeLens:
-    """Two fisheyes back to back in one picture; `turn` (3, 3) takes rays to the second's frame."""
+    """Two fisheyes back to back in one image; `turn` (3, 3) takes rays to the second's frame."""
 
     first: FisheyeLens
     second: FisheyeLens
@@ -297,12 +297,12 @@ class DualFisheyeLens:
 
 @dataclass(frozen=True)
 class CameraModel:
-    """A lens on the robot, for pictures of one size.
+    """A lens on the robot, for images of one size.
 
     `size` is rows and columns. `rotation` (3, 3) takes rays of the lens to the robot's axes (x
-    forward, y left, z up; a mirrored picture has determinant -1), `scale` (2,) pixels of the
-    calibrated picture to those of this size; nothing is seen outside `radii`, given in pixels of
-    the calibrated picture, nor outside the picture.
+    forward, y left, z up; a mirrored image has determinant -1), `scale` (2,) pixels of the
+    calibrated image to those of this size; nothing is visible outside `radii`, given in pixels of
+    the calibrated image, nor outside the image.
     """
 
     lens: Lens
@@ -312,15 +312,15 @@ class CameraModel:
     radii: tuple[float, float]
 
     def project(self, rays: Array) -> Array:
-        """Pixels (N, 2) as column, row of rays (N, 3) in the robot's axes; NaN where not seen."""
+        """Columns and rows (N, 2) of rays (N, 3) in the robot's axes; NaN where not visible."""
         pixels = self._limited(self.lens.project(_normalized(np.asarray(rays)) @ self.rotation))
         pixels = (pixels + 0.5) * self.scale - 0.5
         return self._inside(pixels)
 
     def unproject(self, pixels: Array) -> Array:
         """Unit rays (N, 3) in the robot's axes of pixels (N, 2); NaN where they see nothing."""
-        known = (self._inside(np.asarray(pixels, float)) + 0.5) / self.scale - 0.5
-        rays = self.lens.unproject(self._limited(known))
+        calibrated = (self._inside(np.asarray(pixels, float)) + 0.5) / self.scale - 0.5
+        rays = self.lens.unproject(self._limited(calibrated))
         return np.asarray(_normalized(rays) @ self.rotation.T)
 
     def _limited(self, pixels: Array) -> Array:
@@ -328,155 +328,118 @@ class CameraModel:
             return pixels
         radius = np.hypot(*(pixels - self.lens.center).T)
         near, far = self.radii
-        seen = (radius >= near) & ((radius <= far) | (far == 0.0))
-        return np.where(seen[:, None], pixels, np.nan)
+        visible = (radius >= near) & ((radius <= far) | (far == 0.0))
+        return np.where(visible[:, None], pixels, np.nan)
 
     def _inside(self, pixels: Array) -> Array:
         height, width = self.size
-        seen = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=1)
-        return np.where(seen[:, None], pixels, np.nan)
+        visible = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=1)
+        return np.where(visible[:, None], pixels, np.nan)
 
 
-_AXES = {  # columns: where the picture's right, its bottom and its center look
+_AXES = {  # columns: where the image's right, its bottom and its center look
     'down': np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
     'up': np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     'forward': np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
 _USUAL_AXIS = {'mirror': 'down', 'polar': 'down', 'fisheye': 'up', 'ocam': 'up'}
-_UNCALIBRATED = ('equirectangular', 'panorama')
+_ASPECT_TOLERANCE = 0.02  # relative, of an image against the calibration; covers rounded sizes
 
 
 def make_camera(
-    config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig | None = None
+    calibration: LensCalibration,
+    size: tuple[int, int],
+    panorama: PanoramaConfig | None = None,
+    mount_rpy: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> CameraModel:
-    """Build the camera for pictures of `size` (rows, columns).
+    """Build the camera for images of `size` (rows, columns), mounted at roll, pitch, yaw (deg).
 
-    `panorama` tells the elevations of a picture that is a panorama. Raises CameraError when the
-    parameters describe no camera, or one whose pictures have another shape.
+    `panorama` gives the elevations of an image that is a panorama. Raises CameraError when the
+    parameters describe no camera, or one whose images have another shape.
     """
     if min(size) < 1:
-        raise CameraError(f'a picture of {size[1]} x {size[0]} pixels is empty')
-    config = with_calibration(config)
-    lens = _LENSES[config.camera_model](config, size, panorama or PanoramaConfig())
-    radii = (config.radius_min, config.radius_max)
-    return CameraModel(lens, _rotation(config), size, _scale(config, size), radii)
+        raise CameraError(f'an image of {size[1]} x {size[0]} pixels is empty')
+    lens = _make_lens(calibration, size, panorama or PanoramaConfig())
+    radii = (calibration.radius_min, calibration.radius_max)
+    return CameraModel(
+        lens, _rotation(calibration, mount_rpy), size, _scale(calibration, size), radii
+    )
 
 
-def _rotation(config: CameraConfig) -> Array:
+def _rotation(calibration: LensCalibration, mount_rpy: Sequence[float]) -> Array:
     """Rays of the lens to the robot's axes: the axis, then roll, pitch and yaw (REP-103)."""
-    angles = np.radians([config.mount_roll, config.mount_pitch, config.mount_yaw])
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
-    roll = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    pitch = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    yaw = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    reversal = np.diag([-1.0 if is_mirrored(config) else 1.0, 1.0, 1.0])
-    return np.asarray(yaw @ pitch @ roll @ _AXES[_axis(config)] @ reversal)
+    mount = Rotation.from_euler('xyz', mount_rpy, degrees=True).as_matrix()
+    axis = calibration.axis
+    if axis == 'auto' or calibration.camera_model in UNCALIBRATED:
+        axis = _USUAL_AXIS.get(calibration.camera_model, 'forward')
+    reversal = np.diag([-1.0 if calibration.is_mirrored else 1.0, 1.0, 1.0])
+    return np.asarray(mount @ _AXES[axis] @ reversal)
 
 
-def _axis(config: CameraConfig) -> str:
-    if config.axis != 'auto' and config.camera_model not in _UNCALIBRATED:
-        return config.axis
-    return _USUAL_AXIS.get(config.camera_model, 'forward')
-
-
-def is_mirrored(config: CameraConfig) -> bool:
-    """Whether the picture shows the world reversed."""
-    if config.mirrored == 'auto':
-        return config.camera_model in ('mirror', 'polar')
-    return config.mirrored == 'yes'
-
-
-def _scale(config: CameraConfig, size: tuple[int, int]) -> Array:
-    """Pixels of a picture of `size` per pixel of the calibrated one, along columns and rows."""
+def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
+    """Pixels of an image of `size` per pixel of the calibrated one, along columns and rows."""
     height, width = size
-    calibrated = (config.image_width, config.image_height)
-    if config.camera_model in _UNCALIBRATED or 0 in calibrated or calibrated == (width, height):
+    calibrated = (calibration.image_width, calibration.image_height)
+    if calibration.camera_model in UNCALIBRATED or 0 in calibrated:
         return np.ones(2)
     scale = np.array([width, height]) / calibrated
-    if abs(scale[0] / scale[1] - 1.0) > 0.02:
+    if abs(scale[0] / scale[1] - 1.0) > _ASPECT_TOLERANCE:
         raise CameraError(
-            f'the picture is {width} x {height} but the camera is calibrated for '
-            f'{calibrated[0]} x {calibrated[1]}: set image_width, image_height and the lens '
-            'parameters of this camera (see the command calibrate)'
+            f'the image is {width} x {height} but the camera is calibrated for '
+            f'{calibrated[0]} x {calibrated[1]}: name the calibration_file of this camera (see the '
+            'command calibrate)'
         )
     return scale
 
 
-def _center(config: CameraConfig) -> Array:
-    return np.array([config.cx, config.cy])
+def _make_lens(
+    calibration: LensCalibration, size: tuple[int, int], panorama: PanoramaConfig
+) -> Lens:
+    model, (rows, columns) = calibration.camera_model, size
+    if model == 'panorama':
+        low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
+        return CylinderLens((columns, rows), (float(low), float(high)))
+    if model == 'equirectangular':
+        return CylinderLens((columns, rows), (-np.pi / 2, np.pi / 2))
+    center = np.array([calibration.cx, calibration.cy])
+    if model == 'polar':
+        return _polar_lens(calibration, center)
+    if model == 'ocam':
+        return _ocam_lens(calibration, center, size)
+    focal = np.array([calibration.fx, calibration.fy])
+    if len(calibration.distortion) not in (0, 4):
+        raise CameraError(
+            f'distortion has {len(calibration.distortion)} coefficients; give 4, or none'
+        )
+    k1, k2, k3, k4 = calibration.distortion or (0.0,) * 4
+    if model == 'mirror':
+        return MirrorLens(focal, center, calibration.xi, (k1, k2, k3, k4))
+    fisheye = FisheyeLens(focal, center, (k1, k2, k3, k4))
+    return fisheye if model == 'fisheye' else _dual_fisheye_lens(calibration, fisheye)
 
 
-def _focal(config: CameraConfig) -> Array:
-    return np.array([config.fx, config.fy])
-
-
-def _four(config: CameraConfig) -> tuple[float, float, float, float]:
-    """The distortion coefficients: none, or four."""
-    values = config.distortion or (0.0, 0.0, 0.0, 0.0)
-    if len(values) != 4:
-        raise CameraError(f'distortion has {len(values)} coefficients; give 4, or none')
-    return values[0], values[1], values[2], values[3]
-
-
-def _mirror(config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig) -> Lens:
-    return MirrorLens(_focal(config), _center(config), config.xi, _four(config))
-
-
-def _fisheye(config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig) -> FisheyeLens:
-    return FisheyeLens(_focal(config), _center(config), _four(config))
-
-
-def _ocam(config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig) -> Lens:
-    if len(config.polynomial) < 2 or len(config.affine) != 3:
+def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int]) -> OcamLens:
+    if len(calibration.polynomial) < 2 or len(calibration.affine) != 3:
         raise CameraError('the ocam model needs polynomial (a0 a1 ...) and affine (c d e)')
-    if config.polynomial[0] >= 0.0:
+    if calibration.polynomial[0] >= 0.0:
         raise CameraError('polynomial[0] of the ocam model must be negative')
-    limit = config.radius_max or float(np.hypot(*np.maximum(size, _calibrated_size(config))))
-    c, d, e = config.affine
-    return OcamLens(Polynomial(config.polynomial), _center(config), (c, d, e), limit)
+    calibrated = (calibration.image_height, calibration.image_width)
+    limit = calibration.radius_max or float(np.hypot(*np.maximum(size, calibrated)))
+    c, d, e = calibration.affine
+    return OcamLens(Polynomial(calibration.polynomial), center, (c, d, e), limit)
 
 
-def _calibrated_size(config: CameraConfig) -> tuple[int, int]:
-    return config.image_height, config.image_width
-
-
-def _polar(config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig) -> Lens:
-    radii, angles = (config.radius_min, config.radius_max), (config.angle_min, config.angle_max)
+def _polar_lens(calibration: LensCalibration, center: Array) -> PolarLens:
+    radii = (calibration.radius_min, calibration.radius_max)
+    angles = (calibration.angle_min, calibration.angle_max)
     if radii[0] >= radii[1] or angles[0] >= angles[1]:
         raise CameraError('the polar model needs radius_min < radius_max and angle_min < angle_max')
     low, high = np.radians(angles)
-    return PolarLens(_center(config), radii, (float(low), float(high)))
+    return PolarLens(center, radii, (float(low), float(high)))
 
 
-def _equirectangular(
-    config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig
-) -> CylinderLens:
-    return CylinderLens((size[1], size[0]), (-np.pi / 2, np.pi / 2))
-
-
-def _panorama(
-    config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig
-) -> CylinderLens:
-    low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
-    return CylinderLens((size[1], size[0]), (float(low), float(high)))
-
-
-def _dual_fisheye(config: CameraConfig, size: tuple[int, int], panorama: PanoramaConfig) -> Lens:
-    first = _fisheye(config, size, panorama)
-    center = np.array([config.second_cx, config.second_cy])
-    second = FisheyeLens(first.focal, center, first.distortion)
-    c, s = np.cos(np.radians(config.second_roll)), np.sin(np.radians(config.second_roll))
-    behind = np.diag([-1.0, 1.0, -1.0])
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ behind
-    return DualFisheyeLens(first, second, turn)
-
-
-_LENSES: dict[str, Callable[[CameraConfig, tuple[int, int], PanoramaConfig], Lens]] = {
-    'mirror': _mirror,
-    'fisheye': _fisheye,
-    'ocam': _ocam,
-    'polar': _polar,
-    'equirectangular': _equirectangular,
-    'dual_fisheye': _dual_fisheye,
-    'panorama': _panorama,
-}
+def _dual_fisheye_lens(calibration: LensCalibration, first: FisheyeLens) -> DualFisheyeLens:
+    center = np.array([calibration.second_cx, calibration.second_cy])
+    roll = Rotation.from_euler('z', calibration.second_roll, degrees=True).as_matrix()
+    to_second = roll @ np.diag([-1.0, 1.0, -1.0])
+    return DualFisheyeLens(first, FisheyeLens(first.focal, center, first.distortion), to_second)

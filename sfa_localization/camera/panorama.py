@@ -1,10 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the picture of an omnidirectional camera to a panorama, by fixed-point lookup tables."""
+"""From the image of an omnidirectional camera to a panorama, by fixed-point lookup tables."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,33 +13,39 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.camera.lenses import is_mirrored, make_camera
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.calibration_files import calibration_of
+from sfa_localization.camera.lenses import make_camera
+from sfa_localization.camera.settings import (
+    UNCALIBRATED,
+    CameraConfig,
+    LensCalibration,
+    PanoramaConfig,
+)
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
 Mask = NDArray[np.bool_]
-_ASPECT = 3.5  # a picture wider than this times its height is a panorama
-_SIZES_KEPT = 4  # tables are kept for this many sizes of pictures
+_ASPECT = 3.5  # an image wider than this times its height is a panorama
+_SIZES_KEPT = 4  # tables are kept for this many sizes of images
 
 
 def looks_like_panorama(height: int, width: int) -> bool:
-    """Whether a picture of this shape is a panorama already."""
+    """Whether an image of this shape is a panorama already."""
     return width >= _ASPECT * height
 
 
-def panorama_rays(panorama: PanoramaConfig, supersampling: int = 1) -> Array:
+def panorama_rays(panorama: PanoramaConfig) -> Array:
     """Unit rays (H, W, 3) of the panorama's pixels in the robot's axes (x forward, y left, z up).
 
-    `supersampling` multiplies H and W. Raises CameraError for an empty range of elevations.
+    Raises CameraError for an empty range of elevations.
     """
     low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
     if low >= high:
         raise CameraError('elevation_min of the panorama must be below elevation_max')
-    height, width = panorama.height * supersampling, panorama.width * supersampling
-    turn = (np.arange(width) + 0.5 - width / 2) * 2 * np.pi / width
-    azimuth = -turn if panorama.clockwise else turn
+    height, width = panorama.height, panorama.width
+    clockwise = (np.arange(width) + 0.5 - width / 2) * 2 * np.pi / width
+    azimuth = -clockwise if panorama.clockwise else clockwise
     elevation = high - (np.arange(height) + 0.5) * (high - low) / height
     flat = np.cos(elevation)[:, None]
     up = np.broadcast_to(np.sin(elevation)[:, None], (height, width))
@@ -47,54 +54,69 @@ def panorama_rays(panorama: PanoramaConfig, supersampling: int = 1) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class _Tables:
-    """Where each panorama pixel is read from: OpenCV's fixed-point maps, and what was seen."""
+    """Where each panorama pixel is read from: OpenCV's fixed-point maps, and what is visible."""
 
     pixels: NDArray[np.int16]
     fractions: NDArray[np.uint16]
     border: int
-    seen: Mask
+    visible: Mask
 
 
 class Unwrapper:
-    """Turns pictures of one camera into panoramas; tables are built once per size of picture.
+    """Turns images of one camera into panoramas; tables are built once per size of image.
 
-    Panorama pixels that the camera does not see (outside the picture or its radii, masked, in a
-    blind sector) repeat the nearest seen pixel of their row, or row of the panorama where the whole
-    row is unseen. The repetition is part of the tables, costs nothing, follows the light of
+    Panorama pixels that the camera does not see (outside the image or its radii, masked, in a
+    blind sector) repeat the nearest visible pixel of their row, or row of the panorama where the
+    whole row is hidden. The repetition is part of the tables, costs nothing, follows the light of
     the scene and, unlike a constant color, draws no edge that turns with the robot.
+
+    `calibration` is the lens where it is not to be read from the camera's calibration_file.
     """
 
-    def __init__(self, camera: CameraConfig, panorama: PanoramaConfig) -> None:
+    def __init__(
+        self,
+        camera: CameraConfig,
+        panorama: PanoramaConfig,
+        calibration: LensCalibration | None = None,
+    ) -> None:
         self.camera = camera
         self.panorama = panorama
+        self._calibration = calibration
         self._tables: dict[tuple[int, int], _Tables] = {}
 
-    def __call__(self, image: Image) -> Image:
-        """Unwrap a BGR picture (H, W, 3) uint8 to (panorama.height, panorama.width, 3) uint8.
+    @cached_property
+    def calibration(self) -> LensCalibration:
+        """The lens. Raises CameraError when its file cannot be used."""
+        return self._calibration or calibration_of(self.camera)
 
-        A picture shaped like a panorama is only resized. Raises CameraError when it is no such
-        picture, or not one of this camera.
+    def __call__(self, image: Image) -> Image:
+        """Unwrap a BGR image (H, W, 3) uint8 to (panorama.height, panorama.width, 3) uint8.
+
+        An image shaped like a panorama is only resized. Raises CameraError for an array that is no
+        such image, or not one of this camera.
         """
         _check(image)
-        if self.is_panorama((image.shape[0], image.shape[1])):
+        size = (image.shape[0], image.shape[1])
+        if self.is_panorama(size):
             result = self._aligned(image)
         else:
-            result = self._remapped(image)
+            tables = self._tables_of(size)
+            maps = tables.pixels, tables.fractions
+            result = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=tables.border))
         if self.camera.normalization == 'off':
             return result
         return normalized(result, self.camera.normalization)
 
-    def seen(self, size: tuple[int, int]) -> Mask:
-        """Mask (H, W) of the panorama pixels seen in pictures of `size` (rows, columns)."""
-        scale = self.camera.supersampling
-        return self._tables_of(size).seen[scale // 2 :: scale, scale // 2 :: scale]
+    def visible(self, size: tuple[int, int]) -> Mask:
+        """Mask (H, W) of the panorama pixels visible in images of `size` (rows, columns)."""
+        return self._tables_of(size).visible
 
     def is_panorama(self, size: tuple[int, int]) -> bool:
-        """Whether pictures of `size` (rows, columns) are panoramas already, so only resized."""
-        if self.camera.camera_model == 'panorama':
-            return self.camera.mount_roll == 0.0 and self.camera.mount_pitch == 0.0
-        round_model = self.camera.camera_model != 'equirectangular'
-        return round_model and looks_like_panorama(*size)
+        """Whether images of `size` (rows, columns) are panoramas already, so only resized."""
+        model = self.calibration.camera_model
+        if model == 'panorama':
+            return not any(self.camera.mount_rpy[:2])
+        return model != 'equirectangular' and looks_like_panorama(*size)
 
     def _aligned(self, image: Image) -> Image:
         """A panorama, resized; if the camera makes them, also turned to the convention."""
@@ -104,65 +126,51 @@ class Unwrapper:
         result = image.copy()
         if image.shape[:2] != (height, width):
             result = np.asarray(cv2.resize(image, (width, height), interpolation=method))
-        if self.camera.camera_model != 'panorama':
+        if self.calibration.camera_model != 'panorama':
             return result
-        shift = -round(self.camera.mount_yaw / 360.0 * width)
-        if is_mirrored(self.camera):
+        shift = -round(self.camera.mount_rpy[2] / 360.0 * width)
+        if self.calibration.is_mirrored:
             result = result[:, ::-1]
         result = np.roll(result, shift, axis=1)
         return np.ascontiguousarray(result if self.panorama.clockwise else result[:, ::-1])
 
-    def _remapped(self, image: Image) -> Image:
-        tables = self._tables_of((image.shape[0], image.shape[1]))
-        result = cv2.remap(
-            image, tables.pixels, tables.fractions, cv2.INTER_LINEAR, borderMode=tables.border
-        )
-        if self.camera.supersampling > 1:
-            size = (self.panorama.width, self.panorama.height)
-            result = cv2.resize(result, size, interpolation=cv2.INTER_AREA)
-        return np.asarray(result)
-
     def _tables_of(self, size: tuple[int, int]) -> _Tables:
-        tables = self._tables.get(size)
-        if tables is None:
+        if size not in self._tables:
             if len(self._tables) >= _SIZES_KEPT:
                 self._tables.clear()
-            tables = self._tables[size] = build_tables(self.camera, self.panorama, size)
-        return tables
+            tables = build_tables(self.camera, self.calibration, self.panorama, size)
+            self._tables[size] = tables
+        return self._tables[size]
 
 
 def _check(image: Any) -> None:
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        raise CameraError('a picture must be an array of uint8')
+        raise CameraError('an image must be an array of uint8')
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise CameraError(f'a picture must have shape (H, W, 3), not {image.shape}')
+        raise CameraError(f'an image must have shape (H, W, 3), not {image.shape}')
 
 
-def build_tables(camera: CameraConfig, panorama: PanoramaConfig, size: tuple[int, int]) -> _Tables:
-    """Build the lookup tables for pictures of `size` (rows, columns)."""
-    model = make_camera(camera, size, panorama)
-    rays = panorama_rays(panorama, camera.supersampling)
+def build_tables(
+    camera: CameraConfig,
+    calibration: LensCalibration,
+    panorama: PanoramaConfig,
+    size: tuple[int, int],
+) -> _Tables:
+    """Build the lookup tables for images of `size` (rows, columns)."""
+    model = make_camera(calibration, size, panorama, camera.mount_rpy)
+    rays = panorama_rays(panorama)
     pixels = model.project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
-    seen = np.isfinite(pixels[..., 0]) & ~_in_sectors(rays, camera.blind_sectors)
+    visible = np.isfinite(pixels[..., 0]) & ~_in_sectors(rays, camera.blind_sectors)
     if camera.mask_file:
-        seen &= _unmasked(pixels, read_mask(camera.mask_file, size))
-    rows, columns = nearest_seen(seen)
-    wraps = model.lens.center is None and camera.camera_model != 'dual_fisheye'
-    return _fixed_point(_clamped(pixels[rows, columns], size, wraps), wraps, seen)
-
-
-def _clamped(pixels: Array, size: tuple[int, int], wraps: bool) -> Array:
-    """Move the outer half pixel inside; a picture that closes on itself keeps its columns."""
-    rows = np.clip(pixels[..., 1], 0, size[0] - 1)
-    columns = pixels[..., 0] if wraps else np.clip(pixels[..., 0], 0, size[1] - 1)
-    return np.stack([columns, rows], axis=-1)
-
-
-def _fixed_point(pixels: Array, wraps: bool, seen: Mask) -> _Tables:
-    columns, rows = np.moveaxis(pixels.astype(np.float32), -1, 0)
-    maps = cv2.convertMaps(columns, rows, cv2.CV_16SC2)
+        visible &= _unmasked(pixels, read_mask(camera.mask_file, size))
+    columns, rows = np.moveaxis(pixels[nearest_visible(visible)], -1, 0)
+    wraps = calibration.camera_model in UNCALIBRATED  # its columns close on themselves
+    if not wraps:
+        columns = np.clip(columns, 0, size[1] - 1)
+    rows = np.clip(rows, 0, size[0] - 1)
+    maps = cv2.convertMaps(columns.astype(np.float32), rows.astype(np.float32), cv2.CV_16SC2)
     border = cv2.BORDER_WRAP if wraps else cv2.BORDER_REPLICATE
-    return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, seen)
+    return _Tables(np.asarray(maps[0]), np.asarray(maps[1]), border, visible)
 
 
 def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
@@ -175,74 +183,76 @@ def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
     azimuth = np.degrees(np.arctan2(rays[..., 1], rays[..., 0]))
     hidden = np.zeros(azimuth.shape, bool)
     for start, end in zip(sectors[::2], sectors[1::2], strict=True):
-        whole = end - start >= 360.0 or (end != start and (end - start) % 360.0 == 0.0)
-        hidden |= (azimuth - start) % 360.0 <= (360.0 if whole else (end - start) % 360.0)
+        width = (end - start) % 360.0
+        if end - start >= 360.0 or (end != start and width == 0.0):
+            width = 360.0
+        hidden |= (azimuth - start) % 360.0 <= width
     return hidden
 
 
 def read_mask(path: str, size: tuple[int, int]) -> Mask:
-    """Read a mask picture for pictures of `size` (rows, columns): True where it is not black."""
-    known = Path(path).is_file()  # else OpenCV would warn on its own
-    picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if known else None
-    if picture is None:
-        raise CameraError(f'mask_file {path} is missing or is no picture')
-    resized = cv2.resize(picture, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
+    """Read a mask image for images of `size` (rows, columns): True where it is not black."""
+    exists = Path(path).is_file()  # else OpenCV would warn on its own
+    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if exists else None
+    if mask is None:
+        raise CameraError(f'mask_file {path} is missing or is no image')
+    resized = cv2.resize(mask, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized) >= 128
 
 
 def _unmasked(pixels: Array, mask: Mask) -> Mask:
     """Mask (H, W) of the lookups (H, W, 2) whose nearest pixel is True in the mask."""
-    known = np.nan_to_num(pixels, nan=0.0)
-    rows = np.clip(np.rint(known[..., 1]).astype(int), 0, mask.shape[0] - 1)
-    columns = np.clip(np.rint(known[..., 0]).astype(int), 0, mask.shape[1] - 1)
+    finite = np.nan_to_num(pixels, nan=0.0)
+    rows = np.clip(np.rint(finite[..., 1]).astype(int), 0, mask.shape[0] - 1)
+    columns = np.clip(np.rint(finite[..., 0]).astype(int), 0, mask.shape[1] - 1)
     return np.asarray(mask[rows, columns])
 
 
-def nearest_seen(seen: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each pixel of `seen` (H, W) the row and column (H, W) of the seen pixel that stands in.
+def nearest_visible(visible: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """For each pixel of `visible` (H, W), row and column (H, W) of the visible one to repeat.
 
     The nearest in the same row, around the back; in a row without any, that of the nearest row
-    with some. Raises CameraError when nothing is seen.
+    with some. Raises CameraError when nothing is visible.
     """
-    filled = np.flatnonzero(seen.any(axis=1))
-    if filled.size == 0:
+    usable_rows = np.flatnonzero(visible.any(axis=1))
+    if usable_rows.size == 0:
         raise CameraError(
             'the camera sees no part of the panorama: check its axis, radii, masks and the '
             "panorama's elevations"
         )
-    source = filled[np.abs(np.arange(len(seen))[:, None] - filled).argmin(axis=1)]
-    columns = np.stack([_nearest_column(seen[row]) for row in source])
-    return np.broadcast_to(source[:, None], seen.shape), columns
+    rows = usable_rows[np.abs(np.arange(len(visible))[:, None] - usable_rows).argmin(axis=1)]
+    columns = np.stack([_nearest_column(visible[row]) for row in rows])
+    return np.broadcast_to(rows[:, None], visible.shape), columns
 
 
-def _nearest_column(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    width = len(seen)
-    known = np.flatnonzero(seen)
-    around = np.concatenate([known - width, known, known + width])
+def _nearest_column(visible: NDArray[np.bool_]) -> NDArray[np.intp]:
+    width = len(visible)
+    columns = np.flatnonzero(visible)
+    around = np.concatenate([columns - width, columns, columns + width])
     right = np.searchsorted(around, np.arange(width))
     left = np.maximum(right - 1, 0)
     nearer = np.arange(width) - around[left] < around[right] - np.arange(width)
     return np.asarray(np.where(nearer, around[left], around[right]) % width)
 
 
-_TARGET = 110.0  # mean brightness after normalization
-_GAIN_MAX = 8.0
+_TARGET = 110.0  # gray levels, mean brightness after normalization: the middle of most scenes
+_GAIN_MAX = 8.0  # beyond it, noise is all that grows
 
 
 def normalized(panorama: Image, method: str) -> Image:
     """Normalize brightness: 'exposure' by one gain, 'local' by that of the surroundings."""
-    grey = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
+    gray = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
     if method == 'exposure':
-        gain = min(_TARGET / max(float(grey.mean()), 1.0), _GAIN_MAX)
+        gain = min(_TARGET / max(float(gray.mean()), 1.0), _GAIN_MAX)
         return np.asarray(cv2.convertScaleAbs(panorama, alpha=gain))
-    gain_map = np.minimum(_TARGET / np.maximum(_surroundings(np.asarray(grey)), 1.0), _GAIN_MAX)
+    gain_map = np.minimum(_TARGET / np.maximum(_surroundings(np.asarray(gray)), 1.0), _GAIN_MAX)
     return np.asarray(np.clip(panorama * gain_map[..., None] + 0.5, 0, 255), np.uint8)
 
 
-def _surroundings(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _surroundings(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Mean brightness (H, W) over an eighth of the circle, which closes on itself."""
-    reach = max(grey.shape[1] // 16, 1)
-    wide = cv2.copyMakeBorder(grey, 0, 0, reach, reach, cv2.BORDER_WRAP)
-    window = (2 * reach + 1, 2 * (grey.shape[0] // 4) + 1)
+    reach = max(gray.shape[1] // 16, 1)
+    wide = cv2.copyMakeBorder(gray, 0, 0, reach, reach, cv2.BORDER_WRAP)
+    window = (2 * reach + 1, 2 * (gray.shape[0] // 4) + 1)
     mean = cv2.blur(wide.astype(np.float32), window, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(mean[:, reach:-reach])

@@ -1,20 +1,26 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the camera: its lens and mounting, the panorama, and which images are believed."""
+"""Settings of the camera: source, lens, mounting, panorama, and which images are used."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
 
+from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, setting
+
+NEEDS_CALIBRATION = ('mirror', 'fisheye', 'ocam', 'polar', 'dual_fisheye')
+"""Camera models with parameters of their own, which a calibration finds."""
+UNCALIBRATED = ('equirectangular', 'panorama')
+"""Camera models that follow from the size of the image alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class PanoramaConfig(Settings):
-    """Size and geometry of the panorama: what the network sees.
+    """Size and geometry of the panorama, the input of the network.
 
-    The centre column looks along the robot's +x axis; columns grow clockwise seen from above.
+    The center column looks along the robot's +x axis; columns grow clockwise seen from above.
     """
 
     width: int = setting(600, 'columns of the panorama', unit='px', low=16, high=8192)
@@ -28,46 +34,133 @@ class PanoramaConfig(Settings):
     clockwise: bool = setting(True, 'columns grow clockwise seen from above')
 
     def differences(self, other: PanoramaConfig) -> str:
-        """What is other in `other`, as 'height 30 instead of 60'; '' when they are the same."""
+        """What differs in `other`, as 'height 30 instead of 60'; '' when they are equal."""
         names = [item.name for item in dataclasses.fields(self)]
-        found = [(name, getattr(other, name), getattr(self, name)) for name in names]
-        return ', '.join(f'{name} {a} instead of {b}' for name, a, b in found if a != b)
+        pairs = [(name, getattr(other, name), getattr(self, name)) for name in names]
+        return ', '.join(f'{name} {a} instead of {b}' for name, a, b in pairs if a != b)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureConfig(Settings):
+    """Where the omnicam node takes its images from."""
+
+    source: str = setting(
+        'topic',
+        'topic (image_raw, or image_raw/compressed), device (V4L2), video (a file) or folder (of '
+        'images, in the order of their names)',
+        choices=('topic', 'device', 'video', 'folder'),
+    )
+    source_path: str = setting('', 'device (a path or a number), video file or folder')
+    source_rate: float = setting(
+        0.0,
+        'images per second of a video or folder, or requested from a device; 0: its own, or 10',
+        unit='Hz',
+        low=0.0,
+        high=1000.0,
+    )
+    source_size: tuple[float, ...] = setting(
+        (),
+        'columns and rows requested from a device; empty: its own',
+        unit='px',
+        low=1.0,
+        high=32767.0,
+    )
+    silence_timeout: float = setting(
+        2.0,
+        'time without an image after which the camera counts as silent; a device is then reopened',
+        unit='s',
+        low=0.05,
+        high=3600.0,
+        live=True,
+    )
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if len(self.source_size) not in (0, 2):
+            raise ConfigError('CaptureConfig.source_size: give columns and rows, or nothing')
 
 
 @dataclass(frozen=True, slots=True)
 class CameraConfig(Settings):
-    """The omnidirectional camera: how a pixel of its picture looks into the world.
+    """The omnidirectional camera on the robot, and what hides its view."""
 
-    The default is the simulator's: a hyperbolic mirror seen from below, 640 x 640. The command
-    `calibrate` writes these parameters from a calibration file or from pictures.
+    camera_model: str = setting(
+        'mirror',
+        'camera without a calibration_file: mirror (that of the simulator), equirectangular, or '
+        'panorama (the image is a panorama already)',
+        choices=('mirror', *UNCALIBRATED),
+    )
+    calibration_file: str = setting(
+        '',
+        'calibration of the camera, which replaces camera_model: the file that the command '
+        'calibrate writes, camera_info, OpenCV, Kalibr or camodocal YAML, or OCamCalib '
+        'calib_results.txt; empty: none',
+    )
+    mount_rpy: tuple[float, ...] = setting(
+        (0.0, 0.0, 0.0),
+        'roll, pitch and yaw of the camera on the robot',
+        unit='deg',
+        low=-360.0,
+        high=360.0,
+        live=True,
+    )
+    mask_file: str = setting(
+        '', 'mask of the camera image, black where it shows the robot; empty: none', live=True
+    )
+    blind_sectors: tuple[float, ...] = setting(
+        (),
+        'azimuths hidden by the robot: start and end of each sector, counterclockwise from the '
+        "robot's forward axis; empty: none",
+        unit='deg',
+        low=-360.0,
+        high=720.0,
+        live=True,
+    )
+    normalization: str = setting(
+        'off',
+        'brightness: off, exposure (one gain per panorama), local (by the surrounding brightness)',
+        choices=('off', 'exposure', 'local'),
+        live=True,
+    )
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if len(self.mount_rpy) != 3:
+            raise ConfigError('CameraConfig.mount_rpy: give three angles: roll, pitch and yaw')
+
+
+@dataclass(frozen=True, slots=True)
+class WatchConfig(Settings):
+    """Which images the localization uses, live and offline."""
+
+    novelty_limit: float = setting(
+        3.0,
+        'images of more novelty (1: like those of training) are not used',
+        low=1.0,
+        high=1e6,
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LensCalibration(Settings):
+    """The lens of a camera as its calibration file describes it; no parameter of a node.
+
+    The default is the simulator's hyperbolic mirror seen from below, 640 x 640.
     """
 
     camera_model: str = setting(
         'mirror',
         'mirror (unified model of Mei: central mirrors, and pinhole cameras with xi = 0), fisheye '
         '(equidistant or Kannala-Brandt, as in OpenCV), ocam (polynomial of Scaramuzza), polar '
-        '(uncalibrated: angle linear in radius), equirectangular, dual_fisheye, or panorama '
-        '(the picture is a panorama already)',
-        choices=(
-            'mirror',
-            'fisheye',
-            'ocam',
-            'polar',
-            'equirectangular',
-            'dual_fisheye',
-            'panorama',
-        ),
-    )
-    calibration_file: str = setting(
-        '',
-        'calibration to read instead of the lens parameters below: camera_info, OpenCV or Kalibr '
-        'YAML, or OCamCalib calib_results.txt; empty: none',
+        '(uncalibrated: angle linear in radius), dual_fisheye, equirectangular, or panorama',
+        choices=NEEDS_CALIBRATION + UNCALIBRATED,
     )
     image_width: int = setting(
-        640, 'columns of the pictures calibrated with; 0: any', unit='px', low=0, high=32767
+        640, 'columns of the calibration images; 0: any', unit='px', low=0, high=32767
     )
     image_height: int = setting(
-        640, 'rows of the pictures calibrated with; 0: any', unit='px', low=0, high=32767
+        640, 'rows of the calibration images; 0: any', unit='px', low=0, high=32767
     )
     fx: float = setting(150.0, 'focal length along columns', unit='px', low=0.01, high=1e5)
     fy: float = setting(150.0, 'focal length along rows', unit='px', low=0.01, high=1e5)
@@ -84,11 +177,11 @@ class CameraConfig(Settings):
         (1.0, 0.0, 0.0), 'affine parameters c d e of the ocam model'
     )
     radius_min: float = setting(
-        40.0, 'radius about the center below which nothing is seen', unit='px', low=0.0, high=1e5
+        40.0, 'radius about the center below which nothing is visible', unit='px', low=0, high=1e5
     )
     radius_max: float = setting(
         318.0,
-        'radius about the center beyond which nothing is seen; 0: no limit',
+        'radius about the center beyond which nothing is visible; 0: no limit',
         unit='px',
         low=0.0,
         high=1e5,
@@ -106,140 +199,37 @@ class CameraConfig(Settings):
         0.0, 'dual_fisheye: row of the second center', unit='px', low=-1e5, high=1e5
     )
     second_roll: float = setting(
-        0.0, 'dual_fisheye: turn of the second picture', unit='deg', low=-180.0, high=180.0
+        0.0, 'dual_fisheye: rotation of the second image', unit='deg', low=-180.0, high=180.0
     )
     axis: str = setting(
         'auto',
-        'where the center of the picture looks before mounting angles: down (a mirror seen from '
-        'below), up, or forward; with up and down the top of the picture is forward; auto: down '
+        'where the center of the image looks before mounting angles: down (a mirror seen from '
+        'below), up, or forward; with up and down the top of the image is forward; auto: down '
         'for mirror and polar, up for fisheye and ocam, forward for dual_fisheye',
         choices=('auto', 'down', 'up', 'forward'),
     )
     mirrored: str = setting(
         'auto',
-        'the picture shows the world reversed, as a picture of one mirror does; auto: yes for '
+        'the image shows the world reversed, as the image of one mirror does; auto: yes for '
         'mirror and polar',
         choices=('auto', 'yes', 'no'),
     )
-    mount_roll: float = setting(
-        0.0, 'roll of the camera on the robot', unit='deg', low=-180.0, high=180.0, live=True
-    )
-    mount_pitch: float = setting(
-        0.0, 'pitch of the camera on the robot', unit='deg', low=-180.0, high=180.0, live=True
-    )
-    mount_yaw: float = setting(
-        0.0, 'yaw of the camera on the robot', unit='deg', low=-360.0, high=360.0, live=True
-    )
-    mask_file: str = setting(
-        '', 'picture of the camera picture, black where it shows the robot; empty: none', live=True
-    )
-    blind_sectors: tuple[float, ...] = setting(
-        (),
-        'azimuths hidden by the robot: start and end of each sector, counter-clockwise from the '
-        "robot's forward axis",
-        unit='deg',
-        low=-360.0,
-        high=720.0,
-        live=True,
-    )
-    supersampling: int = setting(
-        1, 'samples per panorama pixel along each axis, averaged; costs its square', low=1, high=4
-    )
-    normalization: str = setting(
-        'off',
-        'brightness: off, exposure (one gain per panorama), local (by the surrounding brightness)',
-        choices=('off', 'exposure', 'local'),
-        live=True,
-    )
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the image shows the world reversed."""
+        if self.mirrored == 'auto':
+            return self.camera_model in ('mirror', 'polar')
+        return self.mirrored == 'yes'
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationConfig(Settings):
-    """What the command `calibrate` cannot see in the pictures."""
+    """What the command `calibrate` cannot find in the images."""
 
     model: str = setting(
         'polar', 'camera model made from circles alone', choices=('polar', 'fisheye')
     )
     field_of_view: float = setting(
         185.0, 'fisheye: field of view within the rim', unit='deg', low=10.0, high=360.0
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class WatchConfig(Settings):
-    """Which panoramas are not believed, live and offline."""
-
-    dark_level: float = setting(
-        8.0, 'a picture of lower mean is dark', unit='grey levels', low=0.0, high=255.0, live=True
-    )
-    flat_level: float = setting(
-        3.0,
-        'a picture of lower deviation is covered',
-        unit='grey levels',
-        low=0.0,
-        high=255.0,
-        live=True,
-    )
-    frozen_pictures: int = setting(
-        5, 'equal pictures in a row that mean a frozen camera', low=2, high=10_000, live=True
-    )
-    novelty_unusable: float = setting(
-        3.0, 'pictures of more novelty are not used', low=1.0, high=1e6, live=True
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class OmnicamNodeConfig(Settings):
-    """Where the omnicam node takes pictures from, and how it watches over the camera."""
-
-    source: str = setting(
-        'topic',
-        'topic (image_raw, or image_raw/compressed), device (V4L2), video (a file) or folder (of '
-        'pictures, in the order of their names)',
-        choices=('topic', 'device', 'video', 'folder'),
-    )
-    source_path: str = setting('', 'device (a path or a number), video file or folder')
-    image_transport: str = setting(
-        'raw', 'which topic to take pictures from', choices=('raw', 'compressed')
-    )
-    frame_id: str = setting('', "frame of the panoramas; empty: the picture's own, or omnicam")
-    lazy: bool = setting(True, 'do nothing while nobody listens to the panorama', live=True)
-    jpeg_quality: int = setting(
-        90, 'quality of panorama/compressed', unit='%', low=1, high=100, live=True
-    )
-    silence_timeout: float = setting(
-        2.0,
-        'time without a picture after which the camera counts as silent',
-        unit='s',
-        low=0.05,
-        high=3600.0,
-        live=True,
-    )
-    frozen_timeout: float = setting(
-        5.0,
-        'time of equal pictures after which the camera counts as frozen; 0: never',
-        unit='s',
-        low=0.0,
-        high=3600.0,
-        live=True,
-    )
-    reopen_min: float = setting(
-        0.5, 'pause before the first attempt to reopen a device', unit='s', low=0.01, high=60.0
-    )
-    reopen_max: float = setting(
-        30.0, 'longest pause between attempts; they double', unit='s', low=0.01, high=3600.0
-    )
-    source_rate: float = setting(
-        0.0,
-        'pictures per second of a video or folder, or asked of a device; 0: its own, or 10',
-        unit='Hz',
-        low=0.0,
-        high=1000.0,
-    )
-    source_loop: bool = setting(False, 'start a video or folder again at its end')
-    source_width: int = setting(
-        0, 'columns asked of a device; 0: its own', unit='px', low=0, high=32767
-    )
-    source_height: int = setting(
-        0, 'rows asked of a device; 0: its own', unit='px', low=0, high=32767
     )

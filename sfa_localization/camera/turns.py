@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turns seen in panoramas: a robot that turns shifts the columns of its panorama.
 
-The shift between neighbouring images is measured without any map or training.
+The shift between neighboring images is measured without any map or training.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _CONTRAST = np.float32(1.0)
 
 
 class VisualGyro:
-    """Heading from the shift of neighbouring panoramas: fed with images in order, it adds up.
+    """Heading from the shift of neighboring panoramas: fed with images in order, it adds up.
 
-    `sign` is 1 where columns grow clockwise seen from above, -1 where counter-clockwise.
+    `sign` is 1 where columns grow clockwise seen from above, -1 where counterclockwise.
     """
 
     def __init__(self, clockwise: bool = True) -> None:
@@ -70,8 +70,8 @@ class VisualGyro:
 def _texture(image: Image) -> Texture:
     """Rows and columns of logarithmic brightness, free of what changes slowly around."""
     height, width = min(image.shape[0], _ROWS), min(image.shape[1], _COLUMNS)
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.shape[2] == 3 else image[..., 0]
-    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.shape[2] == 3 else image[..., 0]
+    small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     light = np.log1p(small.astype(np.float32))
     reach = max(int(width * _WIDEST) // 2, 1)
     wide = np.concatenate([light[:, -reach:], light, light[:, :reach]], axis=1)

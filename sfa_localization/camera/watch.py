@@ -1,8 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which images can be believed: dark, covered, frozen and foreign ones cannot."""
+"""Which images can be used: dark, covered, frozen and novel ones cannot."""
 
 from __future__ import annotations
+
+import time
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -10,35 +13,62 @@ import numpy as np
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.run import Image
 
-_STRIDE = 3
+DARK_LEVEL = 8.0
+"""Gray levels: an image of lower mean is dark, too dark to distinguish places."""
+FLAT_LEVEL = 3.0
+"""Gray levels: an image of lower standard deviation is covered, it shows sensor noise at most."""
+FROZEN_IMAGES = 5
+"""Equal images in a row that mean a frozen camera; fewer also come from a late driver."""
+FROZEN_S = 5.0
+"""Seconds of equal images before a camera is reopened, because that interrupts it."""
+NOVELTY_WARNING = 1.5
+"""Novelty worth a warning, although the image is still used: half the default limit."""
+_STRIDE = 3  # every third pixel along each axis is enough, and nine times faster
 
 
-class PictureWatch:
-    """Is a picture worth believing? Dark, covered, frozen and foreign ones are not."""
+class FrozenWatch:
+    """How often, and for how long, a camera has repeated its last image."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.repeats = 0
+        self._clock = clock
+        self._last: Image | None = None
+        self._since_s = 0.0
+
+    def add(self, image: Image) -> bool:
+        """Take the next image (H, W, 3) uint8; True when it differs from the last one."""
+        sample = image[::_STRIDE, ::_STRIDE]
+        if self._last is not None and np.array_equal(sample, self._last):
+            self.repeats += 1
+            return False
+        self._last, self._since_s, self.repeats = sample.copy(), self._clock(), 0
+        return True
+
+    def frozen_for_s(self) -> float:
+        """Seconds since the last new image, once it has been repeated for FROZEN_S; else 0."""
+        seconds = self._clock() - self._since_s if self.repeats > 1 else 0.0
+        return seconds if seconds > FROZEN_S else 0.0
+
+
+class ImageWatch:
+    """Judges panoramas in the order in which they were taken."""
 
     def __init__(self, config: WatchConfig | None = None) -> None:
         self.config = config or WatchConfig()
-        self._last: Image | None = None
-        self._repeats = 0
+        self._frozen = FrozenWatch()
 
     def judge(self, panorama: Image) -> str:
-        """Why a panorama (H, W, 3) uint8, the next one, cannot be believed; '' when it can."""
-        sample = panorama[::_STRIDE, ::_STRIDE]
-        equal = self._last is not None and np.array_equal(sample, self._last)
-        self._repeats = self._repeats + 1 if equal else 0
-        if not equal:
-            self._last = sample.copy()
-        mean, deviation = cv2.meanStdDev(sample)
-        if float(mean.mean()) < self.config.dark_level:
-            return 'picture is dark'
-        if float(deviation.mean()) < self.config.flat_level:
-            return 'picture is covered: it shows nothing'
-        if self._repeats + 1 >= self.config.frozen_pictures:
-            return 'camera is frozen: it repeats its picture'
+        """Why the next panorama (H, W, 3) uint8 cannot be used; '' when it can."""
+        self._frozen.add(panorama)
+        mean, std = cv2.meanStdDev(panorama[::_STRIDE, ::_STRIDE])
+        if float(mean.mean()) < DARK_LEVEL:
+            return 'image is dark'
+        if float(std.mean()) < FLAT_LEVEL:
+            return 'image is covered: it shows nothing'
+        if self._frozen.repeats + 1 >= FROZEN_IMAGES:
+            return 'camera is frozen: it repeats its image'
         return ''
 
     def judge_novelty(self, novelty: float) -> str:
-        """Why a picture of this novelty cannot be believed; '' when it can."""
-        if not novelty <= self.config.novelty_unusable:
-            return 'picture is unlike any of training'
-        return ''
+        """Why an image of this novelty cannot be used; '' when it can."""
+        return '' if novelty <= self.config.novelty_limit else 'image is unlike any of training'

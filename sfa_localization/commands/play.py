@@ -1,361 +1,56 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay a bag through rclpy, as `ros2 bag play` does, where that is not installed.
-
-Messages go out as the bytes that were recorded, with their topics, types and QoS; header stamps
-stay as they are; the time of reception sets the pace.
-"""
+"""Replay a bag through ROS."""
 
 from __future__ import annotations
 
-import importlib
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+import argparse
 from pathlib import Path
-from typing import Any
 
-import rclpy
-from builtin_interfaces.msg import Time
-from rclpy.context import Context
-from rclpy.duration import Duration
-from rclpy.exceptions import InvalidTopicNameException
-from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    LivelinessPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-)
-from rclpy.signals import SignalHandlerOptions
-from rosbags.convert.converter import migrate_bytes
-from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability, QosTime
-from rosbags.typesys import Stores
-from rosgraph_msgs.msg import Clock
+from sfa_localization.commands.options import add_settings, settings
+from sfa_localization.commands.pace import PlayConfig
 
-from sfa_localization.bags.messages import COMPRESSED, IMAGE, ODOMETRY, typestore
-from sfa_localization.bags.reader import Bag, Topic
-from sfa_localization.bags.storage import Record
-from sfa_localization.commands.play_pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace
-from sfa_localization.commands.settings import PlayConfig
-from sfa_localization.data.errors import BagError
+EXAMPLES = """\
+  play bags/sample
+  play bags/sample --rate 2 --loop --clock
+  play bags/sample --start-offset 10 --topics /panorama/compressed /odom
 
-DEPTH = 10
-LATCHED_DEPTH = 100
-PATIENCE_S = 0.05
-SETTLED_S = 0.5
-RATE_STEP = 1.1
-FOREVER_S = 9223372036
+keys: space pauses, s or right arrow plays one message, up and down change the rate,
+Ctrl-C ends the replay"""
 
 
-@dataclass
-class Played:
-    """What a replay did: messages per topic, and topics left out with the reason."""
-
-    messages: Counter[str] = field(default_factory=Counter)
-    skipped: dict[str, str] = field(default_factory=dict)
-
-
-def play(
-    path: Path | str,
-    *,
-    config: PlayConfig | None = None,
-    loop: bool = False,
-    clock: bool = False,
-    topics: Collection[str] = (),
-    wait_for: Collection[str] = (),
-    context: Context | None = None,
-    strict: bool = False,
-) -> Played:
-    """Replay a bag until its end, or until its context is shut down; Ctrl-C raises.
-
-    `topics` limits it to those named. It starts when the topics of `wait_for` have subscribers
-    (none named: when images and odometry have some and no more come), or after the configured wait.
-    `context` is an initialized one to use; by default its own. Raises BagError.
-    """
-    with _node(context) as node, Bag(path, strict=strict) as bag, Keyboard() as keyboard:
-        player = Player(node, bag, config or PlayConfig(), keyboard, clock, topics)
-        try:
-            player.wait_for_subscribers(wait_for)
-            player.play(loop)
-        except RuntimeError:  # rclpy's, of publishing while ROS is shut down
-            if node.context.ok():
-                raise
-        return player.played
-
-
-@contextmanager
-def _node(context: Context | None) -> Iterator[Node]:
-    """A node of the context, or of one of its own that ends with it."""
-    own = context is None
-    context = context or Context()
-    if own:
-        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.ALL)
-    node = Node('bag_player', context=context, start_parameter_services=False)
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        if own:
-            rclpy.try_shutdown(context=context)
-
-
-class Player:
-    """Publishes the messages of an open bag from a node, at the pace they were received."""
-
-    def __init__(
-        self,
-        node: Node,
-        bag: Bag,
-        config: PlayConfig,
-        keyboard: Keyboard,
-        clock: bool = False,
-        topics: Collection[str] = (),
-    ) -> None:
-        self._node, self._bag, self._config, self._keyboard = node, bag, config, keyboard
-        self.played = Played()
-        self._publishers: dict[str, Publisher] = {}
-        for topic in self._chosen(topics):
-            self._advertise(topic)
-        if not self._publishers:
-            reasons = '; '.join(f'{t}: {why}' for t, why in self.played.skipped.items())
-            raise BagError(f'{bag.path}: no topic can be played ({reasons or "it has none"})')
-        self._ticker = Ticker(node, config.clock_rate) if clock else None
-        self._start_ns = bag.recording.start_ns + int(config.start_offset * 1e9)
-        self.pace = Pace(self._start_ns, config.rate)
-        self._convert = Ros1Converter()
-
-    def _chosen(self, names: Collection[str]) -> list[Topic]:
-        topics = self._bag.topics
-        for name in names:
-            if name not in topics:
-                known = ', '.join(sorted(topics))
-                raise BagError(f'{self._bag.path}: has no topic {name}; --topics can be: {known}')
-        return [topics[name] for name in names or topics]
-
-    def _advertise(self, topic: Topic) -> None:
-        """Create the topic's publisher, or note why it is left out."""
-        kind = message_class(topic.kind)
-        if topic.serialization not in ('cdr', 'ros1'):
-            self._leave_out(topic, f'is serialized as {topic.serialization!r}')
-        elif kind is None:
-            self._leave_out(topic, f'type {topic.kind or "unknown"} is not installed')
-        else:
-            try:
-                publisher = self._node.create_publisher(kind, topic.name, qos_profile(topic.qos))
-                self._publishers[topic.name] = publisher
-            except InvalidTopicNameException:
-                self._leave_out(topic, 'is no valid topic name')
-
-    def _leave_out(self, topic: Topic, reason: str) -> None:
-        self.played.skipped[topic.name] = reason
-        self._node.get_logger().warning(f'not played: {topic.name}: {reason}')
-
-    def wait_for_subscribers(self, topics: Collection[str] = ()) -> bool:
-        """Wait until the topics have subscribers; False if they do not come in time.
-
-        None named: until images and odometry have some, and no more come.
-        """
-        needed = self._needed(topics)
-        deadline, settled = Pace(0, 1.0), Pace(0, 1.0)
-        last = 0
-        while deadline.time_ns < self._config.wait * 1e9 and self._alive():
-            count = sum(p.get_subscription_count() for p in self._publishers.values())
-            met = all(any(p.get_subscription_count() for p in group) for group in needed.values())
-            if topics and met:
-                return True
-            if count != last:
-                last = count
-                settled.jump(0)
-            if not topics and met and count and settled.time_ns > SETTLED_S * 1e9:
-                return True
-            self._keyboard.read(PATIENCE_S)
-        missing = [name for name, group in needed.items()
-                   if not any(p.get_subscription_count() for p in group)]  # fmt: skip
-        if missing and self._alive() and self._config.wait:
-            self._node.get_logger().warning(
-                f'nobody listens to {" and ".join(missing)} after {self._config.wait:g} s: '
-                'playing all the same (--wait sets the time)'
-            )
-        return False
-
-    def _needed(self, topics: Collection[str]) -> dict[str, list[Publisher]]:
-        """Publishers of which one needs a subscriber, by what they are called."""
-        if topics:
-            return {name: [self._publishers[name]] for name in topics if name in self._publishers}
-        kinds = {'images': (IMAGE, COMPRESSED), 'odometry': (ODOMETRY,)}
-        known = self._bag.topics
-        found = {
-            what: [made for name, made in self._publishers.items() if known[name].kind in kind]
-            for what, kind in kinds.items()
-        }
-        return {what: group for what, group in found.items() if group}
-
-    def play(self, loop: bool = False) -> Played:
-        """Publish everything; again and again with `loop`. Ends early when ROS shuts down."""
-        if self._keyboard.attached:
-            self._node.get_logger().info('space: pause, right arrow or s: one message, '
-                                         'up and down: faster and slower')  # fmt: skip
-        while True:
-            self.pace.jump(self._start_ns)
-            if not self._play_once():
-                return self.played
-            if not loop:
-                self._await_acknowledgement()
-                self._report()
-                return self.played
-
-    def _play_once(self) -> bool:
-        """Publish the bag from its start; False when ROS was shut down."""
-        any_played = False
-        for channel, receive_ns, data in self._records():
-            if not self._wait_until(receive_ns):
-                return False
-            if channel.serialization == 'ros1':
-                data = self._convert(data, channel.kind)
-            self._publishers[channel.topic].publish(bytes(data))
-            self.played.messages[channel.topic] += 1
-            any_played = True
-        if not any_played:
-            raise BagError(f'{self._bag.path}: nothing to play after {self._config.start_offset} s')
-        return True
-
-    def _records(self) -> Iterator[Record]:
-        return self._bag.messages(self._publishers, self._start_ns)
-
-    def _wait_until(self, stamp_ns: int) -> bool:
-        """Wait for a message's turn, minding keys and /clock; False when ROS was shut down."""
-        checked = False
-        while self._alive():
-            if self._ticker is not None:
-                self._ticker.tick(self.pace.time_ns)
-            delay = self.pace.delay(stamp_ns)
-            if delay <= 0 and checked:
-                return True
-            checked = True
-            if self._obey(self._keyboard.read(min(max(delay, 0.0), self._patience())), stamp_ns):
-                return True
-        return False
-
-    def _patience(self) -> float:
-        return min(PATIENCE_S, self._ticker.period if self._ticker else PATIENCE_S)
-
-    def _obey(self, key: str, stamp_ns: int) -> bool:
-        """Do what a key asks; True when it asks for the next message now."""
-        if key == PAUSE:
-            self.pace.toggle_pause()
-        elif key == FASTER:
-            self.pace.scale(RATE_STEP)
-        elif key == SLOWER:
-            self.pace.scale(1 / RATE_STEP)
-        elif key == STEP and self.pace.paused:
-            self.pace.jump(stamp_ns)
-            return True
-        return False
-
-    def _alive(self) -> bool:
-        return bool(self._node.context.ok())
-
-    def _report(self) -> None:
-        """Warn of what is damaged in the bag, and of messages that should have been there."""
-        problems = list(self._bag.problems)
-        for name in self._publishers if self._config.start_offset == 0 else ():
-            played, expected = self.played.messages[name], self._bag.topics[name].count
-            if played < expected:
-                problems.append(f'{name}: {played} of {expected} messages could be read')
-        for problem in problems:
-            self._node.get_logger().warning(f'{self._bag.path}: {problem}')
-
-    def _await_acknowledgement(self) -> None:
-        """Let reliable subscribers receive what is still on its way."""
-        for publisher in self._publishers.values():
-            if self._alive():
-                publisher.wait_for_all_acked(Duration(seconds=1))
-
-
-class Ticker:
-    """Publishes the bag's time on /clock, at most `rate` times per second of steady time."""
-
-    def __init__(self, node: Node, rate: float) -> None:
-        self.period = 1 / rate
-        self._publisher = node.create_publisher(Clock, '/clock', DEPTH)
-        self._next = Pace(0, 1.0)
-
-    def tick(self, time_ns: int) -> None:
-        """Publish when it is time to."""
-        if self._next.delay(0) > 0:
-            return
-        seconds, nanoseconds = divmod(time_ns, 10**9)
-        self._publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
-        self._next.jump(-int(self.period * 1e9))
-
-
-class Ros1Converter:
-    """Messages of ROS 1 as the bytes of their ROS 2 counterparts."""
-
-    def __init__(self) -> None:
-        self._ros1, self._ros2 = typestore(Stores.ROS1_NOETIC), typestore(Stores.ROS2_JAZZY)
-        self._cache: dict[str, object] = {}
-
-    def __call__(self, data: bytes, kind: str) -> bytes:
-        """Convert one message of a standard type. Raises BagError for a damaged one."""
-        try:
-            return bytes(
-                migrate_bytes(
-                    self._ros1,
-                    self._ros2,
-                    kind,
-                    kind,
-                    self._cache,
-                    data,
-                    src_is2=False,
-                    dst_is2=True,
-                )
-            )
-        except Exception as error:  # a parser of foreign bytes fails in many ways
-            raise BagError(f'a {kind} of ROS 1 cannot be converted ({error})') from None
-
-
-def message_class(kind: str) -> Callable[..., Any] | None:
-    """The Python class of a message type, or None where it is not installed."""
-    package, _, name = kind.partition('/msg/')
-    if not (package.isidentifier() and name.isidentifier()):
-        return None
-    try:
-        return getattr(importlib.import_module(f'{package}.msg'), name, None)
-    except ImportError:
-        return None
-
-
-def qos_profile(offered: Collection[Qos]) -> QoSProfile:
-    """QoS to publish with: that of the recorded publishers, made to suit every subscriber they had.
-
-    Reliable satisfies subscribers of best effort too, and transient local those of volatile: where
-    the recorded publishers differed, or told nothing, the stronger is offered.
-    """
-    first = next(iter(offered), None)
-    latched = bool(offered) and all(q.durability == QosDurability.TRANSIENT_LOCAL for q in offered)
-    weak = bool(offered) and all(q.reliability == QosReliability.BEST_EFFORT for q in offered)
-    depth = max([q.depth for q in offered if q.depth < FOREVER_S], default=0)
-    profile = QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=max(depth, LATCHED_DEPTH if latched else DEPTH),
-        reliability=ReliabilityPolicy.BEST_EFFORT if weak else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add bag, topics and pace."""
+    parser.add_argument('bag', type=Path, metavar='BAG', help='bag: a folder or a single file')
+    parser.add_argument('--loop', action='store_true', help='start again at the end')
+    parser.add_argument(
+        '--clock', action='store_true', help='publish the time of the bag on /clock'
     )
-    if first is not None and len(set(offered)) == 1:
-        _copy_times(first, profile)
-    return profile
+    parser.add_argument('--topics', nargs='+', default=(), metavar='T', help='only these topics')
+    parser.add_argument(
+        '--wait-for',
+        nargs='+',
+        default=(),
+        metavar='T',
+        help='topics that need a subscriber first; none: one of images and one of odometry',
+    )
+    parser.add_argument('--strict', action='store_true', help='reject a damaged bag')
+    add_settings(parser, PlayConfig)
 
 
-def _copy_times(offered: Qos, profile: QoSProfile) -> None:
-    """Take over deadline, lifespan and liveliness where they are finite."""
-    for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
-        duration: QosTime = getattr(offered, name)
-        if 0 < duration.sec * 10**9 + duration.nsec < FOREVER_S * 10**9:
-            setattr(profile, name, Duration(seconds=duration.sec, nanoseconds=duration.nsec))
-    if offered.liveliness == QosLiveliness.MANUAL_BY_TOPIC:
-        profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+def run(arguments: argparse.Namespace) -> int:
+    """Replay; print the number of messages by topic."""
+    from sfa_localization.commands.bag_player import play
+
+    played = play(
+        arguments.bag,
+        config=settings(PlayConfig, arguments),
+        loop=arguments.loop,
+        clock=arguments.clock,
+        topics=arguments.topics,
+        wait_for=arguments.wait_for,
+        strict=arguments.strict,
+    )
+    for topic, count in sorted(played.messages.items()):
+        print(f'{topic}: {count} messages')
+    return 0

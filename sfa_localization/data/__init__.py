@@ -1,3 +1,3 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain data that all rooms share: drives, poses, errors, files, settings. Numpy only."""
+"""Data types that all rooms share: drives, poses, errors, files, settings. Numpy only."""

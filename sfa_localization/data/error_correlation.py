@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the errors of neighbouring pictures hang together, learnt where a map was learnt.
+"""Correlation of the position errors of neighboring images, learned together with the map.
 
-Pictures of one place err alike, because the map is wrong there; a filter that took each for new
-evidence would be far too sure of itself. The trainer sees it in what it left out.
+Images of one place have similar errors, because the map is wrong there; a filter that took each of
+them as independent would be overconfident. The trainer estimates it from held-out images.
 """
 
 from __future__ import annotations
@@ -18,20 +18,26 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 
 LARGEST_SHARE = 0.95
+"""Below 1, so that every image remains some evidence."""
 _FARTHEST_M = 8.0
+"""Pairs farther apart (m) do not change the fit: their errors hardly correlate."""
 _DISTANCES_M = np.geomspace(0.1, 20.0, 81)
+"""Correlation distances that are tried (m)."""
 _BINS_M = np.geomspace(0.02, _FARTHEST_M, 25)
+"""Edges of the bins of the distance between two images (m)."""
 _ENOUGH_PAIRS = 200
+"""With fewer pairs the estimate scatters more than the default is wrong."""
 _OUTLYING = 3.0
+"""Errors are limited to this many typical ones."""
 _MEDIAN_OF_RAYLEIGH = 1.1774
+"""Median length of a planar vector with unit variance per axis: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorCorrelation:
-    """Errors of pictures d m of way apart correlate by share * exp(-d / distance_m).
+    """Errors of images d m apart along the path correlate by share * exp(-d / distance_m).
 
-    The defaults are what is reckoned with where nothing is known. Raises DataError for numbers
-    that cannot be.
+    The defaults are assumed where nothing was learned. Raises DataError for impossible numbers.
     """
 
     share: float = 0.7
@@ -40,21 +46,20 @@ class ErrorCorrelation:
     def __post_init__(self) -> None:
         if not (0.0 <= self.share < 1.0 and 0.0 < self.distance_m < math.inf):
             raise DataError(
-                f'errors of pictures cannot have a share of {self.share} in common over '
-                f'{self.distance_m} m'
+                f'a correlation of {self.share} over {self.distance_m} m is impossible: share must '
+                f'be in [0, 1), distance_m positive and finite'
             )
 
     @classmethod
     def fit(
         cls, errors: Array, variances: Array, way_m: Array, owner: NDArray[np.int64]
     ) -> ErrorCorrelation:
-        """From errors (M, 2) m of pictures with the variances (M,) m^2 per axis claimed for them.
+        """From errors (M, 2) m of images with predicted variances (M,) m^2 per axis.
 
-        `way_m` (M,) is what had been driven, `owner` (M,) the stretch that a picture belongs to;
-        pictures are compared inside one stretch. Outliers count as moderate errors. The defaults
-        where there are too few pictures to say.
+        `way_m` (M,) is the distance driven before, `owner` (M,) the segment of each image; images
+        are compared inside one segment. Outliers are limited. With too few images the defaults.
         """
-        apart, product = _pairs(_standardised(errors, variances), way_m, owner)
+        apart, product = _pairs(_standardized(errors, variances), way_m, owner)
         if len(apart) < _ENOUGH_PAIRS:
             return cls()
         at = np.digitize(apart, _BINS_M)
@@ -65,8 +70,8 @@ class ErrorCorrelation:
         return cls(*_exponential(distance, correlation, count[filled].astype(float)))
 
 
-def _standardised(errors: Array, variances: Array) -> Array:
-    """Errors (M, 2) over what was claimed, cut at three typical ones, of unit mean square."""
+def _standardized(errors: Array, variances: Array) -> Array:
+    """Errors (M, 2) over their standard deviations, outliers limited, scaled to unit variance."""
     ratio = errors / np.sqrt(variances)[:, None]
     size = np.hypot(*ratio.T)
     limit = _OUTLYING * float(np.median(size)) / _MEDIAN_OF_RAYLEIGH
@@ -75,7 +80,7 @@ def _standardised(errors: Array, variances: Array) -> Array:
 
 
 def _pairs(ratio: Array, way_m: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Distance of all pairs inside a stretch and inside _FARTHEST_M, and the mean product."""
+    """Distance and mean product of all pairs inside a segment and nearer than _FARTHEST_M."""
     apart, product = [np.zeros(0)], [np.zeros(0)]
     for lag in range(1, len(ratio)):
         distance = way_m[lag:] - way_m[:-lag]
@@ -89,12 +94,12 @@ def _pairs(ratio: Array, way_m: Array, owner: NDArray[np.int64]) -> tuple[Array,
 
 def _exponential(distance: Array, correlation: Array, weight: Array) -> tuple[float, float]:
     """Share and distance of the exponential nearest to a correlation (B,), by least squares."""
-    best, found = math.inf, (0.0, 1.0)
+    least, best = math.inf, (0.0, 1.0)
     for length in _DISTANCES_M:
         shape = np.exp(-distance / length)
         share = float((weight * correlation) @ shape / ((weight * shape) @ shape))
         share = min(max(share, 0.0), LARGEST_SHARE)
-        miss = float(weight @ (correlation - share * shape) ** 2)
-        if miss < best - 1e-12:
-            best, found = miss, (share, float(length))
-    return found
+        residual = float(weight @ (correlation - share * shape) ** 2)
+        if residual < least - 1e-12:
+            least, best = residual, (share, float(length))
+    return best

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The errors a user can cause and remedy; the command line shows each as one line, exit 1."""
+"""Errors that a user can cause and remedy; the command line shows each as one line, exit 1."""
 
 
 class LocalizationError(Exception):
@@ -12,24 +12,24 @@ class ConfigError(LocalizationError):
 
 
 class BagError(LocalizationError):
-    """A bag cannot be read, or lacks what is asked of it."""
+    """A bag cannot be read, or lacks required messages."""
 
 
 class ModelError(LocalizationError):
-    """A model file is missing, damaged, of another version, or does not fit the pictures."""
+    """A model file is missing, damaged, of another version, or does not fit the images."""
 
 
 class DataError(LocalizationError):
-    """The recorded data cannot answer the question put to it (too little, degenerate)."""
+    """The recorded data is insufficient (too little, degenerate, not overlapping)."""
 
 
 class CameraError(LocalizationError):
-    """A camera model or picture is unusable."""
+    """A camera model or image is unusable."""
 
 
 class MessageError(LocalizationError):
-    """A message cannot be used; the text is the reason it is counted under."""
+    """A message cannot be used; it is counted under the text of this error."""
 
 
 class NodeError(LocalizationError):
-    """A node process ended, or stays silent."""
+    """A node process ended, or publishes nothing."""

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded streams in the one order in which a filter gets them."""
+"""Odometry and images merged in the order in which a filter receives them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 
 from sfa_localization.data.run import Stamps
 
-ODOMETRY, PICTURE = range(2)
+ODOMETRY, IMAGE = range(2)
 
 
-def in_order(odometry_ns: Stamps, pictures_ns: Stamps) -> Iterator[tuple[int, int, int]]:
-    """Stamp, ODOMETRY or PICTURE, and index in its own stream, by stamp (N,) and (M,).
+def merge_by_stamp(odometry_ns: Stamps, images_ns: Stamps) -> Iterator[tuple[int, int, int]]:
+    """Stamp, ODOMETRY or IMAGE, and index in its own stream, for stamps (N,) and (M,).
 
-    At equal stamps odometry comes first, and a stream keeps its order.
+    At equal stamps odometry comes first, and each stream keeps its order.
     """
-    stamps = np.concatenate([odometry_ns, pictures_ns]).astype(np.int64)
+    stamps = np.concatenate([odometry_ns, images_ns]).astype(np.int64)
     for position in np.argsort(stamps, kind='stable').tolist():
-        kind = ODOMETRY if position < len(odometry_ns) else PICTURE
+        kind = ODOMETRY if position < len(odometry_ns) else IMAGE
         yield int(stamps[position]), kind, position - kind * len(odometry_ns)

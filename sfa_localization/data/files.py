@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are there whole or not at all."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from sfa_localization.data.errors import LocalizationError
 
 
 @contextmanager
-def whole_file(
+def atomic_write(
     path: Path, error: type[LocalizationError] = LocalizationError, *, make_folder: bool = False
 ) -> Iterator[IO[bytes]]:
-    """Write to a temporary name that becomes `path` in the end, or vanishes after any error.
+    """Write to a temporary file that becomes `path` at the end, or is removed after any error.
 
-    `make_folder` makes missing folders first. Raises `error`, naming the path.
+    `make_folder` creates missing folders first. Raises `error`, naming the path.
     """
     temporary = None
     try:

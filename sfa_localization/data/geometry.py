@@ -24,7 +24,7 @@ def wrap_angle(angle_rad: Array | float) -> Array:
 
 
 def rotation(yaw_rad: float) -> Array:
-    """Rotation matrix (2, 2) of a counter-clockwise turn."""
+    """Rotation matrix (2, 2) of a counter-clockwise rotation."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[c, -s], [s, c]])
 
@@ -61,7 +61,7 @@ class RigidTransform:
     yaw_rad: float
 
     def apply(self, points: Array) -> Array:
-        """Transform points (N, 2) in metres."""
+        """Transform points (N, 2) in meters."""
         return np.asarray(points @ rotation(self.yaw_rad).T + [self.x_m, self.y_m])
 
     def apply_yaw(self, yaw_rad: Array) -> Array:
@@ -70,7 +70,7 @@ class RigidTransform:
 
 
 def align(source: Array, target: Array) -> RigidTransform:
-    """Least-squares rotation and translation (no scale, no mirror) from source to target.
+    """Least-squares rotation and translation (no scale, no reflection) from source to target.
 
     Both (N, 2), N >= 2. Raises DataError for fewer points or mismatched shapes.
     """
@@ -88,10 +88,10 @@ def _complex(points: Array) -> Complex:
 def align_complex(
     source: Complex, target: Complex, weights: Array | None = None
 ) -> tuple[complex, complex]:
-    """Least-squares unit turn and shift, turn * source + shift = target, of points x + iy (N,).
+    """Least-squares unit rotation and shift, turn * source + shift = target, of points x + iy (N,).
 
-    `weights` (N,) of the squared distances, all equal by default. Points that show no direction
-    are not turned.
+    `weights` (N,) of the squared distances, all equal by default. Points without extent are
+    not turned.
     """
     a, b = np.average(source, weights=weights), np.average(target, weights=weights)
     products = np.conj(source - a) * (target - b)

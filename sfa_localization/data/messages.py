@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the fields of ROS messages mean, the same for messages of bags and of topics.
+"""Fields of ROS messages as numbers, the same for messages of bags and of topics.
 
-Takes any object with the fields of the message, and knows neither ROS nor bags. Stamps are integer
-nanoseconds, poses (x m, y m, yaw rad). A message that cannot be used raises MessageError with the
-reason, in short words that can be counted.
+Takes any object with the fields of the message, and depends on neither ROS nor rosbags. Stamps are
+integer nanoseconds, poses (x m, y m, yaw rad). A message that cannot be used raises MessageError
+with a short reason that can be counted.
 """
 
 from __future__ import annotations
@@ -17,8 +17,11 @@ from sfa_localization.data.errors import MessageError
 NANOSECONDS = 1_000_000_000
 NO_STAMP = 'zero or negative stamp'
 _LARGEST = 1e9
+"""No robot reaches this number of m, rad, m/s or rad/s: such a field was never set."""
 _LARGEST_VARIANCE = 1e6
+"""Drivers mark an unknown variance by numbers as large as this (SI units)."""
 _SHORTEST_QUATERNION = 1e-3
+"""A shorter quaternion has no direction; normalized ones have length 1."""
 
 
 def read_stamp(stamp: Any) -> int:
@@ -32,7 +35,7 @@ def read_stamp(stamp: Any) -> int:
 
 
 def read_yaw(q: Any) -> float:
-    """Heading of a Quaternion, of any length but (nearly) none: its direction is what counts."""
+    """Heading of a Quaternion of any length above _SHORTEST_QUATERNION."""
     norm = math.hypot(q.x, q.y, q.z, q.w)
     require_sane('quaternion', norm)
     if norm < _SHORTEST_QUATERNION:
@@ -49,7 +52,7 @@ def read_planar(position: Any, orientation: Any) -> tuple[float, float, float]:
 
 
 def read_twist(message: Any) -> tuple[float, float, float, float]:
-    """Of an Odometry: v m/s, omega rad/s, and their variances, 0 where unknown."""
+    """v m/s and omega rad/s of an Odometry, and their variances, 0 where unknown."""
     twist, covariance = message.twist.twist, message.twist.covariance
     v, omega = float(twist.linear.x), float(twist.angular.z)
     require_sane('twist', v, omega)
@@ -57,7 +60,7 @@ def read_twist(message: Any) -> tuple[float, float, float, float]:
 
 
 def read_yaw_rate(message: Any) -> tuple[float, float]:
-    """Of an Imu: omega rad/s about its z axis, and its variance, 0 where unknown."""
+    """omega rad/s of an Imu about its z axis, and its variance, 0 where unknown."""
     if message.angular_velocity_covariance[0] == -1.0:
         raise MessageError('the message marks its yaw rate as unknown')
     omega = float(message.angular_velocity.z)
@@ -66,7 +69,7 @@ def read_yaw_rate(message: Any) -> tuple[float, float]:
 
 
 def require_sane(name: str, *numbers: float) -> None:
-    """Raise MessageError for numbers that are not finite, or that no robot reaches."""
+    """Raise MessageError for numbers that are not finite, or larger than _LARGEST."""
     if not all(map(math.isfinite, numbers)):
         raise MessageError(f'{name} is not finite')
     if any(abs(number) > _LARGEST for number in numbers):
@@ -74,5 +77,5 @@ def require_sane(name: str, *numbers: float) -> None:
 
 
 def _variance(value: float) -> float:
-    """A variance, or 0 (unknown) where the message holds something that is none."""
+    """A variance, or 0 (unknown) where the message holds an impossible one."""
     return float(value) if math.isfinite(value) and 0 < value < _LARGEST_VARIANCE else 0.0

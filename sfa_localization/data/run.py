@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain data that every driver shares: what one drive recorded. Time is integer nanoseconds."""
+"""Data of one recorded drive, shared by all rooms. Time is integer nanoseconds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sfa_localization.data.geometry import Array, compose, relative, wrap_angle
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
 BATCH = 16
-"""Pictures that are read and looked at together."""
+"""Images that are read and processed together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Trajectory:
     def covers(self, stamps_ns: Stamps, tolerance_ns: int = 0) -> NDArray[np.bool_]:
         """Mask (M,) of the stamps between the first and the last pose, and in no gap.
 
-        A stamp is covered when both neighbouring poses lie within `tolerance_ns` (0: any gap).
+        A stamp is covered when both neighboring poses lie within `tolerance_ns` (0: any gap).
         """
         if len(self) == 0:
             return np.zeros(len(stamps_ns), bool)
@@ -48,7 +48,7 @@ class Trajectory:
         return np.asarray(inside & close)
 
     def at(self, stamps_ns: Stamps) -> Array:
-        """Poses (M, 3) interpolated along constant twist between neighbours; clamped outside."""
+        """Poses (M, 3) interpolated along constant twist between neighbors; clamped outside."""
         if len(self) == 1:
             return np.repeat(self.poses, len(stamps_ns), axis=0)
         i = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, 'right') - 1, 0, len(self) - 2)
@@ -58,10 +58,10 @@ class Trajectory:
 
 
 def _along(start: Array, end: Array, t: Array) -> Array:
-    """Poses a fraction t (M,) of the way along the arc from start to end, both (M, 3)."""
+    """Poses at a fraction t (M,) of the arc from start to end, both (M, 3)."""
     step = relative(start, end)
     half = step[:, 2] / 2
-    # An arc's chord lies at half its turn; a shorter part of the arc has a shorter chord.
+    # The chord of an arc points along half its turn; a part of the arc has a shorter chord.
     chord = np.hypot(step[:, 0], step[:, 1]) * np.sinc(t * half / np.pi) / np.sinc(half / np.pi)
     bearing = np.arctan2(step[:, 1], step[:, 0]) - half + t * half
     part = np.stack([t * chord * np.cos(bearing), t * chord * np.sin(bearing), t * step[:, 2]], -1)
@@ -75,9 +75,9 @@ class Odometry:
     `stamps_ns` (N,), `poses` (N, 3), `twists` (N, 2) as v m/s, omega rad/s; `variances` (N, 2) of
     v and omega as in the messages, 0 where unknown. The odometry frame may start anywhere.
 
-    Everywhere in this package a twist is the mean over the time since the message before: what
-    drivers of wheel encoders publish, whose pose has moved by just this twist. The first message's
-    twist moves nothing.
+    Everywhere in this package a twist is the mean over the time since the previous message, as
+    drivers of wheel encoders publish it: the pose has moved by this twist. The first twist is not
+    used.
     """
 
     stamps_ns: Stamps
@@ -101,7 +101,7 @@ class YawRate:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """What became of a stream's messages: how many were used, and why others were not."""
+    """Messages of a stream: the number used, and the numbers skipped by reason."""
 
     used: int = 0
     skipped: dict[str, int] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class Count:
 
 
 class Panoramas(Protocol):
-    """The pictures of a run, streamed: never all in memory at once."""
+    """The images of a run, streamed: never all in memory at once."""
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -147,7 +147,7 @@ class PanoramaArray:
     def read(self, start: int, stop: int) -> Image:
         if not isinstance(self.images, np.memmap) or self.images.filename is None:
             return np.asarray(self.images[start:stop])
-        # Read, not mapped: pages of a map would count as memory that grows with the bag.
+        # Read, not mapped: mapped pages would count as memory that grows with the bag.
         stop = min(stop, len(self))
         size = int(np.prod(self.shape))
         offset = self.images.offset + start * size
@@ -161,9 +161,9 @@ class PanoramaArray:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One drive: pictures, odometry, and, for evaluation only, the truth.
+    """One drive: images, odometry, and, for evaluation only, the ground truth.
 
-    `counts` tells per stream ('images', 'odometry', ...) what was used and skipped.
+    `counts` holds the used and skipped messages per stream ('images', 'odometry', ...).
     """
 
     name: str
@@ -175,7 +175,7 @@ class Run:
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:
-    """Dead reckoning: poses (N, 3) from twists (N, 2), each held since the stamp before."""
+    """Dead reckoning: poses (N, 3) from twists (N, 2), each constant since the previous stamp."""
     poses = np.zeros((len(stamps_ns), 3))
     poses[0] = 0.0 if start is None else start
     dt = np.diff(stamps_ns) * 1e-9
@@ -190,7 +190,7 @@ def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> A
 
 
 def differences(stamps_ns: Stamps, poses: Array) -> Array:
-    """Twists (N, 2) that lead to each pose (N, 3) from the one before; the first is repeated."""
+    """Twists (N, 2) that lead to each pose (N, 3) from the previous; the first is repeated."""
     if len(poses) < 2:
         return np.zeros((len(poses), 2))
     step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps_ns) * 1e-9

@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Base of all settings: typed, described, ranged, and with their only default.
+"""Base of all settings: typed, with a description, a range and the only default.
 
-Each room has a module `settings` of its own; nodes declare their ROS parameters from its classes,
+Each room has its own module `settings`; nodes declare their ROS parameters from its classes,
 and `sfa_localization.config` reads and writes the parameter file from them.
 """
 
@@ -42,7 +42,7 @@ def setting(
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Base of the parameter groups: immutable and checked when made."""
+    """Base of the parameter groups: immutable, and checked when constructed."""
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
@@ -51,7 +51,7 @@ class Settings:
 
     @classmethod
     def from_mapping(cls: type[S], mapping: Mapping[str, Any], where: str) -> S:
-        """Build from plain names and values; `where` names their origin in errors.
+        """Build from names and values; `where` is their origin in errors.
 
         Raises ConfigError for an unknown name, a wrong type or a value out of range.
         """
@@ -69,13 +69,13 @@ class Settings:
 
 
 def nearest(name: str, known: Collection[str]) -> str:
-    """The end of a message about an unknown name: which known one may be meant; '' if none."""
+    """The end of a message about an unknown name: the most similar known one, or ''."""
     close = difflib.get_close_matches(name, sorted(known), n=1)
     return f'; did you mean {close[0]!r}?' if close else ''
 
 
 def _checked(group: str, item: dataclasses.Field[Any], value: Any) -> Any:
-    """Return the value in the default's type, or raise ConfigError."""
+    """Return the value in the type of the default, or raise ConfigError."""
     where = f'{group}.{item.name}'
     value = _converted(where, item.default, value)
     numbers = value if isinstance(value, tuple) else (value,)
@@ -85,7 +85,7 @@ def _checked(group: str, item: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def _converted(where: str, default: Any, value: Any) -> Any:
-    """Accept an int where a float is expected, a list where a tuple is, and nothing else."""
+    """Accept an int for a float and a list for a tuple; otherwise require the same type."""
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
         kind = default[0] if default else 0.0
         return tuple(_converted(where, kind, entry) for entry in value)

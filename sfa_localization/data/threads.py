@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How many cores matrix products may take: one, where the products are small.
+"""Limits linear algebra to one core where the matrices are small.
 
-Several threads gain nothing there, and on a busy robot they wait for each other many times over.
+Several threads gain nothing there, and on a busy robot they wait for each other.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 def one_core() -> AbstractContextManager[object]:
     """Keep linear algebra on the calling core inside the block.
 
-    Does nothing where threadpoolctl is not installed: it makes things faster, never different.
+    Does nothing where threadpoolctl is not installed; the results are the same.
     """
     try:
         from threadpoolctl import threadpool_limits

@@ -1,11 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far the rotated views of one picture agree about the place, and what that says of its error.
+"""Disagreement of the rotated views of one image about the place, and the error it predicts.
 
-The top node sees part of the panorama, in every simulated rotation another part. Where all parts
-are as in training they agree; a near trunk, a person or a covered part of the lens makes some
-views differ. The disagreement is known at run time, needs no other picture, and scales the
-variances of position and heading, learnt from parts of the drive that were left out.
+The top node reads part of the panorama, in every simulated rotation another part. Where all parts
+look as in training the views agree; a near trunk, a person or a covered part of the lens makes
+some differ. The disagreement is available at run time, needs no other image, and scales the
+variances of position and heading, as learned from parts of the drive that were left out.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.features.rotation import Map
 
 _EXPONENTS = np.linspace(0.0, 6.0, 25)
+# Degrees of freedom of Student's t, for the few images with large errors.
 _HEAVY_TAIL = 4.0
+# Of the relative disagreement: beyond these the left-out images are too few to learn from.
 _LIMITS = (0.2, 30.0)
-# Shares of the left-out errors that must lie within the intervals of that probability.
+# Shares of the left-out errors that must lie within the regions of that probability.
 _HALF_AND_MOST = (0.5, 0.95)
 
 
 def disagreement(top: Map) -> Array:
-    """Mean deviation of the slow features over the views of top maps (T, rows, R, K): (T,)."""
+    """Mean standard deviation (T,) of the slow features over the views of top maps (T, ..., K)."""
     views = top.reshape(len(top), -1, top.shape[-1])
     return np.asarray(views.std(1, dtype=np.float64).mean(1))
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Train on many machines: the shards of a drive go over a Dask cluster, sums come back.
+"""Train on many machines: a Dask cluster computes the sums over the shards of a drive.
 
 Workers read the decoded panoramas from the file that `train` keeps beside its output, so they run
 on the same host or see that folder under the same path. They need this package installed. A shard
@@ -39,9 +39,9 @@ def executor_at(address: str | None) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[Executor]:
-    """An executor for hierarchy.train_network on the Dask scheduler at `address`.
+    """An executor for network_training.train_network on the Dask scheduler at `address`.
 
-    Raises ConfigError when Dask is not installed, nobody answers, or there is no worker.
+    Raises ConfigError without Dask, scheduler or worker.
     """
     distributed = _distributed()
     try:
@@ -71,7 +71,7 @@ def _compute(
     client: Any,
     work: Callable[[Shard], Sums],
     shards: Sequence[Shard],
-    on_shard: Callable[[int], None],
+    on_shard: Callable[[int], object],
 ) -> Sums:
     """Map the shards over the cluster and merge neighbors there until one is left."""
     shared = client.scatter(work, broadcast=True, hash=False)
@@ -101,7 +101,9 @@ def _result(future: Any) -> Sums:
             'workers share'
         ) from None
     except _distributed().KilledWorker as error:
-        raise DataError(f'workers die of this training ({error}): give them more memory') from None
+        raise DataError(
+            f'workers are killed by this training ({error}): give them more memory'
+        ) from None
     return sums
 
 
@@ -111,17 +113,17 @@ def _on_worker(work: Callable[[Shard], Sums], shard: Shard) -> Sums:
 
 
 def _pair(first: Sums, second: Sums) -> Sums:
-    """Both merged; the originals stay, for they may be needed again when a worker is lost."""
+    """Both merged; the originals stay, because they are needed again when a worker is lost."""
     merged = copy.deepcopy(first)
     merged.merge(second)
     return merged
 
 
 @dataclass(frozen=True, slots=True)
-class PanoramaFile:
-    """Panoramas in a file of plain bytes: `count` pictures of `shape`, from `offset` on.
+class RemotePanoramas:
+    """Panoramas in a file of plain bytes, images of `shape` from `offset` on.
 
-    Small enough to be sent to workers, who read the pictures themselves.
+    Small enough to be sent to workers, which read the images themselves.
     """
 
     stamps_ns: Stamps
@@ -147,11 +149,11 @@ class PanoramaFile:
 
 
 def _portable(shard: Shard) -> Shard:
-    """The shard with the name of its pictures' file in place of the pictures."""
-    panoramas = shard.drive.panoramas
+    """The shard with the name of its file in place of the images."""
+    panoramas = shard.sequence.panoramas
     if not isinstance(panoramas, PanoramaArray) or not isinstance(panoramas.images, np.memmap):
         raise DataError('a cluster needs panoramas in a file, not in memory')
     images = panoramas.images
     path = Path(str(images.filename)).absolute()
-    file = PanoramaFile(panoramas.stamps_ns, panoramas.shape, path, images.offset)
-    return replace(shard, drive=replace(shard.drive, panoramas=file))
+    file = RemotePanoramas(panoramas.stamps_ns, panoramas.shape, path, images.offset)
+    return replace(shard, sequence=replace(shard.sequence, panoramas=file))

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference engine: the same hierarchy from MDP's nodes, trained on really turned pictures.
+"""The reference engine: the same hierarchy from MDP's nodes, trained on really rotated images.
 
-It makes the paper's sequence, picture after picture at all rotations, and learns the same network
-as hierarchy.py, some hundred times slower. Its result is an ordinary Network.
+It makes the paper's sequence, image after image at all rotations (section 2.2), and learns the
+same network as network_training.py, some hundred times slower. Its result is an ordinary Network.
 """
 
 from __future__ import annotations
@@ -15,49 +15,53 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.errors import ConfigError, DataError
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.features.mdp_shim import import_mdp
-from sfa_localization.features.network import Architecture, Layer, Network, Node, prepare
-from sfa_localization.features.network_training import Drive, shards_of
+from sfa_localization.features.network import Architecture, Layer, Network, Node, input_map
+from sfa_localization.features.network_training import (
+    LIGHT_STD,
+    RELATIVE_CUT,
+    ImageSequence,
+    Shard,
+    require_pairs,
+    shards_of,
+)
 from sfa_localization.features.rotation import Field
-from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.features.sfa import Solution, signed, whitening
 
 
 def train_network(
     architecture: Architecture,
-    drives: Sequence[Drive],
-    config: NetworkConfig,
+    sequences: Sequence[ImageSequence],
+    seed: int = 0,
     *,
-    on_shard: Callable[[int], None] = lambda images: None,
+    light_std: float = LIGHT_STD,
+    relative_cut: float = RELATIVE_CUT,
+    on_shard: Callable[[int], object] = lambda images: None,
 ) -> Network:
-    """Train all layers, as hierarchy.train_network does.
+    """Train all layers, as network_training.train_network does.
 
-    `on_shard` is told how many pictures have been worked through since the last call.
-    Raises ConfigError without MDP or for differences per metre or second, which MDP does not know,
-    and DataError when the pictures vary too little.
+    `on_shard` receives the number of images worked through since the last call.
+    Raises ConfigError without MDP, and DataError when the images vary too little.
     """
-    return train_flow(architecture, drives, config, on_shard=on_shard)[1]
+    require_pairs(sequences)
+    shards = shards_of(sequences, seed, light_std)
+    return train_flow(architecture, shards, relative_cut, on_shard)[1]
 
 
 def train_flow(
     architecture: Architecture,
-    drives: Sequence[Drive],
-    config: NetworkConfig,
-    *,
-    on_shard: Callable[[int], None] = lambda images: None,
+    shards: Sequence[Shard],
+    relative_cut: float = RELATIVE_CUT,
+    on_shard: Callable[[int], object] = lambda images: None,
 ) -> tuple[Any, Network]:
-    """The trained mdp.Flow, from flat prepared maps (T, D) to flat top maps, and its network."""
-    if any(((drive.scale != 0) & (drive.scale != 1)).any() for drive in drives):
-        raise ConfigError('the engine mdp knows no differences but per picture: set difference')
-    if not any(len(drive.panoramas) > 1 for drive in drives):
-        raise DataError('training needs at least two consecutive panoramas')
+    """The trained mdp.Flow, from flat input maps (T, D) to flat top maps, and its network."""
     mdp = import_mdp()
-    flow = build_flow(mdp, architecture, config)
+    flow = build_flow(mdp, architecture, relative_cut)
     data = [
-        _Sequence(architecture, drives, config, on_shard) if node.is_trainable() else None
+        _RotatedSequence(architecture, shards, on_shard) if node.is_trainable() else None
         for node in flow
     ]
     try:
@@ -72,16 +76,16 @@ def train_flow(
 
 
 def _unwrapped(error: BaseException) -> DataError:
-    """What made MDP fail, out of the long report that it wraps around it."""
+    """The cause of MDP's failure, from inside the long report that it raises."""
     inner: BaseException | None = error
     while inner is not None:
         if isinstance(inner, DataError):
             return inner
         inner = inner.__context__
-    return DataError(f'MDP cannot learn from these pictures: {str(error).strip().splitlines()[-1]}')
+    return DataError(f'MDP cannot learn from these images: {str(error).strip().splitlines()[-1]}')
 
 
-def build_flow(mdp: Any, architecture: Architecture, config: NetworkConfig) -> Any:
+def build_flow(mdp: Any, architecture: Architecture, relative_cut: float) -> Any:
     """An untrained mdp.Flow: per layer a switchboard, linear SFA, expansion, SFA and limit."""
     nodes: list[Any] = []
     rows = architecture.map_rows
@@ -89,7 +93,7 @@ def build_flow(mdp: Any, architecture: Architecture, config: NetworkConfig) -> A
         receptive, channels = architecture.fields[depth], architecture.channels[depth]
         shape = (rows[depth], architecture.rotations, channels)
         wires = connections(shape, receptive)
-        nodes += _layer(mdp, layer, int(np.prod(shape)), wires, config.relative_cut)
+        nodes += _layer(mdp, layer, int(np.prod(shape)), wires, relative_cut)
     return mdp.Flow(nodes)
 
 
@@ -136,7 +140,7 @@ def _sfa_node(mdp: Any, inputs: int, outputs: int, relative_cut: float) -> Any:
         if white.shape[1] < outputs:
             raise DataError(
                 f'the signal has rank {white.shape[1]}, fewer than the {outputs} slow features '
-                'asked for: record more varied pictures or ask for fewer'
+                'asked for: record more varied images or ask for fewer'
             )
         delta, turn = mdp.utils.symeig(white.T @ difference @ white, range=(1, outputs))
         return delta, signed(white @ turn)
@@ -146,20 +150,19 @@ def _sfa_node(mdp: Any, inputs: int, outputs: int, relative_cut: float) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sequence:
-    """The training sequence, a picture at all rotations at a time, as MDP takes it.
+class _RotatedSequence:
+    """The training sequence, one image at all rotations at a time, as MDP takes it.
 
     Each part ends with the next one's first sample, which counts for the difference only.
     """
 
     architecture: Architecture
-    drives: Sequence[Drive]
-    config: NetworkConfig
-    on_shard: Callable[[int], None]
+    shards: Sequence[Shard]
+    on_shard: Callable[[int], object]
 
     def __iter__(self) -> Iterator[tuple[Array, bool]]:
         waiting: Array | None = None
-        for image, joined in self._pictures():
+        for image, joined in self._images():
             turned = self._turned(image)
             if waiting is not None:
                 yield (np.concatenate([waiting, turned[:1]]), False) if joined else (waiting, True)
@@ -169,18 +172,18 @@ class _Sequence:
             yield waiting, True
             self.on_shard(1)
 
-    def _pictures(self) -> Iterator[tuple[Image, bool]]:
-        """Every picture (H, W, C), and whether it continues the one before."""
-        for shard in shards_of(self.drives, self.config):
-            for images, scale in shard.batches():
-                yield from zip(images, (scale > 0).tolist(), strict=True)
+    def _images(self) -> Iterator[tuple[Image, bool]]:
+        """Every image (H, W, C), and whether it is a neighbor of the one before it."""
+        for shard in self.shards:
+            for images, joined in shard.batches():
+                yield from zip(images, joined.tolist(), strict=True)
 
     def _turned(self, image: Image) -> Array:
-        """Flat maps (R, D) of a picture at all rotations."""
+        """Flat maps (R, D) of an image at all rotations."""
         rotations = self.architecture.rotations
         step = image.shape[1] // rotations
         turned = np.stack([np.roll(image, -turn * step, axis=1) for turn in range(rotations)])
-        return prepare(turned, self.architecture).reshape(rotations, -1).astype(np.float64)
+        return input_map(turned, self.architecture).reshape(rotations, -1).astype(np.float64)
 
 
 def network_of(flow: Any, architecture: Architecture) -> Network:

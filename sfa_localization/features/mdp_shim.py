@@ -1,11 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Import MDP 3.6, the last release, where NumPy has moved on since.
+"""Import MDP 3.6, the last release, with later versions of NumPy.
 
 Repaired only during the import, and only where it fails without:
- - MDP reads numpy.typeDict, gone since NumPy 1.24: the same table of names is lent to it;
+ - MDP reads numpy.typeDict, gone since NumPy 1.24: the same table of names is provided meanwhile;
  - MDP asks inspect.getfullargspec how many arguments eigh takes, which raises since NumPy 1.25:
-   it is told few, and then uses its own wrapper of eigh.
+   the answer is then none, and MDP uses its own wrapper of eigh.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ def import_mdp() -> ModuleType:
         ) from None
     except (AttributeError, TypeError) as error:
         logger.info('MDP does not import on NumPy %s: %s', np.__version__, error)
-    _forget()
+    _unload()
     try:
-        with _lent_type_names(), _patient_argspec():
+        with _with_type_names(), _with_lenient_argspec():
             return importlib.import_module('mdp')
     except (AttributeError, TypeError, ImportError) as error:
-        _forget()
+        _unload()
         raise ConfigError(
             f'MDP does not work with NumPy {np.__version__} ({error}): use the engine rotation'
         ) from None
 
 
-def _forget() -> None:
-    """Drop the halves of MDP that a failed import left."""
+def _unload() -> None:
+    """Remove the modules of MDP that a failed import left behind."""
     for name in [name for name in sys.modules if name == 'mdp' or name.startswith('mdp.')]:
         del sys.modules[name]
 
 
 @contextmanager
-def _lent_type_names() -> Iterator[None]:
+def _with_type_names() -> Iterator[None]:
     """Provide numpy.typeDict, names of scalar types to the types, inside the block."""
     if 'typeDict' in vars(np):
         yield
@@ -81,7 +81,7 @@ def _known(name: str) -> bool:
 
 
 @contextmanager
-def _patient_argspec() -> Iterator[None]:
+def _with_lenient_argspec() -> Iterator[None]:
     """Let inspect.getfullargspec answer, inside the block, for functions that it cannot read."""
     ask = inspect.getfullargspec
 

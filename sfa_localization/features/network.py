@@ -47,10 +47,10 @@ class Layer:
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
-    """The whole network as data.
+    """Sizes of the network; the weights are in `Network`.
 
     `size` is (rows, columns) of the panorama; pixels are averaged in squares of `binning`.
-    `normalization` 'panorama' takes each channel's mean and scale out of each picture.
+    `normalization` 'panorama' removes the mean and scale of each channel of each image.
     """
 
     size: tuple[int, int]
@@ -82,7 +82,7 @@ class Architecture:
 
     @property
     def map_rows(self) -> list[int]:
-        """Rows of the binned picture and of every layer's map."""
+        """Rows of the binned image and of every layer's map."""
         rows = [self.size[0] // self.binning]
         for receptive in self.fields:
             rows.append(receptive.rows_out(rows[-1]))
@@ -102,9 +102,9 @@ class Architecture:
 
 def _check_binning(size: tuple[int, int], binning: int) -> None:
     if size[0] % binning or size[1] % binning:
-        fit = ' x '.join(str(round(n / binning) * binning) for n in reversed(size))
+        nearest = ' x '.join(str(round(n / binning) * binning) for n in reversed(size))
         raise ConfigError(
-            f'a panorama of {size[1]} x {size[0]} cannot be binned by {binning}: use {fit}'
+            f'a panorama of {size[1]} x {size[0]} cannot be binned by {binning}: use {nearest}'
         )
 
 
@@ -147,25 +147,41 @@ def _check_rows(depth: int, rows: int, layer: Layer) -> None:
         )
 
 
-# 600 x 60 colour panoramas, the paper's size; layers measured on path-traced gardens.
+# 600 x 60 color panoramas, the paper's size; layers found best on path-traced gardens.
 PAPER_LAYERS = (
     Layer(field=(10, 10), stride=(4, 5), linear=32, outputs=32),
     Layer(field=(3, 5), stride=(1, 1), linear=32, outputs=32),
     Layer(field=(4, 20), stride=(1, 1), linear=48, outputs=32),
 )
-# 320 x 40 pictures, the sizes published for this family of networks.
+# 320 x 40 images, the sizes published for this family of networks.
 SMALL_LAYERS = (
     Layer(field=(8, 10), stride=(4, 5), linear=32, outputs=32),
     Layer(field=(6, 14), stride=(3, 7), linear=32, outputs=32),
     Layer(field=(2, 9), stride=(1, 1), linear=32, outputs=32),
 )
 
-# Name -> (binning, layers).
-LAYERS = {
+STANDARD_LAYERS = {
     '600x60': (2, PAPER_LAYERS),
     '300x30': (1, PAPER_LAYERS),
     '320x40': (1, SMALL_LAYERS),
 }
+"""Size of the panorama -> (binning, layers)."""
+
+
+def standard_architecture(size: tuple[int, int], normalization: str) -> Architecture:
+    """The first standard network that fits panoramas of (rows, columns).
+
+    Raises ConfigError when none does, naming the sizes that would.
+    """
+    reasons = []
+    for binning, layers in STANDARD_LAYERS.values():
+        try:
+            return Architecture(size, binning, normalization, layers)
+        except ConfigError as error:
+            reasons.append(str(error))
+    raise ConfigError(
+        f'no standard network fits: {"; ".join(reasons)}; or train with an Architecture of your own'
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,10 +225,10 @@ def expand_into(z: Map, out: Map) -> None:
         at += n - i
 
 
-def prepare(images: Image, architecture: Architecture) -> Map:
+def input_map(images: Image, architecture: Architecture) -> Map:
     """Panoramas (T, H, W, C) uint8 -> binned, normalized map (T, rows, R, stride * C) float32.
 
-    Raises ModelError when the pictures have another size than the network's.
+    Raises ModelError when the images have another size than the network expects.
     """
     if images.ndim != 4 or images.shape[1:3] != architecture.size:
         height, width = architecture.size
@@ -232,7 +248,7 @@ def _binned(image: Image, binning: int) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def _plain(image: Image) -> Map:
+def _unnormalized(image: Image) -> Map:
     channels = image.shape[2]
     return _affine(image, np.full(channels, 1 / 128), np.full(channels, -1.0))
 
@@ -247,12 +263,12 @@ def _affine(image: Image, gain: Array, offset: Array) -> Map:
     return out.reshape(image.shape)
 
 
-def _grey(image: Image) -> Map:
-    return np.asarray(_plain(image) @ np.array([[0.114], [0.587], [0.299]], np.float32))
+def _gray(image: Image) -> Map:
+    return np.asarray(_unnormalized(image) @ np.array([[0.114], [0.587], [0.299]], np.float32))
 
 
 def _per_panorama(image: Image) -> Map:
-    """Zero mean and unit scale of each channel over the whole picture: blind to exposure."""
+    """Zero mean and unit scale of each channel over the whole image: independent of exposure."""
     mean, std = _moments(image)
     gain = 1 / np.maximum(std, 1.0)
     return _affine(image, gain, -mean * gain)
@@ -265,7 +281,7 @@ def _moments(image: Image) -> tuple[Array, Array]:
 
 
 def _brightness(image: Image) -> Map:
-    """Zero mean and unit scale of the whole picture, colours kept in proportion."""
+    """Zero mean and unit scale of the whole image; colors keep their proportion."""
     mean, std = _moments(image)
     variance = float((std**2 + mean**2).mean() - mean.mean() ** 2)
     gain = np.full(len(mean), 1 / max(np.sqrt(variance), 1.0))
@@ -273,7 +289,7 @@ def _brightness(image: Image) -> Map:
 
 
 def _log(image: Image) -> Map:
-    """Logarithm, zero mean of each channel over the whole picture: gains cancel."""
+    """Logarithm, zero mean of each channel over the whole image: gains cancel."""
     logs = _LOGS[image]
     return np.asarray(logs - logs.mean((0, 1), dtype=np.float32))
 
@@ -281,8 +297,8 @@ def _log(image: Image) -> Map:
 _LOGS = np.log(np.arange(256, dtype=np.float32) + 16)
 
 _NORMALIZATIONS = {
-    'none': _plain,
-    'grey': _grey,
+    'none': _unnormalized,
+    'grey': _gray,
     'panorama': _per_panorama,
     'brightness': _brightness,
     'log': _log,
@@ -326,7 +342,7 @@ class Network:
         receptive = self.architecture.fields[depth]
         count, rows, columns, _ = maps.shape
         out = np.empty((count, receptive.rows_out(rows), columns, layer.outputs), np.float32)
-        # One picture at a time: its signals stay in the processor's cache.
+        # One image at a time: its signals stay in the processor's cache.
         for below, above in zip(maps, out, strict=True):
             reduced = linear_stage(below, receptive, node.linear, node.linear_offset)
             slow_stage(reduced, node, layer.clip, above)
@@ -334,13 +350,9 @@ class Network:
 
     def maps(self, images: Image) -> list[Map]:
         """Every layer's output map (T, rows, R, outputs) for panoramas (T, H, W, C)."""
-        below = prepare(images, self.architecture)
+        below = input_map(images, self.architecture)
         made = []
         for depth in range(len(self.nodes)):
             below = self.layer(below, depth)
             made.append(below)
         return made
-
-    def slow_features(self, images: Image) -> Array:
-        """Slow features averaged over all rotations (T, K): the same whatever the heading."""
-        return np.asarray(self.maps(images)[-1].mean((1, 2), dtype=np.float64))

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Train the network layer by layer from streamed panoramas and mergeable statistics.
+"""Train the network layer by layer from streamed panoramas: section 2.2 of the paper.
 
 Each layer needs two passes: one for its linear SFA, one for the SFA of the expanded signals. A
 pass is a sum over shards of the drives, so it may run in this process or on a cluster; the sums
-are merged in the shards' order, so the result does not depend on who did the work.
+are merged in the order of the shards, so the result does not depend on where they ran.
 """
 
 from __future__ import annotations
@@ -19,97 +19,108 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.errors import ConfigError, DataError
-from sfa_localization.data.run import BATCH, Image, Panoramas
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.run import BATCH, Image, Panoramas, Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.network import (
-    LAYERS,
     Architecture,
-    Layer,
     Network,
     Node,
     expand_into,
     folded,
+    input_map,
     linear_stage,
-    prepare,
 )
 from sfa_localization.features.rotation import FieldStatistics, Map, SampleStatistics, Sums
-from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.features.sfa import Solution, Statistics, solve
 
-# Pictures of a shard; signals of a node multiplied at once, which fit a cache.
 SHARD = 64
+"""Images whose sums are computed by one task: enough for its products, few enough to balance."""
+BREAK_TIME_S = 5.0
+BREAK_DISTANCE_M = 2.0
+"""Consecutive images farther apart than either are no neighbors: the drive was interrupted."""
+LIGHT_STD = 0.3
+"""Standard deviation of the logarithmic gain of each training image: features must not code for
+exposure, which changes more between days than within one drive."""
+RELATIVE_CUT = 1e-3
+"""Signals of less variance than this part of the largest are dropped: they are mostly noise."""
+# Signals of a node that are multiplied at once, such that they fit a cache.
 _TOGETHER = 1440
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """The panoramas of one drive and the scale (N - 1,) of the differences between neighbors.
-
-    A scale of 0 is a break; 1 is the paper's difference per picture.
-    """
+class ImageSequence:
+    """The panoramas of one drive, and whether consecutive ones are neighbors, `joined` (N - 1,)."""
 
     panoramas: Panoramas
-    scale: NDArray[np.float32]
+    joined: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, run: Run) -> ImageSequence:
+        """The images of a run; pauses and jumps of the odometry are breaks."""
+        stamps = run.panoramas.stamps_ns
+        seconds = np.diff(stamps) * 1e-9
+        places = run.odometry.trajectory.at(stamps)[:, :2]
+        meters = np.hypot(*np.diff(places, axis=0).T)
+        joined = (seconds > 0) & (seconds <= BREAK_TIME_S) & (meters <= BREAK_DISTANCE_M)
+        return cls(run.panoramas, joined)
 
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Pictures start .. stop - 1 of a drive, with the pair that leads into them.
+    """Images start .. stop - 1 of a sequence, with the pair that leads into them.
 
-    `photometric_std` and `seed` perturb the light of each picture, by its number.
+    The light of each image is changed at random, by `seed` and the image's number.
     """
 
-    drive: Drive
+    sequence: ImageSequence
     start: int
     stop: int
-    photometric_std: float = 0.0
+    light_std: float = 0.0
     seed: tuple[int, int] = (0, 0)
 
-    def batches(self) -> Iterator[tuple[Image, NDArray[np.float32]]]:
-        """Pictures (T, H, W, C), and the scale (T,) of the difference that leads into each."""
-        scale = np.concatenate([np.zeros(1, np.float32), self.drive.scale])
+    def batches(self) -> Iterator[tuple[Image, NDArray[np.bool_]]]:
+        """Images (T, H, W, C), and whether each is a neighbor of the one before it (T,)."""
+        joined = np.concatenate([[False], self.sequence.joined])
         for start in range(self.start, self.stop, BATCH):
             stop = min(start + BATCH, self.stop)
-            yield self._lit(start, stop), scale[start:stop]
+            yield self._lit(start, stop), joined[start:stop]
 
     def lead(self) -> Image | None:
-        """The picture (1, H, W, C) before the first one; None at the drive's start."""
+        """The image (1, H, W, C) before the first one; None at the start of the sequence."""
         return self._lit(self.start - 1, self.start) if self.start else None
 
     def _lit(self, start: int, stop: int) -> Image:
-        images = self.drive.panoramas.read(start, stop)
-        if self.photometric_std == 0:
+        images = self.sequence.panoramas.read(start, stop)
+        if self.light_std == 0:
             return images
-        gains = np.stack(
-            [_gain(self.photometric_std, (*self.seed, at)) for at in range(start, stop)]
-        )
+        gains = np.stack([_gain(self.light_std, (*self.seed, n)) for n in range(start, stop)])
         lit = images * gains[:, None, None, :]
         return np.asarray(np.clip(lit, 0, 255).round().astype(np.uint8))
 
 
 def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
-    """Random exposure and color balance (3,) of one picture, always the same for it."""
+    """Random exposure and color balance (3,) of one image, always the same for it."""
     normal = np.random.default_rng(seed).standard_normal(4).astype(np.float32)
     return np.asarray(np.exp(std * (normal[0] + normal[1:] / 3)), np.float32)
 
 
 class Executor(Protocol):
-    """Whoever computes the sums over the shards and merges them; the same way every time.
+    """Computes the sums over the shards and merges them, always in the same order.
 
-    It tells `on_shard` the number of pictures of each finished shard.
+    It calls `on_shard` with the number of images of each finished shard.
     """
 
     def __call__(
         self,
         work: Callable[[Shard], Sums],
         shards: Sequence[Shard],
-        on_shard: Callable[[int], None],
+        on_shard: Callable[[int], object],
     ) -> Sums: ...
 
 
 def in_this_process(
-    work: Callable[[Shard], Sums], shards: Sequence[Shard], on_shard: Callable[[int], None]
+    work: Callable[[Shard], Sums], shards: Sequence[Shard], on_shard: Callable[[int], object]
 ) -> Sums:
     """Compute the shards on all cores, and merge them in their order."""
     parts = _in_threads(work, shards)
@@ -125,7 +136,7 @@ def in_this_process(
 
 
 def _in_threads(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
-    """The shards' sums in order; one more shard than there are cores is on its way."""
+    """The sums of the shards in order; one more shard than there are cores is in progress."""
     workers = _cores()
     with one_core(), ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Sums]] = deque()
@@ -149,7 +160,10 @@ def _cores() -> int:
 
 @dataclass(frozen=True, slots=True)
 class Partial:
-    """A network in the making: finished layers, and perhaps the linear half of the next."""
+    """A partly trained network: finished layers, and perhaps the linear half of the next one.
+
+    `stages` counts the finished halves of layers.
+    """
 
     architecture: Architecture
     nodes: tuple[Node, ...] = ()
@@ -160,6 +174,10 @@ class Partial:
     @property
     def depth(self) -> int:
         return len(self.nodes)
+
+    @property
+    def stages(self) -> int:
+        return 2 * self.depth + (self.linear is not None)
 
     @property
     def finished(self) -> bool:
@@ -194,17 +212,12 @@ def stage_sums(partial: Partial, shard: Shard) -> Sums:
     lead = shard.lead()
     if lead is not None:
         sums.lead(signals(_below(network, lead)))
-    for images, scale in shard.batches():
+    for images, joined in shard.batches():
         maps = _below(network, images)
         for start in range(0, len(maps), together):
             part = slice(start, start + together)
-            sums.add(signals(maps[part]), scale[part])
+            sums.add(signals(maps[part]), joined[part])
     return sums
-
-
-def stage_statistics(partial: Partial, shard: Shard) -> Statistics:
-    """Statistics of the stage that comes next, over one shard."""
-    return stage_sums(partial, shard).result()
 
 
 def _sums(partial: Partial) -> Sums:
@@ -237,87 +250,54 @@ def _signals(partial: Partial) -> Callable[[Map], Map]:
 
 def _below(network: Network, images: Image) -> Map:
     """Input map of the layer above all of the network's."""
-    maps = prepare(images, network.architecture)
+    maps = input_map(images, network.architecture)
     for depth in range(len(network.nodes)):
         maps = network.layer(maps, depth)
     return maps
 
 
-def shards_of(drives: Sequence[Drive], config: NetworkConfig) -> list[Shard]:
-    """All drives cut into shards of equal length."""
+def shards_of(
+    sequences: Sequence[ImageSequence], seed: int, light_std: float = LIGHT_STD
+) -> list[Shard]:
+    """All sequences cut into shards of equal length."""
     return [
-        Shard(
-            drive,
-            start,
-            min(start + SHARD, len(drive.panoramas)),
-            config.photometric_std,
-            (config.photometric_seed, number),
-        )
-        for number, drive in enumerate(drives)
-        for start in range(0, len(drive.panoramas), SHARD)
+        Shard(s, start, min(start + SHARD, len(s.panoramas)), light_std, (seed, number))
+        for number, s in enumerate(sequences)
+        for start in range(0, len(s.panoramas), SHARD)
     ]
 
 
-def architecture_of(config: NetworkConfig, size: tuple[int, int]) -> Architecture:
-    """The network that the configuration asks for, for panoramas of (rows, columns).
-
-    Raises ConfigError when the layers do not fit the size; it tells the sizes that would.
-    """
-    if config.layers == 'custom':
-        return Architecture(size, config.binning, config.normalization, _custom(config))
-    if config.layers != 'auto':
-        binning, layers = LAYERS[config.layers]
-        return Architecture(size, binning, config.normalization, layers)
-    refusals = []
-    for binning, layers in LAYERS.values():
-        try:
-            return Architecture(size, binning, config.normalization, layers)
-        except ConfigError as error:
-            refusals.append(str(error))
-    raise ConfigError(f'no standard network fits: {"; ".join(refusals)}; or give layers: custom')
-
-
-def _custom(config: NetworkConfig) -> tuple[Layer, ...]:
-    columns = (
-        config.field_rows,
-        config.field_columns,
-        config.stride_rows,
-        config.stride_columns,
-        config.linear_dimensions,
-        config.output_dimensions,
-    )
-    if len({len(column) for column in columns}) != 1:
-        raise ConfigError('field_*, stride_*, linear_dimensions, output_dimensions: one per layer')
-    return tuple(
-        Layer((fr, fc), (sr, sc), linear, outputs, config.clip)
-        for fr, fc, sr, sc, linear, outputs in zip(*columns, strict=True)
-    )
+def require_pairs(sequences: Sequence[ImageSequence]) -> None:
+    """Raise DataError where there is no difference between images to learn from."""
+    if not any(len(s.panoramas) > 1 for s in sequences):
+        raise DataError('training needs at least two consecutive panoramas')
 
 
 def train_network(
     architecture: Architecture,
-    drives: Sequence[Drive],
-    config: NetworkConfig,
+    sequences: Sequence[ImageSequence],
+    seed: int = 0,
     *,
+    light_std: float = LIGHT_STD,
+    relative_cut: float = RELATIVE_CUT,
     start: Partial | None = None,
     executor: Executor = in_this_process,
-    on_stage: Callable[[Partial], None] = lambda partial: None,
-    on_shard: Callable[[int], None] = lambda images: None,
+    on_stage: Callable[[Partial], object] = lambda partial: None,
+    on_shard: Callable[[int], object] = lambda images: None,
 ) -> Network:
-    """Train all layers on the full simulated rotation of every drive.
+    """Train all layers on the full simulated rotation of every sequence (section 2.2).
 
-    `start` continues a training that was cut off; `on_stage` is told each finished stage, and
-    `on_shard` how many pictures have been worked through since the last call.
-    Raises DataError when the pictures vary too little.
+    `start` continues a training that was interrupted; `on_stage` receives each finished stage,
+    `on_shard` the number of images worked through since the last call.
+    Raises DataError when the images vary too little.
     """
-    if not any(len(drive.panoramas) > 1 for drive in drives):
-        raise DataError('training needs at least two consecutive panoramas')
+    require_pairs(sequences)
     partial = start or Partial(architecture)
-    shards = shards_of(drives, config)
+    shards = shards_of(sequences, seed, light_std)
     while not partial.finished:
         total = executor(_Stage(partial), shards, on_shard)
         with one_core():
-            partial = partial.advanced(total.result(), config.relative_cut)
+            partial = partial.advanced(total.result(), relative_cut)
         on_stage(partial)
     return partial.network()
 

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How unlike the training pictures a picture is, layer by layer.
+"""Novelty: how unlike the training images an image is, layer by layer.
 
-Each layer's map is described by the mean and deviation over its columns, which do not depend on
-the heading; the Mahalanobis distance of the description tells how foreign the picture is.
+Each layer's map is described by the mean and standard deviation over its columns, which do not
+depend on the heading; novelty is the Mahalanobis distance of this description.
 """
 
 from __future__ import annotations
@@ -18,12 +18,14 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.rotation import Map
 
+# Principal directions of the descriptions: more would fit the noise of a short drive.
 _DIRECTIONS = 24
+# Share of unseen images of the same drive that count as familiar.
 _QUANTILE = 0.99
 
 
 def describe(maps: Map) -> Array:
-    """Mean and deviation over the columns of maps (T, rows, R, ch): (T, 2 * rows * ch)."""
+    """Mean and standard deviation over the columns of maps (T, rows, R, ch): (T, 2 * rows * ch)."""
     mean = maps.mean(2, dtype=np.float32)
     spread = np.sqrt(np.maximum((maps * maps).mean(2, dtype=np.float32) - mean * mean, 0.0))
     both = np.concatenate([mean, spread], axis=2).reshape(len(maps), -1)
@@ -32,10 +34,10 @@ def describe(maps: Map) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Familiarity:
-    """What training pictures look like to one layer.
+    """The distribution of the training images' descriptions in one layer.
 
-    `mean` (D,), `directions` (D, P) scaled to unit variance; what they do not span counts with
-    its own variance `rest`. `limit` is the distance that 1 in 100 unseen pictures exceeds.
+    `mean` (D,), `directions` (D, P) scaled to unit variance; what they do not span has
+    the variance `rest`. `limit` is the distance that 1 in 100 unseen images exceeds.
     """
 
     mean: Array
@@ -46,9 +48,9 @@ class Familiarity:
 
     @classmethod
     def fit(cls, descriptions: Array) -> Familiarity:
-        """From descriptions (T, D) of the training pictures, in order of driving."""
+        """From descriptions (T, D) of the training images, in order of driving."""
         if len(descriptions) < 4:
-            raise DataError(f'{len(descriptions)} pictures are too few to know familiar ones')
+            raise DataError(f'{len(descriptions)} images are too few to learn novelty from')
         parts = np.arange(len(descriptions)) * 8 // len(descriptions) % 2
         unseen = [
             cls._of(descriptions[parts != part]).distance(descriptions[parts == part])
@@ -80,17 +82,17 @@ class Familiarity:
 
 @dataclass(frozen=True, slots=True)
 class Novelty:
-    """Novelty of a picture: its largest distance in any layer, over the layer's limit."""
+    """Novelty of an image: its largest distance in any layer, over the limit of the layer."""
 
     layers: tuple[Familiarity, ...]
 
     @classmethod
     def fit(cls, descriptions: Sequence[Array]) -> Novelty:
-        """From each layer's descriptions (T, D) of all training pictures."""
+        """From each layer's descriptions (T, D) of the training images."""
         return cls(tuple(Familiarity.fit(layer) for layer in descriptions))
 
     def per_layer(self, maps: Sequence[Map]) -> Array:
-        """Novelty (T, layers) of pictures from every layer's maps: at most 1 is familiar."""
+        """Novelty (T, layers) of images from every layer's maps: at most 1 is familiar."""
         known = zip(self.layers, maps, strict=True)
         return np.stack([layer.distance(describe(m)) / layer.limit for layer, m in known], axis=1)
 

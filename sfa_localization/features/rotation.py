@@ -1,11 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Exact SFA statistics of a full simulated rotation, without rotating a single picture.
+"""Exact SFA statistics of a full simulated rotation, without rotating a single image.
 
-The paper trains each layer on "image t at rotations 0 .. R-1, then image t+1 at rotations
-0 .. R-1, ...". Turning the robot shifts a panorama's columns, and layers with shared weights
-commute with that shift. So with a feature map of R columns, one rotation step apart, the R views
-of a node are its map's R columns, and the sums over the whole sequence, over the R nodes of a
+Section 2.2 of the paper trains each layer on "image t at rotations 0 .. R-1, then image t+1 at
+rotations 0 .. R-1, ...". Turning the robot shifts the columns of a panorama, and layers with shared
+weights commute with that shift. So with a feature map of R columns, one rotation step apart, the R
+views of a node are its map's R columns, and the sums over the whole sequence, over the R nodes of a
 row, are sums over the columns of one map per image:
 
     samples              R       sum_c        x_c x_c^T
@@ -29,6 +29,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.features.sfa import Statistics
 
 Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,16 +90,16 @@ def shifted(columns: Map, shifts: list[int]) -> Map:
 
 
 class Sums(Protocol):
-    """Sums over the rotation sequence, fed picture after picture."""
+    """Sums over the rotation sequence, image after image."""
 
     def lead(self, maps: Map) -> None:
-        """Tell the map (1, ...) before the first one, which counts only as a neighbor."""
+        """Set the map (1, ...) before the first one, which counts only as a neighbor."""
 
-    def add(self, maps: Map, scale: Map) -> None:
-        """Add maps (T, ...), and differences to the map before times scale (T,); 0: a break."""
+    def add(self, maps: Map, joined: Mask) -> None:
+        """Add maps (T, ...), and the difference to the map before where `joined` (T,) is true."""
 
     def merge(self, other: Any) -> None:
-        """Add what another has seen."""
+        """Add the sums of another part of the sequence."""
 
     def result(self) -> Statistics:
         """The sums over the explicit rotation sequence, divided by the number of rotations."""
@@ -130,12 +131,12 @@ class FieldStatistics:
     def lead(self, maps: Map) -> None:
         self._last = strips(maps, self.field)
 
-    def add(self, maps: Map, scale: Map) -> None:
+    def add(self, maps: Map, joined: Mask) -> None:
         columns = strips(maps, self.field)
         self.samples += columns.shape[0] * columns.shape[1]
         self.total += columns.sum((0, 1, 2), dtype=np.float64)
         self.same += _product(columns, shifted(columns, self.lags))
-        difference = _between_images(columns, self._last, scale)
+        difference = _between_images(columns, self._last, joined)
         self.pairs += difference.shape[0] * difference.shape[1]
         if len(difference):
             neighbors = windows(difference, self.field.columns, self.field.spacing)
@@ -182,17 +183,12 @@ class FieldStatistics:
         return self.between[:, at * p : (at + 1) * p]
 
 
-def _between_images(columns: Map, last: Map | None, scale: Map) -> Map:
-    """scale[t] (x_{t,c} - x_{t-1,c-1}) for the pairs of nonzero scale: (pairs, rows, R, P)."""
+def _between_images(columns: Map, last: Map | None, joined: Mask) -> Map:
+    """x_{t,c} - x_{t-1,c-1} of the pairs that are joined: (pairs, rows, R, P)."""
     if last is None:
-        columns, last, scale = columns[1:], columns[:1], scale[1:]
-        before = np.concatenate([last, columns[:-1]]) if len(columns) else columns
-    else:
-        before = np.concatenate([last, columns[:-1]])
-    joined = scale > 0
-    difference = columns[joined] - np.roll(before[joined], 1, axis=2)
-    difference *= scale[joined, None, None, None]
-    return np.asarray(difference)
+        columns, last, joined = columns[1:], columns[:1], joined[1:]
+    before = np.concatenate([last, columns[:-1]]) if len(columns) else columns
+    return np.asarray(columns[joined] - np.roll(before[joined], 1, axis=2))
 
 
 def _product(a: Map, b: Map) -> Map:
@@ -213,12 +209,12 @@ class SampleStatistics:
     def lead(self, maps: Map) -> None:
         self._last = maps[:, -1]
 
-    def add(self, maps: Map, scale: Map) -> None:
+    def add(self, maps: Map, joined: Mask) -> None:
         self.samples += maps.shape[1] * maps.shape[2]
         self.total += maps.sum((1, 2, 3), dtype=np.float64)
         self.second += _square(maps)
         self.within += _square(_turned(maps))
-        self._add_pairs(maps, scale)
+        self._add_pairs(maps, joined)
         self._last = maps[:, -1].copy()
 
     def merge(self, other: SampleStatistics) -> None:
@@ -237,30 +233,20 @@ class SampleStatistics:
             float(self.samples * r), self.total, self.second, float(steps), difference
         )
 
-    def _add_pairs(self, maps: Map, scale: Map) -> None:
-        joined = np.flatnonzero(scale > 0)
+    def _add_pairs(self, maps: Map, joined: Mask) -> None:
+        """Add x_{t,c} - x_{t-1,c-1}, cyclic in the last axis, of the pairs that are joined."""
+        seconds = np.flatnonzero(joined)
         if self._last is None:
-            joined = joined[joined > 0]
-        pairs = np.empty((len(maps), len(joined), *maps.shape[2:]), maps.dtype)
-        for at, t in enumerate(joined.tolist()):
-            _difference_into(maps[:, t], self._before(maps, t), float(scale[t]), pairs[:, at])
-        if len(joined):
+            seconds = seconds[seconds > 0]
+        pairs = np.empty((len(maps), len(seconds), *maps.shape[2:]), maps.dtype)
+        for k, t in enumerate(seconds.tolist()):
+            before = self._last if t == 0 else maps[:, t - 1]
+            assert before is not None
+            np.subtract(maps[:, t, :, 1:], before[..., :-1], out=pairs[:, k, :, 1:])
+            np.subtract(maps[:, t, :, 0], before[..., -1], out=pairs[:, k, :, 0])
+        if len(seconds):
             self.between += _square(pairs)
             self.pairs += pairs.shape[1] * pairs.shape[2]
-
-    def _before(self, maps: Map, t: int) -> Map:
-        if t > 0:
-            return maps[:, t - 1]
-        assert self._last is not None
-        return self._last
-
-
-def _difference_into(second: Map, first: Map, scale: float, out: Map) -> None:
-    """scale (x_{t,c} - x_{t-1,c-1}), cyclic in the last axis."""
-    np.subtract(second[..., 1:], first[..., :-1], out=out[..., 1:])
-    np.subtract(second[..., 0], first[..., -1], out=out[..., 0])
-    if scale != 1.0:
-        out *= np.float32(scale)
 
 
 def _turned(signals: Map) -> Map:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""By how much the camera's stamps are late, from turns that images and odometry have both seen.
+"""By how much the camera's stamps are late, from turns that images and odometry both show.
 
 The time by which the turns between images lag behind those of the odometry is what the two clocks,
 or exposure and transfer, differ by. No map is needed: it works from the first turns on.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfa_localization.data.events import ODOMETRY, in_order
+from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
@@ -26,8 +26,8 @@ LONGEST_S = 2.5
 class CameraClock:
     """`delay_s` by which images are stamped later than odometry, known to `std_s`.
 
-    0 and infinity where the drive does not show it: it takes turns that begin and end. What is
-    `assumed` holds however small it is beside its standard deviation.
+    0 and infinity where the drive does not show it: it takes turns that begin and end. An `assumed`
+    delay is used even where it is smaller than its standard deviation.
     """
 
     delay_s: float = 0.0
@@ -41,31 +41,31 @@ class CameraClock:
 
     @property
     def delay_ns(self) -> int:
-        """What to take off the images' stamps: 0 for a delay that may well be none."""
-        shown = self.assumed or abs(self.delay_s) > _SIGNIFICANT * self.std_s
-        return round(self.delay_s * 1e9) if shown else 0
+        """What to subtract from the images' stamps: 0 for a delay that is not significant."""
+        significant = self.assumed or abs(self.delay_s) > _SIGNIFICANT_STDS * self.std_s
+        return round(self.delay_s * 1e9) if significant else 0
 
 
-_SIGNIFICANT = 2.0
-# Mean absolute value of a standard normal variable.
+_SIGNIFICANT_STDS = 2.0
+# Mean absolute value of a standard normal variable: sqrt(2 / pi).
 _MEAN_OF_NORMAL = 0.798
 _STEP_S = 0.02
 _GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
-# Images farther apart in time are not compared, nor such with a pause of the odometry between.
+# Images farther apart in time are not compared, nor images with a pause of the odometry between.
 _APART_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
-# Of images that come faster than this, not all are compared: turns between them are too small.
+# Images closer in time than this are skipped: turns between them are too small.
 _NEAR_NS = 150_000_000
-# An estimate holds for images stamped so much later: those already under way keep the old one,
-# so that what is made of them does not depend on which message came first.
-_UNDER_WAY_NS = 1_000_000_000
+# An estimate applies to images stamped so much later: those already in transit keep the old one,
+# so that the result does not depend on which message came first.
+_IN_TRANSIT_NS = 1_000_000_000
 _WINDOW_NS = round(LONGEST_S * 1e9) + 100_000_000
 _REMEMBERED_NS = 10_000_000_000
 # Differences beyond a few of these are mismatches of images and count no more, rad.
 _SCALE_RAD, _OUTLIER = 0.05, 4.0
-# A turn by less does not say how well images and odometry agree on turns, rad.
+# A turn by less does not show how well images and odometry agree on turns, rad.
 _TURN_RAD = 0.05
 _TURNS_MIN = 10
-# Neighbouring pairs err alike: what they say counts for half.
+# Factor on the standard deviation, because neighboring pairs err alike.
 _CAUTION = 2.0
 _SCALE_MIN_RAD = 1e-3
 _STD_MAX_S = 0.03
@@ -75,7 +75,7 @@ class CameraClockFinder:
     """Compares the turns between images with those of the odometry, as both come in.
 
     `memory` is the number of image pairs after which an old one counts little; clocks drift.
-    `start` is what is believed of the clock before anything is found.
+    `start` is the estimate until another is found.
     """
 
     def __init__(self, memory: float = np.inf, start: CameraClock | None = None) -> None:
@@ -91,7 +91,7 @@ class CameraClockFinder:
         self._cost, self._power, self._turns, self._size, self._left = np.zeros((5, 2, len(_GRID)))
 
     def expect(self, clock: CameraClock) -> None:
-        """Believe this of the clock until something is found."""
+        """Use this estimate until another is found."""
         self._found[0] = 0, clock
 
     @property
@@ -100,14 +100,14 @@ class CameraClockFinder:
         return self._found[-1][1]
 
     def clock_at(self, stamp_ns: int) -> CameraClock:
-        """The estimate that holds for an image of this stamp."""
+        """The estimate that applies to an image of this stamp."""
         for found_ns, clock in reversed(self._found):
-            if found_ns + _UNDER_WAY_NS <= stamp_ns:
+            if found_ns + _IN_TRANSIT_NS <= stamp_ns:
                 return clock
         return self._found[0][1]
 
     def add_odometry(self, stamp_ns: int, omega: float) -> None:
-        """Take a turn rate rad/s, held since the message before; stale stamps are passed over."""
+        """Take a turn rate rad/s, held since the message before; late stamps are skipped."""
         if self._stamps:
             gap = stamp_ns - self._stamps[-1]
             if gap <= 0:
@@ -166,7 +166,7 @@ class CameraClockFinder:
         """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
         side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
         turns, size, left = (a[side, best] for a in (self._turns, self._size, self._left))
-        # Columns may grow either way: the better sign is the right one.
+        # Columns may grow clockwise or counter-clockwise: the better sign is the right one.
         if turns < _TURNS_MIN or left > size / 2 or not 0 < best < len(_GRID) - 1:
             return CameraClock()
         scale = max(left / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
@@ -186,13 +186,13 @@ def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float
 
     `headings` are what `sfa_localization.camera.turns.headings` reads from the images.
     """
-    finder, seen = CameraClockFinder(), iter(headings)
+    finder, image_headings = CameraClockFinder(), iter(headings)
     rates = _turn_rates(odometry).tolist()
-    for stamp_ns, kind, i in in_order(odometry.stamps_ns, stamps_ns):
+    for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):
         if kind == ODOMETRY:
             finder.add_odometry(stamp_ns, rates[i])
         else:
-            finder.add_heading(stamp_ns, next(seen))
+            finder.add_heading(stamp_ns, next(image_headings))
     return finder.clock
 
 

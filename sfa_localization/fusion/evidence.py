@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether measurements agree under the odometry's motion, and where they put the robot.
 
-A measurement that the filter refuses may be wrong, or the filter may be. What decides is whether
-the refused ones agree among themselves: laid along the odometry's path, turned and shifted as a
-whole, they must fit over a number of pictures and a stretch of way.
+A measurement that the filter rejects may be wrong, or the filter may be. What decides is whether
+the rejected ones agree among themselves: laid along the odometry's path, which is turned and
+shifted as one piece, they must match over a number of images and a distance.
 """
 
 from __future__ import annotations
@@ -17,69 +17,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.belief import Belief, Evidence, MeasurementEvent
 
+FEW_IMAGES = 3
+"""Agreement that is no coincidence: two images always agree on some motion, the third checks."""
+ENOUGH_IMAGES = 5
+"""Images that overrule an established estimate: half a second to a second of any camera."""
+MANY_IMAGES = 4 * ENOUGH_IMAGES
+"""So many agree even where the robot has not moved: a passing fault has ended by then."""
+AGREEING_DISTANCE_M = 2.0
+"""Distance over which images must agree: beyond it the errors that neighbors share differ."""
 CAPACITY = 60
 """Measurements remembered at most; beyond, every other one of the older half is dropped."""
-_REACH = 9.0
-"""Squared standard deviations within which two measurements agree."""
-_DRIFT = 0.05
-"""Odometry's error per metre that agreement allows for; and per metre, radians."""
-_EFFORT = 3
+REMEMBERED_M, REMEMBERED_STDS = 3 * AGREEING_DISTANCE_M, 30.0
+"""Distance (m, and in standard deviations of a measurement) after which one is forgotten: about
+twice what any decision of `recover` asks for, so that agreement may begin late."""
+AGREEING_VARIANCES = 9.0
+"""Squared standard deviations within which two measurements agree: 3 sigma."""
+ODOMETRY_DRIFT = 0.05
+"""Error of odometry that agreement allows for, per meter: m, and rad; a poor robot's 5 %."""
+BASELINE_STDS = 3.0
+"""Two positions show a heading where they lie farther apart than 3 sigma of their difference."""
+_NEWTON_STEPS = 3  # of a fit that starts within its linear range
 
 
-class Evidence(NamedTuple):
-    """A measurement beside the dead-reckoned pose at its stamp; yaw is NaN where unknown."""
-
-    reckoned: tuple[float, float, float]
-    travelled_m: float
-    position: tuple[float, float]
-    yaw: float
-    variance: float
-    yaw_variance: float
-    agreed: bool
-
-
-class Fit(NamedTuple):
+class Agreement(NamedTuple):
     """Where agreeing measurements put the robot now: pose (3,), covariance (3, 3).
 
-    Over the same stretch of way, `contradicting` counts what the filter accepted, `dissenting`
-    what it refused but does not agree either. `std_m` and `yaw_std` are those told by pictures.
+    Over the same distance, `contradicting` counts what the filter accepted, `dissenting` what it
+    rejected but does not agree either. `position_std` and `yaw_std` are the mean claimed ones.
     """
 
     pose: Array
     covariance: Array
-    pictures: int
-    span_m: float
-    std_m: float
+    images: int
+    distance_m: float
+    position_std: float
     yaw_std: float
     contradicting: int
     dissenting: int
-    has_yaw: bool
+
+    @property
+    def has_yaw(self) -> bool:
+        return math.isfinite(self.yaw_std)
 
 
-def remember(
-    evidence: tuple[Evidence, ...], item: Evidence, reach_m: float
-) -> tuple[Evidence, ...]:
-    """Append, forgetting what lies more than `reach_m` of way behind, and thinning the rest."""
-    oldest = item.travelled_m - reach_m
+def remember(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Evidence, ...]:
+    """The evidence with a measurement more, without what lies far behind; the rest thinned out."""
+    variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
+    variance = (variances[0] + variances[1]) / 2
+    newest = Evidence(
+        belief.dead_reckoned,
+        belief.traveled_m,
+        (x, y),
+        yaw[0] if yaw else math.nan,
+        variance,
+        variances[2] if yaw else math.inf,
+        accepted,
+    )
+    evidence = belief.memory.evidence
+    oldest_m = belief.traveled_m - max(REMEMBERED_M, REMEMBERED_STDS * math.sqrt(variance))
     start = 0
-    while start < len(evidence) and evidence[start].travelled_m < oldest:
+    while start < len(evidence) and evidence[start].traveled_m < oldest_m:
         start += 1
-    kept = (*evidence[start:], item) if start else (*evidence, item)
+    kept = (*evidence[start:], newest)
     if len(kept) <= CAPACITY:
         return kept
-    # What is recent stays whole: it is what the next decision counts.
+    # The newer half stays complete: it is what the next decision counts.
     return kept[: CAPACITY // 2 : 2] + kept[CAPACITY // 2 :]
 
 
-def relocate(evidence: Sequence[Evidence], config: FilterConfig) -> Fit | None:
+def relocate(evidence: Sequence[Evidence], decorrelation_m: float) -> Agreement | None:
     """The pose at the newest measurement that most others agree with; None without agreement.
 
-    Only measurements that the filter refused have a say. Hypotheses come from the newest one's
-    own heading and from its pairs with others.
+    Only measurements that the filter rejected count. Hypotheses come from the newest one's own
+    heading and from its pairs with others. `decorrelation_m`: see ErrorCorrelation.distance_m.
     """
-    table = _Table([item for item in evidence if not item.agreed])
+    table = _Table([item for item in evidence if not item.accepted])
     best: NDArray[np.bool_] | None = None
     turn = 0.0
     for turn_h, variance in table.hypotheses():
@@ -88,112 +102,105 @@ def relocate(evidence: Sequence[Evidence], config: FilterConfig) -> Fit | None:
             best, turn = agree, turn_h
     if best is None:
         return None
-    fit = table.fit(best, turn, config)
-    oldest = evidence[-1].travelled_m - fit.span_m
-    recent = [item for item in evidence if item.travelled_m >= oldest]
-    against = sum(item.agreed for item in recent)
-    return fit._replace(contradicting=against, dissenting=len(recent) - against - fit.pictures)
+    found = table.agreement(best, turn, decorrelation_m)
+    oldest = evidence[-1].traveled_m - found.distance_m
+    recent = [item for item in evidence if item.traveled_m >= oldest]
+    against = sum(item.accepted for item in recent)
+    return found._replace(contradicting=against, dissenting=len(recent) - against - found.images)
 
 
-def consistent(evidence: Sequence[Evidence], heading_offset: float, yaw_std: float) -> int:
+def consistent(evidence: Sequence[Evidence], turn: float, turn_std: float) -> int:
     """How many of the newest measurements agree with the last one, without a break.
 
-    `heading_offset` turns dead reckoning into the map, known to `yaw_std`.
+    `turn` turns dead reckoning into the map, known to `turn_std`.
     """
-    agree = _Table(evidence).agreeing(heading_offset, yaw_std**2)
+    agree = _Table(evidence).agreeing(turn, turn_std**2)
     return int(np.argmin(agree[::-1])) if not agree.all() else len(agree)
 
 
 class _Table:
-    """Evidence as arrays, the newest last."""
+    """Evidence as arrays, the newest last; positions in the plane as complex numbers."""
 
     def __init__(self, evidence: Sequence[Evidence]) -> None:
-        self.reckoned = np.array([item.reckoned for item in evidence])
-        self.travelled = np.array([item.travelled_m for item in evidence])
-        self.position = np.array([item.position for item in evidence])
+        self.dead_reckoned = np.array([item.dead_reckoned for item in evidence])
+        self.position = np.array([complex(*item.position) for item in evidence])
         self.yaw = np.array([item.yaw for item in evidence])
+        self.has_yaw = np.isfinite(self.yaw)
         self.variance = np.array([item.variance for item in evidence])
         self.yaw_variance = np.array([item.yaw_variance for item in evidence])
-        self.back = self.travelled[-1] - self.travelled
-        step = self.reckoned[:, :2] - self.reckoned[-1, :2]
+        traveled = np.array([item.traveled_m for item in evidence])
+        self.behind_m = traveled[-1] - traveled
+        self.drift = (ODOMETRY_DRIFT * self.behind_m) ** 2
+        step = self.dead_reckoned[:, :2] - self.dead_reckoned[-1, :2]
         self.path = step[:, 0] + 1j * step[:, 1]
-        shift = self.position - self.position[-1]
-        self.shift = shift[:, 0] + 1j * shift[:, 1]
+        self.shift = self.position - self.position[-1]
 
     def hypotheses(self) -> list[tuple[float, float]]:
         """Turns from dead reckoning to the map, with their variances."""
         found = []
-        if math.isfinite(self.yaw[-1]):
-            turn = float(wrap_angle(self.yaw[-1] - self.reckoned[-1, 2]))
+        if self.has_yaw[-1]:
+            turn = float(wrap_angle(self.yaw[-1] - self.dead_reckoned[-1, 2]))
             found.append((turn, float(self.yaw_variance[-1])))
         both = self.variance + self.variance[-1]
         length = np.abs(self.path)
-        for i in np.flatnonzero(length > 3 * np.sqrt(both)):
+        for i in np.flatnonzero(length > BASELINE_STDS * np.sqrt(both)):
             turn = float(np.angle(self.shift[i] * np.conj(self.path[i])))
             found.append((turn, float(both[i] / length[i] ** 2)))
         return found
 
+    def yaw_residual(self, turn: float) -> Array:
+        """Measured headings minus those of dead reckoning after a turn; 0 where none is known."""
+        difference = self.yaw - self.dead_reckoned[:, 2] - turn
+        return np.asarray(wrap_angle(np.where(self.has_yaw, difference, 0.0)))
+
     def agreeing(self, turn: float, turn_variance: float) -> NDArray[np.bool_]:
         """Mask of the measurements that agree with the newest one under a turn."""
-        miss = self.shift - np.exp(1j * turn) * self.path
-        allowed = self.variance + self.variance[-1] + (_DRIFT * self.back) ** 2
+        residual = self.shift - np.exp(1j * turn) * self.path
+        allowed = self.variance + self.variance[-1] + self.drift
         allowed = allowed + turn_variance * np.abs(self.path) ** 2
-        agree = np.abs(miss) ** 2 <= _REACH * allowed
-        knows = np.isfinite(self.yaw)
-        turned = wrap_angle(np.where(knows, self.yaw - self.reckoned[:, 2] - turn, 0.0))
-        loose = self.yaw_variance + turn_variance + (_DRIFT * self.back) ** 2
-        return np.asarray(agree & (~knows | (turned**2 <= _REACH * loose)))
+        agree = np.abs(residual) ** 2 <= AGREEING_VARIANCES * allowed
+        allowed_yaw = self.yaw_variance + turn_variance + self.drift
+        near = self.yaw_residual(turn) ** 2 <= AGREEING_VARIANCES * allowed_yaw
+        return np.asarray(agree & (~self.has_yaw | near))
 
-    def fit(self, agree: NDArray[np.bool_], turn: float, config: FilterConfig) -> Fit:
+    def agreement(self, agree: NDArray[np.bool_], turn: float, decorrelation_m: float) -> Agreement:
         """Least squares over the agreeing measurements: pose at the newest, and its covariance."""
-        knows = agree & np.isfinite(self.yaw)
-        weight = agree / (self.variance + (_DRIFT * self.back) ** 2)
-        yaw_weight = knows / (self.yaw_variance + (_DRIFT * self.back) ** 2)
-        place = complex(*self.position[-1])
-        where = self.position[:, 0] + 1j * self.position[:, 1]
-        for _ in range(_EFFORT):
-            laid = np.exp(1j * turn) * self.path
-            miss = where - place - laid
-            lean = wrap_angle(np.where(knows, self.yaw - self.reckoned[:, 2] - turn, 0.0))
-            normal, right = _normal_equations(weight, laid, miss)
+        has_yaw = agree & self.has_yaw
+        weight = agree / (self.variance + self.drift)
+        yaw_weight = has_yaw / (self.yaw_variance + self.drift)
+        place = self.position[-1]
+        for _ in range(_NEWTON_STEPS):
+            path = np.exp(1j * turn) * self.path
+            normal, right = _normal_equations(weight, path, self.position - place - path)
             normal[2, 2] += yaw_weight.sum()
-            right[2] += float(yaw_weight @ lean)
-            step = np.linalg.solve(normal + 1e-12 * np.eye(3), right)
+            right[2] += float(yaw_weight @ self.yaw_residual(turn))
+            normal += 1e-12 * np.eye(3)  # regular even where a lone position shows no turn
+            step = np.linalg.solve(normal, right)
             place, turn = place + complex(step[0], step[1]), turn + float(step[2])
-        yaw = float(wrap_angle(self.reckoned[-1, 2] + turn))
-        span = float(self.back[agree].max())
-        dependence = _dependence(int(agree.sum()), span, config)
-        return Fit(
-            pose=np.array([place.real, place.imag, yaw]),
-            covariance=np.asarray(np.linalg.inv(normal + 1e-12 * np.eye(3)) * dependence),
-            pictures=int(agree.sum()),
-            span_m=span,
-            std_m=math.sqrt(float(self.variance[agree].mean())),
-            yaw_std=math.sqrt(float(self.yaw_variance[knows].mean())) if knows.any() else math.inf,
+        images, distance_m = int(agree.sum()), float(self.behind_m[agree].max())
+        # Neighboring images err alike and count as fewer.
+        dependence = max(1.0, images / (1 + distance_m / decorrelation_m))
+        yaw_variance = self.yaw_variance[has_yaw].mean() if has_yaw.any() else math.inf
+        return Agreement(
+            pose=np.array([place.real, place.imag, wrap_angle(self.dead_reckoned[-1, 2] + turn)]),
+            covariance=np.asarray(np.linalg.inv(normal) * dependence),
+            images=images,
+            distance_m=distance_m,
+            position_std=math.sqrt(float(self.variance[agree].mean())),
+            yaw_std=math.sqrt(float(yaw_variance)),
             contradicting=0,
             dissenting=0,
-            has_yaw=bool(knows.any()),
         )
 
 
-def _normal_equations(weight: Array, laid: Array, miss: Array) -> tuple[Array, Array]:
-    """Of shifts (x, y) and a small turn that bring `laid` to what it misses (complex, m)."""
-    lever = 1j * laid
+def _normal_equations(weight: Array, path: Array, residual: Array) -> tuple[Array, Array]:
+    """Of the shift (x, y) and the small turn that bring a path (N,) onto its `residual` (complex).
+
+    A turn moves a point z of the path by i z: its column of the design matrix.
+    """
+    lever = 1j * path
     total = weight.sum()
-    normal = np.array(
-        [
-            [total, 0.0, weight @ lever.real],
-            [0.0, total, weight @ lever.imag],
-            [weight @ lever.real, weight @ lever.imag, weight @ np.abs(lever) ** 2],
-        ]
-    )
-    right = np.array(
-        [weight @ miss.real, weight @ miss.imag, weight @ (np.conj(lever) * miss).real]
-    )
-    return normal, right
-
-
-def _dependence(pictures: int, span_m: float, config: FilterConfig) -> float:
-    """Factor on the variance: neighbouring pictures err alike and count as fewer."""
-    independent = 1 + span_m / config.decorrelation
-    return max(1.0, pictures / independent)
+    x, y = weight @ lever.real, weight @ lever.imag
+    normal = np.array([[total, 0.0, x], [0.0, total, y], [x, y, weight @ np.abs(lever) ** 2]])
+    turned = (np.conj(lever) * residual).real
+    return normal, np.array([weight @ residual.real, weight @ residual.imag, weight @ turned])

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A bounded, sorted history of events, replayed from wherever a late one belongs.
+"""A bounded, sorted history of events, replayed from where a late one belongs.
 
-What is believed is a pure function of the sorted events: an event that comes late gives exactly
-what it would have given in time.
+Beliefs are a pure function of the sorted events: an event that comes late has exactly the effect
+that it would have had in time.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Generic, TypeVar
 E = TypeVar('E')
 B = TypeVar('B')
 Key = tuple[int, int]
-_SLACK = 64
+_SLACK = 64  # events added between two clean-ups, which cost a copy of the lists
 
 
 class History(Generic[E, B]):
     """Events by (stamp_ns, rank), each with the belief after it; `step` makes the next belief.
 
-    `start` is believed at `start_ns`, before which nothing can be placed.
+    `start` is the belief at `start_ns`, before which no event can be placed.
     """
 
     def __init__(

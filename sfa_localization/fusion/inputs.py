@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What sensors tell, made fit for the filter: checked, with floors and factors on their noise."""
+"""Sensor values made fit for the filter: checked, with floors and factors on their noise."""
 
 from __future__ import annotations
 
@@ -15,19 +15,26 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.motion import Twist
 from sfa_localization.fusion.settings import FilterConfig
 
-_LARGEST_VARIANCE = 1e6
-_LARGEST_COORDINATE = 1e9
-_LARGEST_TWIST = 100.0
-_UNKNOWN_YAW_STD = 0.2
-_LARGEST_ENTRY = 1e12
-_SINGULAR = 1e-10
-_LARGEST_YAW = 1e6
+SPEED_STD_FLOOR, RATE_STD_FLOOR = 0.01, 0.005
+"""Least standard deviations of a reading (m/s, rad/s): drivers understate what encoders resolve."""
+POSITION_STD, _UNKNOWN_YAW_STD = 0.3, 0.2
+"""Standard deviations (m, rad) of a measurement whose message has no covariance."""
+POSITION_STD_FLOOR, YAW_STD_FLOOR = 0.05, 0.02
+"""Least standard deviations of a measurement (m, rad): no map from images is better everywhere."""
+YAW_STD_LIMIT = 1.0
+"""A heading less certain than this (rad) is left out: its error is not Gaussian any more."""
+_LARGEST_VARIANCE = 1e6  # m^2 or rad^2: messages with it mean that nothing is known
+_LARGEST_COORDINATE = 1e9  # m
+_LARGEST_TWIST = 100.0  # m/s and rad/s
+_LARGEST_YAW = 1e6  # rad, beyond which an angle has no digits left
+_LARGEST_ENTRY = 1e12  # of a covariance, beyond which products overflow
+_SINGULAR = 1e-10  # determinant over the product of the variances: a correlation of 1
 
 
 def read_twist(
     v: float, omega: float, variances: Sequence[float] | Array, config: FilterConfig
 ) -> Twist:
-    """A reading with the noise it is believed to have, from the `variances` (2,) it tells.
+    """A reading with the noise to expect of it, from the `variances` (2,) in its message.
 
     DataError says why it cannot be one.
     """
@@ -36,50 +43,49 @@ def read_twist(
         raise DataError('not finite')
     if abs(v) > _LARGEST_TWIST or abs(omega) > _LARGEST_TWIST:
         raise DataError('absurdly fast')
-    told_v, told_omega = variances
+    v_variance, omega_variance = variances
+    factor = config.odometry_factor
     return Twist(
         v,
         omega,
-        _variance(told_v, config.speed_std_floor, config.speed_std, config),
-        _variance(told_omega, config.rate_std_floor, config.rate_std, config),
+        _variance(v_variance, factor, SPEED_STD_FLOOR, config.speed_std),
+        _variance(omega_variance, factor, RATE_STD_FLOOR, config.rate_std),
     )
 
 
-def _variance(told: float, floor: float, default: float, config: FilterConfig) -> float:
-    if not (math.isfinite(told) and 0 < told < _LARGEST_VARIANCE):
+def _variance(claimed: float, factor: float, floor: float, default: float) -> float:
+    if not (math.isfinite(claimed) and 0 < claimed < _LARGEST_VARIANCE):
         return default**2
-    return max(config.odometry_factor * float(told), floor**2)
+    return max(factor * float(claimed), floor**2)
 
 
-def read_measurement(
-    value: ArrayLike, covariance: ArrayLike, config: FilterConfig
-) -> tuple[Array, Array]:
-    """A position (2,) or pose (3,) and its covariance as they are fused.
+def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> tuple[Array, Array]:
+    """A position (2,) or pose (3,) and its covariance, times a factor, as they are fused.
 
     A heading that is not known well enough is left out. DataError says why there is nothing left.
     """
-    given, spread = np.asarray(value, float), np.asarray(covariance, float)
-    if given.shape not in ((2,), (3,)) or spread.shape != (given.size, given.size):
+    given, matrix = np.asarray(value, float), np.asarray(covariance, float)
+    if given.shape not in ((2,), (3,)) or matrix.shape != (given.size, given.size):
         raise DataError('shape is not that of a position or a pose')
     # In plain numbers from here: arrays of two or three cost more than what is done with them.
-    told, rows = given.tolist(), spread.tolist()
-    if not (abs(told[0]) <= _LARGEST_COORDINATE and abs(told[1]) <= _LARGEST_COORDINATE):
+    pose, rows = given.tolist(), matrix.tolist()
+    if not (abs(pose[0]) <= _LARGEST_COORDINATE and abs(pose[1]) <= _LARGEST_COORDINATE):
         raise DataError('position is not finite')
-    if len(told) == 3 and not _knows_yaw(told[2], rows, config):
-        given, rows = given[:2], [row[:2] for row in rows[:2]]
+    if len(pose) == 3 and not _has_yaw(pose[2], rows):
+        pose, rows = pose[:2], [row[:2] for row in rows[:2]]
     if not any(map(any, rows)):
-        stds = [config.position_std, config.position_std, _UNKNOWN_YAW_STD][: len(rows)]
+        stds = [POSITION_STD, POSITION_STD, _UNKNOWN_YAW_STD][: len(rows)]
         rows = np.diag(np.square(stds)).tolist()
     if not _is_positive(rows):
         raise DataError('covariance is not symmetric positive')
     if rows[0][0] >= _LARGEST_VARIANCE or rows[1][1] >= _LARGEST_VARIANCE:
-        raise DataError('covariance tells that nothing is known')
-    return given.copy(), _conditioned(rows, config)
+        raise DataError('covariance means that nothing is known')
+    return np.array(pose), _conditioned(rows, factor)
 
 
-def _knows_yaw(yaw: float, rows: list[list[float]], config: FilterConfig) -> bool:
+def _has_yaw(yaw: float, rows: list[list[float]]) -> bool:
     variance = rows[2][2]
-    if not (abs(yaw) < _LARGEST_YAW and variance <= config.yaw_std_limit**2):
+    if not (abs(yaw) < _LARGEST_YAW and variance <= YAW_STD_LIMIT**2):
         return False
     return variance > 0 or not any(map(any, rows))
 
@@ -102,17 +108,16 @@ def _is_positive(rows: list[list[float]]) -> bool:
     return a > 0 and d > 0 and determinant > limit and skew <= 1e-6 * largest < _LARGEST_ENTRY
 
 
-def _conditioned(rows: list[list[float]], config: FilterConfig) -> Array:
+def _conditioned(rows: list[list[float]], factor: float) -> Array:
     """Symmetric, with the factor applied, then what is below the floor raised to it."""
-    half = config.measurement_factor / 2
-    floor, yaw_floor = config.position_std_floor**2, config.yaw_std_floor**2
+    half, floor = factor / 2, POSITION_STD_FLOOR**2
     xx = max((rows[0][0] + rows[0][0]) * half, floor)
     xy = (rows[0][1] + rows[1][0]) * half
     yy = max((rows[1][1] + rows[1][1]) * half, floor)
     if len(rows) == 2:
         return np.array([[xx, xy], [xy, yy]])
     xt, yt = (rows[0][2] + rows[2][0]) * half, (rows[1][2] + rows[2][1]) * half
-    tt = max((rows[2][2] + rows[2][2]) * half, yaw_floor)
+    tt = max((rows[2][2] + rows[2][2]) * half, YAW_STD_FLOOR**2)
     return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 
@@ -135,18 +140,18 @@ def lower_root(covariance: Array, factor: float) -> list[list[float]]:
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
-    """A pose (3,) and covariance (3, 3) set from outside; DataError where they are none."""
-    value, spread = np.asarray(pose, float), np.asarray(covariance, float)
+    """A pose (3,) and covariance (3, 3) set from outside; DataError where they cannot be one."""
+    value, matrix = np.asarray(pose, float), np.asarray(covariance, float)
     if value.shape != (3,) or not np.all(np.isfinite(value)):
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
     if np.abs(value).max() > _LARGEST_COORDINATE:
         raise DataError(f'initial pose {pose!r} is absurdly far away')
-    if spread.shape != (3, 3) or not is_covariance(spread):
+    if matrix.shape != (3, 3) or not _is_covariance(matrix):
         raise DataError('covariance of the initial pose is not a symmetric positive (3, 3) one')
-    return value, symmetric(spread)
+    return value, symmetric(matrix)
 
 
-def is_covariance(matrix: Array) -> bool:
+def _is_covariance(matrix: Array) -> bool:
     """Finite, symmetric and positive definite."""
     if not np.all(np.isfinite(matrix)):
         return False

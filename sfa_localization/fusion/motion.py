@@ -1,11 +1,25 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of the pose filter's state: constant turn rate and velocity (CTRV), driven by odometry.
+"""Motion of the filter's state: constant turn rate and velocity (CTRV), driven by odometry.
 
-The state is [x m, y m, yaw rad, v m/s, omega rad/s, yaw-rate bias rad/s, wheel scale - 1,
-e_x, e_y, e_yaw]. The last three are what pictures of one place get wrong alike, in standard
-deviations of the measurement: they fade over the distance driven, so that a robot that stands
-still learns from its thousandth picture no more than from the first.
+Section 5 of the paper names the model (CTRV, its reference [17]) and prints no equation of it, so
+the formulas stand here. With h = omega dt / 2 and the chord c = v dt sin(h) / h, a motion at
+constant v and omega leads from (x, y, yaw) to (`_arc`)
+
+    x' = x + c cos(yaw + h)    y' = y + c sin(yaw + h)    yaw' = yaw + omega dt
+
+and its derivatives fill the Jacobian (`_advance`). The state has seven components more than a pose:
+
+- V, OMEGA: speed m/s and turn rate rad/s of the robot, as in CTRV. Odometry replaces them:
+  v = (1 + scale) v_odometry and omega = omega_odometry - bias (`drive`).
+- BIAS: what the odometry's turn rate reads too much, rad/s; a random walk in time.
+- SCALE: true speed over wheel speed, minus 1; a random walk over the distance. Both calibrate the
+  odometry while driving (augmented Kalman filter: Larsen et al., ICRA 1998).
+- ERROR (3): the error that images of one place share, in standard deviations of the measurement.
+  Images of neighboring places err alike, because the map is wrong there: e' = f e + sqrt(1 - f^2) n
+  with f = exp(-distance / decorrelation) and n white of unit variance (Gauss-Markov process as
+  added state: Gelb, Applied Optimal Estimation, 1974). So a robot that stands still learns from
+  its thousandth image no more than from the first.
 """
 
 from __future__ import annotations
@@ -17,19 +31,34 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.settings import FilterConfig
 
 X, Y, YAW, V, OMEGA, BIAS, SCALE, ERROR = range(8)
 SIZE = 10
-_HELD_VARIANCE = 1e-8
-# A pose that moves or turns by more than its twist explains and this was reset.
-_JUMP_M, _JUMP_RAD = 0.3, 0.5
+TURN_RADIUS_M = 0.25
+"""Distance that one radian of turning counts as: about half the track of a small robot."""
+YAW_PER_METER = 0.005
+"""Heading error that grows with the distance, rad per sqrt(m): turns the wheels do not show."""
+ODOMETRY_CORRELATION_S = 0.1
+"""Time for which odometry readings err alike: about the time constant of a wheel controller."""
+BIAS_WALK = 1e-4
+"""Random walk of the turn-rate bias, rad/s per sqrt(s): that of a cheap warm gyroscope."""
+SCALE_WALK = 1e-3
+"""Random walk of the wheel scale, 1/sqrt(m): a percent over 100 m, as load and ground change."""
+ACCELERATION, ANGULAR_ACCELERATION = 1.0, 1.0
+"""Change of speed (m/s per sqrt(s)) and turn rate (rad/s per sqrt(s)) without new odometry."""
+UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
+"""Speed (m/s) and turning (rad per sqrt(s)) of a robot whose odometry is silent for long."""
+STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
+"""A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
+_HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
+_JUMP_M, _JUMP_RAD = 0.3, 0.5  # a pose that moves this far beyond its twist was reset
+_STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
 _DIAGONAL = np.arange(SIZE)
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Estimate at one stamp: `mean` (10,), `covariance` (10, 10), in the order told above."""
+    """Estimate at one stamp: `mean` (10,) and `covariance` (10, 10), in the order of X to ERROR."""
 
     stamp_ns: int
     mean: Array
@@ -85,38 +114,50 @@ class Step(NamedTuple):
     noise: Array
 
 
+class MotionNoise(NamedTuple):
+    """How driving makes the state uncertain; see the parameters of these names.
+
+    `decorrelation_m` is the distance over which the error that images share fades.
+    """
+
+    slip_per_meter: float
+    yaw_per_radian: float
+    decorrelation_m: float
+
+
 class Twist(NamedTuple):
-    """An odometry reading, with variances: v m/s, omega rad/s."""
+    """An odometry reading with its variances: v m/s, omega rad/s."""
 
     v: float
     omega: float
     v_variance: float
     omega_variance: float
 
-    def stands(self, config: FilterConfig) -> bool:
-        return abs(self.v) < config.standstill_speed and abs(self.omega) < config.standstill_rate
+    @property
+    def stands(self) -> bool:
+        return abs(self.v) < STANDSTILL_SPEED and abs(self.omega) < STANDSTILL_RATE
 
 
-def driven_twist(
+def twist_from_poses(
     before: tuple[float, float, float],
     after: tuple[float, float, float],
     seconds: float,
     twist: Twist,
 ) -> Twist:
-    """The reading with the mean twist by which odometry's own pose has moved since the last one.
+    """The reading with the mean twist by which the odometry's own pose moved since the last one.
 
-    Publishers differ in what their twist is the mean of; their pose says what it was. The twist
-    stays where the pose does not go with it: it was reset, or is not kept at all.
+    Publishers differ in the time over which they average their twist; their pose is unambiguous.
+    The twist stays where the pose disagrees with it: then the pose was reset, or is not filled.
     """
     dx, dy = after[0] - before[0], after[1] - before[1]
-    turn, way = wrap(after[2] - before[2]), math.hypot(dx, dy)
+    turn, distance = wrap(after[2] - before[2]), math.hypot(dx, dy)
     expected, turned = abs(twist.v) * seconds, abs(twist.omega) * seconds
-    reset = way > expected + _JUMP_M or abs(turn) > turned + _JUMP_RAD
-    if seconds <= 0 or reset or (way == 0.0 and turn == 0.0):
+    reset = distance > expected + _JUMP_M or abs(turn) > turned + _JUMP_RAD
+    if seconds <= 0 or reset or (distance == 0.0 and turn == 0.0):
         return twist
-    forward = dx * math.cos(before[2] + turn / 2) + dy * math.sin(before[2] + turn / 2)
     half = turn / 2
-    arc = forward * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
+    chord = dx * math.cos(before[2] + turn / 2) + dy * math.sin(before[2] + turn / 2)
+    arc = chord * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
     return twist._replace(v=arc / seconds, omega=turn / seconds)
 
 
@@ -133,8 +174,15 @@ class _Arc(NamedTuple):
 
 
 def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
+    """The motion of the module's formulas; with s = sin(h) / h its derivatives are
+
+    dx/dv = dt s cos(yaw + h)
+    dx/domega = (dt / 2) (v dt ds/dh cos(yaw + h) - c sin(yaw + h)),    ds/dh = (cos(h) - s) / h
+
+    and the same for y with sin for cos and cos for -sin.
+    """
     half = omega * dt / 2
-    if abs(half) < 1e-4:  # the straight-line limit, exact to rounding here
+    if abs(half) < _STRAIGHT_RAD:
         sinc, slope = 1 - half * half / 6, -half / 3
     else:
         sinc = math.sin(half) / half
@@ -152,94 +200,67 @@ def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
     )
 
 
-def drive(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
-    """Move by odometry: `twist` held over the last `dt` seconds becomes the state's v and omega.
+def drive(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
+    """Move by odometry: `twist`, held over the last `dt` seconds, becomes the state's v and omega.
 
-    v = scale * v_odometry and omega = omega_odometry - bias, each with the noise of its reading.
+    v' = (1 + scale) v_odometry and omega' = omega_odometry - bias: the columns of the old v and
+    omega in the Jacobian vanish; those of scale and bias are v_odometry and -1 times those of v'
+    and omega'. Each reading adds noise of its own variance through the same columns.
     """
-    if twist.stands(config):
+    if twist.stands:
         return _stand(mean)
-    x, y, yaw, _, _, bias, scale, *errors = mean.tolist()
-    v, omega = (1.0 + scale) * twist.v, twist.omega - bias
-    arc = _arc(yaw, v, omega, dt)
-    moved = abs(v) * dt + config.turn_radius * abs(omega) * dt
-    fade = math.exp(-moved / config.decorrelation)
-    after = np.array(
-        [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
-        + [fade * error for error in errors]
-    )
-    jacobian = _arc_jacobian(arc, dt, fade)
-    # Columns of the old v and omega vanish: odometry replaces them, through scale and bias.
-    gain = np.zeros((SIZE, 2))
-    gain[[X, Y, V], 0] = arc.dx_dv, arc.dy_dv, 1.0
-    gain[[X, Y, YAW, OMEGA], 1] = arc.dx_domega, arc.dy_domega, dt, 1.0
-    jacobian[:, V] = jacobian[:, OMEGA] = 0.0
-    jacobian[:, SCALE] += twist.v * gain[:, 0]
-    jacobian[:, BIAS] -= gain[:, 1]
-    variances = np.array([twist.v_variance, twist.omega_variance])
-    noise = (gain * variances).dot(gain.T)
-    _add_lasting_noise(noise, gain, variances, dt, config)
-    _add_drift(noise, abs(v) * dt, abs(omega) * dt, dt, fade, config)
-    return Step(after, jacobian, noise)
+    v, omega = (1.0 + float(mean[SCALE])) * twist.v, twist.omega - float(mean[BIAS])
+    step = _advance(mean, v, omega, twist, dt, noise)
+    gain = step.jacobian[:, V : OMEGA + 1].copy()
+    step.jacobian[:, V] = step.jacobian[:, OMEGA] = 0.0
+    step.jacobian[:, SCALE] += twist.v * gain[:, 0]
+    step.jacobian[:, BIAS] -= gain[:, 1]
+    white = (gain * np.array([twist.v_variance, twist.omega_variance])).dot(gain.T)
+    return step._replace(noise=white + step.noise)
 
 
-def coast(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
-    """Move on without new odometry: v and omega stay, and become less sure (CTRV).
+def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
+    """Move on without new odometry: v and omega stay, and become less certain (CTRV).
 
     `twist` is the last reading, whose noise still counts.
     """
-    x, y, yaw, v, omega, bias, scale, *errors = mean.tolist()
-    if v == 0.0 and omega == 0.0:
-        step = _stand(mean)
-    else:
-        arc = _arc(yaw, v, omega, dt)
-        moved = abs(v) * dt + config.turn_radius * abs(omega) * dt
-        fade = math.exp(-moved / config.decorrelation)
-        after = np.array(
-            [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
-            + [fade * error for error in errors]
-        )
-        jacobian = _arc_jacobian(arc, dt, fade)
-        noise = np.zeros((SIZE, SIZE))
-        gain = jacobian[:, V : OMEGA + 1]
-        variances = np.array([twist.v_variance, twist.omega_variance])
-        _add_lasting_noise(noise, gain, variances, dt, config)
-        _add_drift(noise, abs(v) * dt, abs(omega) * dt, dt, fade, config)
-        step = Step(after, jacobian, noise)
-    step.noise[V, V] += config.acceleration**2 * dt
-    step.noise[OMEGA, OMEGA] += config.angular_acceleration**2 * dt
+    v, omega = float(mean[V]), float(mean[OMEGA])
+    standing = v == 0.0 and omega == 0.0
+    step = _stand(mean) if standing else _advance(mean, v, omega, twist, dt, noise)
+    step.noise[V, V] += ACCELERATION**2 * dt
+    step.noise[OMEGA, OMEGA] += ANGULAR_ACCELERATION**2 * dt
     return step
 
 
-def halt(mean: Array, twist: Twist, dt: float, config: FilterConfig) -> Step:
-    """Odometry has been silent for too long: expect no motion, and any motion.
+def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
+    """Odometry has been silent for too long: expect no motion, and allow for any.
 
-    What a robot may have done since is bounded by `unknown_speed` or its last reading, `twist`.
+    What a robot may have done since is bounded by UNKNOWN_SPEED or its last reading, `twist`.
     """
     step = _stand(mean)
-    speed = doubt(step.noise, twist, dt, config)
-    fade = math.exp(-speed * dt / config.decorrelation)
+    speed = add_unknown_motion(step.noise, twist, dt)
+    fade = math.exp(-speed * dt / noise.decorrelation_m)
     for i in range(ERROR, SIZE):
         step.mean[i] *= fade
         step.jacobian[i, i] = fade
         step.noise[i, i] += 1 - fade * fade
     step.noise[V, V] = speed**2
-    step.noise[OMEGA, OMEGA] = config.unknown_rate**2
+    step.noise[OMEGA, OMEGA] = UNKNOWN_RATE**2
     return step
 
 
-def doubt(noise: Array, twist: Twist, dt: float, config: FilterConfig) -> float:
-    """Add to `noise` (10, 10) what a robot may have done unseen for `dt` s; returns its speed."""
-    speed = max(config.unknown_speed, abs(twist.v))
-    spread = 2 * speed**2 * dt
-    noise[X, X] += spread
-    noise[Y, Y] += spread
-    noise[YAW, YAW] += config.unknown_rate**2 * dt
+def add_unknown_motion(covariance: Array, twist: Twist, dt: float) -> float:
+    """Add to a covariance (10, 10) what a robot may have done unseen for `dt` s; its speed, m/s."""
+    speed = max(UNKNOWN_SPEED, abs(twist.v))
+    variance = 2 * speed**2 * dt
+    covariance[X, X] += variance
+    covariance[Y, Y] += variance
+    covariance[YAW, YAW] += UNKNOWN_RATE**2 * dt
     return speed
 
 
 def _stand(mean: Array) -> Step:
-    """The wheels say that the robot stands: nothing moves, and nothing becomes less sure."""
+    """The wheels stand: nothing moves, and nothing becomes less certain."""
     after = mean.copy()
     after[V] = after[OMEGA] = 0.0
     jacobian = np.eye(SIZE)
@@ -249,43 +270,53 @@ def _stand(mean: Array) -> Step:
     return Step(after, jacobian, noise)
 
 
-def _arc_jacobian(arc: _Arc, dt: float, fade: float) -> Array:
+def _advance(
+    mean: Array, v: float, omega: float, twist: Twist, dt: float, noise: MotionNoise
+) -> Step:
+    """CTRV at v and omega over dt: mean, full Jacobian, and the noise that driving itself adds."""
+    x, y, yaw, _, _, bias, scale, *errors = mean.tolist()
+    arc = _arc(yaw, v, omega, dt)
+    fade = math.exp(-(abs(v) * dt + TURN_RADIUS_M * abs(omega) * dt) / noise.decorrelation_m)
+    after = np.array(
+        [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale]
+        + [fade * error for error in errors]
+    )
     jacobian = np.zeros((SIZE, SIZE))
     jacobian[_DIAGONAL, _DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
     jacobian[X, YAW], jacobian[Y, YAW] = -arc.dy, arc.dx
     jacobian[X, V], jacobian[Y, V] = arc.dx_dv, arc.dy_dv
     jacobian[X, OMEGA], jacobian[Y, OMEGA] = arc.dx_domega, arc.dy_domega
     jacobian[YAW, OMEGA] = dt
-    return jacobian
+    added = _lasting_noise(jacobian[:3, V : OMEGA + 1], twist, dt)
+    _add_drift(added, abs(v) * dt, abs(omega) * dt, dt, fade, noise)
+    return Step(after, jacobian, added)
 
 
-def _add_lasting_noise(
-    noise: Array, gain: Array, variances: Array, dt: float, config: FilterConfig
-) -> None:
-    """Readings err alike for a while, so that their error does not average out with the rate.
+def _lasting_noise(gain: Array, twist: Twist, dt: float) -> Array:
+    """Noise (10, 10) of readings that err alike for a while; `gain` (3, 2) is d pose / d twist.
 
-    Over dt it moves the pose as a constant error of variance (variance * correlation / dt) would.
+    Such errors do not average out with the rate of the messages: over dt they move the pose as a
+    constant error of variance (variance * correlation / dt) would.
     """
-    if dt <= 0:
-        return
-    part = gain[:3]
-    noise[:3, :3] += (part * (variances * (config.odometry_correlation / dt))).dot(part.T)
+    noise = np.zeros((SIZE, SIZE))
+    if dt > 0:
+        variances = np.array([twist.v_variance, twist.omega_variance])
+        noise[:3, :3] = (gain * (variances * (ODOMETRY_CORRELATION_S / dt))).dot(gain.T)
+    return noise
 
 
 def _add_drift(
-    noise: Array, metres: float, radians: float, dt: float, fade: float, config: FilterConfig
+    covariance: Array, meters: float, radians: float, dt: float, fade: float, noise: MotionNoise
 ) -> None:
-    """Slip in proportion to the way, and the random walks of bias, scale and picture error."""
-    slip = config.slip_per_metre**2 * metres
-    noise[X, X] += slip
-    noise[Y, Y] += slip
-    noise[YAW, YAW] += config.yaw_per_metre**2 * metres + config.yaw_per_radian**2 * radians
-    if config.estimate_bias:
-        noise[BIAS, BIAS] += config.bias_walk**2 * dt
-    if config.estimate_scale:
-        noise[SCALE, SCALE] += config.scale_walk**2 * metres
+    """Add slip in proportion to the distance, and the random walks of bias, scale and ERROR."""
+    slip = noise.slip_per_meter**2 * meters
+    covariance[X, X] += slip
+    covariance[Y, Y] += slip
+    covariance[YAW, YAW] += YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
+    covariance[BIAS, BIAS] += BIAS_WALK**2 * dt
+    covariance[SCALE, SCALE] += SCALE_WALK**2 * meters
     for i in range(ERROR, SIZE):
-        noise[i, i] += 1 - fade * fade
+        covariance[i, i] += 1 - fade * fade
 
 
 def wrap(angle: float) -> float:

@@ -1,6 +1,14 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit directions, origins and a map of given expansion; noise and weights found on the way."""
+"""Learn a map of given expansion: alternate its global solution and the noise that this leaves.
+
+    expand      slow features to phi(s)                          expansions.py
+    eliminate   the map's weights from equation 1                quadratic_form.py
+    solve       directions, origins and biases, certified        quadratic_form.py, phases.py
+    noise       variance and correlation of the residuals        here
+
+The noise matters because odometry's links are weighted against the images.
+"""
 
 from __future__ import annotations
 
@@ -10,152 +18,181 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array
 from sfa_localization.metric.expansions import Basis
 from sfa_localization.metric.quadratic_form import (
     Elimination,
     Links,
-    Problem,
+    QuadraticForm,
     Solution,
     Stack,
     eliminate,
 )
+from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.settings import MetricConfig
 
 Complex = NDArray[np.complex128]
 
+LINK_WEIGHT = 2.0
+"""Weight of odometry's links over that by their variances: noise of the features, which least
+squares takes for noise of the place, contracts the map, and the links counteract that."""
+YAW_BIAS_STD = 0.003
+"""rad/s: the yaw-rate bias to expect of odometry or a gyroscope, estimated per run."""
+# m^2 per axis: a start that the first round replaces.
+_FIRST_VARIANCE = 0.04
 # Odometry's own paths are no better than this, however well a map fits them.
 _NOISE_MIN_M = 1e-3
+# The variance settles to _SETTLED, its relative change, in two or three rounds.
 _ROUNDS = 6
-# Residuals further apart than this many pictures are taken as independent.
+_SETTLED = 0.01
+# Residuals further apart than this many images are taken as independent.
 _LAGS = 50
-# Student's t with this many degrees of freedom stands for pictures that mislead.
-_FREEDOM = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
-    """Everything that a drive fixes, for one expansion of the features."""
+class MetricProblem:
+    """Everything that metric learning is given: it holds the data, `fit` solves for one basis."""
 
+    features: Array
+    """(M, K) slow features of the images of the segments."""
+    segments: Segments
+    stack: Stack
+    links: Links
+    config: MetricConfig
+    seed: int = 0
+    """Of the parts that are left out, and of the points that the forecast draws."""
+
+    @classmethod
+    def of(
+        cls, features: Array, segments: Segments, config: MetricConfig, seed: int = 0
+    ) -> MetricProblem:
+        """From features (N, K) of all images. Raises DataError when they are unusable."""
+        stack = Stack.of(segments)
+        rows = _checked_rows(np.asarray(features, float), stack, config)
+        return cls(rows, segments, stack, Links.of(segments), config, seed)
+
+    def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
+        """Alternate solution and noise until the noise settles; `start` shortens the way."""
+        expanded = basis.expand(self.features)
+        noise_ratio = 1.0 + basis.missing(expanded)
+        solution = start.solution if start else None
+        variance = start.variance if start else _FIRST_VARIANCE
+        correlation = start.correlation if start else LINK_WEIGHT
+        for _ in range(max(rounds, 1)):
+            elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
+            solution = self._solve(elimination, variance * correlation, solution)
+            weights = elimination.weights(solution.coefficients(self.stack.run))
+            predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
+            residuals = solution.places(self.stack) - predicted
+            before = variance
+            correlation = LINK_WEIGHT * _correlation(residuals, self.stack)
+            freedom = _freedom(elimination, basis, self.stack)
+            variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
+            if abs(variance - before) < _SETTLED * variance:
+                break
+        assert solution is not None
+        return MapFit(
+            self, basis, expanded, noise_ratio, variance, correlation,
+            elimination, solution, np.asarray(residuals), weights,
+        )  # fmt: skip
+
+    def _solve(
+        self, elimination: Elimination, variance: float, before: Solution | None
+    ) -> Solution:
+        form = QuadraticForm(elimination.gram, self.links, self.stack.run, variance, YAW_BIAS_STD)
+        if before is None:
+            solution = form.solve(None, np.zeros(self.stack.run[-1] + 1))
+        else:
+            solution = form.solve(before.z, before.bias)
+        return self._unmirrored(solution)
+
+    def _unmirrored(self, solution: Solution) -> Solution:
+        """Where the cost is the same for the mirror image, let the signs of the turns decide."""
+        if np.abs(solution.h.imag).max() > 1e-9 * np.abs(solution.h).max():
+            return solution
+        at, turn = self.links.at, self.links.turn
+        turned = np.angle(solution.z[at + 1] * np.conj(solution.z[at]))
+        if np.cos(turned - turn).sum() >= np.cos(turned + turn).sum():
+            return solution
+        return replace(solution, z=np.conj(solution.z), o=np.conj(solution.o))
+
+
+@dataclass(frozen=True, slots=True)
+class MapFit:
+    """A problem solved for one basis."""
+
+    problem: MetricProblem
     basis: Basis
     expanded: Array
     """(M, m)"""
-    point_weights: Array
-    """(M,) the robust weight of each picture."""
-    links: Links
+    noise_ratio: Array
+    """(M,) variance of each residual over `variance`: at least 1, more where inducing points are
+    missing."""
     variance: float
-    """Of a picture's residual, m^2 per axis."""
+    """Of an image's residual, m^2 per axis."""
+    correlation: float
+    """How many images count as one beside odometry's links, because residuals of neighbors are
+    correlated; times LINK_WEIGHT."""
     elimination: Elimination
     solution: Solution
-    correlation: float
-    """How many pictures count as one beside odometry's links: residuals of neighbours go together,
-    and noise of the features, which least squares takes for noise of the place, contracts the map;
-    the link weight makes up for that."""
     residuals: Complex
-    """(M,) where odometry puts a picture minus where the map does."""
+    """(M,) where odometry puts an image minus where the map does, meters."""
     map_weights: Complex
     """(m,)"""
 
     @property
+    def stack(self) -> Stack:
+        return self.problem.stack
+
+    @property
     def weights(self) -> Array:
-        """(M,) of each picture in the least squares."""
-        return self.point_weights / (1.0 + self.basis.missing(self.expanded))
+        """(M,) of each image in the least squares."""
+        return 1.0 / self.noise_ratio
+
+    @property
+    def places(self) -> Complex:
+        """Where the segments put the images (M,), meters."""
+        return self.solution.places(self.stack)
+
+    @property
+    def link_variance(self) -> float:
+        """Variance of a position against which odometry's links are weighted, m^2."""
+        return self.variance * self.correlation
+
+    def form(self, elimination: Elimination) -> QuadraticForm:
+        """The quadratic form after another elimination, with this noise and these biases."""
+        links, run = self.problem.links, self.stack.run
+        return QuadraticForm(elimination.gram, links, run, self.link_variance, 0.0)
 
 
-def fit(
-    basis: Basis,
-    features: Array,
-    stack: Stack,
-    links: Links,
-    config: MetricConfig,
-    start: Fit | None = None,
-    rounds: int = _ROUNDS,
-) -> Fit:
-    """Alternate the global solution and the noise it leaves; (M, K) features of the stack."""
-    expanded = basis.expand(features)
-    missing = 1.0 + basis.missing(expanded)
-    trust = np.ones(len(expanded)) if start is None else start.point_weights
-    variance = 0.04 if start is None else start.variance
-    correlation = config.link_weight if start is None else start.correlation
-    links = links if start is None else start.links
-    solution = None if start is None else start.solution
-    for _ in range(max(rounds, 1)):
-        elimination = eliminate(expanded, basis.ridge, trust / missing, stack)
-        solution = _solve(elimination, links, stack, variance * correlation, config, solution)
-        weights = elimination.weights(solution.coefficients(stack.run))
-        residuals = targets(solution, stack) - _product(expanded, weights)
-        before = variance
-        correlation = config.link_weight * _correlation(residuals, stack)
-        variance = _variance(elimination, basis, trust / missing, residuals, stack)
-        if config.robust:
-            trust = _point_trust(residuals, variance * missing)
-            links = _link_trust(links, solution, config)
-        if abs(variance - before) < 0.01 * variance:
-            break
-    assert solution is not None
-    return Fit(
-        basis,
-        expanded,
-        trust,
-        links,
-        variance,
-        elimination,
-        solution,
-        correlation,
-        residuals,
-        weights,
-    )
+def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
+    """The features (M, K) of the stack's images."""
+    if features.ndim != 2 or len(features) <= stack.images.max():
+        raise DataError(
+            f'slow features of shape {features.shape} for images up to {stack.images.max()}: '
+            'one row per image is needed'
+        )
+    rows = features[stack.images]
+    bad = int((~np.isfinite(rows)).any(1).sum())
+    if bad:
+        raise DataError(f'slow features of {bad} images are not finite: train the network again')
+    if np.all(rows.std(0) < 1e-9):
+        raise DataError('the slow features are constant: the images of the run do not differ')
+    if config.slow_features > features.shape[1]:
+        raise DataError(
+            f'slow_features is {config.slow_features}, but there are only {features.shape[1]}'
+        )
+    return rows
 
 
-def _solve(
-    elimination: Elimination,
-    links: Links,
-    stack: Stack,
-    variance: float,
-    config: MetricConfig,
-    before: Solution | None,
-) -> Solution:
-    problem = Problem(elimination.gram, links, stack.run, variance, config.yaw_bias_std)
-    bias = np.zeros(stack.run[-1] + 1) if before is None else before.bias
-    return _unmirrored(problem.solve(None if before is None else before.z, bias), links)
-
-
-def _unmirrored(solution: Solution, links: Links) -> Solution:
-    """Where the cost cannot tell the map from its mirror image, let the turns' signs decide."""
-    if np.abs(solution.h.imag).max() > 1e-9 * np.abs(solution.h).max():
-        return solution
-    turned = solution.z[links.at + 1] * np.conj(solution.z[links.at])
-    if np.cos(np.angle(turned) - links.turn).sum() >= np.cos(np.angle(turned) + links.turn).sum():
-        return solution
-    return replace(solution, z=np.conj(solution.z), o=np.conj(solution.o))
-
-
-def problem_of(fit: Fit, stack: Stack) -> Problem:
-    """The quadratic form that a fit minimizes, at its biases."""
-    variance = fit.variance * fit.correlation
-    return Problem(fit.elimination.gram, fit.links, stack.run, variance, 0.0)
-
-
-def _product(expanded: Array, weights: Complex) -> Complex:
-    return np.asarray(expanded @ weights.real + 1j * (expanded @ weights.imag))
-
-
-def targets(solution: Solution, stack: Stack) -> Complex:
-    """Where the segments put the pictures (M,)."""
-    path = stack.corrected(solution.bias)
-    return np.asarray(solution.o[stack.owner] + solution.z[stack.owner] * path)
-
-
-def _variance(
-    elimination: Elimination, basis: Basis, weights: Array, residuals: Complex, stack: Stack
-) -> float:
-    """Of a residual per axis, corrected for the freedom of map, origins and directions."""
+def _freedom(elimination: Elimination, basis: Basis, stack: Stack) -> float:
+    """Degrees of freedom that map, origins and directions leave to M residuals."""
     inverse = scipy.linalg.solve_triangular(
         elimination.factor, np.eye(len(elimination.factor)), lower=True
     )
     used = len(basis.ridge) - float(basis.ridge @ (inverse**2).sum(0))
-    freedom = float(len(residuals)) - used - 1.5 * stack.segments
-    return residual_variance(residuals * np.sqrt(weights), freedom)
+    return float(len(stack.images)) - used - 1.5 * stack.segments
 
 
 def residual_variance(residuals: Complex, freedom: float) -> float:
@@ -177,23 +214,3 @@ def _correlation(residuals: Complex, stack: Stack) -> float:
             break
         total += 2.0 * float(product.mean()) / power
     return total
-
-
-def _point_trust(residuals: Complex, variance: Array) -> Array:
-    return np.asarray((_FREEDOM + 2.0) / (_FREEDOM + np.abs(residuals) ** 2 / variance))
-
-
-def _link_trust(links: Links, solution: Solution, config: MetricConfig) -> Links:
-    """Weights of Student's t for turns and displacements that contradict the map."""
-    own, at = solution.bias[links.run], links.at
-    turned = np.angle(solution.z[at + 1] * np.conj(solution.z[at]))
-    off = wrap_angle(turned - (links.turn - own * links.turn_time))
-    moved = links.displacement - own * links.displacement_drift
-    gone = np.abs(solution.o[at + 1] - solution.o[at] - solution.z[at] * moved)
-    turn = (_FREEDOM + 1.0) / (_FREEDOM + off**2 / links.turn_variance)
-    move = (_FREEDOM + 2.0) / (_FREEDOM + gone**2 / links.displacement_variance)
-    return replace(
-        links,
-        turn_trust=turn * config.use_turns,
-        displacement_trust=move * config.use_displacements,
-    )

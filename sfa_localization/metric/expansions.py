@@ -1,14 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps from slow features to metres: monomials, or a Gaussian process.
+"""Maps from slow features to meters: monomials (section 4 of the paper), or a Gaussian process.
 
-Both are linear in an expansion phi(s): position = Phi w with a Gaussian prior on w. A Gaussian
-process is its expansion over the training features themselves, so one solver serves both.
+The paper estimates p = W^T s (section 3). Both are linear in an expansion phi(s), position = Phi w,
+with a Gaussian prior on w. A Gaussian process is its expansion over the training features
+themselves, so one solver serves both.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError, ModelError
-from sfa_localization.data.geometry import Array, RigidTransform, rotation
+from sfa_localization.data.geometry import Array
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -39,7 +40,7 @@ class Basis(Protocol):
         """(M,) prior variance that the expansion leaves out, over a point's variance."""
 
     def to_arrays(self) -> Arrays:
-        """Everything needed to make it again."""
+        """Everything needed to restore it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,17 +194,17 @@ _BASES: dict[str, type[Monomials] | type[Process]] = {'monomials': Monomials, 'g
 
 @dataclass(frozen=True, slots=True)
 class MetricMap:
-    """From slow features to metres in the map frame, with covariance."""
+    """From slow features to meters in the map frame, with covariance."""
 
     basis: Basis
     weights: Array
     """(m, 2)"""
     spread: Array
-    """(m, m) square root of the weights' posterior covariance, metres."""
+    """(m, m) square root of the weights' posterior covariance, meters."""
     sway: Array
-    """(m, r, 2) how the weights follow the uncertain directions, metres per standard deviation."""
+    """(m, r, 2) weights' change per standard deviation of the joint errors of the segments, m."""
     noise_m: float
-    """Standard deviation of a point per axis, metres."""
+    """Standard deviation of an image's residual per axis, meters."""
     inflation: float
     """Factor on the variance that makes left-out segments consistent."""
 
@@ -213,9 +214,9 @@ class MetricMap:
         return self.basis.features
 
     def predict(self, features: Array) -> tuple[Array, Array]:
-        """Positions (M, 2) in metres and covariances (M, 2, 2) of slow features (M, >= K).
+        """Positions (M, 2) in meters and covariances (M, 2, 2) of slow features (M, >= K).
 
-        Raises DataError when there are fewer features than it was learnt from.
+        Raises DataError when there are fewer features than it was learned from.
         """
         features = np.atleast_2d(np.asarray(features, float))
         if features.shape[1] < self.features:
@@ -230,15 +231,8 @@ class MetricMap:
         joint = np.einsum('ikl,ikm->ilm', sway, sway)
         return np.asarray(self.inflation * (joint + own[:, None, None] * np.eye(2)))
 
-    def moved(self, frame: RigidTransform) -> MetricMap:
-        """The same map in another frame."""
-        turn = rotation(frame.yaw_rad)
-        weights = self.weights @ turn.T
-        weights[-1] += [frame.x_m, frame.y_m]
-        return replace(self, weights=weights, sway=self.sway @ turn.T)
-
     def to_arrays(self) -> Arrays:
-        """Plain arrays: what `from_arrays` makes the same map of."""
+        """Plain arrays, from which `from_arrays` restores the map."""
         own = {
             'weights': self.weights,
             'spread': self.spread,

@@ -1,15 +1,15 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The metric map's predictions from fewer products, for one picture at a time.
+"""The metric map's predictions from fewer products, for one image at a time.
 
-With k the kernel of a picture with the m inducing ones, e = k W^T whitens it. Everything that
-MetricMap.predict tells is then linear or quadratic in k:
+With k the kernel of an image with the m inducing ones, e = k W^T whitens it. Everything that
+MetricMap.predict returns is then linear or quadratic in k:
 
     position  k W^T w + w_0,    sway  k W^T v + v_0,
     variance  c + k a - |k C|^2,    C C^T = W^T (n I - Q) W,    n = noise^2 / ratio,
 
 with Q the weights' posterior covariance, always below its prior n I. So two m x m products become
-one triangular one, which reads a quarter of the memory, or an eighth where float32 will do.
+one triangular one, which reads a quarter of the memory, or an eighth where float32 suffices.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Predictor(Protocol):
 
 
 def fast_map(metric: MetricMap) -> Predictor:
-    """The quickest form of a map; the map itself where there is no quicker one."""
+    """The fastest form of a map; the map itself where there is no faster one."""
     if not isinstance(metric.basis, Process):
         return metric
     return FastProcess.of(metric, metric.basis)
@@ -83,11 +83,13 @@ class FastProcess:
     def predict(self, features: Array) -> tuple[Array, Array]:
         """Positions (M, 2) m and covariances (M, 2, 2) of slow features (M, >= K)."""
         kernel = matern(features[:, : len(self.scale)] * self.scale, self.points)
-        told = kernel @ self.linear + self.constant
-        own = np.maximum(told[:, 2] - _explained(kernel, self.factor), self.floor)
-        sway = told[:, 3:].reshape(len(told), -1, 2)
+        combined = kernel @ self.linear + self.constant
+        own = np.maximum(combined[:, 2] - _explained(kernel, self.factor), self.floor)
+        sway = combined[:, 3:].reshape(len(combined), -1, 2)
         joint = sway.transpose(0, 2, 1) @ sway
-        return told[:, :2], np.asarray(self.inflation * (joint + own[:, None, None] * np.eye(2)))
+        return combined[:, :2], np.asarray(
+            self.inflation * (joint + own[:, None, None] * np.eye(2))
+        )
 
 
 def _root(symmetric: Array) -> Array:
@@ -103,19 +105,19 @@ def _root(symmetric: Array) -> Array:
 def _rounded(
     factor: Array, points: Array, floor: float
 ) -> NDArray[np.float32] | NDArray[np.float64]:
-    """The factor in float32 where that does no harm to the variance, in Fortran order."""
+    """The factor in float32 where the variance stays accurate, in Fortran order."""
     small = np.asfortranarray(factor, np.float32)
     probe = matern(points[:: max(1, len(points) // 64)] * 1.02, points)
     change = _explained(probe, small) - ((probe @ factor) ** 2).sum(1)
-    harmless = np.abs(change).max() < _TOLERANCE * floor
-    return small if harmless else np.asfortranarray(factor)
+    accurate = np.abs(change).max() < _TOLERANCE * floor
+    return small if accurate else np.asfortranarray(factor)
 
 
 def _explained(kernel: Array, factor: NDArray[np.float32] | NDArray[np.float64]) -> Array:
-    """|k C|^2 (M,), reading only the lower triangle for a single picture."""
+    """|k C|^2 (M,), reading only the lower triangle for a single image."""
     if len(kernel) > 1:
-        whole: Array = np.matmul(kernel, factor, dtype=factor.dtype, casting='same_kind')
+        product: Array = np.matmul(kernel, factor, dtype=factor.dtype, casting='same_kind')
     else:
-        product = linalg.get_blas_funcs('trmv', (factor,))
-        whole = product(factor, kernel[0].astype(factor.dtype), lower=1, trans=1)[None]
-    return np.asarray((whole.astype(np.float64) ** 2).sum(1))
+        multiply = linalg.get_blas_funcs('trmv', (factor,))
+        product = multiply(factor, kernel[0].astype(factor.dtype), lower=1, trans=1)[None]
+    return np.asarray((product.astype(np.float64) ** 2).sum(1))

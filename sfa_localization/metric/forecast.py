@@ -2,18 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The error to expect of one image on a path between the trained ones; needs no ground truth.
 
-A stretch of the drive that is left out lies, as a rule, farther from all other images than a path
-of later use: legs end at the border, and lanes are alone in their strip. So the forecast asks at
-points drawn evenly over the covered ground. The nearest image of such a point is one distance
-away, and on the other side the nearest is at another distance. Around the image nearest to the
-point all images are left out up to these two distances, on the one side and on the other, and the
-map predicts it from the rest: it is then as far from its neighbours as the point is.
+A stretch of the drive that is left out is usually farther from all other images than a path of
+later use: legs end at the border, and a lane is alone in its strip. So the forecast draws points
+evenly over the covered ground, and for each finds the distances to the nearest image, and to the
+nearest on the opposite side. Around the image nearest to the point, all images up to these two
+distances on the two sides are left out, and the map predicts it from the rest: it is then as far
+from its neighbors as the point is.
 
-What no left-out image can show is not in it: another light than that of the trained drives, or
-a wheel radius that is wrong everywhere.
+It does not contain what no left-out image can show: other light than that of the trained drives,
+or a wheel radius that is wrong everywhere.
 
-Images left out together cost no new fit: with residuals r and the hat matrix H of the least
-squares, the group G is off by (I - H_GG)^-1 r_G where it was not used.
+Leaving out images needs no new fit: with residuals r and the hat matrix H of the least squares, the
+errors of a group G that is not used are (I - H_GG)^-1 r_G.
 """
 
 from __future__ import annotations
@@ -25,16 +25,18 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from sfa_localization.data.geometry import Array, RigidTransform
-from sfa_localization.metric.alternation import Fit, targets
+from sfa_localization.metric.alternation import MapFit
 from sfa_localization.metric.quadratic_form import Stack
 
 Indices = NDArray[np.int64]
 
 REACH_M = 1.0
 """Ground further than this from every image is not covered by the drive."""
+# Enough for the mean and the map of the expected error; each is a small linear system.
 _POINTS = 1000
+# Of distances, in which left-out images are weighted.
 _BINS = 12
-# Images before and after one that tell in which direction the robot was driving.
+# Images before and after one whose direction is the robot's.
 _AROUND = 2
 
 
@@ -88,23 +90,24 @@ class Forecast:
         return replace(self, points=frame.apply(self.points))
 
 
-def forecast(whole: Fit, stack: Stack, sway: Array, rng: np.random.Generator) -> Forecast:
+def forecast(fit: MapFit, sway_variance: Array, rng: np.random.Generator) -> Forecast:
     """The forecast of a fit, in its own frame.
 
-    `sway` (M,) m^2 is how uncertain the drive's own positions are where each image was taken:
-    the map repeats their errors, which leaving out images cannot show.
+    `sway_variance` (M,) m^2 is how uncertain the drive's own positions are where each image was
+    taken: the map repeats their errors, which leaving out images cannot show.
     """
-    ends = targets(whole.solution, stack)
-    places = np.column_stack([ends.real, ends.imag])
+    complex_places = fit.places
+    places = np.column_stack([complex_places.real, complex_places.imag])
     points = _covered(places, rng)
     near, nearest = cKDTree(places).query(points)
     far = _beyond(places, points, nearest)
-    leaver = _Leaver(whole)
+    white, weights = fit.elimination.whitened(fit.expanded).T, fit.weights
     errors = np.empty(len(points))
     for k, image in enumerate(nearest):
-        gap = _gap(ends, stack, int(image), near[k], far[k], rng)
-        errors[k] = abs(leaver.error(int(image), gap))
-    return Forecast(points, near, np.hypot(errors, np.sqrt(sway[nearest])))
+        gap = _gap(complex_places, fit.stack, int(image), near[k], far[k], rng)
+        left_out = _left_out_errors(white[gap], weights[gap], fit.residuals[gap])
+        errors[k] = abs(complex(left_out[gap == image][0]))
+    return Forecast(points, near, np.hypot(errors, np.sqrt(sway_variance[nearest])))
 
 
 def nearest_used(places: Array, part: Indices) -> Array:
@@ -121,7 +124,7 @@ def nearest_used(places: Array, part: Indices) -> Array:
 
 
 def _covered(places: Array, rng: np.random.Generator) -> Array:
-    """Points drawn evenly where the tracks (M, 2) are around and one is near: (K, 2)."""
+    """Points (K, 2) drawn evenly inside the hull of the places (M, 2), and near one of them."""
     hull = ConvexHull(places)
     normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
     tree = cKDTree(places)
@@ -145,7 +148,7 @@ def _beyond(places: Array, points: Array, nearest: Indices) -> Array:
 
 
 def _gap(
-    ends: NDArray[np.complex128],
+    places: NDArray[np.complex128],
     stack: Stack,
     image: int,
     near: float,
@@ -154,32 +157,27 @@ def _gap(
 ) -> Indices:
     """Rows around an image: within `near`, and on one side, fore or aft, nearer than `far`."""
     first = stack.first[stack.owner[image]]
-    last = np.append(stack.first[1:], len(ends))[stack.owner[image]] - 1
-    along = ends[min(image + _AROUND, last)] - ends[max(image - _AROUND, first)]
-    # A robot that turned on the spot was driving in no direction.
+    last = np.append(stack.first[1:], len(places))[stack.owner[image]] - 1
+    along = places[min(image + _AROUND, last)] - places[max(image - _AROUND, first)]
+    # A robot that turned on the spot has no direction of driving.
     if along == 0.0:
         along = np.exp(2j * np.pi * rng.random())
     side = along * rng.choice([-1.0, 1.0])
-    away = ends - ends[image]
+    away = places - places[image]
     distance = np.abs(away)
     inside = (distance <= near) | ((np.real(away * np.conj(side)) > 0.0) & (distance < far))
     inside[image] = True
     return np.flatnonzero(inside)
 
 
-class _Leaver:
-    """Errors of images where they, and others, were not used."""
+def _left_out_errors(
+    white: Array, weights: Array, residuals: NDArray[np.complex128]
+) -> NDArray[np.complex128]:
+    """Errors (G,) of a group of images by a map learned without them.
 
-    def __init__(self, whole: Fit) -> None:
-        self._half = whole.elimination.halved(whole.expanded).T
-        self._weights = whole.weights
-        self._residuals = whole.residuals
-
-    def error(self, image: int, group: Indices) -> complex:
-        """Of the map at an image of the group of rows that it is learnt without, metres."""
-        half = self._half[group]
-        own = np.eye(len(group)) - (half @ half.T) * self._weights[group]
-        # Where the rest fixes nothing, the group held the map alone.
-        own[np.diag_indices_from(own)] += 1e-9
-        left = np.linalg.solve(own, self._residuals[group])
-        return complex(left[group == image][0])
+    From their whitened features (G, m), weights and residuals (G,) in the map of all images.
+    """
+    remaining = np.eye(len(white)) - (white @ white.T) * weights
+    # Where nothing but the group determines the map, the matrix is singular.
+    remaining[np.diag_indices_from(remaining)] += 1e-9
+    return np.asarray(np.linalg.solve(remaining, residuals))

@@ -1,46 +1,47 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fix the map's frame: the odometry frame at the start of the first run, or an anchor."""
+"""Determine the map's frame: the odometry frame at the start of the first run, or an anchor.
+
+The paper leaves it open (end of section 3.2): found solutions may be translated and rotated.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, compose, invert
-from sfa_localization.metric.alternation import Fit, targets
-from sfa_localization.metric.quadratic_form import Stack
-from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.metric.alternation import MapFit
 
 
-def gauge(fit: Fit, segments: Segments, stack: Stack, config: MetricConfig) -> RigidTransform:
+def map_frame(fit: MapFit) -> RigidTransform:
     """The transform from the fit's arbitrary frame to the map frame.
 
-    The certified track is laid on the odometry of the first run, each picture weighted by how
+    The certified track is aligned with the odometry of the first run, each image weighted by how
     little the odometry can have drifted until then: the map coincides with the odometry frame at
     the start of the run. With an anchor, the run starts at the anchor's pose in the map.
     """
-    poses, variances = _odometry(segments, fit)
+    segments, stack, anchor = fit.problem.segments, fit.stack, fit.problem.config.anchor
+    poses, variances = _odometry(fit)
     rows = np.flatnonzero(stack.owner < len(poses))
     owner = stack.owner[rows]
     path = stack.corrected(fit.solution.bias)[rows]
     driven = poses[owner, 0] + 1j * poses[owner, 1] + np.exp(1j * poses[owner, 2]) * path
     weights = 1.0 / (variances[owner] + fit.variance)
-    turn, shift = align_complex(targets(fit.solution, stack)[rows], driven, weights)
+    turn, shift = align_complex(fit.places[rows], driven, weights)
     frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
-    if not config.use_anchor:
+    if not anchor:
         return frame
-    start = np.array([config.anchor_x, config.anchor_y, config.anchor_yaw])
-    onto = compose(start, invert(segments[0].start))
-    moved = compose(onto, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
+    to_anchor = compose(np.array(anchor), invert(segments[0].start))
+    moved = compose(to_anchor, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
     return RigidTransform(*(float(value) for value in moved))
 
 
-def _odometry(segments: Segments, fit: Fit) -> tuple[Array, Array]:
+def _odometry(fit: MapFit) -> tuple[Array, Array]:
     """Poses (n, 3) of the first segments' frames in the odometry frame, and variances (n,).
 
-    Free of the bias; the variances are those of the places; up to the odometry's first break.
+    Corrected for the bias; the variances are those of the places; up to the first break.
     """
+    segments = fit.problem.segments
     bias = float(fit.solution.bias[0])
     poses, variances = [np.asarray(segments[0].start, float)], [0.0]
     yaw_variance = place_variance = 0.0

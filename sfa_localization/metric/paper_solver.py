@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's own solver: momentum descent on equations 1 to 8, kept as the reference.
 
-Equation 6 lacks the case of the last line, which has only its second term; the cosine of
-equation 5 cannot tell a turn from its mirror image. Both are kept as they must be meant.
+Equation 6 lacks the case of the last line, which has only its second term; here it has that. The
+cosine of equation 5 is the same for a turn and its mirror image; signed turns decide afterwards.
 """
 
 from __future__ import annotations
@@ -15,20 +15,26 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.alternation import Fit, residual_variance
+from sfa_localization.metric.alternation import MapFit, MetricProblem, residual_variance
 from sfa_localization.metric.expansions import Monomials, monomials
 from sfa_localization.metric.phases import certify, phase_cost
-from sfa_localization.metric.quadratic_form import Links, Problem, Solution, Stack, eliminate
-from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.metric.quadratic_form import QuadraticForm, Solution, eliminate, schur
 
 Complex = NDArray[np.complex128]
 
-_PAPER_FEATURES = 8
+PAPER_FEATURES = 8
+"""Section 4: the eight slowest features, 45 monomials."""
+ITERATIONS = 1000
+"""Section 4: the descent ends at about 1000 iterations."""
+LEARNING_RATE = 1e-5
+"""beta of equation 7, section 4."""
+MOMENTUM = 0.95
+"""gamma of equation 7, section 4."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """theta: alpha (N,) rad, origins (N, 2) m, weights (J, 2)."""
+    """theta of equation 1: alpha (N,) rad, origins o (N, 2) m, weights W (J, 2)."""
 
     alpha: Array
     origins: Array
@@ -62,7 +68,7 @@ class Lines:
         return cost
 
     def gradient(self, theta: Parameters) -> Parameters:
-        """Equations 2 to 4, and equation 6 when there are turns."""
+        """By alpha: equation 2, or equation 6 with turns; by o: equation 3; by W: equation 4."""
         lines = len(theta.alpha)
         misfit = self._misfit(theta)
         predicted = self.regressors @ theta.weights - theta.origins[self.line]
@@ -76,14 +82,17 @@ class Lines:
         return Parameters(alpha, origins, -self.regressors.T @ misfit)
 
     def _misfit(self, theta: Parameters) -> Array:
+        """The vectors inside the norm of equation 1, (M, 2)."""
         direction = np.column_stack([np.cos(theta.alpha), np.sin(theta.alpha)])[self.line]
         placed = theta.origins[self.line] + self.distances[:, None] * direction
         return np.asarray(placed - self.regressors @ theta.weights)
 
     def _turn_misfit(self, theta: Parameters) -> Array:
+        """The terms inside the second square of equation 5, (N - 1,)."""
         return np.asarray(np.cos(theta.alpha[:-1] - theta.alpha[1:]) - np.cos(self.turns))
 
     def _turn_gradient(self, theta: Parameters) -> Array:
+        """What equation 6 adds to equation 2, (N,)."""
         step = theta.alpha[:-1] - theta.alpha[1:]
         pull = np.nan_to_num(np.sin(step) * -self._turn_misfit(theta))
         gradient = np.zeros(len(theta.alpha))
@@ -92,40 +101,34 @@ class Lines:
         return gradient
 
 
-def descend(lines: Lines, start: Parameters, config: MetricConfig) -> tuple[Parameters, Array]:
-    """Equations 7 and 8 until the iterations are used up or the cost stands still.
+def descend(
+    lines: Lines,
+    start: Parameters,
+    iterations: int = ITERATIONS,
+    learning_rate: float = LEARNING_RATE,
+    momentum: float = MOMENTUM,
+) -> tuple[Parameters, Array]:
+    """Momentum descent.
+
+    Equation 7, v_t = gamma v_{t-1} + beta dC/dtheta; equation 8, theta_t = theta_{t-1} - v_t.
 
     Returns the parameters and the cost (I,) before each iteration and after the last. Raises
     DataError when the descent diverges.
     """
     count, theta = len(start.alpha), start.flat()
     velocity, history = np.zeros_like(theta), [lines.cost(start)]
-    for _ in range(config.paper_iterations):
+    for _ in range(iterations):
         slope = lines.gradient(Parameters.of(theta, count)).flat()
-        velocity = config.paper_momentum * velocity + config.paper_learning_rate * slope
+        velocity = momentum * velocity + learning_rate * slope
         theta = theta - velocity
         history.append(lines.cost(Parameters.of(theta, count)))
         if not np.isfinite(history[-1]):
-            raise DataError('the descent diverges: lower paper_learning_rate')
-        if abs(history[-1] - history[-2]) < config.paper_change_min:
-            break
+            raise DataError("the paper's descent diverges on this drive: set solver: certified")
     return Parameters.of(theta, count), np.array(history)
 
 
-def random_start(lines: Lines, config: MetricConfig) -> Parameters:
-    """The paper's simulator start: everything uniform."""
-    rng = np.random.default_rng(config.metric_seed)
-    count = int(lines.line[-1]) + 1
-    half = np.array([config.paper_area_x, config.paper_area_y]) / 2
-    return Parameters(
-        rng.uniform(0.0, 2.0 * np.pi, count),
-        rng.uniform(-half, half, (count, 2)),
-        rng.uniform(-1.0, 1.0, (lines.regressors.shape[1], 2)),
-    )
-
-
 def odometry_start(lines: Lines, starts: Array) -> Parameters:
-    """The paper's robot start: lines (N, 3) where odometry has them, weights fitted to that."""
+    """The paper's start on the robot: lines (N, 3) of odometry, weights regressed on them."""
     alpha, origins = starts[:, 2], starts[:, :2]
     direction = np.column_stack([np.cos(alpha), np.sin(alpha)])[lines.line]
     placed = origins[lines.line] + lines.distances[:, None] * direction
@@ -133,49 +136,46 @@ def odometry_start(lines: Lines, starts: Array) -> Parameters:
     return Parameters(np.array(alpha), np.array(origins), weights)
 
 
-def learn(features: Array, stack: Stack, links: Links, config: MetricConfig) -> tuple[Fit, Array]:
-    """The descent on the stack's features (M, K): its fit, and the cost (I,) of its iterations.
+def learn(problem: MetricProblem) -> tuple[MapFit, Array]:
+    """The descent from odometry: its fit, and the cost (I,) of its iterations.
 
-    Raises DataError when the segments are not straight lines: the paper's costs know no other.
+    Raises DataError when the segments are not straight lines, as the paper's costs assume.
     """
+    stack, links = problem.stack, problem.links
     if np.any(stack.path.imag):
         raise DataError('the paper solver needs straight lines: set segments: straight')
-    count = min(config.slow_features or _PAPER_FEATURES, features.shape[1])
-    regressors = monomials(features[:, :count])
+    count = min(problem.config.slow_features or PAPER_FEATURES, problem.features.shape[1])
+    regressors = monomials(problem.features[:, :count])
     turns = np.full(stack.segments - 1, np.nan)
     turns[links.at] = links.turn
-    lines = Lines(
-        regressors, stack.path.real, stack.owner, turns if config.paper_turns else np.zeros(0)
-    )
-    random = config.paper_start == 'random'
-    start = random_start(lines, config) if random else odometry_start(lines, stack.starts)
-    theta, history = descend(lines, start, config)
+    lines = Lines(regressors, stack.path.real, stack.owner, turns)
+    theta, history = descend(lines, odometry_start(lines, stack.starts))
     if _mirrored(theta.alpha, turns):
         theta = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
-    return _fit(theta, regressors, count, stack, links), history
+    return _fit(theta, regressors, count, problem), history
 
 
 def _mirrored(alpha: Array, turns: Array) -> bool:
-    """Whether the signed turns (N - 1,) fit the mirror image better: no cosine can tell."""
+    """Whether the signed turns (N - 1,) fit the mirror image better: no cosine can decide."""
     step = np.diff(alpha)
     return bool(np.nansum(np.cos(step - turns)) < np.nansum(np.cos(-step - turns)))
 
 
-def _fit(theta: Parameters, regressors: Array, count: int, stack: Stack, links: Links) -> Fit:
-    """The descent's end in the certified solver's terms, certificate included."""
-    terms = regressors.shape[1]
+def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProblem) -> MapFit:
+    """The result of the descent as a fit, certificate included."""
+    stack, terms = problem.stack, regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
     expanded = np.column_stack([regressors[:, 1:], np.ones(len(regressors))])
     weights = np.roll(theta.weights, -1, axis=0) @ np.array([1.0, 1.0j])
     o, z = theta.origins @ np.array([1.0, 1.0j]), np.exp(1j * theta.alpha)
     residuals = o[stack.owner] + z[stack.owner] * stack.path - expanded @ weights
     freedom = len(residuals) - terms - 1.5 * stack.segments
-    variance = residual_variance(residuals, freedom)
-    elimination = eliminate(expanded, basis.ridge, np.ones(len(expanded)), stack)
+    variance, ones = residual_variance(residuals, freedom), np.ones(len(expanded))
+    elimination = eliminate(expanded, basis.ridge, ones, stack)
     bias = np.zeros(stack.run[-1] + 1)
-    h = Problem(elimination.gram, links, stack.run, variance, 0.0).reduced(bias)
+    form = QuadraticForm(elimination.gram, problem.links, stack.run, variance, 0.0)
+    h = schur(form.system(bias))[0]
     solution = Solution(z, o, bias, certify(h, z), h, phase_cost(h, z))
-    trust = np.ones(len(expanded))
-    return Fit(
-        basis, expanded, trust, links, variance, elimination, solution, 1.0, residuals, weights
+    return MapFit(
+        problem, basis, expanded, ones, variance, 1.0, elimination, solution, residuals, weights
     )

@@ -3,7 +3,8 @@
 """Phase synchronization: minimize z^H H z / 2 over unit phases, and prove the minimum global.
 
 H (N, N) is Hermitian and positive semidefinite; z (N,) has |z_n| = 1. Unsupervised metric
-learning is this problem once the map and the segments' origins are eliminated.
+learning (equations 1 and 5 of the paper) is this problem once the map and the segments' origins are
+eliminated; the paper descends on the angles instead, equations 2 and 6 to 8.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ Complex = NDArray[np.complex128]
 
 # Relative to the largest eigenvalue of H; what rounding leaves of an exact zero.
 CERTIFICATE_TOLERANCE = 1e-9
+# Far more than Newton needs; the damping makes each step a descent.
 _NEWTON_STEPS = 100
 # Newton's steps shrink quadratically: the one after this would be rounding.
 _CONVERGED = 1e-9
+# Of the relaxation, a last resort that is seldom entered.
 _SWEEPS = 500
 
 
@@ -64,7 +67,8 @@ def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Ce
     from the semidefinite relaxation, which the certificate is dual to; the first certified minimum
     ends the search. What is returned may be uncertified: ask the certificate.
     """
-    z = min([refine(h, unit(s)) for s in starts] or [_spectral(h)], key=lambda c: phase_cost(h, c))
+    first = [unit(s) for s in starts] or [spectral_start(h)]
+    z = min([refine(h, s) for s in first], key=lambda c: phase_cost(h, c))
     certificate = certify(h, z)
     for more in (_spectral_starts, _upgraded_starts, _relaxed_starts):
         if certificate.certified:
@@ -72,10 +76,6 @@ def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Ce
         z = min([z, *(refine(h, c) for c in more(h, z))], key=lambda c: phase_cost(h, c))
         certificate = certify(h, z)
     return z, certificate
-
-
-def _spectral(h: Complex) -> Complex:
-    return refine(h, spectral_start(h))
 
 
 def _spectral_starts(h: Complex, z: Complex) -> list[Complex]:
@@ -164,7 +164,7 @@ def angle_hessian(h: Complex, z: Complex) -> Array:
 
 def _step(hessian: Array, gradient: Array, damping: float) -> Array:
     """Newton step; where the Hessian is not positive, along its absolute value."""
-    # Turning all together changes nothing: hold the mean.
+    # Turning all together changes nothing: fix the mean.
     damped = hessian + np.mean(np.abs(np.diag(hessian))) / len(hessian)
     damped[np.diag_indices_from(damped)] += damping
     try:

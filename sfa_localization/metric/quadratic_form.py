@@ -1,15 +1,30 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Unsupervised metric learning as a quadratic form in the segments' directions.
+"""Unsupervised metric learning as a quadratic form in the directions of the segments.
 
-Picture m of segment n lies at o_n + z_n q_nm, and the map says Phi w. Least squares over the
-weights w and then over the origins o leaves z^H H z: the complex form of the paper's equation 1,
-with signed turns and odometry's displacements between segments as further squares.
+With p = x + i y in meters and z_n = exp(i alpha_n), equation 1 of the paper reads
+
+    2 C = sum_n sum_m |o_n + z_n q_nm - phi(s_nm)^T w|^2,
+
+where q_nm = d_nm on a straight line; on a curved segment it is the odometry's path. This is the
+only square that reads the features. `eliminate` minimizes it over the map's weights w, which
+leaves `Elimination.gram`, a quadratic form in [o, z, -b z]: the paths are corrected for the
+yaw-rate bias b of each run, q_nm - b drift_nm. `QuadraticForm` adds what odometry measured from
+one segment to the next, each square weighted by `variance`, that of an image's position, over its
+own:
+
+    |z_{n+1} - exp(i turn_n) z_n|^2               signed turns: the second sum of equation 5, which
+                                                  has only cosines, the same for left and right
+    |o_{n+1} - o_n - z_n displacement_n|^2        displacements: not in the paper
+    b^2                                           prior of the biases: not in the paper
+
+`schur` minimizes over the origins o. What remains is z^H H z with |z_n| = 1, see phases.py. Where
+equations 2 to 4 are zero, w and o are those of `Elimination.weights` and `schur`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,20 +38,30 @@ from sfa_localization.metric.segments import Segments
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
+# Newton steps on the biases: their cost is nearly quadratic, so that three are usual.
 _BIAS_STEPS = 8
+# rad/s: of the numerical derivative by the biases, far below any bias that matters.
+_BIAS_DIFFERENCE = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
 class Stack:
-    """The pictures of all N segments, one after the other: M rows."""
+    """The images of all N segments, one after the other: M rows."""
 
     images: Indices
+    """(M,) indices of the images among all of the drives."""
     owner: Indices
+    """(M,) segment of each row."""
     path: Complex
+    """(M,) q: places in the frame of the segment, meters."""
     drift: Complex
+    """(M,) meters per rad/s that a yaw-rate bias adds to `path`."""
     headings: Array
+    """(M,) rad in the frame of the segment."""
+    times_s: Array
+    """(M,) seconds since the reference heading of the segment: drift of `headings`."""
     first: Indices
-    """(N,) row of each segment's first picture."""
+    """(N,) row of each segment's first image."""
     run: Indices
     """(N,) run of each segment."""
     starts: Array
@@ -51,6 +76,7 @@ class Stack:
             np.concatenate([s.path for s in segments]),
             np.concatenate([s.path_drift for s in segments]),
             np.concatenate([s.headings for s in segments]),
+            np.concatenate([s.times_s for s in segments]),
             np.concatenate([[0], np.cumsum(sizes)[:-1]]),
             np.array([s.run for s in segments]),
             np.array([s.start for s in segments]),
@@ -71,7 +97,10 @@ class Stack:
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """What odometry says from one segment to the next: L measured turns and displacements."""
+    """What odometry measured from one segment to the next: L turns and displacements.
+
+    One of infinite variance has no weight.
+    """
 
     at: Indices
     run: Indices
@@ -81,22 +110,21 @@ class Links:
     displacement: Complex
     displacement_variance: Array
     displacement_drift: Complex
-    turn_trust: Array
-    displacement_trust: Array
 
     @classmethod
-    def of(cls, segments: Segments, turns: bool, displacements: bool) -> Links:
-        """All that are known; trust 0 where not to be used."""
+    def of(cls, segments: Segments) -> Links:
+        """Of all segments from which odometry leads on."""
         items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
         column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
         at = np.array([n for n, _ in items], np.int64)
         run = np.array([s.run for _, s in items], np.int64)
-        trust = [np.full(len(at), float(used)) for used in (turns, displacements)]
-        return cls(at, run, *column, *trust)
+        return cls(at, run, *column)
 
-    def trusted(self, turn: Array, displacement: Array) -> Links:
-        """The same links with other weights (L,)."""
-        return replace(self, turn_trust=turn, displacement_trust=displacement)
+    @property
+    def used(self) -> bool:
+        """Whether any turn or displacement has a weight."""
+        variances = np.concatenate([self.turn_variance, self.displacement_variance])
+        return bool(np.isfinite(variances).any())
 
 
 _MEASURED = (
@@ -111,7 +139,7 @@ _MEASURED = (
 
 @dataclass(frozen=True, slots=True)
 class Elimination:
-    """Least squares over the map's weights: what is left of the features.
+    """Equation 1 minimized over the map's weights: what remains of the features.
 
     `gram` (3N, 3N) is the quadratic form in [o, z, -b z]; the weights are
     w = F^-1 cross [o, z, -b z] with F = factor factor^T.
@@ -127,9 +155,9 @@ class Elimination:
 
     def leverage(self, expanded: Array) -> Array:
         """phi^T F^-1 phi (M,) of expanded features (M, m)."""
-        return np.asarray((self.halved(expanded) ** 2).sum(0))
+        return np.asarray((self.whitened(expanded) ** 2).sum(0))
 
-    def halved(self, expanded: Array) -> Array:
+    def whitened(self, expanded: Array) -> Array:
         """factor^-1 phi (m, M) of expanded features (M, m)."""
         return np.asarray(scipy.linalg.solve_triangular(self.factor, expanded.T, lower=True))
 
@@ -140,20 +168,20 @@ class Elimination:
 
 
 def eliminate(expanded: Array, ridge: Array, weights: Array, stack: Stack) -> Elimination:
-    """Eliminate the map from features expanded to (M, m), each picture with a weight (M,)."""
+    """Eliminate the map from features expanded to (M, m), each image with a weight (M,)."""
     weighted = expanded * weights[:, None]
     normal = weighted.T @ expanded
     normal[np.diag_indices_from(normal)] += ridge
     factor = _cholesky(normal)
     columns = np.column_stack([np.ones(len(weights)), stack.path, stack.drift])
     cross = np.vstack([_products(weighted, column, stack) for column in columns.T]).T
-    half = _halve(factor, cross)
-    gram = _moments(columns, weights, stack) - half.conj().T @ half
+    white = _whiten(factor, cross)
+    gram = _moments(columns, weights, stack) - white.conj().T @ white
     return Elimination((gram + gram.conj().T) / 2, factor, cross)
 
 
 def _cholesky(matrix: Array) -> Array:
-    """Lower factor; what nothing holds is held weakly, and only then."""
+    """Lower factor; a singular matrix gets a weak ridge first."""
     try:
         return np.asarray(scipy.linalg.cholesky(matrix, lower=True))
     except np.linalg.LinAlgError:
@@ -179,7 +207,7 @@ def _moments(columns: Complex, weights: Array, stack: Stack) -> Complex:
     return moments.reshape(3 * n, 3 * n)
 
 
-def _halve(factor: Array, right: Complex) -> Complex:
+def _whiten(factor: Array, right: Complex) -> Complex:
     """factor^-1 right, for complex right."""
     both = np.hstack([right.real, right.imag])
     both = scipy.linalg.solve_triangular(factor, both, lower=True, overwrite_b=True)
@@ -203,14 +231,19 @@ class Solution:
     h: Complex
     cost: float
 
+    def places(self, stack: Stack) -> Complex:
+        """Where the segments put the images (M,), meters."""
+        path = stack.corrected(self.bias)
+        return np.asarray(self.o[stack.owner] + self.z[stack.owner] * path)
+
     def coefficients(self, run: Indices) -> Complex:
         """[o, z, -b z] (3N,)."""
         return np.concatenate([self.o, self.z, -self.bias[run] * self.z])
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
-    """The features' quadratic form and odometry's links, at a point variance."""
+class QuadraticForm:
+    """The squares of the features and of odometry's links, for a position variance, m^2."""
 
     gram: Complex
     links: Links
@@ -220,26 +253,22 @@ class Problem:
 
     def system(self, bias: Array) -> Complex:
         """The quadratic form (2N, 2N) in [o, z] at the runs' biases (R,)."""
-        own = self._tied(self.gram, bias, bias)
-        for rows, weight in self._links(bias):
-            own = own + rows.conj().T @ (weight[:, None] * rows)
-        return np.asarray(own)
+        form = self._biased_gram(bias)
+        for rows, weight in self._link_rows(bias):
+            form = form + rows.conj().T @ (weight[:, None] * rows)
+        return np.asarray(form)
 
-    def reduced(self, bias: Array) -> Complex:
-        """H (N, N): the quadratic form in z alone."""
-        return schur(self.system(bias))[0]
-
-    def _tied(self, gram: Complex, left: Array, right: Array) -> Complex:
-        """S(left)^T gram S(right), S = [[1, 0], [0, 1], [0, -b]]."""
+    def _biased_gram(self, bias: Array) -> Complex:
+        """S^T gram S (2N, 2N) with [o, z, -b z] = S [o, z], S = [[1, 0], [0, 1], [0, -b]]."""
         n = len(self.run)
-        a, b = -left[self.run], -right[self.run]
-        tied = gram[:, : 2 * n].copy()
-        tied[:, n:] += gram[:, 2 * n :] * b
-        own = tied[: 2 * n]
-        own[n:] += a[:, None] * tied[2 * n :]
-        return np.asarray(own)
+        b = -bias[self.run]
+        product = self.gram[:, : 2 * n].copy()
+        product[:, n:] += self.gram[:, 2 * n :] * b
+        form = product[: 2 * n]
+        form[n:] += b[:, None] * product[2 * n :]
+        return np.asarray(form)
 
-    def _links(self, bias: Array) -> list[tuple[Complex, Array]]:
+    def _link_rows(self, bias: Array) -> list[tuple[Complex, Array]]:
         """Rows (L, 2N) whose weighted squares are the turns' and the displacements' costs."""
         links, n, at = self.links, len(self.run), np.arange(len(self.links.at))
         turns, moves = np.zeros((2, len(at), 2 * n), complex)
@@ -249,8 +278,8 @@ class Problem:
         moves[at, links.at + 1] = 1.0
         moves[at, links.at] = -1.0
         moves[at, n + links.at] = -(links.displacement - own * links.displacement_drift)
-        turn_weight = self.variance * links.turn_trust / links.turn_variance
-        move_weight = self.variance * links.displacement_trust / links.displacement_variance
+        turn_weight = self.variance / links.turn_variance
+        move_weight = self.variance / links.displacement_variance
         return [(turns, turn_weight), (moves, move_weight)]
 
     def slope(self, bias: Array, x: Complex) -> Array:
@@ -259,7 +288,7 @@ class Problem:
         z = x[n:]
         right = self.gram[2 * n :] @ np.concatenate([x, -bias[self.run] * z])
         own = np.bincount(self.run, np.real(-np.conj(z) * right), len(bias))
-        (turns, turn_weight), (moves, move_weight) = self._links(bias)
+        (turns, turn_weight), (moves, move_weight) = self._link_rows(bias)
         turned = -1j * links.turn_time * turns[np.arange(len(links.at)), n + links.at]
         for change, rows, weight in (
             (turned, turns, turn_weight),
@@ -270,28 +299,30 @@ class Problem:
         return np.asarray(own + self.variance * bias / self.bias_std**2)
 
     def solve(self, start: Complex | None, bias: Array) -> Solution:
-        """The best directions, origins and biases; from `start` (N,), or from everywhere."""
+        """The best directions, origins and biases; near `start` (N,), or globally without one."""
         h, origins = schur(self.system(bias))
         z = refine(h, start) if start is not None else synchronize(h)[0]
         if self.bias_std > 0:
-            bias, z = self._debias(bias, z)
+            bias, z = self._estimate_bias(bias, z)
             h, origins = schur(self.system(bias))
         z, certificate = synchronize(h, [z])
         cost = float(np.real(np.vdot(z, h @ z))) / 2
         return Solution(z, origins @ z, bias, certificate, h, cost)
 
-    def _settle(self, bias: Array, z: Complex) -> tuple[Complex, Array]:
+    def _refined(self, bias: Array, z: Complex) -> tuple[Complex, Array]:
         """Directions at given biases, and the slope of the cost by the biases."""
         h, origins = schur(self.system(bias))
         z = refine(h, z)
         return z, self.slope(bias, np.concatenate([origins @ z, z]))
 
-    def _debias(self, bias: Array, z: Complex) -> tuple[Array, Complex]:
-        """Newton on the biases, with the directions following (the envelope's slope is exact)."""
-        runs, small = len(bias), 1e-5
-        z, slope = self._settle(bias, z)
-        columns = [self._settle(bias + small * unit, z)[1] - slope for unit in np.eye(runs)]
-        curvature = np.column_stack(columns) / small
+    def _estimate_bias(self, bias: Array, z: Complex) -> tuple[Array, Complex]:
+        """Newton on the biases; the directions follow, so the slope is that of the envelope."""
+        runs = len(bias)
+        z, slope = self._refined(bias, z)
+        columns = [
+            self._refined(bias + _BIAS_DIFFERENCE * unit, z)[1] - slope for unit in np.eye(runs)
+        ]
+        curvature = np.column_stack(columns) / _BIAS_DIFFERENCE
         floor = self.variance / self.bias_std**2 * np.eye(runs)
         curvature = (curvature + curvature.T) / 2
         if np.linalg.eigvalsh(curvature)[0] < floor[0, 0] / 2:
@@ -300,18 +331,18 @@ class Problem:
             step = -np.linalg.solve(curvature, slope)
             step = np.clip(step, -self.bias_std, self.bias_std)
             bias = bias + step
-            z, slope = self._settle(bias, z)
+            z, slope = self._refined(bias, z)
             if np.abs(step).max() < 1e-9 * self.bias_std:
                 break
         return bias, z
 
 
 def schur(system: Complex) -> tuple[Complex, Complex]:
-    """Eliminate the origins: H (N, N), and the origins (N, N) as a linear map of z."""
+    """Minimize over the origins: H (N, N), and the origins (N, N) as a linear map of z."""
     n = len(system) // 2
     own = np.real(system[:n, :n]).copy()
     level = max(float(np.trace(own)) / n, 1e-300)
-    # Moving everything together costs nothing: pin the mean.
+    # Moving all origins together costs nothing: fix the mean.
     own += level / n
     origins = -np.asarray(_solve(_cholesky(own), system[:n, n:]))
     h = system[n:, n:] + system[n:, :n] @ origins

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a drive can fix a map at all, and what to drive instead."""
+"""Whether a drive can determine a map at all, and what to drive instead."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.alternation import Fit, targets
-from sfa_localization.metric.phases import angle_hessian, metric_upgrade, refine
+from sfa_localization.metric.alternation import MapFit
+from sfa_localization.metric.map_covariance import angle_covariance
+from sfa_localization.metric.phases import metric_upgrade
 from sfa_localization.metric.quadratic_form import Stack
-from sfa_localization.metric.settings import MetricConfig
 
 Complex = NDArray[np.complex128]
 
+ANGLE_STD_MAX_DEG = 10.0
+"""Standard deviation of a segment's direction beyond which the map bends visibly."""
+# Fewer directions leave any shear possible.
 _SEGMENTS_MIN = 3
+# Narrower drives do not cover an area.
 _WIDTH_MIN_M = 0.5
-# Of the metric upgrade's singular values: below, some shear is as good as the map.
+# Of the metric upgrade's singular values: below, some shear explains the data as well.
 _UPGRADE_MIN = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
-    """What the drive offered."""
+    """Amount and geometry of the data."""
 
     segments: int
     images: int
@@ -39,9 +43,9 @@ class Diagnostics:
     crossings: int
     """Pairs of segments that cross, of different stretches of the drive."""
     upgrade_condition: float
-    """0: without turns any shear explains the data; NaN when turns rule that out."""
+    """0: any shear explains the data; NaN when turns rule that out."""
     mirror_ambiguous: bool
-    """Nothing tells the map from its mirror image."""
+    """The mirror image of the map explains the data as well."""
     angle_std_rad: float
     """Largest uncertainty of a segment's direction relative to the whole map."""
 
@@ -53,20 +57,19 @@ def check_amount(stack: Stack) -> None:
     """Raises DataError when there are too few segments to try."""
     if stack.segments < _SEGMENTS_MIN:
         raise DataError(
-            f'only {stack.segments} segments of odometry with pictures: drive at least '
+            f'only {stack.segments} segments of odometry with images: drive at least '
             f'{_SEGMENTS_MIN}, in different directions and crossing each other'
         )
 
 
-def diagnose(fit: Fit, stack: Stack) -> Diagnostics:
+def diagnose(fit: MapFit) -> Diagnostics:
     """Diagnostics of a fit."""
-    places = targets(fit.solution, stack)
+    places, stack, links = fit.places, fit.stack, fit.problem.links
     steps = stack.path[1:] - stack.path[:-1]
     same = stack.owner[1:] == stack.owner[:-1]
     heading = steps[same] * fit.solution.z[stack.owner[1:][same]]
-    links = fit.links
-    signed = bool(np.any(links.turn_trust > 0) or np.any(links.displacement_trust > 0))
-    signed = signed or not _straight(stack)
+    # Curved paths and odometry's links differ from their mirror image.
+    signed = links.used or bool(np.any(stack.path.imag))
     condition = np.nan if signed else metric_upgrade(np.real(fit.solution.h))[1]
     return Diagnostics(
         segments=stack.segments,
@@ -81,25 +84,12 @@ def diagnose(fit: Fit, stack: Stack) -> Diagnostics:
     )
 
 
-def angle_covariance(fit: Fit) -> Array:
-    """Covariance (N, N) of the directions, rad^2, relative to the whole map's rotation."""
-    hessian = angle_hessian(fit.solution.h, refine(fit.solution.h, fit.solution.z))
-    values, vectors = np.linalg.eigh(hessian)
-    n = len(values)
-    common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
-    inverse = np.where(common, 0.0, 1.0 / np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
-    centered = np.eye(n) - 1.0 / n
-    spread = centered @ vectors
-    scale = fit.variance * fit.correlation
-    return np.asarray(scale * (spread * inverse) @ spread.T)
-
-
-def check(diagnostics: Diagnostics, config: MetricConfig) -> None:
-    """Raises DataError, telling what to drive, when the data cannot fix the map."""
+def check(diagnostics: Diagnostics) -> None:
+    """Raises DataError, naming what to drive, when the data cannot determine the map."""
     if diagnostics.upgrade_condition < _UPGRADE_MIN:
         raise DataError(
             'without turns the lines leave the map sheared or collapsed: drive at least three '
-            'well-spread directions, or set use_turns'
+            'well-spread directions'
         )
     if min(diagnostics.extent_m) < _WIDTH_MIN_M:
         raise DataError(
@@ -108,19 +98,15 @@ def check(diagnostics: Diagnostics, config: MetricConfig) -> None:
         )
     if diagnostics.crossings == 0:
         raise DataError(
-            'no segment crosses another, so nothing ties them together but odometry: drive across '
+            'no segment crosses another, so only odometry connects them: drive across '
             'earlier tracks, from well-spread directions'
         )
-    if np.rad2deg(diagnostics.angle_std_rad) > config.angle_std_max:
+    if np.rad2deg(diagnostics.angle_std_rad) > ANGLE_STD_MAX_DEG:
         raise DataError(
             f'directions are uncertain by up to {np.rad2deg(diagnostics.angle_std_rad):.0f} deg: '
             'drive longer, in more directions, and cross earlier tracks '
             f'({diagnostics.crossings} crossings now)'
         )
-
-
-def _straight(stack: Stack) -> bool:
-    return not np.any(stack.path.imag)
 
 
 def _extent(places: Complex) -> tuple[float, float]:
@@ -130,13 +116,13 @@ def _extent(places: Complex) -> tuple[float, float]:
 
 
 def _directions(steps: Complex) -> float:
-    """From the length-weighted double angle, which is blind to driving to or fro."""
+    """From the length-weighted double angle, which is the same for driving back and forth."""
     total = np.abs(steps).sum()
     return 1.0 - float(abs((steps**2 / np.maximum(np.abs(steps), 1e-12)).sum()) / max(total, 1e-12))
 
 
 def _crossings(places: Complex, stack: Stack) -> int:
-    """Chords of segments that cross, leaving out neighbours on the drive."""
+    """Chords of segments that cross, leaving out neighbors on the drive."""
     ends = np.append(stack.first[1:], len(places)) - 1
     a, b = places[stack.first], places[ends]
     i, j = np.triu_indices(len(a), 2)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS messages to and from plain values; what is malformed raises MessageError with the reason.
 
-Messages are filled here and nowhere else; what their fields mean stands in `decoding`. Stamps are
+Messages are filled here and nowhere else; their fields are read in `data.messages`. Stamps are
 integer nanoseconds, poses are (x m, y m, yaw rad), covariances of poses are (3, 3) in that order.
 """
 
@@ -75,13 +75,13 @@ def to_quaternion(yaw_rad: float) -> Quaternion:
 
 
 def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
-    """Stamp and picture (H, W, 3) uint8 BGR of either image message."""
+    """Stamp and image (H, W, 3) uint8 BGR of either image message."""
     read = read_compressed if isinstance(message, CompressedImage) else read_raw
     return read_stamp(message.header.stamp), read(message)
 
 
 def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
-    """A bgr8 message of a picture (H, W, 3) uint8."""
+    """A bgr8 message of an image (H, W, 3) uint8."""
     image = np.ascontiguousarray(image, np.uint8)
     message = ImageMessage(encoding='bgr8', is_bigendian=0)
     message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
@@ -92,7 +92,7 @@ def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
 
 
 def to_compressed(image: Image, stamp_ns: int, frame: str, quality: int) -> CompressedImage:
-    """A JPEG message of a picture (H, W, 3) uint8 BGR."""
+    """A JPEG message of an image (H, W, 3) uint8 BGR."""
     message = CompressedImage(format='bgr8; jpeg compressed bgr8')
     message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
     message.data = array.array('B', encode_jpeg(image, quality))
@@ -105,7 +105,7 @@ def to_info(panorama: PanoramaConfig) -> String:
 
 
 def read_info(message: String) -> PanoramaConfig:
-    """What a panorama shows, by panorama/info."""
+    """The settings of a panorama, from panorama/info."""
     try:
         values = json.loads(message.data)
     except (ValueError, RecursionError):
@@ -178,9 +178,9 @@ def to_odometry(
     message.pose.covariance = to_covariance(covariance)
     v, omega = (float(value) for value in np.asarray(twist, float))
     message.twist.twist.linear.x, message.twist.twist.angular.z = v, omega
-    spread = np.diag([_FIXED_VARIANCE] * 6)
-    spread[np.ix_([0, 5], [0, 5])] = twist_covariance
-    message.twist.covariance = spread.ravel()
+    full = np.diag([_FIXED_VARIANCE] * 6)
+    full[np.ix_([0, 5], [0, 5])] = twist_covariance
+    message.twist.covariance = full.ravel()
     return message
 
 
@@ -205,7 +205,7 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
 
 
 def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> QuaternionStamped:
-    """How far images have turned about the vertical, from wherever."""
+    """How far images have turned about the vertical, from any start."""
     require_sane('output', yaw_rad)
     message = QuaternionStamped(quaternion=to_quaternion(yaw_rad))
     message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
@@ -218,12 +218,12 @@ def read_turned(message: QuaternionStamped) -> tuple[int, float]:
 
 
 def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:
-    """How pictures' errors hang together: the share that is common, and over which way."""
+    """How the errors of neighboring images correlate: share, and distance in m."""
     return to_array([correlation.share, correlation.distance_m], _CORRELATION)
 
 
 def read_error_correlation(message: Float64MultiArray) -> ErrorCorrelation:
-    """Raises MessageError for numbers that cannot be."""
+    """How errors correlate, from sfa/error_correlation. Raises MessageError."""
     if len(message.data) != 2:
         raise MessageError(f'{len(message.data)} numbers where {_CORRELATION} are expected')
     try:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 node: odometry and poses seen in pictures in, the robot's pose in the map out."""
+"""ROS 2 node: odometry and poses from images in, the robot's pose in the map out."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import uncertainty
 from sfa_localization.nodes.conversions import (
     Motion,
     read_error_correlation,
@@ -63,60 +64,52 @@ _LEVELS = {
     Level.DEGRADED: DiagnosticStatus.WARN,
     Level.LOST: DiagnosticStatus.ERROR,
 }
+PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
+"""Time between the poses of ekf/path, and how many it keeps: those of 17 minutes."""
+IMAGES_SILENCE = 3.0
+"""Images may be silent for so many times silence_timeout: they come less often than odometry."""
 _WATCH_PERIOD_S = 0.2
 _REPEAT_STATE_S = 1.0
-_BACKWARD_JUMP_NS = -500_000_000
-_ODOM, _SEEN = 'odom', 'sfa/pose_with_covariance'
-_CORRELATION = 'sfa/error_correlation'
+_BACKWARD_JUMP_NS = -500_000_000  # of simulated time: less is jitter
+_ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
 
 
 class EkfNode(LocalizationNode):
-    """Feeds the pose filter, and tells what it believes and how far that can be trusted."""
+    """Feeds the pose filter; publishes its estimate and how far that can be trusted."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('ekf_node', [EkfNodeConfig, FilterConfig], **options)
+        self._jumps: Any = None
+        self._begin()
+
+    def _begin(self) -> None:
         self._config = self.settings(EkfNodeConfig)
         self._filter = PoseFilter(self.settings(FilterConfig))
         self._paused = False
-        self._jumps: Any = None
-        self._path: deque[PoseStamped] = deque(maxlen=self._config.path_length)
+        self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_ns = 0
         self._frames = self._config.odom_frame, self._config.base_frame
-        self._told = ''
-        self._told_level: Level | None = None
-        self._since_told = 0
-        self._moved = (0, 0.0)
+        self._state_text = ''
+        self._state_level: Level | None = None
+        self._ticks_since_state = 0
+        self._last_moved = (0, 0.0)
 
     def setup(self) -> None:
-        self._config = self.settings(EkfNodeConfig)
-        self._filter = PoseFilter(self.settings(FilterConfig))
-        self._paused = False
-        self._path.clear()
-        self._told_level = None
-        self._moved = (0, 0.0)
+        self._begin()
         self._make_publishers()
         self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
-        self.subscribe(PoseWithCovarianceStamped, _SEEN, self._receive_pose, sensor_qos(20))
-        self.subscribe(
-            Float64,
-            'sfa/camera_delay',
-            self._receive_delay,
-            latched_qos(),
-            while_inactive=True,
-        )
+        self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
-        self.subscribe(
-            Float64MultiArray,
-            _CORRELATION,
-            self._receive_correlation,
-            latched_qos(),
-            while_inactive=True,
-        )
+        for kind, topic, receive in (
+            (Float64, 'sfa/camera_delay', self._receive_delay),
+            (Float64MultiArray, 'sfa/error_correlation', self._receive_correlation),
+        ):
+            self.subscribe(kind, topic, receive, latched_qos(), while_inactive=True)
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(PoseWithCovarianceStamped, topic, self._set_pose, reliable_qos(1))
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
-        self.every(_WATCH_PERIOD_S, self._tell_state)
+        self.every(_WATCH_PERIOD_S, self._publish_state)
         # Looped playback steps simulated time back; stamps alone would show it only later.
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -143,7 +136,7 @@ class EkfNode(LocalizationNode):
             )
 
     def started(self) -> None:
-        self._tell_state()
+        self._publish_state()
 
     def teardown(self) -> None:
         if self._jumps is not None:
@@ -156,7 +149,7 @@ class EkfNode(LocalizationNode):
         if isinstance(settings, FilterConfig):
             self._filter.reconfigure(settings)
 
-    # What comes in.
+    # Inputs.
 
     def _receive_odometry(self, message: Odometry) -> None:
         motion = read_odometry(message)
@@ -181,7 +174,7 @@ class EkfNode(LocalizationNode):
             self._publish_pose(stamp_ns)
             raise MessageError('paused')
         if covariance.any() and not covariance[2].any():
-            covariance[2, 2] = math.inf  # a source that tells no heading leaves its variance 0
+            covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self._filter.add_measurement(stamp_ns, pose, covariance)
         self._verdict.publish(_verdict(update))
         self._publish_pose(stamp_ns)
@@ -196,15 +189,15 @@ class EkfNode(LocalizationNode):
         self._filter.expect_delay(float(message.data))
 
     def _receive_correlation(self, message: Float64MultiArray) -> None:
-        self._filter.correlate(read_error_correlation(message))
+        self._filter.reconfigure(correlation=read_error_correlation(message))
 
     def _set_pose(self, message: PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
             message.header.stamp = to_stamp(max(self._newest_ns(), 1))
         stamp_ns, pose, covariance = self._read_in_map(message)
-        self._filter.initialise(stamp_ns, pose, covariance if covariance.any() else None)
+        self._filter.set_pose(stamp_ns, pose, covariance if covariance.any() else None)
         self.get_logger().info(f'pose set to {pose[0]:.2f}, {pose[1]:.2f}, {pose[2]:.2f} rad')
-        self._tell_state()
+        self._publish_state()
 
     def _read_in_map(self, message: PoseWithCovarianceStamped) -> tuple[int, Any, Any]:
         frame = message.header.frame_id.lstrip('/')
@@ -218,15 +211,15 @@ class EkfNode(LocalizationNode):
 
     def _reset(self, _: Any, response: Any) -> Any:
         self._forget()
-        self._tell_state()
+        self._publish_state()
         response.success, response.message = True, self._status().level.name
         return response
 
     def _pause(self, request: Any, response: Any) -> Any:
         self._paused = bool(request.data)
-        self._tell_state()
+        self._publish_state()
         response.success = True
-        response.message = 'pictures are not fused' if self._paused else 'pictures are fused'
+        response.message = 'images are not fused' if self._paused else 'images are fused'
         return response
 
     def _clock_jumped(self, jump: TimeJump) -> None:
@@ -239,7 +232,7 @@ class EkfNode(LocalizationNode):
         self._filter.reset()
         self._path.clear()
 
-    # What goes out.
+    # Outputs.
 
     def _publish_odometry(self, state: State, motion: Motion) -> None:
         frame = self._config.map_frame
@@ -271,7 +264,7 @@ class EkfNode(LocalizationNode):
             )
 
     def _extend_path(self, state: State) -> None:
-        if abs(state.stamp_ns - self._path_ns) < self._config.path_period * 1e9:
+        if abs(state.stamp_ns - self._path_ns) < PATH_PERIOD_S * 1e9:
             return
         self._path_ns = state.stamp_ns
         self._path.append(to_pose(state.pose, state.stamp_ns, self._config.map_frame))
@@ -285,51 +278,50 @@ class EkfNode(LocalizationNode):
         """The filter's status, and what the wall clock adds: inputs that do not arrive."""
         status, added = self._filter.status, []
         by_now = self._by_now()
-        for topic, limit in (
-            (_ODOM, self._config.odometry_silence),
-            (_SEEN, self._config.picture_silence),
-        ):
+        timeout_s = self._config.silence_timeout
+        for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
             silent = self.monitor(topic).silent_for_s()
             if math.isfinite(silent) and silent > limit:
                 added.append(f'nothing on {topic} for {silent:.0f} s')
         if self._paused:
-            added.append('paused: pictures are not fused')
+            added.append('paused: images are not fused')
         level = status.level
         if added and level is Level.LOCALISED:
             level = Level.DEGRADED
-        unsure = _unsure(by_now, self._filter.config) if level is Level.DEGRADED else []
-        if unsure:
-            level = Level.LOST
-        return Status(level, (*unsure, *status.reasons, *added))
+        lost = []
+        if level is Level.DEGRADED and by_now is not None:
+            # The filter's time is that of its messages: by the wall clock it may be lost.
+            lost = [f'{reason} by now' for reason in uncertainty(by_now, self._filter.config)]
+        return Status(Level.LOST if lost else level, (*lost, *status.reasons, *added))
 
     def _by_now(self) -> State | None:
-        """The estimate; where nothing has moved it on for long, as it is by the wall clock."""
+        """The estimate; after a long silence, predicted to the present by the wall clock."""
         state = self._filter.state
         if state is None:
             return None
-        if state.stamp_ns != self._moved[0]:
-            self._moved = state.stamp_ns, steady_s()
-        silent_s = steady_s() - self._moved[1]
-        heard = self.monitor(_ODOM).received or self.monitor(_SEEN).received
-        if not heard or silent_s <= self._config.odometry_silence:
+        if state.stamp_ns != self._last_moved[0]:
+            self._last_moved = state.stamp_ns, steady_s()
+        silent_s = steady_s() - self._last_moved[1]
+        heard = self.monitor(_ODOM).received or self.monitor(_IMAGE_POSE).received
+        if not heard or silent_s <= self._config.silence_timeout:
             return state
         return self._filter.at(state.stamp_ns + round(silent_s * 1e9))
 
-    def _tell_state(self) -> None:
+    def _publish_state(self) -> None:
         """Publish the state when its level changes at once, when its reasons do at most at 1 Hz."""
         if not self.active:
             return
         status = self._status()
         text = ': '.join([status.level.name, '; '.join(status.reasons)]).rstrip(': ')
-        self._since_told += 1
-        changed = status.level is not self._told_level
-        due = text != self._told and self._since_told * _WATCH_PERIOD_S >= _REPEAT_STATE_S
-        if not (changed or due):
+        self._ticks_since_state += 1
+        changed = status.level is not self._state_level
+        waited_s = self._ticks_since_state * _WATCH_PERIOD_S
+        if not changed and (text == self._state_text or waited_s < _REPEAT_STATE_S):
             return
-        self._since_told = 0
+        self._ticks_since_state = 0
         if changed:
             self.get_logger().info(text)
-        self._told, self._told_level = text, status.level
+        self._state_text, self._state_level = text, status.level
         self._state.publish(String(data=text))
 
     def health(self) -> tuple[int, str, dict[str, str]]:
@@ -337,24 +329,14 @@ class EkfNode(LocalizationNode):
         values = {'state': status.level.name}
         values.update({name: str(n) for name, n in sorted(self._filter.counts.items())})
         if state is not None:
-            values['position deviation [m]'] = f'{state.position_std:.3f}'
-            values['heading deviation [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
+            values['position std [m]'] = f'{state.position_std:.3f}'
+            values['heading std [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
         clock = self._filter.camera_clock
         if clock.known:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
-        return _LEVELS[status.level], '; '.join(status.reasons) or 'localised', values
-
-
-def _unsure(by_now: State | None, config: FilterConfig) -> list[str]:
-    """Why the estimate is lost by the wall clock: the filter knows the time of messages only."""
-    found = []
-    if by_now is not None and by_now.position_std > config.lost_std:
-        found.append(f'position known to {by_now.position_std:.1f} m only by now')
-    if by_now is not None and by_now.yaw_std > config.lost_yaw_std:
-        found.append(f'heading known to {math.degrees(by_now.yaw_std):.0f} deg only by now')
-    return found
+        return _LEVELS[status.level], '; '.join(status.reasons) or 'localized', values
 
 
 def _verdict(update: Update) -> DiagnosticArray:

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Base of the nodes: a lifecycle node that starts itself, guards callbacks and tells its health.
+"""Base of the nodes: a lifecycle node that starts itself, guards callbacks, reports its health.
 
 A node written on it declares its Settings classes, makes its publishers and subscriptions in
-`setup`, drops what else it holds in `teardown`, and says how it is in `health`.
+`setup`, drops what else it holds in `teardown`, and reports its state in `health`.
 """
 
 from __future__ import annotations
@@ -24,13 +24,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.reasons import bounded
+from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
 from sfa_localization.nodes import parameters, signals
 from sfa_localization.nodes.monitor import Monitor
 from sfa_localization.nodes.settings import NodeConfig
 
+DIAGNOSTICS_PERIOD_S = 1.0
+"""Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -56,7 +58,7 @@ def latched_qos() -> QoSProfile:
 class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     """Lifecycle node with settings as parameters; `start` configures and activates it.
 
-    Raises ConfigError from the constructor for a parameter that is refused.
+    Raises ConfigError from the constructor for a parameter that is rejected.
     """
 
     def __init__(self, name: str, kinds: Sequence[type[Settings]], **options: Any) -> None:
@@ -87,10 +89,10 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """Make publishers and subscriptions; a LocalizationError says why it cannot be done."""
 
     def started(self) -> None:
-        """What is to be done once the publishers are enabled."""
+        """Called once the publishers are enabled."""
 
     def teardown(self) -> None:
-        """Let go of what `setup` made beyond publishers, subscriptions, services and timers."""
+        """Release what `setup` made beyond publishers, subscriptions, services and timers."""
 
     def settings_changed(self, settings: Settings) -> None:
         """Live parameters have changed to `settings`, which are checked already."""
@@ -129,7 +131,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         *,
         while_inactive: bool = False,
     ) -> None:
-        """A subscription whose refused messages are counted under `topic` and end nothing.
+        """A subscription whose rejected messages are counted under `topic` and end nothing.
 
         An inactive node drops messages; not `while_inactive` those that come but once, latched.
         """
@@ -194,17 +196,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._entities.append((self.destroy_timer, made))
 
     def refuse(self, topic: str, reason: str) -> int:
-        """Count a refused message; log the first of a reason, then each thousandth.
+        """Count a rejected message; log the first of a reason, then each thousandth.
 
         Returns how many of this reason there have been.
         """
         count = self.monitor(topic).refuse(reason)
         if count == 1 or count % 1000 == 0:
-            self.get_logger().warning(f'{topic}: {bounded(reason)} ({count} so far)')
+            self.get_logger().warning(f'{topic}: {short_line(reason)} ({count} so far)')
         return count
 
     def _defect(self, name: str, error: Exception) -> str:
-        """Count an error that nobody can have meant, and show where it came from."""
+        """Count an error in the program itself, and log where it came from."""
         reason = f'internal error: {type(error).__name__}'
         if self.refuse(name, reason) == 1:
             self.get_logger().error(traceback.format_exc())
@@ -225,7 +227,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return receive
 
     def _attempt(self, name: str, callback: Callable[[], None]) -> bool:
-        """Call; what is raised is counted and logged under `name`. Whether nothing was."""
+        """Call; what it raises is counted and logged under `name`. True where it raised nothing."""
         try:
             callback()
         except LocalizationError as error:
@@ -249,7 +251,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             self._diagnostics = self.publisher(DiagnosticArray, '/diagnostics')
-            self.every(self.settings(NodeConfig).diagnostics_period, self._tell_health)
+            self.every(DIAGNOSTICS_PERIOD_S, self._publish_health)
             self.setup()
         except LocalizationError as error:
             self.failure = str(error)
@@ -291,12 +293,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._entities.clear()
         self.monitors.clear()
 
-    def _tell_health(self) -> None:
+    def _publish_health(self) -> None:
         if not self.active:
             return
         found: list[tuple[int, str, dict[str, str]]] = []
         if not self._attempt('health', lambda: found.append(self.health())):
-            found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be found out', {}))
+            found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be determined', {}))
         level, text, values = found[0]
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{topic}: '))
@@ -350,7 +352,7 @@ def _initialised(args: Sequence[str] | None) -> bool:
     try:
         rclpy.init(args=None if args is None else list(args))
     except RuntimeError as error:  # the base of all that rclpy raises here
-        # What it says of arguments that it does not know is their list, and no more.
+        # Of unknown arguments its text is their list, and no more.
         unknown = isinstance(error, rclpy_implementation.UnknownROSArgsError)
         reason = f'unknown arguments after --ros-args: {error}' if unknown else str(error)
         rclpy.logging.get_logger('sfa_localization').fatal(reason)

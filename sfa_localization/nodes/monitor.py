@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node knows about its own health: rates, latencies, refusals. Bounded memory."""
+"""A node's record of its inputs: rates, latencies, rejections. Bounded memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from sfa_localization.data.reasons import ReasonCounter
+from sfa_localization.data.rejections import RejectionCounter
 
 _WINDOW = 500
 
@@ -20,12 +20,12 @@ def steady_s() -> float:
 
 
 class Monitor:
-    """Counts of what came in, was used, or was refused and why; latency over the last messages."""
+    """Counts of messages received, used, and rejected by reason; latency of the last messages."""
 
     def __init__(self) -> None:
         self.received = 0
         self.used = 0
-        self.refused = ReasonCounter()
+        self.refused = RejectionCounter()
         self.last_received_s: float | None = None
         self._arrivals: deque[float] = deque(maxlen=_WINDOW)
         self._latencies: deque[float] = deque(maxlen=_WINDOW)
@@ -39,13 +39,13 @@ class Monitor:
         return now
 
     def use(self, received_s: float | None = None) -> None:
-        """Note that the message that arrived at `received_s` has been dealt with by now."""
+        """Note that the message that arrived at `received_s` has been processed by now."""
         self.used += 1
         if received_s is not None:
             self._latencies.append(steady_s() - received_s)
 
     def refuse(self, reason: str) -> int:
-        """Count a refusal; returns how many of this reason there have been."""
+        """Count a rejection; returns how many of this reason there have been."""
         return self.refused.add(reason)
 
     def silent_for_s(self) -> float:
@@ -69,14 +69,14 @@ class Monitor:
 
     def values(self, prefix: str = '') -> dict[str, str]:
         """Names and texts for a diagnostic status."""
-        told = {
+        texts = {
             f'{prefix}received': str(self.received),
             f'{prefix}used': str(self.used),
             f'{prefix}rate [Hz]': f'{self.rate_hz():.1f}',
             f'{prefix}latency p50 [ms]': f'{self.latency_ms(50):.2f}',
             f'{prefix}latency p99 [ms]': f'{self.latency_ms(99):.2f}',
         }
-        # Copied, for the thread of a feed may add to it meanwhile.
+        # Copied, because the thread of a feed may add to it meanwhile.
         refused = sorted(dict(self.refused).items())
-        told.update({f'{prefix}refused: {why}': str(n) for why, n in refused})
-        return told
+        texts.update({f'{prefix}refused: {why}': str(n) for why, n in refused})
+        return texts

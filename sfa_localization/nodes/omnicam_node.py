@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 node: pictures of an omnidirectional camera in, panoramas out, with the pictures' stamps.
+"""ROS 2 node: images of an omnidirectional camera in, panoramas out, with the images' stamps.
 
-Pictures come from a topic, or straight from a device, a video file or a folder. Nothing is done
-while nobody listens (`lazy`), and of pictures that come too fast only the newest is used.
+Images come from a topic, or straight from a device, a video file or a folder. Nothing is done
+without a subscriber, and of images that come too fast only the newest is used.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
-from sfa_localization.camera.capture import Feed, FeedStatus, FrozenWatch, opener
+from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import CameraConfig, OmnicamNodeConfig, PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
+from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import LocalizationError, MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
@@ -36,22 +37,25 @@ from sfa_localization.nodes.lifecycle import (
     sensor_qos,
 )
 from sfa_localization.nodes.monitor import steady_s
+from sfa_localization.nodes.settings import OmnicamNodeConfig
 
-_DEMAND_PERIOD_S = 0.1
-_LITTLE_SEEN = 0.5
+_DEMAND_PERIOD_S = 0.1  # between looks for subscribers: a new one waits no longer for images
+_LITTLE_VISIBLE = 0.5  # share of the panorama below which a warning is given
+_JPEG_QUALITY = 90  # percent; no visible artifacts, about a tenth of the raw size
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
 class OmnicamNode(LocalizationNode):
-    """Unwraps each picture and publishes it as `panorama` and `panorama/compressed`.
+    """Unwraps each image and publishes it as `panorama` and `panorama/compressed`.
 
-    `panorama/info`, latched, says which elevations the rows are, and which way the columns go.
+    `panorama/info`, latched, gives the elevations of the rows and the direction of the columns.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(
-            'omnicam_node', [OmnicamNodeConfig, CameraConfig, PanoramaConfig], **options
-        )
+        groups = [OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig]
+        super().__init__('omnicam_node', groups, **options)
+        self._config = self.settings(OmnicamNodeConfig)
+        self._source = self.settings(CaptureConfig)
         self._unwrapper = self._new_unwrapper()
         self._size: tuple[int, int] | None = None
         self._frozen = FrozenWatch()
@@ -66,7 +70,6 @@ class OmnicamNode(LocalizationNode):
     # Life cycle.
 
     def setup(self) -> None:
-        self._config = self.settings(OmnicamNodeConfig)
         self._unwrapper = self._new_unwrapper()
         self._build_tables(self._unwrapper)
         self._frozen = FrozenWatch()
@@ -76,11 +79,15 @@ class OmnicamNode(LocalizationNode):
         self._info = self.publisher(String, self.following('panorama/info'), latched_qos())
         raw = self._config.image_transport == 'raw'
         self._input = 'image_raw' if raw else self.following('image_raw/compressed')
-        if self._config.source == 'topic':
+        if self._source.source == 'topic':
             self.require_input(self._input)
         else:
-            self._input = self._config.source_path
-            self._make_feed()
+            self._input = self._source.source_path
+            guarded = self._guarded(self._input, self._use_newest)
+            self._arrival = self.create_guard_condition(lambda: guarded(None))
+            self._feed = Feed(
+                opener(self._source), self._deliver, self._source, self._reject, self._wanted
+            )
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
 
     def started(self) -> None:
@@ -96,24 +103,11 @@ class OmnicamNode(LocalizationNode):
         self._feed = self._arrival = self._newest = None
         self._unsubscribe()
 
-    def _make_feed(self) -> None:
-        guarded = self._guarded(self._input, self._use_newest)
-        self._arrival = self.create_guard_condition(lambda: guarded(None))
-        self._feed = Feed(
-            opener(self._config), self._deliver, self._config, self._refuse_picture, self._wanted
-        )
-
-    # Demand: without listeners there is no subscription, and files wait.
+    # Demand: without subscribers there is no subscription, and files wait.
 
     def _wanted(self) -> bool:
-        if not self.active:
-            return False
-        return not self._config.lazy or self._listeners() > 0
-
-    def _listeners(self) -> int:
-        return int(
-            self._panoramas.get_subscription_count() + self._compressed.get_subscription_count()
-        )
+        outputs = (self._panoramas, self._compressed)
+        return self.active and any(output.get_subscription_count() for output in outputs)
 
     def _follow_demand(self) -> None:
         if self._feed is not None:
@@ -139,19 +133,19 @@ class OmnicamNode(LocalizationNode):
             self.destroy_subscription(self._subscription)
             self._subscription = None
 
-    # Pictures.
+    # Images.
 
     def _use_message(self, message: ImageMessage | CompressedImage) -> None:
-        stamp_ns, picture = read_image(message)
-        self._publish(picture, stamp_ns, self._config.frame_id or message.header.frame_id)
+        stamp_ns, image = read_image(message)
+        self._publish(image, stamp_ns, self._config.frame_id or message.header.frame_id)
 
-    def _deliver(self, picture: Image) -> None:
-        """Called in the feed's thread: keep the newest picture only, and wake the executor."""
+    def _deliver(self, image: Image) -> None:
+        """Called in the feed's thread: keep the newest image only, and wake the executor."""
         with self._newest_lock:
-            self._newest = self.get_clock().now().nanoseconds, picture
+            self._newest = self.get_clock().now().nanoseconds, image
         self._arrival.trigger()
 
-    def _refuse_picture(self, reason: str) -> None:
+    def _reject(self, reason: str) -> None:
         self.refuse(self._input, reason)
 
     def _use_newest(self, _: None) -> None:
@@ -159,28 +153,27 @@ class OmnicamNode(LocalizationNode):
             newest, self._newest = self._newest, None
         if newest is None:
             return
-        stamp_ns, picture = newest
+        stamp_ns, image = newest
         if stamp_ns <= 0:
             raise MessageError('the clock has not started')
         if self._wanted():
-            self._publish(picture, stamp_ns, self._config.frame_id)
+            self._publish(image, stamp_ns, self._config.frame_id)
 
-    def _publish(self, picture: Image, stamp_ns: int, frame: str) -> None:
-        panorama = self._unwrapper(picture)
-        self._size = (picture.shape[0], picture.shape[1])
+    def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
+        panorama = self._unwrapper(image)
+        self._size = (image.shape[0], image.shape[1])
         frame = frame or 'omnicam'
-        if self._panoramas.get_subscription_count() or not self._config.lazy:
+        if self._panoramas.get_subscription_count():
             self._panoramas.publish(to_image(panorama, stamp_ns, frame))
         if self._compressed.get_subscription_count():
-            quality = self._config.jpeg_quality
-            self._compressed.publish(to_compressed(panorama, stamp_ns, frame, quality))
-        self._frozen.see(picture)
+            self._compressed.publish(to_compressed(panorama, stamp_ns, frame, _JPEG_QUALITY))
+        self._frozen.add(image)
 
     # Parameters that change while running.
 
     def settings_changed(self, settings: Settings) -> None:
-        if isinstance(settings, OmnicamNodeConfig):
-            self._config = settings
+        if isinstance(settings, CaptureConfig):
+            self._source = settings
             if self._feed is not None:
                 self._feed.config = settings
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
@@ -192,7 +185,7 @@ class OmnicamNode(LocalizationNode):
         return Unwrapper(self.settings(CameraConfig), self.settings(PanoramaConfig))
 
     def _check_camera(self, changes: Sequence[Parameter]) -> SetParametersResult:
-        """Refuse a mask, sector, mount or elevation from which no panorama can be made."""
+        """Reject a mask, sector, mount or elevation from which no panorama can be made."""
         try:
             camera = parameters.changed(self.settings(CameraConfig), changes)
             panorama = parameters.changed(self.settings(PanoramaConfig), changes)
@@ -203,62 +196,59 @@ class OmnicamNode(LocalizationNode):
         return SetParametersResult(successful=True)
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
-        """Build the tables for the size of picture that is, or will be, in use, if it is known."""
-        camera = unwrapper.camera
-        size = self._size or (camera.image_height, camera.image_width)
+        """Build the tables for the size of image that is, or will be, in use, if it is known."""
+        lens = unwrapper.calibration
+        size = self._size or (lens.image_height, lens.image_width)
         if 0 not in size:
-            unwrapper.seen(size)
+            unwrapper.visible(size)
 
     # Health.
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        values = {'camera model': self.settings(CameraConfig).camera_model}
+        details = {'camera model': self._unwrapper.calibration.camera_model}
         if self._size is not None:
-            values['picture'] = f'{self._size[1]} x {self._size[0]}'
-        for judge in (self._judge_source, self._judge_pictures):
-            level, text = judge(values)
+            details['image'] = f'{self._size[1]} x {self._size[0]}'
+        for judge in (self._judge_source, self._judge_images):
+            level, text = judge(details)
             if level != _OK or text:
-                return level, text, values
-        return _OK, 'running', values
+                return level, text, details
+        return _OK, 'running', details
 
-    def _judge_source(self, values: dict[str, str]) -> tuple[int, str]:
+    def _judge_source(self, details: dict[str, str]) -> tuple[int, str]:
         if self._feed is not None:
-            return _judge_feed(self._feed.status(), values)
+            return _judge_feed(self._feed.status(), details)
         if self._subscription is None:
             return _OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
-        if silent_s > self._config.silence_timeout:
-            return _ERROR, f'no picture on {self._input} for {silent_s:.0f} s'
+        if silent_s > self._source.silence_timeout:
+            return _ERROR, f'no image on {self._input} for {silent_s:.0f} s'
         return _OK, ''
 
-    def _judge_pictures(self, values: dict[str, str]) -> tuple[int, str]:
+    def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:
         frozen_s = self._frozen.frozen_for_s()
-        if 0.0 < self._config.frozen_timeout < frozen_s:
-            return _WARN, f'the camera has repeated its last picture for {frozen_s:.0f} s'
+        if frozen_s:
+            return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
         monitor = self.monitor(self._input)
         if monitor.received and not monitor.used:
-            return _ERROR, 'no picture could be used so far'
-        seen = self._seen_share()
-        values['panorama seen [%]'] = f'{100 * seen:.0f}'
-        if seen < _LITTLE_SEEN:
-            return _WARN, f'the camera sees only {100 * seen:.0f} % of the panorama'
+            return _ERROR, 'no image could be used so far'
+        visible = 1.0
+        if self._size is not None and not self._unwrapper.is_panorama(self._size):
+            visible = float(self._unwrapper.visible(self._size).mean())
+        details['panorama visible [%]'] = f'{100 * visible:.0f}'
+        if visible < _LITTLE_VISIBLE:
+            return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
         return _OK, ''
 
-    def _seen_share(self) -> float:
-        if self._size is None or self._unwrapper.is_panorama(self._size):
-            return 1.0
-        return float(self._unwrapper.seen(self._size).mean())
 
-
-def _judge_feed(status: FeedStatus, values: dict[str, str]) -> tuple[int, str]:
-    values['source'] = status.state
-    values['source lost'] = str(status.lost)
+def _judge_feed(status: FeedStatus, details: dict[str, str]) -> tuple[int, str]:
+    details['source'] = status.state
+    details['source lost'] = str(status.lost)
     if status.state == 'lost':
         return _ERROR, f'camera lost, will be opened again: {status.problem}'
     if status.state == 'opening':
         return _WARN, 'opening the camera'
-    return _OK, 'at the end of the pictures' if status.state == 'ended' else ''
+    return _OK, 'at the end of the images' if status.state == 'ended' else ''
 
 
 def main(args: Sequence[str] | None = None) -> int:

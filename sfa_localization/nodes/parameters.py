@@ -31,7 +31,7 @@ _LARGEST_INTEGER = 2**63 - 1
 def declare(node: Node, kind: type[S]) -> S:
     """Declare every field of `kind` as a parameter of `node`; return the values given to it.
 
-    Settings that are not `live` become read-only. Raises ConfigError for a value that is refused.
+    Settings that are not `live` become read-only. Raises ConfigError for a value that is rejected.
     """
     values = {
         item.name: _plain(item, _declare_field(node, item)) for item in dataclasses.fields(kind)
@@ -42,8 +42,8 @@ def declare(node: Node, kind: type[S]) -> S:
 def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) -> None:
     """Check changes of live parameters together, and hand the new settings to `apply`.
 
-    `current` returns the settings in force. A change that they cannot take is refused, with the
-    reason as the answer to whoever asked for it, and nothing is applied.
+    `current` returns the settings in force. A change that they cannot take is rejected, with the
+    reason in the answer to the request, and nothing is applied.
     """
 
     def check(changes: list[Parameter]) -> SetParametersResult:
@@ -84,7 +84,7 @@ def _plain(item: dataclasses.Field[Any], value: Any) -> Any:
 def warn_of_unknown(node: Node) -> None:
     """Warn of each value given to the node for a parameter that it does not have.
 
-    Parameters of the other nodes are passed over: a section `/**` gives them to all.
+    Parameters of the other nodes are ignored: a section `/**` gives them to all.
     """
     others = {
         item.name

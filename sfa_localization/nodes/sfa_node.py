@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 node: panoramas in; slow features, and the pose that each picture tells, out."""
+"""ROS 2 node: panoramas in; slow features, and the pose from each image, out."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
+from sfa_localization.camera.watch import NOVELTY_WARNING
 from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError, ModelError
 from sfa_localization.data.settings import Settings
 from sfa_localization.localizer import Observation, Observer
@@ -41,7 +42,7 @@ from sfa_localization.nodes.lifecycle import (
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.place_model import PlaceModel
 
-_TURNED_FRAME = 'first_image'
+_FEATURE_FRAME, _TURNED_FRAME = 'slow_feature_space', 'first_image'
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -53,15 +54,15 @@ class SfaNode(LocalizationNode):
         self._config = self.settings(SfaNodeConfig)
         self._observer: Observer | None = None
         self._loaded: tuple[str, PlaceModel] | None = None
-        self._seen: Observation | None = None
+        self._last: Observation | None = None
         self._declared: PanoramaConfig | None = None
-        self._undeclared_said = False
+        self._undeclared_logged = False
         self.add_on_set_parameters_callback(self._check_model)
 
     def setup(self) -> None:
         self._config = self.settings(SfaNodeConfig)
         self._observer = Observer(self._load(self._config.model), self.settings(WatchConfig))
-        self._seen = None
+        self._last = None
         self._features = self.publisher(Float64MultiArray, 'sfa/slow_features')
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
@@ -72,13 +73,13 @@ class SfaNode(LocalizationNode):
         self._delay = self.publisher(Float64, 'sfa/camera_delay', latched_qos())
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
-        kind = CompressedImage if self._config.compressed else ImageMessage
-        compressed = self._config.compressed
+        compressed = self._config.image_transport == 'compressed'
+        kind = CompressedImage if compressed else ImageMessage
         self._topic = self.following('panorama/compressed') if compressed else 'panorama'
-        self._declared, self._undeclared_said = None, False
+        self._declared, self._undeclared_logged = None, False
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
-        # Depth 1: when pictures come faster than they are located, the oldest is dropped.
+        # Depth 1: when images come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
 
     def started(self) -> None:
@@ -90,7 +91,7 @@ class SfaNode(LocalizationNode):
     # The model.
 
     def _load(self, path: str) -> PlaceModel:
-        """Read a model, and locate once so that the first picture does not wait."""
+        """Read a model, and locate once so that the first image does not wait."""
         if not path:
             raise ConfigError(
                 "parameter 'model' is empty: name the file that the train command wrote "
@@ -107,7 +108,7 @@ class SfaNode(LocalizationNode):
         return model
 
     def _check_model(self, changes: list[Parameter]) -> SetParametersResult:
-        """Refuse a model that cannot be loaded before anything changes, in any state."""
+        """Reject a model that cannot be loaded before anything changes, in any state."""
         for change in changes:
             if change.name == 'model':
                 try:
@@ -138,13 +139,13 @@ class SfaNode(LocalizationNode):
         return response
 
     def _publish_correlation(self) -> None:
-        """The filter weighs images by what the model knows of its own errors."""
+        """Publish how the model's errors correlate and how late images were: ekf_node needs it."""
         assert self._observer is not None
         correlation = self._observer.model.error_correlation
         self._correlation.publish(to_error_correlation(correlation))
         self._delay.publish(Float64(data=float(self._observer.model.camera_delay_s)))
 
-    # Pictures.
+    # Images.
 
     def _receive_info(self, message: String) -> None:
         self._declared = read_info(message)
@@ -152,23 +153,23 @@ class SfaNode(LocalizationNode):
     def _declared_problem(self, model: PlaceModel) -> str:
         """How the panoramas are declared to differ from those of training; '' when they do not."""
         if self._declared is None:
-            self._say_undeclared(model.panorama)
+            self._log_undeclared(model.panorama)
             return ''
         differences = model.panorama.differences(self._declared)
         if not differences:
             return ''
         return (
-            f'panorama is declared to be unlike those of training: {differences}; '
+            f'panorama is declared to differ from those of training: {differences}; '
             'set these parameters of omnicam_node'
         )
 
-    def _say_undeclared(self, expected: PanoramaConfig) -> None:
-        """Say once that elevations and direction of a foreign source's panoramas are believed."""
-        if self._undeclared_said or self.count_publishers(self.resolve_topic_name(self._info)):
+    def _log_undeclared(self, expected: PanoramaConfig) -> None:
+        """Log once that elevations and direction of a foreign source's panoramas are assumed."""
+        if self._undeclared_logged or self.count_publishers(self.resolve_topic_name(self._info)):
             return
-        self._undeclared_said = True
+        self._undeclared_logged = True
         self.get_logger().info(
-            f'nobody declares on {self._info} what the panoramas show: they are taken to be from '
+            f'nobody publishes on {self._info} what the panoramas show: assumed are '
             f'{expected.elevation_min:g} to {expected.elevation_max:g} deg, '
             f'{"clockwise" if expected.clockwise else "counter-clockwise"}, as in training'
         )
@@ -178,52 +179,51 @@ class SfaNode(LocalizationNode):
         problem = self._declared_problem(self._observer.model)
         if problem:
             raise MessageError(problem)
-        self._seen = seen = self._observer.observe(*read_image(message))
-        self._publish(seen)
-        if seen.problem:
-            raise MessageError(seen.problem)
+        self._last = observation = self._observer.observe(*read_image(message))
+        self._publish(observation)
+        if observation.problem:
+            raise MessageError(observation.problem)
 
-    def _publish(self, seen: Observation) -> None:
-        """A pose without covariance cannot say that it is worthless, so then there is none."""
-        frame, slow = self._config.map_frame, seen.estimate.slow_features
+    def _publish(self, observation: Observation) -> None:
+        """An unusable image gets no pose without covariance: it would look like a usable one."""
+        frame, slow = self._config.map_frame, observation.estimate.slow_features
+        stamp_ns, pose = observation.stamp_ns, observation.pose
         if np.all(np.isfinite(slow)):
             self._features.publish(to_array(slow, 'slow features'))
-            feature_pose = _feature_pose(slow, seen.stamp_ns, self._config.feature_frame)
-            self._feature_pose.publish(feature_pose)
-        if math.isfinite(seen.turned):
-            self._turned.publish(to_turned(seen.turned, seen.stamp_ns, _TURNED_FRAME))
-        if not seen.problem:
-            self._pose.publish(to_pose(seen.pose, seen.stamp_ns, frame))
-        self._uncertain.publish(
-            to_pose_with_covariance(seen.pose, seen.covariance, seen.stamp_ns, frame)
-        )
+            self._feature_pose.publish(_feature_pose(slow, stamp_ns))
+        if math.isfinite(observation.turned):
+            self._turned.publish(to_turned(observation.turned, stamp_ns, _TURNED_FRAME))
+        if not observation.problem:
+            self._pose.publish(to_pose(pose, stamp_ns, frame))
+        covariance = observation.covariance
+        self._uncertain.publish(to_pose_with_covariance(pose, covariance, stamp_ns, frame))
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        problem = self._seen.problem if self._seen is not None else ''
-        novelty = self._seen.estimate.novelty if self._seen is not None else 0.0
+        problem = self._last.problem if self._last is not None else ''
+        novelty = self._last.estimate.novelty if self._last is not None else 0.0
         values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
         silent = self.monitor(self._topic).silent_for_s()
         if math.isinf(silent):
-            return _WARN, f'waiting for pictures on {self._topic}', values
-        if silent > self._config.camera_timeout:
-            return _ERROR, f'no picture on {self._topic} for {silent:.0f} s', values
+            return _WARN, f'waiting for images on {self._topic}', values
+        if silent > self._config.silence_timeout:
+            return _ERROR, f'no image on {self._topic} for {silent:.0f} s', values
         declared = self._declared_problem(self._observer.model) if self._observer else ''
         if declared:
             return _ERROR, declared, values
         if self.monitor(self._topic).used == 0:
-            return _ERROR, 'no picture has been usable', values
+            return _ERROR, 'no image has been usable', values
         if problem:
             return _ERROR, problem, values
-        if novelty > self._config.novelty_warning:
-            return _WARN, 'pictures are unlike those of training', values
+        if novelty > NOVELTY_WARNING:
+            return _WARN, 'images are unlike those of training', values
         return _OK, 'locating', values
 
 
-def _feature_pose(slow: Any, stamp_ns: int, frame: str) -> PoseStamped:
+def _feature_pose(slow: Any, stamp_ns: int) -> PoseStamped:
     """The first three slow features as a position, as the paper draws them."""
-    first = [*(float(value) for value in slow[:3]), 0.0, 0.0, 0.0][:3]
-    message = to_pose([first[0], first[1], 0.0], stamp_ns, frame)
-    message.pose.position.z = first[2]
+    x, y, z = [*map(float, slow[:3]), 0.0, 0.0, 0.0][:3]
+    message = to_pose([x, y, 0.0], stamp_ns, _FEATURE_FRAME)
+    message.pose.position.z = z
     return message
 
 

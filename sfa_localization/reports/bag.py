@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of what a bag holds: a contact sheet, and the path its odometry tells."""
+"""Figures of a bag: a contact sheet of its images, and the path of its odometry."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sfa_localization.reports.evaluation import save
 
 
 def write_contact_sheet(samples: Sequence[Image], title: str, path: Path) -> None:
-    """Write BGR pictures (H, W, 3) as a PNG, in reading order. Raises LocalizationError."""
+    """Write BGR images (H, W, 3) as one PNG, in reading order. Raises LocalizationError."""
     height, width = samples[0].shape[:2]
     columns = max(1, round(np.sqrt(len(samples) * height / width)))
     rows = -(-len(samples) // columns)
-    wide = 10 / columns
-    figure = Figure((10, rows * wide * height / width + 0.5), layout='constrained')
+    inches = 10 / columns
+    figure = Figure((10, rows * inches * height / width + 0.5), layout='constrained')
     figure.suptitle(title, fontsize=10)
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
     for axis in axes:
@@ -32,7 +32,7 @@ def write_contact_sheet(samples: Sequence[Image], title: str, path: Path) -> Non
 
 
 def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
-    """Write the odometry's path (N, 3) and the places (M, 3) of the pictures as a PNG.
+    """Write the path (N, 3) of odometry and the poses (M, 3) of the images as a PNG.
 
     Raises LocalizationError.
     """
@@ -46,5 +46,5 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     axes.set(title=title, xlabel='x in m (odometry)', ylabel='y in m (odometry)')
     axes.title.set_fontsize(10)
     axes.legend(loc='upper right')
-    figure.colorbar(dots, label='pictures, % of the drive', shrink=0.7)
+    figure.colorbar(dots, label='images, % of the drive', shrink=0.7)
     save(figure, path)

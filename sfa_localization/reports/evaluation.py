@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures and table of an evaluation: where the estimates lie, and how far off they are.
+"""Figures and table of an evaluation: the estimated paths and their errors.
 
 Every function takes plain arrays and trajectories in the frame of the ground truth and writes one
-file; nothing here opens a window. Colours are Okabe and Ito's, told apart by colour-blind readers.
+file; nothing here opens a window. The colors are those of Okabe and Ito for color-blind readers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure, SubFigure
 
-from sfa_localization.data.files import whole_file
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Stamps, Trajectory
 
@@ -32,7 +32,7 @@ LABELS = {
     'ekf': 'EKF: SFA + odometry',
     'supervised': 'supervised reference',
 }
-# Lines above dots above the truth; dots for what is estimated picture by picture.
+# Lines above dots above the truth; dots for estimates from single images.
 STYLES: dict[str, dict[str, Any]] = {
     'odometry': {'color': '#E69F00', 'linestyle': '--', 'linewidth': 1.4, 'zorder': 3},
     'sfa': {'color': '#56B4E9', 'linestyle': '', 'marker': 'o', 'markersize': 2.6, 'zorder': 2},
@@ -42,18 +42,21 @@ STYLES: dict[str, dict[str, Any]] = {
 OTHER: dict[str, Any] = {'color': '#CC79A7', 'linestyle': '-', 'linewidth': 1.2}
 TRUTH: dict[str, Any] = {'color': '0.72', 'linewidth': 5.0, 'solid_capstyle': 'round', 'zorder': 1}
 MAPS_SHOWN = 8
-# Slow features have unit variance: colours saturate at two standard deviations.
+"""Firing maps in one figure: the slowest features carry the place."""
 FEATURE_LIMIT = 2.0
+"""Standard deviations at which the colors saturate; slow features have unit variance."""
 DOTS_PER_INCH = 130
-METRES_OF_MARGIN = 0.5
+"""Resolution of the figures: sharp on a screen, and still small files."""
+MARGIN_M = 0.5
+"""Margin around the paths (m)."""
 
 
 def position_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Array]:
-    """Seconds since the truth's start (M,) and Euclidean errors in metres (M,).
+    """Seconds since the truth's start (M,) and Euclidean errors in meters (M,).
 
     Estimates at stamps without ground truth are left out.
     """
-    kept = _within(truth, estimate)
+    kept = truth.covers(estimate.stamps_ns)
     offset = estimate.poses[kept, :2] - truth.at(estimate.stamps_ns[kept])[:, :2]
     return _seconds(truth, estimate.stamps_ns[kept]), np.hypot(offset[:, 0], offset[:, 1])
 
@@ -63,13 +66,9 @@ def heading_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Arra
 
     Estimates without a heading (NaN) or without ground truth are left out.
     """
-    kept = _within(truth, estimate) & np.isfinite(estimate.poses[:, 2])
+    kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
     offset = wrap_angle(estimate.poses[kept, 2] - truth.at(estimate.stamps_ns[kept])[:, 2])
     return _seconds(truth, estimate.stamps_ns[kept]), np.degrees(offset)
-
-
-def _within(truth: Trajectory, estimate: Trajectory) -> Any:
-    return truth.covers(estimate.stamps_ns)
 
 
 def _seconds(truth: Trajectory, stamps_ns: Stamps) -> Array:
@@ -79,7 +78,7 @@ def _seconds(truth: Trajectory, stamps_ns: Stamps) -> Array:
 def trajectories_figure(
     path: Path, truth: Trajectory, estimates: Estimates, scores: Scores | None = None
 ) -> None:
-    """Draw the true path and the estimated ones, seen from above, axes equal, in metres.
+    """Draw the true and the estimated paths from above, axes equal, in meters.
 
     `scores`, by the estimates' names, adds each mean error to the legend.
     """
@@ -99,10 +98,10 @@ def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
 
 
 def heading_figure(path: Path, truth: Trajectory, estimate: Trajectory, name: str = 'ekf') -> None:
-    """Draw the true path coloured by the absolute heading error (degrees) of one estimate."""
+    """Draw the true path colored by the absolute heading error (degrees) of one estimate."""
     figure = Figure(figsize=(8.0, 6.6), layout='constrained')
     axes = figure.add_subplot()
-    kept = _within(truth, estimate) & np.isfinite(estimate.poses[:, 2])
+    kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
     places = truth.at(estimate.stamps_ns[kept])[:, :2]
     _, error = heading_errors(truth, estimate)
     top = max(float(np.percentile(np.abs(error), 98)), 1.0) if len(error) else 1.0
@@ -115,7 +114,7 @@ def heading_figure(path: Path, truth: Trajectory, estimate: Trajectory, name: st
 def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
     """Draw the spatial firing maps of the first 8 slow features: their value at every place.
 
-    `positions` (N, 2) in metres, where the pictures were taken; `features` (N, K).
+    `positions` (N, 2) of the images in meters; `features` (N, K).
     """
     figure = Figure(figsize=(12.0, 6.2), layout='compressed')
     grid = figure.subplots(2, MAPS_SHOWN // 2, sharex=True, sharey=True, squeeze=False)
@@ -131,7 +130,10 @@ def overview_figure(
     positions: Array,
     features: Array,
 ) -> None:
-    """Draw paths, position error over time and four firing maps in one picture."""
+    """Draw paths, position error over time and four firing maps in one figure.
+
+    `positions` (N, 2) of the images in meters; `features` (N, K).
+    """
     figure = Figure(figsize=(13.0, 6.2), layout='constrained')
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
     _draw_paths(left.add_subplot(), truth, estimates, scores)
@@ -143,20 +145,20 @@ def overview_figure(
 
 
 def table(scores: Scores) -> str:
-    """Lay out position errors in metres, one line per estimate, as a Markdown table."""
+    """Position errors in meters, one line per estimate, as a Markdown table."""
     rows = {name: [_number(score[c], c) for c in COLUMNS] for name, score in scores.items()}
     return _markdown('position error (m)', COLUMNS, rows)
 
 
 def heading_table(scores: Scores) -> str:
-    """Lay out heading errors in degrees, one line per estimate that has a heading."""
-    known = {name: score['yaw_deg'] for name, score in scores.items() if score.get('yaw_deg')}
-    rows = {name: [f'{yaw[column]:.2f}' for column in YAW_COLUMNS] for name, yaw in known.items()}
+    """Heading errors in degrees, one line per estimate that has a heading."""
+    errors = {name: score['yaw_deg'] for name, score in scores.items() if score.get('yaw_deg')}
+    rows = {name: [f'{yaw[column]:.2f}' for column in YAW_COLUMNS] for name, yaw in errors.items()}
     return _markdown('heading error (degrees)', YAW_COLUMNS, rows)
 
 
 def _markdown(corner: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
-    """A table whose columns are padded, so that it can be read as plain text too."""
+    """A table with padded columns, so that it is readable as plain text too."""
     labels = {name: _label(name) for name in rows}
     first = max(map(len, [corner, *labels.values()]))
     width = max(map(len, [*columns, *(cell for row in rows.values() for cell in row)]))
@@ -180,7 +182,7 @@ def write_report(
     positions: Array,
     features: Array,
 ) -> None:
-    """Write every picture and ``report.md`` into `folder`, made when missing.
+    """Write all figures and ``report.md`` into `folder`, created when missing.
 
     Estimates are in the truth's frame; `positions` (N, 2) m and `features` (N, K) belong together.
     Raises LocalizationError when a file cannot be written.
@@ -189,11 +191,11 @@ def write_report(
     errors_figure(folder / 'errors.png', truth, estimates)
     firing_maps_figure(folder / 'firing_maps.png', positions, features)
     overview_figure(folder / 'overview.png', truth, estimates, scores, positions, features)
-    pictures = ['trajectories', 'errors', 'firing_maps']
+    figures = ['trajectories', 'errors', 'firing_maps']
     if 'ekf' in estimates:
         heading_figure(folder / 'heading.png', truth, estimates['ekf'])
-        pictures.append('heading')
-    images = [f'![{name}]({name}.png)' for name in pictures]
+        figures.append('heading')
+    images = [f'![{name}]({name}.png)' for name in figures]
     parts = ['# Evaluation', table(scores), heading_table(scores), *images]
     save_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
 
@@ -206,7 +208,7 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
     for name, estimate in estimates.items():
         mean = f': {_number(scores[name]["mean"], "mean")} m' if name in scores else ''
         points = estimate.poses[truth.covers(estimate.stamps_ns)]
-        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **_style(name))
+        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **STYLES.get(name, OTHER))
     _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False)
     axes.set_title('Estimated and true paths (mean error)' if scores else 'Paths')
@@ -214,21 +216,17 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
 
 def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*position_errors(truth, estimate), label=_label(name), **_style(name))
+        axes.plot(*position_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
     if estimates:
-        above: dict[str, Any] = {
-            'loc': 'lower left',
-            'bbox_to_anchor': (0.0, 1.0),
-            'frameon': False,
-        }
-        axes.legend(**above, ncols=len(estimates), fontsize='small')
+        above: dict[str, Any] = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0)}
+        axes.legend(**above, frameon=False, ncols=len(estimates), fontsize='small')
 
 
 def _draw_heading_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*heading_errors(truth, estimate), label=_label(name), **_style(name))
+        axes.plot(*heading_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
     axes.axhline(0.0, color='0.4', linewidth=0.8)
     axes.set(xlabel='time (s)', ylabel='heading error (°)', xlim=(0, None))
     axes.grid(alpha=0.3)
@@ -261,29 +259,29 @@ def _filling_size(figure: Figure | SubFigure, panels: int, points: int) -> float
 def _dots(
     axes: Axes,
     points: Array,
-    values: Array,
+    numbers: Array,
     size: float,
-    colours: str,
+    colormap: str,
     limits: tuple[float, float],
 ) -> PathCollection:
-    """Scatter points (N, 2) coloured by values (N,)."""
+    """Scatter points (N, 2) colored by numbers (N,)."""
     x, y = points[:, 0], points[:, 1]
     low, high = limits
-    dots = axes.scatter(x, y, c=values, s=size, cmap=colours, vmin=low, vmax=high, linewidths=0)
+    dots = axes.scatter(x, y, c=numbers, s=size, cmap=colormap, vmin=low, vmax=high, linewidths=0)
     _frame_view(axes, points)
     return dots
 
 
 def _bulk(estimate: Trajectory) -> Array:
-    """Poses without the few that lie farthest out, which need not be seen."""
+    """Corners (2, 3) of the estimate without its outermost percents, which need not be seen."""
     low, high = np.nanpercentile(estimate.poses[:, :2], (1.0, 99.0), axis=0)
     return np.pad(np.stack([low, high]), ((0, 0), (0, 1)))
 
 
 def _frame_view(axes: Axes, points: Array) -> None:
-    """Equal axes in metres, cut to the points and some more."""
+    """Equal axes in meters, limited to the points and a margin."""
     if len(points):
-        low, high = points.min(axis=0) - METRES_OF_MARGIN, points.max(axis=0) + METRES_OF_MARGIN
+        low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect('equal')
     axes.set(xlabel='x (m)', ylabel='y (m)')
@@ -295,10 +293,6 @@ def _label(name: str) -> str:
     return LABELS.get(name, name)
 
 
-def _style(name: str) -> dict[str, Any]:
-    return STYLES.get(name, OTHER)
-
-
 def _number(value: float | None, column: str) -> str:
     if value is None:
         return '-'
@@ -306,12 +300,12 @@ def _number(value: float | None, column: str) -> str:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, at once or not at all. Raises LocalizationError."""
-    with whole_file(path, make_folder=True) as file:
+    """Write a figure as PNG, completely or not at all. Raises LocalizationError."""
+    with atomic_write(path, make_folder=True) as file:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
 def save_text(path: Path, text: str) -> None:
-    """Write a text file, at once or not at all. Raises LocalizationError."""
-    with whole_file(path, make_folder=True) as file:
+    """Write a text file, completely or not at all. Raises LocalizationError."""
+    with atomic_write(path, make_folder=True) as file:
         file.write(text.encode())

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a training, as the paper's figures 3 to 5 show it; no ground truth is needed."""
+"""Figures of a training, like figures 3 to 5 of the paper; no ground truth is needed."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric import learning as metric
+from sfa_localization.metric.learning import positions
 from sfa_localization.reports import evaluation as report
-from sfa_localization.training import Trained, summary
+from sfa_localization.reports.summary import summary
+from sfa_localization.training import Trained
 
+# Inches.
 _SIZE = (7.0, 6.0)
 
 
@@ -23,7 +25,7 @@ def write_training_report(folder: Path, trained: Trained) -> None:
 
     Makes the folder. Raises LocalizationError when a file cannot be written.
     """
-    images, places = metric.positions(trained.metric, trained.segments)
+    images, places = positions(trained.metric, trained.segments)
     names = ['coverage', 'line_fits', 'firing_maps']
     coverage_figure(folder / 'coverage.png', trained, places)
     line_fits_figure(folder / 'line_fits.png', trained, places)
@@ -40,7 +42,7 @@ def write_training_report(folder: Path, trained: Trained) -> None:
 
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
-    """Draw where images were taken, (M, 2) m, on the error to expect around them."""
+    """Draw where images were taken, (M, 2) m, on the expected error around them."""
     figure, axes = _figure()
     expected = trained.metric.forecast
     dots = axes.scatter(
@@ -51,19 +53,19 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     x, y, error = expected.worst
     axes.plot(x, y, 'x', color='red', markersize=10, label=f'worst: {error:.2f} m')
     axes.legend(loc='upper right')
-    _places(axes, 'Images in the map, and the error to expect between them')
+    _places(axes, 'Images in the map, and the expected error between them')
     report.save(figure, path)
 
 
 def line_fits_figure(path: Path, trained: Trained, places: Array) -> None:
-    """Draw every segment where odometry (places (M, 2) m) and the slow features put it."""
+    """Draw every segment by odometry (places (M, 2) m) and by the slow features."""
     figure, axes = _figure()
-    seen = places - trained.metric.residuals
+    predicted = places - trained.metric.residuals
     start = 0
     for segment in trained.segments:
         part = slice(start, start + len(segment.images))
         (line,) = axes.plot(*places[part].T, linewidth=2.5, alpha=0.4)
-        axes.plot(*seen[part].T, linewidth=0.8, color=line.get_color())
+        axes.plot(*predicted[part].T, linewidth=0.8, color=line.get_color())
         start = part.stop
     _places(axes, 'Segments: odometry (wide), slow features (thin)')
     report.save(figure, path)
@@ -78,9 +80,9 @@ def headings_figure(path: Path, trained: Trained) -> None:
     error = np.degrees(fit.left_out_error)
     limit = max(3 * float(np.quantile(np.abs(error), 0.95)), 1.0)
     band = np.degrees(1.96 * fit.left_out_std)
-    along.fill_between(trained.heading_images, -band, band, alpha=0.25, label='95 % interval')
-    along.plot(trained.heading_images, error, '.', markersize=3, color='black')
-    along.set(xlabel='picture', ylabel='left-out heading error (deg)', ylim=(-limit, limit))
+    along.fill_between(fit.images, -band, band, alpha=0.25, label='95 % interval')
+    along.plot(fit.images, error, '.', markersize=3, color='black')
+    along.set(xlabel='image', ylabel='left-out heading error (deg)', ylim=(-limit, limit))
     along.legend(loc='upper right')
     against.semilogy(fit.certainty, np.abs(error) + 1e-3, '.', markersize=3)
     against.set(xlabel='certainty |g|', ylabel='|heading error| (deg)')

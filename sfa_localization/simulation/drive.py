@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot drives through a simulated garden and records what its sensors tell.
+"""A robot drives through a simulated garden and records what its sensors measure.
 
 All that is random follows from the seeds of the garden and of the drive: same seeds, same bytes.
 """
@@ -21,28 +21,32 @@ from scipy.signal import lfilter
 from tqdm import tqdm
 
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.lenses import CameraModel, make_camera
+from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
 from sfa_localization.simulation.garden import Garden, rounded
-from sfa_localization.simulation.rendering import Light, View
+from sfa_localization.simulation.rendering import Light, View, panorama_view, raw_view
 from sfa_localization.simulation.routes import ROUTES, Lawn, Motion, Route
 from sfa_localization.simulation.settings import SimulationConfig
 
 START_NS = 1_700_000_000 * 10**9
-REST_S = 0.5
-ACCELERATION = 1.0
-TURN_ACCELERATION = 2.0
-SLIP_TIME_S = 2.0
-LIGHT_TIME_S = 30.0
+RAW_SIZE = 640, 640  # rows, columns of the simulated mirror's images
+REST_S = 0.5  # at the start and the end of each drive
+ACCELERATION = 1.0  # m/s^2
+TURN_RATE = 0.6  # rad/s, on the spot
+TURN_ACCELERATION = 2.0  # rad/s^2
+SLIP_TIME_S = 2.0  # correlation time of the wheels' slip: some meters of grass
+GYRO_BIAS_TIME_S = 40.0  # correlation time of the gyroscope's wandering bias
+LIGHT_TIME_S = 30.0  # correlation time of sun, exposure and tone: a cloud passes
 
 Entry = tuple[int, Callable[[], None]]
 
 # The errors that make odometry drift, and how they are scaled to a wanted drift.
 _DRIFT_ERRORS = ('scale_error', 'slip', 'gyro_bias')
-_DRIFT_ITERATIONS = 3
-_DRIFT_FACTOR_MAX = 5.0
-_NO_DRIFT_M = 0.01
+_DRIFT_ITERATIONS = 3  # the drift grows almost linearly with the errors, so a few are enough
+_DRIFT_FACTOR_MAX = 5.0  # in each iteration, so that a drive lucky to drift little stays sane
+_NO_DRIFT_M = 0.01  # below it no factor is meaningful
 ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM = range(5)
 # The robot may have been switched on this far from where the recording starts.
 _FRAME_REACH_M = 50.0
@@ -50,7 +54,7 @@ _FRAME_REACH_M = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What happened and what was measured: truth in frame `world`, stamps of the pictures."""
+    """A recorded drive: the truth in frame `world`, the measurements, the stamps of the images."""
 
     truth: Trajectory
     odometry: Odometry
@@ -59,7 +63,7 @@ class Drive:
 
     @property
     def image_poses(self) -> Array:
-        """True poses (M, 3) of the pictures."""
+        """True poses (M, 3) of the images."""
         return self.truth.at(self.image_stamps_ns)
 
 
@@ -70,11 +74,11 @@ def random_stream(config: SimulationConfig, stream: int, item: int = 0) -> np.ra
 
 
 def drive(garden: Garden, config: SimulationConfig) -> Drive:
-    """Plan the route of `config`, drive it from the dock and measure; no pictures are made."""
+    """Plan the route of `config`, drive it from the dock and measure; no images are made."""
     lawn = Lawn(garden.half, garden.obstacles)
     plan = ROUTES[config.trajectory]
     route = plan(lawn, garden.dock, random_stream(config, ROUTE_STREAM), config.length)
-    stamps, twists, pictures = _motion(route, config)
+    stamps, twists, imaging = _motion(route, config)
     truth = Trajectory(stamps, integrate(stamps, twists, garden.dock))
     if config.trajectory == 'test' and config.test_drift > 0:
         config = _drifting(truth, twists, config)
@@ -82,7 +86,7 @@ def drive(garden: Garden, config: SimulationConfig) -> Drive:
     poses = integrate(stamps, measured, _odometry_start(config))
     odometry = Odometry(stamps, poses, measured, variances)
     gyro = YawRate(stamps, measured[:, 1], variances[:, 1])
-    return Drive(truth, odometry, gyro, _image_stamps(stamps, twists, pictures, config))
+    return Drive(truth, odometry, gyro, _image_stamps(stamps, twists, imaging, config))
 
 
 def _odometry_start(config: SimulationConfig) -> Array:
@@ -94,34 +98,33 @@ def _odometry_start(config: SimulationConfig) -> Array:
 
 
 def _motion(route: Route, config: SimulationConfig) -> tuple[Stamps, Array, Array]:
-    """Stamps (N,), true twists (N, 2) held since the stamp before, pictures wanted (N,)."""
+    """Stamps (N,), true twists (N, 2) held since the last stamp, 1 where images are taken (N,)."""
     dt_ns = round(1e9 / config.odometry_rate)
-    rest = Motion(np.zeros((1, 2)), pictures=False)
-    parts = [_increments(motion, config, dt_ns * 1e-9) for motion in [rest, *route, rest]]
+    rest = Motion(np.zeros((1, 2)), images=False)
+    motions = [rest, *route, rest]
+    parts = [_increments(motion, config, dt_ns * 1e-9) for motion in motions]
     increments = np.concatenate([np.zeros((1, 2)), *parts])
-    wanted = [
-        part[:, 0] * 0 + motion.pictures for part, motion in zip(parts[1:-1], route, strict=True)
-    ]
-    pictures = np.concatenate([[0], parts[0][:, 0], *wanted, parts[-1][:, 0]])
+    lengths = [1, *map(len, parts)]
+    imaging = np.repeat([0.0, *(motion.images for motion in motions)], lengths)
     stamps = START_NS + np.arange(len(increments), dtype=np.int64) * dt_ns
-    return stamps, increments / (dt_ns * 1e-9), pictures
+    return stamps, increments / (dt_ns * 1e-9), imaging
 
 
 def _increments(motion: Motion, config: SimulationConfig, dt: float) -> Array:
-    """Way and turn (N, 2) in each time step of a motion, from rest to rest."""
-    way = np.concatenate([[0], np.cumsum(motion.steps[:, 0])])
+    """Distance and turn (N, 2) in each time step of a motion, from rest to rest."""
+    distance = np.concatenate([[0], np.cumsum(motion.steps[:, 0])])
     turn = np.concatenate([[0], np.cumsum(motion.steps[:, 1])])
-    if way[-1] > 0:
-        done = _profile(way[-1], config.speed, ACCELERATION, dt)
-        return np.diff(np.stack([done, np.interp(done, way, turn)], -1), axis=0)
+    if distance[-1] > 0:
+        done = _profile(distance[-1], config.speed, ACCELERATION, dt)
+        return np.diff(np.stack([done, np.interp(done, distance, turn)], -1), axis=0)
     if turn[-1] == 0:
         return np.zeros((round(REST_S / dt), 2))
-    done = np.sign(turn[-1]) * _profile(abs(turn[-1]), config.turn_rate, TURN_ACCELERATION, dt)
+    done = np.sign(turn[-1]) * _profile(abs(turn[-1]), TURN_RATE, TURN_ACCELERATION, dt)
     return np.diff(np.stack([0 * done, done], -1), axis=0)
 
 
 def _profile(distance: float, speed: float, acceleration: float, dt: float) -> Array:
-    """Distance gone (N + 1,) after every time step: speeding up, steady, slowing down."""
+    """Distance covered (N + 1,) after every time step: speeding up, steady, slowing down."""
     speed = min(speed, float(np.sqrt(distance * acceleration)))
     ramp = speed / acceleration
     total = distance / speed + ramp
@@ -129,14 +132,14 @@ def _profile(distance: float, speed: float, acceleration: float, dt: float) -> A
     t = np.linspace(0, total, count + 1)
     rising, falling = np.minimum(t, ramp), np.maximum(t - (total - ramp), 0)
     steady = np.clip(t - ramp, 0, total - 2 * ramp)
-    gone = acceleration * rising**2 / 2 + speed * steady + speed * falling
-    return np.asarray(gone - acceleration * falling**2 / 2)
+    covered = acceleration * rising**2 / 2 + speed * steady + speed * falling
+    return np.asarray(covered - acceleration * falling**2 / 2)
 
 
 def _drifting(truth: Trajectory, twists: Array, config: SimulationConfig) -> SimulationConfig:
     """The same errors of wheels and gyroscope, scaled to drift by `config.test_drift` on average.
 
-    What is drawn makes some test drives nearly perfect and others useless; so all compare.
+    Errors as drawn make some test drives nearly perfect and others useless; scaled ones compare.
     """
     for _ in range(_DRIFT_ITERATIONS):
         measured, _ = _measured(twists, config, random_stream(config, SENSOR_STREAM))
@@ -163,7 +166,7 @@ def _measured(
     count = len(twists)
     wheel, gyro = 1 + config.scale_error * rng.standard_normal(2)
     slip = config.slip * wandering(count, dt, SLIP_TIME_S, rng)
-    bias = config.gyro_bias * wandering(count, dt, config.gyro_bias_time, rng)
+    bias = config.gyro_bias * wandering(count, dt, GYRO_BIAS_TIME_S, rng)
     noise = rng.standard_normal((count, 2)) * [config.speed_noise, config.gyro_noise]
     v, omega = twists.T
     measured_v = v * (wheel + slip) + noise[:, 0] * (v != 0)
@@ -178,18 +181,18 @@ def wandering(count: int, dt: float, time_s: float, rng: np.random.Generator) ->
     """A stationary random process (count,) of unit variance, correlated over `time_s`."""
     keep = np.exp(-dt / time_s)
     pushes = rng.standard_normal(count) * np.sqrt(1 - keep**2)
-    values, _ = lfilter([1.0], [1.0, -keep], pushes, zi=keep * rng.standard_normal(1))
-    return np.asarray(values, float)
+    process, _ = lfilter([1.0], [1.0, -keep], pushes, zi=keep * rng.standard_normal(1))
+    return np.asarray(process, float)
 
 
 def _image_stamps(
-    stamps: Stamps, twists: Array, pictures: Array, config: SimulationConfig
+    stamps: Stamps, twists: Array, imaging: Array, config: SimulationConfig
 ) -> Stamps:
-    """Stamps (M,) of the pictures: one at every `images_every` m, or degrees of a turn in place."""
+    """Stamps (M,) of the images: one at every `images_every` m, or degrees of a turn in place."""
     turning = (twists[:, 0] == 0) / np.radians(config.images_every_turn)
     rate = np.abs(twists[:, 0]) / config.images_every + np.abs(twists[:, 1]) * turning
     dt = np.diff(stamps) * 1e-9
-    progress = np.concatenate([[0], np.cumsum((rate * pictures)[1:] * dt)])
+    progress = np.concatenate([[0], np.cumsum((rate * imaging)[1:] * dt)])
     marks = np.arange(0.5, progress[-1])
     after = np.searchsorted(progress, marks)
     part = (marks - progress[after - 1]) / (progress[after] - progress[after - 1])
@@ -216,8 +219,10 @@ def lights(stamps_ns: Stamps, config: SimulationConfig) -> list[Light]:
     ]
 
 
-def pictures(garden: Garden, drive: Drive, config: SimulationConfig, view: View) -> Iterator[Image]:
-    """The noisy pictures of a drive in order, rendered ahead by a thread per core."""
+def render_images(
+    garden: Garden, drive: Drive, config: SimulationConfig, view: View
+) -> Iterator[Image]:
+    """The noisy images of a drive in order, rendered ahead by a thread per core."""
     jobs = zip(drive.image_poses, lights(drive.image_stamps_ns, config), strict=True)
     take = partial(_take, garden, config, view)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -230,14 +235,14 @@ def pictures(garden: Garden, drive: Drive, config: SimulationConfig, view: View)
 def _take(
     garden: Garden, config: SimulationConfig, view: View, index: int, pose: Array, light: Light
 ) -> Image:
-    picture = garden.picture(pose, view, light)
+    image = garden.image(pose, view, light)
     rng = random_stream(config, PIXEL_STREAM, index)
-    noise = rng.standard_normal(picture.shape, dtype=np.float32)
-    return rounded(picture + np.float32(config.image_noise) * noise)
+    noise = rng.standard_normal(image.shape, dtype=np.float32)
+    return rounded(image + np.float32(config.image_noise) * noise)
 
 
 def _ahead(pool: ThreadPoolExecutor, jobs: Iterator[Callable[[], Image]]) -> Iterator[Image]:
-    """Results in order; only a few jobs are under way, so that memory stays small."""
+    """Results in order; only a few jobs run ahead, so that memory stays small."""
     waiting: deque[Future[Image]] = deque()
     for job in jobs:
         waiting.append(pool.submit(job))
@@ -251,48 +256,51 @@ def simulate(
     config: SimulationConfig,
     out: Path,
     panorama: PanoramaConfig | None = None,
-    camera: CameraConfig | None = None,
+    camera: CameraModel | None = None,
     progress: bool = False,
 ) -> Drive:
     """Record a drive to the bag `out`; `progress` shows a bar. Returns what was recorded.
 
-    Raises BagError when the bag exists or cannot be written, ConfigError for a senseless setting.
+    Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
     garden = Garden(config.world, config)
     recorded = drive(garden, config)
     if config.images == 'panorama':
-        view = garden.panorama_view(panorama or PanoramaConfig())
+        view = panorama_view(panorama or PanoramaConfig())
     else:
-        view = garden.raw_view(camera or CameraConfig())
+        camera = camera or make_camera(LensCalibration(), RAW_SIZE)
+        view = raw_view(camera.unproject, camera.size)
     with BagWriter(out, config.storage) as bag:
-        stills = pictures(garden, recorded, config, view)
+        noisy = render_images(garden, recorded, config, view)
         count = len(recorded.image_stamps_ns)
-        shown = tqdm(stills, out.name, count, unit='picture', disable=not progress)
+        shown = tqdm(noisy, out.name, count, unit='image', disable=not progress)
         _write(bag, recorded, shown, config)
     return recorded
 
 
-def _write(bag: BagWriter, drive: Drive, stills: Iterable[Image], config: SimulationConfig) -> None:
+def _write(bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig) -> None:
     """Write all messages in the order of their stamps."""
     entries = heapq.merge(
-        _readings(bag, drive), _stills(bag, drive, stills, config), key=lambda entry: entry[0]
+        _sensor_entries(bag, drive),
+        _image_entries(bag, drive, frames, config),
+        key=lambda entry: entry[0],
     )
     for _, write in entries:
         write()
 
 
-def _stills(
-    bag: BagWriter, drive: Drive, stills: Iterable[Image], config: SimulationConfig
+def _image_entries(
+    bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig
 ) -> Iterator[Entry]:
     compressed = None if config.compression == 'none' else config.compression
     topic = '/panorama' if config.images == 'panorama' else '/image_raw'
     topic += '/compressed' if compressed else ''
-    for stamp, image in zip(map(int, drive.image_stamps_ns), stills, strict=True):
+    for stamp, image in zip(map(int, drive.image_stamps_ns), frames, strict=True):
         yield stamp, partial(bag.image, topic, stamp, image, 'camera', compressed)
 
 
-def _readings(bag: BagWriter, drive: Drive) -> Iterator[Entry]:
+def _sensor_entries(bag: BagWriter, drive: Drive) -> Iterator[Entry]:
     odometry, gyro = drive.odometry, drive.yaw_rate
     for i, stamp in enumerate(map(int, odometry.stamps_ns)):
         twist, variance = odometry.twists[i], odometry.variances[i]

@@ -3,7 +3,7 @@
 """A simulated garden: what grows and stands where, all drawn from a world seed.
 
 The robot drives in a rectangle of lawn about the origin of the frame `world`; a strip of plants
-surrounds it, then hedges, fences and walls, then the neighbours' trees and houses.
+surrounds it, then hedges, fences and walls, then the neighbors' trees and houses.
 """
 
 from __future__ import annotations
@@ -14,21 +14,30 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from sfa_localization.camera.lenses import make_camera
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
-from sfa_localization.data.errors import CameraError, ConfigError
+from sfa_localization.camera.lenses import CameraModel
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
-from sfa_localization.simulation.rendering import Light, Scene, Shape, View, panorama_view, raw_view
+from sfa_localization.simulation.rendering import (
+    Light,
+    Scene,
+    Shape,
+    View,
+    panorama_view,
+    raw_view,
+)
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.simulation.textures import Floats
 
 Tint = tuple[float, float, float]
 
 STRIP_M = 0.9
-"""From the driven area to the nearest plant; the robot's centre may reach the area's edge."""
+"""From the driven area to the nearest plant; the robot's center may reach the area's edge."""
 FENCE_M = 2.3
 """From the driven area to the hedges and fences around it."""
+CAMERA_HEIGHT_M = 0.45
+"""Of the mirror's focus above the lawn."""
 
 GRASS: Tint = (0.07, 0.24, 0.13)
 BARK: Tint = (0.17, 0.25, 0.34)
@@ -64,7 +73,7 @@ def choose(rng: np.random.Generator, tints: tuple[Tint, ...]) -> Tint:
 def panel(
     corner: ArrayLike, across: ArrayLike, up: ArrayLike, step: float, surface: str, tint: Tint
 ) -> Shape:
-    """A parallelogram whose normal is across x up, in a mesh of about `step` metres."""
+    """A parallelogram whose normal is across x up, in a mesh of about `step` meters."""
     origin, right, rise = (np.asarray(axis, float) for axis in (corner, across, up))
     n, m = (max(1, int(np.ceil(np.linalg.norm(axis) / step))) for axis in (right, rise))
     i, j = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, m + 1))
@@ -77,10 +86,10 @@ def panel(
 
 
 def box(
-    centre: Array, size: Array, surface: str, tint: Tint, low: float = 0.0, step: float = 0.5
+    center: Array, size: Array, surface: str, tint: Tint, low: float = 0.0, step: float = 0.5
 ) -> list[Shape]:
-    """An upright box without a bottom: `centre` (x, y), `size` (x, y, height) in metres."""
-    (x, y), (w, d, h) = centre, size
+    """An upright box without a bottom: `center` (x, y), `size` (x, y, height) in meters."""
+    (x, y), (w, d, h) = center, size
     west, east, south, north = x - w / 2, x + w / 2, y - d / 2, y + d / 2
     up = [0, 0, h]
     walls: list[tuple[ArrayLike, ArrayLike, ArrayLike]] = [
@@ -101,9 +110,9 @@ def solid(mesh: trimesh.Trimesh, surface: str, tint: Tint) -> Shape:
 
 
 def bumpy(shape: Shape, rng: np.random.Generator, height: float, wavelength: float) -> Shape:
-    """The shape with its surface pushed about smoothly by some `height` in metres.
+    """The shape with its surface pushed about smoothly by some `height` in meters.
 
-    The push depends on the place alone, so that neighbouring panels stay joined.
+    The push depends on the place alone, so that neighboring panels stay joined.
     """
     waves = rng.standard_normal((8, 3)) * 2 * np.pi / wavelength / np.sqrt(3)
     pushes = rng.standard_normal((8, 3)) * height / np.sqrt(8)
@@ -117,12 +126,12 @@ def bumpy(shape: Shape, rng: np.random.Generator, height: float, wavelength: flo
 
 
 def blob(
-    centre: Array, radii: Array, tint: Tint, rng: np.random.Generator, detail: int = 3
+    center: Array, radii: Array, tint: Tint, rng: np.random.Generator, detail: int = 3
 ) -> Shape:
-    """A leafy ellipsoid about `centre` (3,) with half-axes `radii` (3,) in metres."""
+    """A leafy ellipsoid about `center` (3,) with half-axes `radii` (3,) in meters."""
     mesh = trimesh.creation.icosphere(subdivisions=detail)
     mesh.apply_scale(np.asarray(radii, float))
-    mesh.apply_translation(centre)
+    mesh.apply_translation(center)
     size = float(np.mean(radii))
     return bumpy(solid(mesh, 'leaves', tint), rng, 0.13 * size, 1.1 * size)
 
@@ -158,17 +167,17 @@ def conifer(foot: Array, height: float, rng: np.random.Generator) -> list[Shape]
     return shapes
 
 
-def house(centre: Array, size: Array, rng: np.random.Generator) -> list[Shape]:
+def house(center: Array, size: Array, rng: np.random.Generator) -> list[Shape]:
     """Walls with windows on all sides and a gabled roof; `size` (x, y, height of the walls)."""
     brick = rng.random() < 0.4
     surface, tint = ('bricks', choose(rng, BRICKS)) if brick else ('plaster', choose(rng, PLASTERS))
-    shapes = box(centre, size, surface, tint)
+    shapes = box(center, size, surface, tint)
     for side in range(4):
-        shapes += _windows(centre, size, side, rng)
-    return shapes + _gable(centre, size, (surface, tint), rng)
+        shapes += _windows(center, size, side, rng)
+    return shapes + _gable(center, size, (surface, tint), rng)
 
 
-def _windows(centre: Array, size: Array, side: int, rng: np.random.Generator) -> list[Shape]:
+def _windows(center: Array, size: Array, side: int, rng: np.random.Generator) -> list[Shape]:
     """Framed panes on one wall, storey above storey; one of them is a door."""
     along = side % 2
     length, out = size[along], (1 if side > 1 else -1)
@@ -178,7 +187,7 @@ def _windows(centre: Array, size: Array, side: int, rng: np.random.Generator) ->
     for storey in range(int(size[2] // 2.4)):
         for place in range(count):
             is_door = storey == 0 and place == door
-            middle = np.array(centre, float)
+            middle = np.array(center, float)
             middle[along] += ((place + 0.5) / count - 0.5) * length
             middle[1 - along] += out * size[1 - along] / 2
             low, high = (0.05, 2.0) if is_door else (0.9 + 2.5 * storey, 1.2)
@@ -205,13 +214,13 @@ def _pane(
 
 
 def _gable(
-    centre: Array, size: Array, wall: tuple[str, Tint], rng: np.random.Generator
+    center: Array, size: Array, wall: tuple[str, Tint], rng: np.random.Generator
 ) -> list[Shape]:
     """A roof with its ridge along the longer side, and the two gables under it."""
     long = 0 if size[0] >= size[1] else 1
     ahead, aside = np.eye(3)[long] * size[long], np.eye(3)[1 - long] * size[1 - long]
     rise = np.array([0, 0, rng.uniform(0.3, 0.5) * size[1 - long]])
-    base = np.array([centre[0], centre[1], size[2]])
+    base = np.array([center[0], center[1], size[2]])
     tint = choose(rng, ROOFS)
     shapes = []
     for sign in (1.0, -1.0) if long == 0 else (-1.0, 1.0):
@@ -233,7 +242,7 @@ def _triangle(corners: Array, outwards: Array, wall: tuple[str, Tint]) -> Shape:
 class Plot:
     """The garden as it is laid out: shapes, and what the robot must keep clear of.
 
-    `half` (2,) is half the driven area in metres; `obstacles` are discs (x, y, radius) inside it.
+    `half` (2,) is half the driven area in meters; `obstacles` are discs (x, y, radius) inside it.
     """
 
     half: Array
@@ -242,7 +251,7 @@ class Plot:
     obstacles: list[tuple[float, float, float]] = field(default_factory=list)
 
     def beside(self, side: int, along: float, out: float) -> Array:
-        """The point (2,) `out` metres outside the area on a side, `along` (-1..1) it."""
+        """The point (2,) `out` meters outside the area on a side, `along` (-1..1) it."""
         reach, width = self.half[side % 2], self.half[1 - side % 2]
         local = np.array([reach + out, along * (width + max(out, 0))])
         turn = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[side]
@@ -287,15 +296,15 @@ def _section(plot: Plot, kind: str, side: int, edges: Array) -> None:
     deep, high = (
         (0.9, plot.rng.uniform(1.2, 2.3)) if kind == 'hedge' else (0.15, plot.rng.uniform(0.8, 1.8))
     )
-    centre = plot.beside(side, float(edges.mean()), FENCE_M + deep / 2)
+    center = plot.beside(side, float(edges.mean()), FENCE_M + deep / 2)
     size = [*plot.extent(side, deep, width), high]
     if kind == 'hedge':
-        parts = box(centre, np.array(size), 'leaves', choose(plot.rng, GREENS), step=0.22)
+        parts = box(center, np.array(size), 'leaves', choose(plot.rng, GREENS), step=0.22)
         seed = plot.rng.integers(2**32)
         plot.shapes += [bumpy(part, np.random.default_rng(seed), 0.10, 0.9) for part in parts]
         return
     tints = {'boards': WOODS, 'stones': STONES, 'bricks': BRICKS, 'plaster': PLASTERS}[kind]
-    plot.shapes += box(centre, np.array(size), kind, choose(plot.rng, tints))
+    plot.shapes += box(center, np.array(size), kind, choose(plot.rng, tints))
 
 
 def bed(plot: Plot) -> None:
@@ -305,9 +314,9 @@ def bed(plot: Plot) -> None:
         side, along = int(plot.rng.integers(4)), plot.rng.uniform(-0.97, 0.97)
         radius = plot.rng.uniform(0.18, 0.5)
         out = plot.rng.uniform(STRIP_M + 1.2 * radius, FENCE_M)
-        centre = np.array([*plot.beside(side, along, out), radius * 0.8])
+        center = np.array([*plot.beside(side, along, out), radius * 0.8])
         tint = choose(plot.rng, BLOOMS if plot.rng.random() < 0.35 else GREENS)
-        plot.shapes.append(blob(centre, radius * np.array([1, 1, 0.9]), tint, plot.rng))
+        plot.shapes.append(blob(center, radius * np.array([1, 1, 0.9]), tint, plot.rng))
     for tint in ((0.55, 0.25, 0.08), (0.06, 0.25, 0.70), (0.10, 0.50, 0.62), (0.45, 0.45, 0.45)):
         side, along = int(plot.rng.integers(4)), plot.rng.uniform(-0.9, 0.9)
         foot = plot.beside(side, along, STRIP_M + 0.6)
@@ -315,7 +324,7 @@ def bed(plot: Plot) -> None:
 
 
 def buildings(plot: Plot) -> None:
-    """The shed in the garden, the house behind one side, neighbours behind the others."""
+    """The shed in the garden, the house behind one side, neighbors behind the others."""
     sides = plot.rng.permutation(4)
     shed = plot.beside(int(sides[0]), plot.rng.choice([-0.75, 0.75]), STRIP_M + 1.1)
     plot.shapes += box(shed, np.array([2.0, 2.0, 2.1]), 'boards', choose(plot.rng, WOODS))
@@ -324,9 +333,9 @@ def buildings(plot: Plot) -> None:
     for number, side in enumerate(sides[1:]):
         out = 6.5 if number == 0 else plot.rng.uniform(10, 18)
         wide, deep = plot.rng.uniform(8, 12), plot.rng.uniform(6, 8)
-        centre = plot.beside(int(side), plot.rng.uniform(-0.6, 0.6), out)
+        center = plot.beside(int(side), plot.rng.uniform(-0.6, 0.6), out)
         height = plot.rng.choice([3.0, 5.2])
-        plot.shapes += house(centre, np.array([*plot.extent(side, deep, wide), height]), plot.rng)
+        plot.shapes += house(center, np.array([*plot.extent(side, deep, wide), height]), plot.rng)
 
 
 def trees(plot: Plot, dock: Array) -> None:
@@ -354,14 +363,13 @@ def _free_spot(plot: Plot, dock: Array) -> Array:
 class Garden:
     """A garden of one world seed, ready to be looked at from any pose of the frame `world`.
 
-    `half` (2,) is half the driven area in metres, `obstacles` (N, 3) discs inside it as x, y,
+    `half` (2,) is half the driven area in meters, `obstacles` (N, 3) discs inside it as x, y,
     radius, `dock` (3,) the pose that every drive starts from.
     """
 
     def __init__(self, seed: int, config: SimulationConfig | None = None) -> None:
         """Lay out and light the garden. Raises ConfigError when the area is too small."""
-        self._config = config or SimulationConfig()
-        half = _checked_half(self._config.area)
+        half = _checked_half((config or SimulationConfig()).area)
         plot = Plot(half, np.random.default_rng([seed, 0]))
         self.dock = np.array([plot.rng.uniform(-0.5, 0.5) * half[0], 0.3 - half[1], np.pi / 2])
         for part in (lawn, border, bed, buildings):
@@ -370,42 +378,25 @@ class Garden:
         self.half = half
         self.obstacles = np.array(plot.obstacles).reshape(-1, 3)
         self.scene = Scene(plot.shapes, _sun(plot.rng), np.random.default_rng([seed, 1]))
-        self._views: dict[object, View] = {}
 
     def render_panorama(self, pose: Array, panorama: PanoramaConfig) -> Image:
-        """The noiseless panorama (H, W, 3) BGR seen from `pose` (x m, y m, yaw rad)."""
-        return rounded(self.picture(pose, self.panorama_view(panorama)))
+        """The noiseless panorama (H, W, 3) BGR from `pose` (x m, y m, yaw rad)."""
+        return rounded(self.image(pose, panorama_view(panorama)))
 
-    def render_raw(self, pose: Array, camera: CameraConfig) -> Image:
-        """The noiseless raw picture (H, W, 3) BGR of a camera of a given size in pixels."""
-        return rounded(self.picture(pose, self.raw_view(camera)))
+    def render_raw(self, pose: Array, camera: CameraModel) -> Image:
+        """The noiseless raw image (H, W, 3) BGR of a camera from `pose` (x m, y m, yaw rad)."""
+        return rounded(self.image(pose, raw_view(camera.unproject, camera.size)))
 
-    def picture(self, pose: Array, view: View, light: Light | None = None) -> Floats:
+    def image(self, pose: Array, view: View, light: Light | None = None) -> Floats:
         """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose (3,)."""
         light = light or Light()
-        position = np.array([pose[0], pose[1], self._config.camera_height])
-        return view.picture(self.scene.look(position, float(pose[2]), view.dome, light), light.gain)
-
-    def panorama_view(self, panorama: PanoramaConfig) -> View:
-        """The view of `render_panorama`, built once per configuration."""
-        if panorama not in self._views:
-            self._views[panorama] = panorama_view(panorama)
-        return self._views[panorama]
-
-    def raw_view(self, camera: CameraConfig) -> View:
-        """The view of `render_raw`, built once per camera. Raises CameraError without a size."""
-        if camera not in self._views:
-            size = (camera.image_width, camera.image_height)
-            if 0 in size:
-                raise CameraError('the simulated camera needs image_width and image_height')
-            model = make_camera(camera, size[::-1])
-            self._views[camera] = raw_view(model.unproject, size, PanoramaConfig())
-        return self._views[camera]
+        position = np.array([pose[0], pose[1], CAMERA_HEIGHT_M])
+        return view.image(self.scene.look(position, float(pose[2]), view.dome, light), light.gain)
 
 
-def rounded(picture: Floats) -> Image:
-    """Brightness as a picture of 8 bits."""
-    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+def rounded(image: Floats) -> Image:
+    """Brightness as an image of 8 bits."""
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
 def _checked_half(area: tuple[float, ...]) -> Array:

@@ -1,10 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Ray-cast pictures of a scene of triangles, as an omnidirectional camera sees it.
+"""Ray-cast images of a scene of triangles, as an omnidirectional camera sees it.
 
-Rays are cast on a *dome*, a grid of elevations and azimuths about the camera; a picture is the
-dome resampled: into a panorama, or into the raw picture of a mirror. The light of sun and sky is
-worked out once for every vertex, so that a picture costs one ray per point of the dome.
+Rays are cast on a *dome*, a grid of elevations and azimuths about the camera; an image is the
+dome resampled: into a panorama, or into the raw image of a mirror. The light of sun and sky is
+computed once for every vertex, so that an image costs one ray per point of the dome.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Dome:
         return cls(elevations_rad, columns, rays.astype(np.float32))
 
     def turned(self, yaw_rad: float) -> Floats:
-        """The rays (rows, columns, 3) of a robot turned counter-clockwise."""
+        """The rays (rows, columns, 3) of a robot turned counterclockwise."""
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         matrix = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
         return np.asarray(self.rays @ matrix, np.float32)
@@ -94,10 +94,10 @@ class Dome:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A kind of picture: the dome it needs, and how the dome becomes the picture."""
+    """A kind of image: the dome it needs, and how the dome becomes the image."""
 
     dome: Dome
-    picture: Callable[[Floats, Floats], Floats]
+    image: Callable[[Floats, Floats], Floats]
 
 
 def panorama_view(config: PanoramaConfig) -> View:
@@ -106,22 +106,21 @@ def panorama_view(config: PanoramaConfig) -> View:
     rows = band[0] - (np.arange(2 * config.height) + 0.5) * (band[0] - band[1]) / config.height / 2
     size = (config.width, config.height)
 
-    def picture(dome: Floats, gain: Floats) -> Floats:
+    def image(dome: Floats, gain: Floats) -> Floats:
         small = cv2.resize(dome, size, interpolation=cv2.INTER_AREA) * gain
         return np.asarray(small if config.clockwise else small[:, ::-1], np.float32)
 
-    return View(Dome.build(rows, 2 * config.width), picture)
+    return View(Dome.build(rows, 2 * config.width), image)
 
 
-def raw_view(
-    unproject: Callable[[Array], Array], size: tuple[int, int], config: PanoramaConfig
-) -> View:
-    """The raw picture of a camera, sharp where the panorama of `config` will look.
+def raw_view(unproject: Callable[[Array], Array], size: tuple[int, int]) -> View:
+    """The raw image of a camera, sharp in the elevations of the default panorama.
 
     `unproject` maps pixels (N, 2) to unit rays (N, 3) in the robot's axes, NaN where nothing is
-    seen; `size` is (width, height). Below the lawn's near edge the picture shows the robot.
+    visible; `size` is (rows, columns). Below the lawn's near edge the image shows the robot.
     """
-    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    config = PanoramaConfig()
+    columns, rows = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
     rays = unproject(np.stack([columns.ravel(), rows.ravel()], -1).astype(float))
     azimuth = np.arctan2(rays[:, 1], rays[:, 0])
     elevation = np.arcsin(np.clip(rays[:, 2], -1, 1))
@@ -132,19 +131,19 @@ def raw_view(
     y = np.interp(elevation, falling, np.arange(len(falling))[::-1])
     map_x, map_y = (_as_map(axis, size) for axis in (x, y))
     below = elevation < falling[0] - np.radians(1)
-    cover = np.where(np.isnan(elevation), 1.0, below).reshape(size[::-1]).astype(np.float32)
-    hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(size[1], size[0], 3)
+    cover = np.where(np.isnan(elevation), 1.0, below).reshape(size).astype(np.float32)
+    hull = np.nan_to_num(_hull(azimuth, elevation)).reshape(*size, 3)
 
-    def picture(dome_picture: Floats, gain: Floats) -> Floats:
-        wrapped = np.concatenate([dome_picture[:, -1:], dome_picture, dome_picture[:, :1]], 1)
-        seen = cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray((seen * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
+    def image(dome_image: Floats, gain: Floats) -> Floats:
+        wrapped = np.concatenate([dome_image[:, -1:], dome_image, dome_image[:, :1]], 1)
+        scene = cv2.remap(wrapped, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray((scene * (1 - cover[..., None]) + hull * cover[..., None]) * gain)
 
-    return View(dome, picture)
+    return View(dome, image)
 
 
-def _as_map(values: Array, size: tuple[int, int]) -> Floats:
-    return np.nan_to_num(values).reshape(size[::-1]).astype(np.float32)
+def _as_map(coordinates: Array, size: tuple[int, int]) -> Floats:
+    return np.nan_to_num(coordinates).reshape(size).astype(np.float32)
 
 
 def _rows_for(elevation: Array, config: PanoramaConfig) -> Array:
@@ -188,7 +187,7 @@ class Scene:
 
     @property
     def triangles(self) -> Array:
-        """All triangles (F, 3, 3) in metres."""
+        """All triangles (F, 3, 3) in meters."""
         return np.asarray(self._vertices[self._faces])
 
     def _light_vertices(
@@ -216,12 +215,12 @@ class Scene:
         return (hits < 0).astype(float)
 
     def _corners(self, light: Array) -> Floats:
-        """Per face (F, 12): texture metres and light at corner 0, and their change to 1 and 2."""
+        """Per face (F, 12): texture meters and light at corner 0, and their change to 1 and 2."""
         corners = self._vertices[self._faces]
         normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
         axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(1)]
-        metres = np.take_along_axis(corners, axes[:, None, :], 2)
-        values = np.concatenate([metres, light[self._faces]], 2)
+        meters = np.take_along_axis(corners, axes[:, None, :], 2)
+        values = np.concatenate([meters, light[self._faces]], 2)
         parts = [values[:, 0], values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]]
         return np.concatenate(parts, 1).astype(np.float32)
 
@@ -235,9 +234,9 @@ class Scene:
         rays = dome.turned(yaw_rad)
         start = np.broadcast_to(position, (rays.shape[0] * rays.shape[1], 3)).astype(np.float32)
         hits = self._embree.run(start, rays.reshape(-1, 3), output=True)
-        seen = self._surfaces(hits, rays, 2 * np.pi / dome.columns, light)
+        surfaces = self._surfaces(hits, rays, 2 * np.pi / dome.columns, light)
         missed = (hits['primID'] < 0).reshape(rays.shape[:2])
-        return np.asarray(np.where(missed[..., None], self._sky_at(dome, yaw_rad), seen))
+        return np.asarray(np.where(missed[..., None], self._sky_at(dome, yaw_rad), surfaces))
 
     def _surfaces(
         self, hits: dict[str, NDArray[np.float32]], rays: Floats, pixel_rad: float, light: Light

@@ -21,16 +21,16 @@ CLEARANCE_M = 0.8
 """From the robot's center to any obstacle."""
 TIGHTEST_M = 0.8
 """Smallest radius of a curve."""
-CELL_M = 0.5
-STEP_M = 0.05
+CELL_M = 0.5  # side of the cells in which coverage is counted
+STEP_M = 0.05  # between points of a curve
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Driven in one go: `steps` (M, 2) of way in metres and turn in radians, pictures or not."""
+    """Driven from rest to rest: `steps` (M, 2) of distance in m and turn in rad, images or not."""
 
     steps: Array
-    pictures: bool = True
+    images: bool = True
 
 
 Route = list[Motion]
@@ -40,7 +40,7 @@ class Lawn:
     """Free ground: a rectangle of half sizes `half` (2,) about the origin, without some discs."""
 
     def __init__(self, half: Array, obstacles: Array) -> None:
-        """`obstacles` (N, 3) are discs x, y, radius in metres."""
+        """`obstacles` (N, 3) are discs x, y, radius in meters."""
         self.half = np.asarray(half, float)
         self._obstacles = np.asarray(obstacles, float).reshape(-1, 3)
 
@@ -55,7 +55,7 @@ class Lawn:
         return np.asarray(inside & (gaps >= self._obstacles[:, 2] + CLEARANCE_M).all(-1))
 
     def clear(self, start: Array, ends: Array) -> NDArray[np.bool_]:
-        """Mask (N,) of the straight ways from `start` (2,) or (N, 2) to `ends` (N, 2)."""
+        """Mask (N,) of the free straight lines from `start` (2,) or (N, 2) to `ends` (N, 2)."""
         t = np.linspace(0, 1, 200)[:, None, None]
         return np.asarray(self.free(start + t * (ends - start)).all(0))
 
@@ -101,48 +101,47 @@ class Plan:
         self.heading = float(start[2])
         self.length_m = 0.0
 
-    def turn_to(self, heading_rad: float, pictures: bool = True) -> None:
-        """Turn on the spot, the shorter way."""
+    def turn_to(self, heading_rad: float, images: bool = True) -> None:
+        """Turn on the spot, in the shorter direction."""
         turn = float(wrap_angle(heading_rad - self.heading))
         if abs(turn) > 1e-6:
-            self.route.append(Motion(np.array([[0.0, turn]]), pictures))
+            self.route.append(Motion(np.array([[0.0, turn]]), images))
         self.heading = heading_rad
 
-    def straight_to(self, target: Array, pictures: bool = True) -> None:
+    def straight_to(self, target: Array, images: bool = True) -> None:
         """Turn towards a point (2,) and drive there."""
-        way = target - self.position
-        distance = float(np.hypot(*way))
+        offset = target - self.position
+        distance = float(np.hypot(*offset))
         if distance < 1e-3:
             return
-        self.turn_to(float(np.arctan2(way[1], way[0])), pictures)
-        self.route.append(Motion(np.array([[distance, 0.0]]), pictures))
+        self.turn_to(float(np.arctan2(offset[1], offset[0])), images)
+        self.route.append(Motion(np.array([[distance, 0.0]]), images))
         self.position, self.length_m = np.asarray(target, float), self.length_m + distance
 
-    def reach(self, target: Array, rng: np.random.Generator, pictures: bool = False) -> None:
-        """Drive to a point (2,), around the obstacles in the way."""
+    def reach(self, target: Array, rng: np.random.Generator, images: bool = False) -> None:
+        """Drive to a point (2,), around the obstacles."""
         if not self.lawn.clear(self.position, target[None])[0]:
-            self.straight_to(self._detour(target, rng), pictures)
-        self.straight_to(target, pictures)
+            self.straight_to(self._detour(target, rng), images)
+        self.straight_to(target, images)
 
     def _detour(self, target: Array, rng: np.random.Generator) -> Array:
         points = self.lawn.random_points(rng, 500)
         points = points[self.lawn.clear(self.position, points) & self.lawn.clear(target, points)]
         if not len(points):
             raise DataError('the simulated lawn is too crowded to drive on; name a larger area')
-        way = np.linalg.norm(points - self.position, axis=1) + np.linalg.norm(
-            points - target, axis=1
-        )
-        return np.asarray(points[way.argmin()])
+        there = np.linalg.norm(points - self.position, axis=1)
+        onward = np.linalg.norm(points - target, axis=1)
+        return np.asarray(points[(there + onward).argmin()])
 
     def follow(self, points: Array) -> None:
         """Drive along a smooth line (N, 2) that starts here, after turning to its direction."""
-        ways = np.diff(points, axis=0)
-        headings = np.unwrap(np.arctan2(ways[:, 1], ways[:, 0]))
+        chords = np.diff(points, axis=0)
+        headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
         # The heading at each point is the mean of the chords on both sides.
         inner = (headings[1:] + headings[:-1]) / 2
         at = np.concatenate([1.5 * headings[:1] - 0.5 * headings[1:2], inner, headings[-1:]])
         self.turn_to(float(at[0]))
-        steps = np.stack([np.hypot(*ways.T), np.diff(at)], -1)
+        steps = np.stack([np.hypot(*chords.T), np.diff(at)], -1)
         self.route.append(Motion(steps))
         self.position, self.heading = points[-1], float(at[-1])
         self.length_m += float(steps[:, 0].sum())
@@ -170,9 +169,9 @@ def _between(start: Array, end: Array) -> Array:
     return np.asarray(start + np.linspace(0, 1, count)[:, None] * (end - start))
 
 
-def _sector(ways: Array) -> NDArray[np.int64]:
-    """Which sixth of the directions ways (..., 2) point to; forth and back are the same."""
-    angle = np.arctan2(ways[..., 1], ways[..., 0]) % np.pi
+def _sector(offsets: Array) -> NDArray[np.int64]:
+    """Which sixth of the directions offsets (..., 2) have; forth and back are the same."""
+    angle = np.arctan2(offsets[..., 1], offsets[..., 0]) % np.pi
     return np.asarray(angle / np.pi * 6, int) % 6
 
 
@@ -185,7 +184,7 @@ def _most_new(cells: Coverage, driven: Array, start: Array, ends: Array) -> Arra
 
 
 def lines(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 0.0) -> Route:
-    """Ten straight lines of 8 m or more in well spread directions; no pictures between them.
+    """Ten straight lines of 8 m or more in well spread directions; no images between them.
 
     On small lawns the lines are at least 0.6 of its shorter side. `length_m` is not used.
     """
@@ -196,8 +195,7 @@ def lines(lawn: Lawn, start: Array, rng: np.random.Generator, length_m: float = 
         if np.hypot(*(other - plan.position)) < np.hypot(*(one - plan.position)):
             one, other = other, one
         plan.reach(one, rng)
-        way = other - one
-        plan.turn_to(float(np.arctan2(way[1], way[0])), pictures=False)
+        plan.turn_to(float(np.arctan2(*(other - one)[::-1])), images=False)
         plan.straight_to(other)
     return plan.route
 
@@ -242,7 +240,7 @@ def _lane(plan: Plan, axis: int, offset: float, ahead: float, rng: np.random.Gen
         ends[:, axis] = np.array([-ahead, ahead]) * plan.lawn.half[axis]
         ends[:, 1 - axis] = offset + shift
         if plan.lawn.clear(ends[0], ends[1:])[0]:
-            plan.reach(ends[0], rng, pictures=bool(plan.route))
+            plan.reach(ends[0], rng, images=bool(plan.route))
             plan.straight_to(ends[1])
             return -ahead
     return ahead
@@ -294,9 +292,9 @@ def _spline_around(lawn: Lawn, start: Array, rng: np.random.Generator) -> Array:
 
 
 def _drivable(lawn: Lawn, curve: Array) -> bool:
-    ways = np.diff(curve, axis=0)
-    bends = np.abs(wrap_angle(np.diff(np.arctan2(ways[:, 1], ways[:, 0]))))
-    gentle = bends < np.hypot(*ways[1:].T) / TIGHTEST_M
+    chords = np.diff(curve, axis=0)
+    bends = np.abs(wrap_angle(np.diff(np.arctan2(chords[:, 1], chords[:, 0]))))
+    gentle = bends < np.hypot(*chords[1:].T) / TIGHTEST_M
     return bool(lawn.free(curve).all() and gentle.all())
 
 
@@ -343,8 +341,8 @@ def _arcs_from(
 
 
 def _arc(state: tuple[Array, float], bend: float) -> Array:
-    way = np.linspace(0, ARC_M, int(ARC_M / STEP_M) + 1)
-    heading = state[1] + bend * way
+    distance = np.linspace(0, ARC_M, int(ARC_M / STEP_M) + 1)
+    heading = state[1] + bend * distance
     x = state[0][0] + (np.sin(heading) - np.sin(state[1])) / bend
     y = state[0][1] - (np.cos(heading) - np.cos(state[1])) / bend
     return np.stack([x, y, heading], -1)

@@ -15,7 +15,7 @@ class SimulationConfig(Settings):
 
     trajectory: str = setting(
         'coverage',
-        'coverage (criss-crossing straight legs), lines (straight lines, no pictures between), '
+        'coverage (criss-crossing straight legs), lines (straight lines, no images between), '
         'mower (a grid of lanes), test (one smooth closed curve), curves (wandering, no straight '
         'line)',
         choices=('coverage', 'lines', 'mower', 'test', 'curves'),
@@ -29,25 +29,25 @@ class SimulationConfig(Settings):
         0.0, 'length of coverage, test and curves; 0: by the area', unit='m', low=0.0, high=1e5
     )
     images: str = setting(
-        'raw', 'picture of the mirror, or the panorama itself', choices=('raw', 'panorama')
+        'raw', 'image of the mirror, or the panorama itself', choices=('raw', 'panorama')
     )
-    images_every: float = setting(0.2, 'way between pictures', unit='m', low=0.02, high=10.0)
+    images_every: float = setting(0.2, 'distance between images', unit='m', low=0.02, high=10.0)
     images_every_turn: float = setting(
-        30.0, 'turn on the spot between pictures', unit='deg', low=1.0, high=360.0
+        30.0, 'turn on the spot between images', unit='deg', low=1.0, high=360.0
     )
     compression: str = setting(
-        'none', 'of the pictures, published below /compressed', choices=('none', 'jpeg', 'png')
+        'none', 'of the images, published below /compressed', choices=('none', 'jpeg', 'png')
     )
     storage: str = setting('mcap', 'storage of the bag', choices=('mcap', 'sqlite3'))
-    camera_height: float = setting(0.45, 'camera above the lawn', unit='m', low=0.1, high=2.0)
-    image_noise: float = setting(1.5, 'deviation of pixels', unit='grey levels', low=0.0, high=50.0)
+    image_noise: float = setting(
+        1.5, 'standard deviation of the pixel noise', unit='gray levels', low=0.0, high=50.0
+    )
     illumination: float = setting(
         0.1, 'change of light: 0 none, 1 clouds and exposure at their worst', low=0.0, high=1.0
     )
     speed: float = setting(1.0, 'driving speed', unit='m/s', low=0.05, high=3.0)
-    turn_rate: float = setting(0.6, 'turning speed on the spot', unit='rad/s', low=0.05, high=3.0)
     odometry_rate: float = setting(
-        50.0, 'odometry, gyroscope, truth', unit='Hz', low=5.0, high=500.0
+        50.0, 'rate of odometry, gyroscope and ground truth', unit='Hz', low=5.0, high=500.0
     )
     odometry_frame: str = setting(
         'random',
@@ -63,15 +63,21 @@ class SimulationConfig(Settings):
         high=10.0,
     )
     scale_error: float = setting(
-        0.005, "deviation of a run's factor of wheel radius and of gyroscope", low=0.0, high=0.2
+        0.005,
+        "standard deviation of a run's scale errors of wheel radius and gyroscope",
+        low=0.0,
+        high=0.2,
     )
-    slip: float = setting(0.02, 'deviation of wheel slip, about 2 s long', low=0.0, high=0.5)
+    slip: float = setting(
+        0.02, 'standard deviation of wheel slip, correlated over about 2 s', low=0.0, high=0.5
+    )
     speed_noise: float = setting(0.01, 'white noise of the speed', unit='m/s', low=0.0, high=1.0)
     gyro_bias: float = setting(
-        0.0016, 'deviation of the wandering gyroscope bias', unit='rad/s', low=0.0, high=0.1
-    )
-    gyro_bias_time: float = setting(
-        40.0, 'time in which the bias wanders off', unit='s', low=0.1, high=1e5
+        0.0016,
+        'standard deviation of the wandering gyroscope bias',
+        unit='rad/s',
+        low=0.0,
+        high=0.1,
     )
     gyro_noise: float = setting(
         0.005, 'white noise of the yaw rate', unit='rad/s', low=0.0, high=1.0

@@ -3,7 +3,7 @@
 """Procedural textures of the simulated garden: tileable surfaces with mip levels, and the sky.
 
 All values are display brightness, the square root of the light that a surface sends back; images
-are BGR. A surface's texture covers PERIOD_M by PERIOD_M metres and repeats without a seam.
+are BGR. A surface's texture covers PERIOD_M by PERIOD_M meters and repeats without a seam.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SKY_LOWEST_DEG, SKY_HIGHEST_DEG = -6.0, 90.0
 def noise(
     rng: np.random.Generator, low: float, high: float, stretch: float = 1.0, fall: float = 1.0
 ) -> Floats:
-    """Tileable noise (TILE, TILE) of unit deviation, between `low` and `high` cycles per tile.
+    """Tileable noise (TILE, TILE) of unit variance, between `low` and `high` cycles per tile.
 
     `stretch` > 1 draws it out into vertical streaks; amplitudes fall with frequency ** `fall`.
     """
@@ -42,7 +42,7 @@ def noise(
     return np.asarray(field / field.std(), np.float32)
 
 
-def _coloured(brightness: Floats, hue: Floats | float = 0.0) -> Floats:
+def _colored(brightness: Floats, hue: Floats | float = 0.0) -> Floats:
     """Stack to BGR; positive `hue` leans from green-blue to yellow-red."""
     blue, green, red = brightness - hue, brightness + 0 * hue, brightness + hue
     return np.stack(np.broadcast_arrays(blue, green, red), -1).astype(np.float32)
@@ -50,24 +50,24 @@ def _coloured(brightness: Floats, hue: Floats | float = 0.0) -> Floats:
 
 def _grass(rng: np.random.Generator) -> Floats:
     fine, coarse = noise(rng, 20, 220), noise(rng, 2, 14)
-    return _coloured(0.76 + 0.09 * fine + 0.05 * coarse, 0.035 * noise(rng, 2, 40))
+    return _colored(0.76 + 0.09 * fine + 0.05 * coarse, 0.035 * noise(rng, 2, 40))
 
 
 def _leaves(rng: np.random.Generator) -> Floats:
     clumps, leaves = noise(rng, 6, 24), noise(rng, 24, 120)
-    return _coloured(0.72 + 0.12 * clumps + 0.13 * leaves, 0.04 * noise(rng, 8, 60))
+    return _colored(0.72 + 0.12 * clumps + 0.13 * leaves, 0.04 * noise(rng, 8, 60))
 
 
 def _bark(rng: np.random.Generator) -> Floats:
-    return _coloured(0.72 + 0.15 * noise(rng, 16, 160, stretch=4))
+    return _colored(0.72 + 0.15 * noise(rng, 16, 160, stretch=4))
 
 
 def _plaster(rng: np.random.Generator) -> Floats:
-    return _coloured(0.86 + 0.035 * noise(rng, 1, 10) + 0.03 * noise(rng, 30, 200))
+    return _colored(0.86 + 0.035 * noise(rng, 1, 10) + 0.03 * noise(rng, 30, 200))
 
 
 def _plain(rng: np.random.Generator) -> Floats:
-    return _coloured(0.85 + 0.03 * noise(rng, 2, 60))
+    return _colored(0.85 + 0.03 * noise(rng, 2, 60))
 
 
 def _cells(rng: np.random.Generator, wide: int, high: int, joint: int, shift: float) -> Floats:
@@ -81,20 +81,20 @@ def _cells(rng: np.random.Generator, wide: int, high: int, joint: int, shift: fl
 
 
 def _boards(rng: np.random.Generator) -> Floats:
-    return _coloured(_cells(rng, 16, TILE, 2, 0) + 0.06 * noise(rng, 8, 160, stretch=6))
+    return _colored(_cells(rng, 16, TILE, 2, 0) + 0.06 * noise(rng, 8, 160, stretch=6))
 
 
 def _bricks(rng: np.random.Generator) -> Floats:
-    return _coloured(_cells(rng, 32, 16, 2, 0.5) + 0.04 * noise(rng, 20, 160))
+    return _colored(_cells(rng, 32, 16, 2, 0.5) + 0.04 * noise(rng, 20, 160))
 
 
 def _paving(rng: np.random.Generator) -> Floats:
-    return _coloured(_cells(rng, 64, 64, 3, 0) + 0.05 * noise(rng, 10, 160))
+    return _colored(_cells(rng, 64, 64, 3, 0) + 0.05 * noise(rng, 10, 160))
 
 
 def _roof(rng: np.random.Generator) -> Floats:
     slope = (np.arange(TILE)[:, None] % 32) / 32
-    return _coloured(_cells(rng, 32, 32, 2, 0.5) - 0.15 * slope.astype(np.float32))
+    return _colored(_cells(rng, 32, 32, 2, 0.5) - 0.15 * slope.astype(np.float32))
 
 
 def _stones(rng: np.random.Generator) -> Floats:
@@ -106,7 +106,7 @@ def _stones(rng: np.random.Generator) -> Floats:
     shades = 0.78 + 0.10 * rng.standard_normal(len(points))
     edge = np.clip((distance[:, 1] - distance[:, 0]) / 4, 0, 1)
     field = shades[nearest[:, 0]] * (0.6 + 0.4 * edge)
-    return _coloured(field.reshape(TILE, TILE).astype(np.float32) + 0.04 * noise(rng, 30, 160))
+    return _colored(field.reshape(TILE, TILE).astype(np.float32) + 0.04 * noise(rng, 30, 160))
 
 
 SURFACES: dict[str, Callable[[np.random.Generator], Floats]] = {
@@ -136,7 +136,7 @@ class Atlas:
         return cls(np.concatenate([_strip(surface(rng)) for surface in SURFACES.values()]))
 
     def sample(self, u: Floats, v: Floats, surface: Floats, footprint_m: Floats) -> Image:
-        """Colours (..., 3) at metres (u, v) on surfaces by index, averaged over footprint_m."""
+        """Colors (..., 3) at meters (u, v) on surfaces by index, averaged over footprint_m."""
         texel = PERIOD_M / TILE
         level = np.clip(np.rint(np.log2(footprint_m / texel + 1e-6)), 0, LEVELS - 1)
         side = np.exp2(-level) * TILE
@@ -147,8 +147,8 @@ class Atlas:
         return np.asarray(cv2.remap(self.pixels, x, y, cv2.INTER_LINEAR), np.uint8)
 
 
-def _fraction(metres: Floats) -> Floats:
-    turns = metres * np.float32(1 / PERIOD_M)
+def _fraction(meters: Floats) -> Floats:
+    turns = meters * np.float32(1 / PERIOD_M)
     return np.asarray(turns - np.floor(turns), np.float32)
 
 
@@ -166,20 +166,20 @@ def _strip(texture: Floats) -> Image:
 def sky(rng: np.random.Generator) -> Image:
     """Sky with clouds, haze and far hills: BGR (SKY_ROWS, SKY_COLUMNS, 3), highest row first.
 
-    Columns grow counter-clockwise from the world's +x axis.
+    Columns grow counterclockwise from the world's +x axis.
     """
     elevation = np.linspace(SKY_HIGHEST_DEG, SKY_LOWEST_DEG, SKY_ROWS, dtype=np.float32)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False, dtype=np.float32)[None]
     height = np.clip(elevation / 60, 0, 1)
     blue = np.array([0.93, 0.74, 0.55], np.float32) - height[..., None] * [0.05, 0.18, 0.28]
     white = np.array([0.95, 0.94, 0.93], np.float32)
-    colour = _mix(blue.astype(np.float32), white, _clouds(rng, elevation, azimuth))
+    color = _mix(blue.astype(np.float32), white, _clouds(rng, elevation, azimuth))
     for distance in (1.0, 0.5):
         hills = 0.6 + 2.2 * (1.2 - distance) + 1.1 * _outline(rng, azimuth)
         cover = np.clip((hills - elevation) / 0.3 + 0.5, 0, 1)
         green = np.array([0.42, 0.44, 0.38], np.float32) * (0.55 + 0.55 * distance)
-        colour = _mix(colour, green.astype(np.float32), cover)
-    return np.clip(np.rint(colour * 255), 0, 255).astype(np.uint8)
+        color = _mix(color, green.astype(np.float32), cover)
+    return np.clip(np.rint(color * 255), 0, 255).astype(np.uint8)
 
 
 def _mix(below: Floats, above: Floats, cover: Floats) -> Floats:

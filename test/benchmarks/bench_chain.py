@@ -178,10 +178,9 @@ def chain(model_path: Path, model: PlaceModel, folder: Path) -> list[subprocess.
     parameters = {
         'omnicam_node': ['camera_model:=panorama', f'width:={size.width}',
                          f'height:={size.height}', f'elevation_min:={size.elevation_min}',
-                         f'elevation_max:={size.elevation_max}', 'image_width:=0',
-                         'image_height:=0'],
+                         f'elevation_max:={size.elevation_max}'],
         'sfa_node': [f'model:={model_path}'],
-        'ekf_node': ['set_initial_pose:=true'],
+        'ekf_node': ['initial_pose:=[0.0, 0.0, 0.0]'],
     }  # fmt: skip
     code = 'import sys; from sfa_localization.nodes.{} import main; sys.exit(main())'
     return [

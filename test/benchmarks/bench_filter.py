@@ -3,7 +3,7 @@
 """The pose filter against filterpy alone, and a run of a million steps: `python bench_filter.py`.
 
 Both sides predict and update with the same motion model on the same data, in turns, in one run;
-what the ratio shows is the price of history, gate, recovery and immutable states.
+what the ratio shows is the price of the history, the gate, recovery and immutable states.
 """
 
 from __future__ import annotations
@@ -18,14 +18,19 @@ import time
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.fusion import motion
-from sfa_localization.fusion.motion import ERROR, SIZE, YAW, Twist
+from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Twist
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.settings import FilterConfig, resolved
+from sfa_localization.fusion.settings import FilterConfig
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 20_000_000
 READING = (0.8, 0.3, 4e-4, 1e-4)
+CORRELATION = ErrorCorrelation()
+NOISE = MotionNoise(
+    FilterConfig().slip_per_metre, FilterConfig().yaw_per_radian, CORRELATION.distance_m
+)
 SPREAD = np.diag([0.04, 0.04, 0.0025])
 
 
@@ -45,13 +50,13 @@ def wrapped(z: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
 def bare_steps(poses: np.ndarray) -> float:
     """Seconds that filterpy alone takes for one predict and update per pose."""
-    config, twist = resolved(FilterConfig()), Twist(*READING)
+    twist = Twist(*READING)
     ekf = Bare(SIZE, 3)
-    ekf.x, ekf.P = np.zeros(SIZE), PoseFilter(config)._fusion.blank(0).covariance
-    share = config.correlated_share
+    ekf.x, ekf.P = np.zeros(SIZE), PoseFilter()._rules.recovery.blank(0).covariance
+    share = CORRELATION.share
     start = time.thread_time()
     for pose in poses:
-        step = motion.drive(ekf.x, twist, STEP_NS * 1e-9, config)
+        step = motion.drive(ekf.x, twist, STEP_NS * 1e-9, NOISE)
         ekf.F, ekf.Q, ekf.next_x = step.jacobian, step.noise, step.mean
         ekf.predict()
         h = np.zeros((3, SIZE))
@@ -66,8 +71,8 @@ def bare_steps(poses: np.ndarray) -> float:
 
 def our_steps(poses: np.ndarray) -> float:
     """Seconds that PoseFilter takes for the same."""
-    fused = PoseFilter(FilterConfig())
-    fused.initialise(START_NS, poses[0], SPREAD)
+    fused = PoseFilter()
+    fused.set_pose(START_NS, poses[0], SPREAD)
     start = time.thread_time()
     for k, pose in enumerate(poses, 1):
         stamp_ns = START_NS + k * STEP_NS
@@ -78,11 +83,11 @@ def our_steps(poses: np.ndarray) -> float:
 
 def circle(steps: int) -> np.ndarray:
     """Where the reading leads, with errors as large as told (steps, 3)."""
-    mean, config = np.zeros(SIZE), resolved(FilterConfig())
+    mean = np.zeros(SIZE)
     rng = np.random.default_rng(1)
     poses = np.empty((steps, 3))
     for k in range(steps):
-        mean = motion.drive(mean, Twist(*READING), STEP_NS * 1e-9, config).mean
+        mean = motion.drive(mean, Twist(*READING), STEP_NS * 1e-9, NOISE).mean
         poses[k] = mean[:3] + rng.standard_normal(3) * np.sqrt(np.diag(SPREAD)) / 2
     return poses
 
@@ -107,8 +112,8 @@ def bench_filter(steps: int = 500, rounds: int = 15) -> dict[str, float]:
 
 def bench_long_run(steps: int = 1_000_000) -> dict[str, float]:
     """Odometry at 50 Hz with a picture at 5 Hz: the covariance's least eigenvalue, and memory."""
-    fused = PoseFilter(FilterConfig())
-    fused.initialise(START_NS, (0, 0, 0), SPREAD)
+    fused = PoseFilter()
+    fused.set_pose(START_NS, (0, 0, 0), SPREAD)
     least, memory = math.inf, 0
     for k in range(1, steps + 1):
         stamp_ns = START_NS + k * STEP_NS

@@ -28,12 +28,13 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import align, rotation, wrap_angle
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
-from sfa_localization.training import Recipe, read_drive, train
+from sfa_localization.training import Recipe, train
 
 # Route, area (m) and length (m, 0: by the area) of the training drive; the garden's number is the
 # place in this list.

@@ -24,25 +24,22 @@ from metric_worlds import Drive, criss_cross, drive, garden_features, grid, mean
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align
-from sfa_localization.metric.alternation import fit
+from sfa_localization.metric.alternation import MapFit, MetricProblem
 from sfa_localization.metric.expansions import Monomials, monomials
-from sfa_localization.metric.paper_solver import (
-    Lines,
-    descend,
-    odometry_start,
-    random_start,
-)
+from sfa_localization.metric.paper_solver import Lines, Parameters, descend, odometry_start
 from sfa_localization.metric.phases import phase_cost
-from sfa_localization.metric.quadratic_form import Links, Stack
+from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import check, diagnose
 
 NOISE = {'bias': 1e-3, 'yaw_noise': 0.01, 'speed_noise': 0.03}
 # The paper's eight features and no ridge; the yaw-rate bias has no place in its costs.
-CONFIG = MetricConfig(metric_map='monomials', slow_features=8, ridge=0.0)
+CONFIG = MetricConfig(metric_map='monomials', slow_features=8)
 # The descent has succeeded when it ends this close to the global minimum of its own cost.
 SUCCESS = 1.1
+# Section 4 of the paper: a garden of 16 m x 18 m.
+HALF_AREA_M = np.array([8.0, 9.0])
 
 
 @dataclass
@@ -70,8 +67,7 @@ def pieces(seed: int) -> Problem:
 
 
 def problem(run: Drive, kind: str, seed: int) -> Problem:
-    config = SegmentConfig(segments=kind, line_length_min=4.0, piece_length=4.0)
-    segments = cut(run.odometry, run.stamps_ns, config)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments=kind))
     features = garden_features(run.poses[:, :2], noise=0.05, count=8, seed=seed, world=seed)
     return Problem(run, segments, features)
 
@@ -85,12 +81,10 @@ KINDS: dict[str, Callable[[int], Problem]] = {
 
 def certified(trial: Problem) -> dict[str, float]:
     """Solve one problem; its certificate, time, and error beside regression on ground truth."""
-    stack = Stack.of(trial.segments)
-    links = Links.of(trial.segments, True, True)
-    features = trial.features[stack.images]
+    problem = MetricProblem.of(trial.features, trial.segments, CONFIG)
+    stack = problem.stack
     started = time.perf_counter()
-    basis = Monomials.fit(features, 8, 0.0)
-    result = fit(basis, features, stack, links, CONFIG)
+    result = problem.fit(Monomials.fit(problem.features, 8, 0.0))
     seconds = time.perf_counter() - started
     truth = trial.run.poses[stack.images, :2]
     found = result.expanded @ result.map_weights
@@ -101,15 +95,15 @@ def certified(trial: Problem) -> dict[str, float]:
         'ms': 1e3 * seconds,
         'uml': error(align(own, truth).apply(own), truth),
         'supervised': error(result.expanded @ weights, truth),
-        'sufficient': sufficient(result, stack),
+        'sufficient': sufficient(result),
         'segments': stack.segments,
     }
 
 
-def sufficient(result, stack: Stack) -> bool:
+def sufficient(result: MapFit) -> bool:
     """Whether the diagnostics call the data sufficient."""
     try:
-        check(diagnose(result, stack), CONFIG)
+        check(diagnose(result))
     except DataError:
         return False
     return True
@@ -127,22 +121,38 @@ def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
     stack = Stack.of(trial.segments)
     regressors = monomials(trial.features[stack.images])
     lines = Lines(regressors, stack.path.real, stack.owner, np.zeros(0))
-    config = replace(CONFIG, paper_iterations=iterations, metric_seed=seed)
     least = best_cost(trial, stack)
     starts = {
-        'random': random_start(lines, config),
+        'random': random_start(lines, seed),
         'odometry': odometry_start(lines, stack.starts),
     }
-    return {name: descend(lines, start, config)[1][-1] / least for name, start in starts.items()}
+    return {
+        name: descend(lines, start, iterations)[1][-1] / least for name, start in starts.items()
+    }
 
 
 def best_cost(trial: Problem, stack: Stack) -> float:
     """Global minimum of equation 1 (certified; the cost of noisy lines is never zero)."""
     features = trial.features[stack.images]
-    plain = replace(CONFIG, yaw_bias_std=0.0)
-    links = Links.of(trial.segments, False, False)
-    result = fit(Monomials.fit(features, 8, 0.0), features, stack, links, plain, rounds=1)
-    return phase_cost(result.solution.h, result.solution.z)
+    basis = Monomials.fit(features, 8, 0.0)
+    elimination = eliminate(basis.expand(features), basis.ridge, np.ones(len(features)), stack)
+    links = Links.of(trial.segments)
+    unused = np.full(len(links.at), np.inf)
+    links = replace(links, turn_variance=unused, displacement_variance=unused)
+    form = QuadraticForm(elimination.gram, links, stack.run, 1.0, 0.0)
+    solution = form.solve(None, np.zeros(stack.run[-1] + 1))
+    return phase_cost(solution.h, solution.z)
+
+
+def random_start(lines: Lines, seed: int) -> Parameters:
+    """The paper's start in its simulator: everything uniform."""
+    rng = np.random.default_rng(seed)
+    count = int(lines.line[-1]) + 1
+    return Parameters(
+        rng.uniform(0.0, 2.0 * np.pi, count),
+        rng.uniform(-HALF_AREA_M, HALF_AREA_M, (count, 2)),
+        rng.uniform(-1.0, 1.0, (lines.regressors.shape[1], 2)),
+    )
 
 
 def run(problems: int, descended: int) -> dict[str, object]:

@@ -10,24 +10,31 @@ from __future__ import annotations
 import array
 import json
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from sfa_localization.camera.calibration_files import calibration_text
+from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper, build_tables
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 
-CAMERA = CameraConfig(
-    image_width=1280,
-    image_height=960,
-    fx=225.0,
-    fy=225.0,
-    cx=640.0,
-    cy=480.0,
-    radius_min=60.0,
-    radius_max=476.0,
+CAMERA, LENS = (
+    CameraConfig(),
+    LensCalibration(
+        image_width=1280,
+        image_height=960,
+        fx=225.0,
+        fy=225.0,
+        cx=640.0,
+        cy=480.0,
+        radius_min=60.0,
+        radius_max=476.0,
+    ),
 )
 PANORAMAS = {
     '600x60': PanoramaConfig(),
@@ -56,15 +63,15 @@ def bench_unwrap(rounds: int = 400) -> dict[str, float]:
     """Median time of a whole unwrapping over that of cv2.remap with the same tables, at worst."""
     raw, ratios, result = picture(), [], {}
     for name, panorama in PANORAMAS.items():
-        unwrap = Unwrapper(CAMERA, panorama)
-        tables = build_tables(CAMERA, panorama, raw.shape[:2])
+        unwrap = Unwrapper(CAMERA, panorama, LENS)
+        tables = build_tables(CAMERA, LENS, panorama, raw.shape[:2])
         maps = tables.pixels, tables.fractions
 
         def remap(maps=maps, border=tables.border):
             return cv2.remap(raw, *maps, cv2.INTER_LINEAR, borderMode=border)
 
         def rebuild(panorama=panorama):
-            return Unwrapper(CAMERA, panorama)(raw)
+            return Unwrapper(CAMERA, panorama, LENS)(raw)
 
         unwrap(raw)
         times = interleaved([remap, lambda unwrap=unwrap: unwrap(raw)], rounds)
@@ -81,20 +88,21 @@ def bench_roundtrip() -> dict[str, float]:
     """PSNR in dB of unwrapped simulated pictures against the directly rendered panorama."""
     from sfa_localization.simulation.garden import Garden
 
-    lens = {'radius_min': 0.0, 'radius_max': 0.0, 'image_width': 800, 'image_height': 800}
+    limits = {'radius_min': 0.0, 'radius_max': 0.0, 'image_width': 800, 'image_height': 800}
     center = {'cx': 399.5, 'cy': 399.5}
-    cameras = {
-        'mirror': CameraConfig(),
-        'fisheye': CameraConfig(camera_model='fisheye', fx=195.0, fy=195.0, **lens, **center),
-        'ocam': CameraConfig(
-            camera_model='ocam', polynomial=(-150.0, 0.0, 1.8e-3, -1e-7), **lens, **center
+    lenses = {
+        'mirror': LensCalibration(),
+        'fisheye': LensCalibration(camera_model='fisheye', fx=195.0, fy=195.0, **limits, **center),
+        'ocam': LensCalibration(
+            camera_model='ocam', polynomial=(-150.0, 0.0, 1.8e-3, -1e-7), **limits, **center
         ),
     }
     garden, pose, panorama = Garden(1), np.array([0.5, -1.0, 0.7]), PanoramaConfig()
     direct = garden.render_panorama(pose, panorama).astype(float)
     result = {}
-    for name, camera in cameras.items():
-        error = Unwrapper(camera, panorama)(garden.render_raw(pose, camera)) - direct
+    for name, lens in lenses.items():
+        camera = make_camera(lens, (lens.image_height, lens.image_width))
+        error = Unwrapper(CAMERA, panorama, lens)(garden.render_raw(pose, camera)) - direct
         result[f'psnr_{name}_db'] = float(10 * np.log10(255**2 / np.mean(error**2)))
     return result
 
@@ -102,9 +110,10 @@ def bench_roundtrip() -> dict[str, float]:
 class _Loop:
     """Sends pictures to a relay and to the omnicam node in turns, and times each answer."""
 
-    def __init__(self, domain_id: int) -> None:
+    def __init__(self, domain_id: int, calibration: Path) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
         from rclpy.qos import QoSProfile, ReliabilityPolicy
         from sensor_msgs.msg import Image
 
@@ -116,10 +125,11 @@ class _Loop:
         # Reliable throughout: a lost picture would otherwise be timed as a slow one.
         self.qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
         overrides = {f'qos_overrides./raw_{n}.subscription.reliability': 'reliable' for n in 'abc'}
+        overrides['calibration_file'] = str(calibration)
         self.node = OmnicamNode(
             context=self.context,
             cli_args=['--ros-args', '-r', 'image_raw:=/raw_a', '-r', 'panorama:=/out_a'],
-            parameter_overrides=_parameters(overrides),
+            parameter_overrides=[Parameter(n, value=value) for n, value in overrides.items()],
         )
         self.relay = rclpy.create_node('relay', context=self.context)
         self.peer = rclpy.create_node('peer', context=self.context)
@@ -169,25 +179,6 @@ class _Loop:
         rclpy.try_shutdown(context=self.context)
 
 
-def _parameters(values: dict[str, object]) -> list[object]:
-    from rclpy.parameter import Parameter
-
-    camera = {
-        name: getattr(CAMERA, name)
-        for name in (
-            'image_width',
-            'image_height',
-            'fx',
-            'fy',
-            'cx',
-            'cy',
-            'radius_min',
-            'radius_max',
-        )
-    }
-    return [Parameter(name, value=value) for name, value in (values | camera).items()]
-
-
 def bench_omnicam(rounds: int = 150, domain_id: int = 65) -> dict[str, float]:
     """The node's latency in to out less that of a bare rclpy relay, over the time of unwrapping.
 
@@ -201,9 +192,12 @@ def bench_omnicam(rounds: int = 150, domain_id: int = 65) -> dict[str, float]:
     message = Image(encoding='bgr8', height=960, width=1280, step=3840)
     message.header.stamp.sec = 1
     message.data = array.array('B', raw.tobytes())
-    unwrap = Unwrapper(CAMERA, PANORAMAS['600x60'])
+    unwrap = Unwrapper(CAMERA, PANORAMAS['600x60'], LENS)
     unwrap(raw)
-    loop = _Loop(domain_id)
+    with tempfile.TemporaryDirectory() as folder:
+        calibration = Path(folder, 'camera.yaml')
+        calibration.write_text(calibration_text(LENS, CAMERA.mount_rpy))
+        loop = _Loop(domain_id, calibration)
     try:
         times = np.array(
             [[loop.time_one(which, message) for which in range(3)] for _ in range(rounds)]

@@ -32,29 +32,35 @@ from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
 from sfa_localization.features import network_training as hierarchy
 from sfa_localization.features.agreement import Agreement
-from sfa_localization.features.network import prepare
+from sfa_localization.features.image_features import harmonics, layer_harmonics, slow_features
+from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
-    Drive,
-    architecture_of,
+    RELATIVE_CUT,
+    ImageSequence,
     in_this_process,
+    shards_of,
     train_network,
 )
 from sfa_localization.features.novelty import Novelty, describe
-from sfa_localization.features.settings import NetworkConfig
-from sfa_localization.features.sfa import StreamingSFA
-from sfa_localization.metric.compass import Compass, _kernel, _solve, harmonics
+from sfa_localization.features.sfa import Statistics, solve
+from sfa_localization.metric.compass import Compass, kernel_between
+from sfa_localization.metric.compass_training import (
+    INDUCING_IMAGES,
+    PLACE_FEATURES,
+    _solve,
+    compass_layers,
+)
 from sfa_localization.metric.expansions import MetricMap, Process
 from sfa_localization.metric.fast_expansions import FastProcess
-from sfa_localization.metric.settings import HeadingConfig, MetricConfig
-from sfa_localization.place_model import PlaceModel, heading_input, top_features
+from sfa_localization.metric.selection import INDUCING_POINTS
+from sfa_localization.place_model import PlaceModel
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
-CONFIG = NetworkConfig()
-ARCHITECTURE = architecture_of(CONFIG, SIZE)
+ARCHITECTURE = standard_architecture(SIZE, 'panorama')
 
 
-def panoramas(path: Path, count: int, seed: int = 0) -> Drive:
+def panoramas(path: Path, count: int, seed: int = 0) -> ImageSequence:
     """Colour textures that change and turn slowly, in a memory-mapped file."""
     rng = np.random.default_rng(seed)
     tiles = [_texture(rng) for _ in range(count // 60 + 3)]
@@ -66,7 +72,7 @@ def panoramas(path: Path, count: int, seed: int = 0) -> Drive:
         images[t] = np.roll(np.clip(blend, 0, 255), turn[t], axis=1)
     images.flush()
     read_only = np.memmap(path, np.uint8, 'r', shape=images.shape)
-    return Drive(PanoramaArray(np.arange(count), read_only), np.ones(count - 1, np.float32))
+    return ImageSequence(PanoramaArray(np.arange(count), read_only), np.ones(count - 1, bool))
 
 
 def _texture(rng: np.random.Generator) -> np.ndarray:
@@ -88,7 +94,7 @@ def bench_training(folder: Path, quick: bool = False) -> dict[str, float]:
     count = 200 if quick else PAPER_PICTURES
     drive = panoramas(folder / 'paper.u8', count)
     wall, cpu = time.perf_counter(), time.process_time()
-    train_network(ARCHITECTURE, [drive], CONFIG)
+    train_network(ARCHITECTURE, [drive])
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     name = 'train_200_pictures' if quick else 'train_paper_size'
     return {f'{name}_s': wall, f'{name}_cpu_s': cpu, 'cores': float(hierarchy._cores())}
@@ -107,11 +113,11 @@ def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
         part = _first(drive, size)
         with one_core():
             start = time.process_time()
-            flow, _ = mdp_engine.train_flow(ARCHITECTURE, [part], CONFIG)
+            flow, _ = mdp_engine.train_flow(ARCHITECTURE, shards_of([part], 0))
             seconds['mdp'].append(time.process_time() - start)
             part = _first(drive, our_size)
             start = time.process_time()
-            network = train_network(ARCHITECTURE, [part], CONFIG, executor=_on_one_core)
+            network = train_network(ARCHITECTURE, [part], executor=_on_one_core)
             seconds['ours'].append(time.process_time() - start)
     theirs = _extrapolated(sizes, seconds['mdp'])
     ours = _extrapolated(our_sizes, seconds['ours'])
@@ -135,9 +141,9 @@ def _on_one_core(work, shards, on_shard):
         hierarchy._cores = cores
 
 
-def _first(drive: Drive, count: int) -> Drive:
+def _first(drive: ImageSequence, count: int) -> ImageSequence:
     part = PanoramaArray(drive.panoramas.stamps_ns[:count], drive.panoramas.images[:count])
-    return Drive(part, drive.scale[: count - 1])
+    return ImageSequence(part, drive.joined[: count - 1])
 
 
 def _extrapolated(sizes: tuple[int, ...], seconds: list[float]) -> np.ndarray:
@@ -149,7 +155,7 @@ def _extrapolated(sizes: tuple[int, ...], seconds: list[float]) -> np.ndarray:
 def _execution(flow, network, image: np.ndarray) -> dict[str, float]:
     """MDP's execution of a prepared frame over all that locate does with the picture."""
     model = made_up_model(network)
-    flat = prepare(image, ARCHITECTURE).reshape(1, -1).astype(float)
+    flat = input_map(image, ARCHITECTURE).reshape(1, -1).astype(float)
     with one_core():
         theirs, ours = in_turns([lambda: flow.execute(flat), lambda: model.locate(image[0])], 30)
     return {'locate_speedup_vs_mdp': float(np.median(theirs) / np.median(ours))}
@@ -171,8 +177,7 @@ def in_turns(functions: list[Callable[[], object]], rounds: int) -> np.ndarray:
 def made_up_model(network) -> PlaceModel:
     """A model of the default sizes whose map and compass mean nothing; their cost is real."""
     rng = np.random.default_rng(0)
-    metric, heading = MetricConfig(), HeadingConfig()
-    count = metric.inducing_points
+    count = INDUCING_POINTS
     points = rng.normal(size=(count, 16))
     basis = Process.at(points * 0.3, np.full(16, 0.3), 0.01)
     expanded = basis.expand(points)
@@ -182,10 +187,10 @@ def made_up_model(network) -> PlaceModel:
     map_ = MetricMap(basis, rng.normal(size=(count + 1, 2)), spread, sway, 0.05, 1.0)
     images = rng.integers(0, 256, (40, *SIZE, 3), np.uint8)
     maps = network.maps(images)
-    layers = tuple(layer - 1 for layer in heading.heading_layers)
-    width = heading_input([m[:1] for m in maps], layers).shape[1]
+    layers = compass_layers(len(network.nodes))
+    width = layer_harmonics([m[:1] for m in maps], layers).shape[1]
     with one_core():
-        compass = _compass(rng, heading.heading_inducing_points, heading.heading_features, width)
+        compass = _compass(rng, INDUCING_IMAGES, PLACE_FEATURES, width)
     return PlaceModel(
         network,
         map_,
@@ -203,7 +208,7 @@ def _compass(rng: np.random.Generator, count: int, features: int, width: int) ->
     s = rng.normal(size=(count, features))
     f = rng.normal(size=(count, width, 2)) @ np.array([1, 1j])
     f /= np.linalg.norm(f, axis=1, keepdims=True)
-    kernel = _kernel(s, f, s, f, 2.0)
+    kernel = kernel_between(s, f, s, f, 2.0)
     moment = kernel.conj().T @ np.exp(1j * rng.uniform(-3, 3, count))
     solution = _solve(kernel.conj().T @ kernel, moment, kernel, 0.1)
     scales = np.ones(features), np.ones(width)
@@ -271,7 +276,7 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
         made += [_product(description, layer.directions), _product(description, layer.axes)]
     fast = model._predictor()
     assert isinstance(fast, FastProcess)
-    features = top_features(maps)[:, : len(fast.scale)] * fast.scale
+    features = slow_features(maps)[:, : len(fast.scale)] * fast.scale
     kernel = np.ones((1, len(fast.points)))
     made += [_product(features, fast.points.T.copy()), _product(kernel, fast.linear)]
     made.append(_triangular(fast.factor))
@@ -281,8 +286,8 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
             wave = np.ones(maps[layer].shape[2], np.complex64)
             made.append(_product(wave, maps[layer].astype(np.complex64)))
         f = np.concatenate([harmonics(maps[layer]) for layer in model.heading_layers], axis=1)
-        made.append(_product(f.astype(np.complex64), compass._fast.adjoint))
-        made.append(_triangular(compass._fast.factor))
+        made.append(_product(f.astype(np.complex64), compass._factors.adjoint))
+        made.append(_triangular(compass._factors.factor))
         made.append(_product(np.ones((1, len(compass.weights)), complex), compass.weights))
     return made
 
@@ -319,17 +324,18 @@ def bench_memory(folder: Path, quick: bool = False) -> dict[str, float]:
 def peak(path: Path, count: int) -> float:
     """Peak memory (MiB) of this process after training on a file's first pictures."""
     images = np.memmap(path, np.uint8, 'r', shape=(count, *SIZE, 3))
-    drive = Drive(PanoramaArray(np.arange(count), images), np.ones(count - 1, np.float32))
-    config = replace(
-        CONFIG,
-        layers='custom',
-        linear_dimensions=(16, 16, 16),
-        output_dimensions=(16, 16, 16),
-    )
-    train_network(architecture_of(config, SIZE), [drive], config)
+    drive = ImageSequence(PanoramaArray(np.arange(count), images), np.ones(count - 1, bool))
+    layers = tuple(replace(layer, linear=16, outputs=16) for layer in ARCHITECTURE.layers)
+    train_network(replace(ARCHITECTURE, layers=layers), [drive])
     # Not ru_maxrss: a process inherits it from the one that started it.
     status = Path('/proc/self/status').read_text()
     return float(re.search(r'VmHWM:\s+(\d+) kB', status).group(1)) / 1024
+
+
+def statistics(x: np.ndarray) -> Statistics:
+    """The sums over a signal (N, D)."""
+    dx = np.diff(x, axis=0)
+    return Statistics(len(x), x.sum(0), x.T @ x, len(dx), dx.T @ dx)
 
 
 def bench_sklearn_sfa(rounds: int = 3) -> dict[str, float]:
@@ -343,7 +349,7 @@ def bench_sklearn_sfa(rounds: int = 3) -> dict[str, float]:
     theirs, ours = in_turns(
         [
             lambda: SFA(n_components=32).fit(signal),
-            lambda: StreamingSFA(32).partial_fit(signal).fit(),
+            lambda: solve(statistics(signal), 32, RELATIVE_CUT),
         ],
         rounds,
     )
@@ -354,7 +360,7 @@ def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> d
     """All figures, by name."""
     if model is None:
         drive = panoramas(folder / 'locate.u8', 96)
-        located = made_up_model(train_network(ARCHITECTURE, [drive], CONFIG))
+        located = made_up_model(train_network(ARCHITECTURE, [drive]))
     else:
         located = PlaceModel.load(model)
     figures = bench_locate(located, 300 if quick else 2000)

@@ -165,7 +165,7 @@ def nodes(folder: Path):
         place().model.save(folder / 'model.npz')
     size = [f'height:={PLACE_SIZE[0]}', f'width:={PLACE_SIZE[1]}']
     parameters = {
-        'omnicam_node': ['camera_model:=panorama', 'image_width:=0', 'image_height:=0', *size],
+        'omnicam_node': ['camera_model:=panorama', *size],
         'sfa_node': [f'model:={folder / "model.npz"}'],
         'ekf_node': [],
     }

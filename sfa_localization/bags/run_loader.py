@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""From a bag to a run: the pictures joined to the odometry of one drive, in one pass."""
+"""From a bag to a run: the images joined to the odometry of one drive, in one pass."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.bags import messages
-from sfa_localization.bags.arrays import Values, to_trajectory, to_yaw_rate
-from sfa_localization.bags.reader import Bag, Topic
+from sfa_localization.bags import decoding
+from sfa_localization.bags.motion_arrays import StampedValues, to_trajectory, to_yaw_rate
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.bags.streams import Stream
-from sfa_localization.bags.writer import BagWriter
+from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, PanoramaArray, Run, Stamps
 
-__all__ = ['Bag', 'BagWriter', 'PanoramaFile', 'Topic', 'load_run']
-
 logger = logging.getLogger(__name__)
 Unwrap = Callable[[Image], Image]
 Progress = Callable[[int, int], None]
+ODOMETRY_TOLERANCE_S = 0.5
+"""An image is used when odometry lies this near on both sides (s): interpolating over a longer
+pause would invent a path."""
 
 
 def load_run(
@@ -43,15 +42,17 @@ def load_run(
     want_truth: bool = False,
     strict: bool = False,
     config: BagConfig | None = None,
+    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
 ) -> Run:
-    """Read a drive in one pass; its pictures go to a file in the folder `cache`, which is yours.
+    """Read a drive in one pass; its images go to a file in the folder `cache`, which is yours.
 
-    `unwrap` makes panoramas of pictures that are none yet. `progress` is told (done, total)
-    pictures. Without `want_truth` no topic of true poses is even opened. Pictures without odometry
-    nearby, or of another size than the first, are skipped and counted. Raises BagError.
+    `unwrap` makes panoramas of images that are none yet. `progress` is called with the numbers of
+    images (done, total). Without `want_truth` no topic of true poses is even opened. Images
+    farther than `odometry_tolerance_s` from odometry (0: outside all of it), or of another size
+    than the first, are skipped and counted. Raises BagError.
     """
     with Bag(path, strict=strict, config=config) as bag:
-        loader = _Loader(bag, topics or TopicNames(), want_truth)
+        loader = _Loader(bag, topics or TopicNames(), want_truth, odometry_tolerance_s)
         run = loader.load(Path(cache), unwrap, progress)
         for problem in bag.problems:
             logger.warning('%s: %s', path, problem)
@@ -59,7 +60,7 @@ def load_run(
 
 
 class PanoramaFile:
-    """Context manager that writes pictures of one size to a new file in `folder`.
+    """Context manager that writes images of one size to a new file in `folder`.
 
     The file is removed when an error ends the block.
     """
@@ -74,110 +75,111 @@ class PanoramaFile:
     def __enter__(self) -> PanoramaFile:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         self._file.close()
         if kind is not None:
             self._path.unlink(missing_ok=True)
 
     @property
     def stamps_ns(self) -> Stamps:
-        """Stamps of the pictures so far."""
+        """Stamps of the images so far."""
         return np.array(self._stamps, np.int64)
 
-    def fitting(self, image: Image) -> Image:
-        """The picture itself. Raises MessageError when its size is not that of the first."""
+    def check_size(self, image: Image) -> Image:
+        """The image itself. Raises MessageError when its size is not that of the first."""
         self._shape = self._shape or image.shape
         if image.shape != self._shape:
             height, width = self._shape[:2]
-            raise MessageError(f'size is not {width}x{height} like the first picture')
+            raise MessageError(f'size is not {width}x{height} like the first image')
         return image
 
     def add(self, stamp_ns: int, image: Image) -> None:
-        """Append a picture of that size."""
+        """Append an image of that size."""
         self._file.write(np.ascontiguousarray(image).data)
         self._stamps.append(stamp_ns)
 
     def finish(self, keep: NDArray[np.bool_]) -> PanoramaArray:
-        """The pictures marked in `keep` (N,), memory-mapped; the file shrinks to them."""
+        """The images marked in `keep` (N,), memory-mapped; the file shrinks to them."""
         self._file.close()
         shape = (len(self._stamps), *(self._shape or ()))
         kept = np.flatnonzero(keep)
-        pictures = np.memmap(self._path, np.uint8, 'r+', shape=shape)
+        images = np.memmap(self._path, np.uint8, 'r+', shape=shape)
         for target, source in enumerate(kept):
             if target != source:
-                pictures[target] = pictures[source]
-        pictures.flush()
-        size = pictures[:1].nbytes * len(kept)
-        del pictures
+                images[target] = images[source]
+        images.flush()
+        size = images[:1].nbytes * len(kept)
+        del images
         os.truncate(self._path, size)
-        images = np.memmap(self._path, np.uint8, 'r', shape=(len(kept), *shape[1:]))
-        return PanoramaArray(self.stamps_ns[kept], images)
+        mapped = np.memmap(self._path, np.uint8, 'r', shape=(len(kept), *shape[1:]))
+        return PanoramaArray(self.stamps_ns[kept], mapped)
 
 
 class _Loader:
     """Reads the topics that make a run."""
 
-    def __init__(self, bag: Bag, topics: TopicNames, want_truth: bool) -> None:
-        self._bag = bag
+    def __init__(
+        self, bag: Bag, topics: TopicNames, want_truth: bool, odometry_tolerance_s: float
+    ) -> None:
+        self._bag, self._tolerance_s = bag, odometry_tolerance_s
         self._image_topic = bag.find('image', topics.image)
         self._streams = {'odometry': bag.odometry_stream(topics.odometry)}
-        found = [topic for topic in bag.topics.values() if topic.kind == messages.IMU]
-        if found and not topics.imu and not any(topic.count for topic in found):
-            names = ', '.join(topic.name for topic in found)
-            logger.warning('%s: no message on %s: going on without gyroscope', bag.path, names)
-            found = []
-        if topics.imu or found:
+        if topics.imu or self._has_imu():
             imu = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
             imu.required = bool(topics.imu)
             self._streams['imu'] = imu
         if want_truth:
             name = bag.find('ground_truth', topics.ground_truth)
-            self._streams['ground_truth'] = bag.stream(name, messages.pose_of)
-        self._values: dict[str, Values] = {use: [] for use in self._streams}
+            self._streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+        self._values: dict[str, StampedValues] = {use: [] for use in self._streams}
+
+    def _has_imu(self) -> bool:
+        """Whether a gyroscope was recorded; topics that are all empty are only warned of."""
+        found = [topic for topic in self._bag.topics.values() if topic.kind == decoding.IMU]
+        if found and not any(topic.count for topic in found):
+            names = ', '.join(topic.name for topic in found)
+            logger.warning('%s: no message on %s: continuing without gyroscope',
+                           self._bag.path, names)  # fmt: skip
+            return False
+        return bool(found)
 
     def load(self, cache: Path, unwrap: Unwrap | None, progress: Progress | None) -> Run:
         try:
-            with PanoramaFile(cache, self._bag.path.name) as pictures:
+            with PanoramaFile(cache, self._bag.path.name) as file:
                 images = self._bag.stream(
-                    self._image_topic, lambda m: pictures.fitting(_prepared(m, unwrap))
+                    self._image_topic, lambda m: file.check_size(_panorama(m, unwrap))
                 )
-                self._read(images, pictures, progress)
+                self._read(images, file, progress)
                 odometry = self._bag.to_odometry(
                     self._streams['odometry'], self._values['odometry']
                 )
-                panoramas = self._join(images, pictures, odometry)
+                panoramas = self._join(images, file, odometry)
         except OSError as error:
-            raise BagError(f'{cache}: no place for the pictures: {error.strerror}') from None
+            raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         return self._run(panoramas, odometry, images.tally.count)
 
-    def _read(self, images: Stream, pictures: PanoramaFile, progress: Progress | None) -> None:
+    def _read(self, images: Stream, file: PanoramaFile, progress: Progress | None) -> None:
         uses = {id(stream): use for use, stream in self._streams.items()}
         total = self._bag.topics[images.topic].count
         for stream, stamp_ns, value in self._bag.read([images, *self._streams.values()]):
             if stream is not images:
                 self._values[uses[id(stream)]].append((stamp_ns, value))
                 continue
-            pictures.add(stamp_ns, value)
+            file.add(stamp_ns, value)
             if progress is not None:
                 progress(images.received, total)
 
-    def _join(self, images: Stream, pictures: PanoramaFile, odometry: Odometry) -> PanoramaArray:
-        """The pictures that odometry surrounds closely enough."""
-        seconds = self._bag.config.odometry_tolerance
-        keep = odometry.trajectory.covers(pictures.stamps_ns, int(seconds * 1e9))
+    def _join(self, images: Stream, file: PanoramaFile, odometry: Odometry) -> PanoramaArray:
+        """The images with odometry near enough on both sides."""
+        keep = odometry.trajectory.covers(file.stamps_ns, int(self._tolerance_s * 1e9))
         lost = int(np.count_nonzero(~keep))
-        images.tally.unuse(f'no odometry within {seconds:g} s', lost)
+        images.tally.withdraw(f'no odometry within {self._tolerance_s:g} s', lost)
         if not keep.any():
             raise BagError(
-                f'{self._bag.path}: none of {lost} pictures of {images.topic} has odometry within '
-                f'{seconds:g} s; are both stamped by one clock (stamp_source: receive)?'
+                f'{self._bag.path}: none of {lost} images of {images.topic} has odometry within '
+                f'{self._tolerance_s:g} s; are both stamped by one clock (stamp_source: receive)?'
             )
-        return pictures.finish(keep)
+        return file.finish(keep)
 
     def _run(self, panoramas: PanoramaArray, odometry: Odometry, images: Count) -> Run:
         yaw_rate, truth = self._values.get('imu'), self._values.get('ground_truth')
@@ -194,9 +196,9 @@ class _Loader:
         )
 
 
-def _prepared(message: Any, unwrap: Unwrap | None) -> Image:
-    """The message's picture as a panorama. Raises LocalizationError."""
-    image = messages.image_of(message)
+def _panorama(message: Any, unwrap: Unwrap | None) -> Image:
+    """The image of a message as a panorama. Raises LocalizationError."""
+    image = decoding.image_of(message)
     if unwrap is None or looks_like_panorama(*image.shape[:2]):
         return image
     return unwrap(image)

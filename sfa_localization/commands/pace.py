@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""When to play what: a clock that runs at a rate, pauses and steps, and the keys that do so."""
+"""The pace of a replay: a clock with a rate, pauses and steps, and the keys that control it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import termios
 import time
 import tty
 from collections.abc import Callable
-from types import TracebackType
+from dataclasses import dataclass
 from typing import Any
+
+from sfa_localization.data.settings import Settings, setting
 
 PAUSE, STEP, FASTER, SLOWER = 'pause', 'step', 'faster', 'slower'
 KEYS = {
@@ -23,6 +25,21 @@ KEYS = {
     b'\x1b[A': FASTER,
     b'\x1b[B': SLOWER,
 }
+
+
+@dataclass(frozen=True, slots=True)
+class PlayConfig(Settings):
+    """How a bag is replayed."""
+
+    rate: float = setting(1.0, 'speed of the replay', unit='x', low=1e-3, high=1e6)
+    start_offset: float = setting(0.0, 'begin this far into the bag', unit='s', low=0.0, high=1e9)
+    wait: float = setting(
+        20.0,
+        'longest wait for subscribers of images and odometry before the start',
+        unit='s',
+        low=0.0,
+        high=3600.0,
+    )
 
 
 class Pace:
@@ -53,18 +70,18 @@ class Pace:
         self._bag_ns, self._since = stamp_ns, self._now()
 
     def toggle_pause(self) -> None:
-        """Stop, or go on from where it stopped."""
+        """Pause, or continue from there."""
         self.jump(self.time_ns)
         self.paused = not self.paused
 
     def scale(self, factor: float) -> None:
-        """Multiply the rate, from now on."""
+        """Multiply the rate."""
         self.jump(self.time_ns)
         self.rate *= factor
 
 
 class Keyboard:
-    """Context manager that reads single keys while standard input is a terminal in front."""
+    """Context manager that reads single keys if standard input is a foreground terminal."""
 
     def __init__(self, descriptor: int | None = None) -> None:
         self._descriptor = descriptor
@@ -78,18 +95,13 @@ class Keyboard:
             tty.setcbreak(self._descriptor)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         if self._descriptor is not None and self._saved is not None:
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._saved)
 
     @property
     def attached(self) -> bool:
-        """Whether there are keys to press."""
+        """Whether keys can be read."""
         return self._descriptor is not None
 
     def read(self, timeout: float) -> str:
@@ -101,17 +113,17 @@ class Keyboard:
         if not ready:
             return ''
         data = os.read(self._descriptor, 8)
-        if not data:  # the terminal went away
+        if not data:  # the terminal was closed
             self._descriptor = None
         return KEYS.get(data, '')
 
 
 def _foreground_terminal() -> int | None:
-    """Descriptor of standard input when it is a terminal whose foreground is this process."""
+    """Descriptor of standard input if it is a terminal and this process is in its foreground."""
     try:
         descriptor = sys.stdin.fileno()
         if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
             return descriptor
-    except (OSError, ValueError, AttributeError):  # no standard input at all
+    except (OSError, ValueError, AttributeError):  # there is no standard input
         pass
     return None

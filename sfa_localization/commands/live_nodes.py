@@ -1,8 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes as real processes on a ROS domain of their own, fed by a player of a bag.
+"""The three nodes as real processes in a ROS domain of their own, with a bag player as input.
 
-A recorder listens to what they publish, and notices when one of them ends or stays silent.
+A recorder subscribes to their outputs, and detects when a node ends or stays silent.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from sfa_localization.commands.processes import Processes
-from sfa_localization.commands.settings import DemoConfig
 from sfa_localization.data.errors import LocalizationError, NodeError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import read_stamp
@@ -35,21 +35,31 @@ from sfa_localization.nodes.conversions import read_odometry, read_pose
 
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 PLAYER = 'play'
-# What each node publishes, by which it is known to be at work.
+# The output by which each node is monitored.
 OUTPUTS = {
     'omnicam_node': 'panorama',
     'sfa_node': 'sfa/pose_with_covariance',
     'ekf_node': 'ekf/odometry',
 }
 INPUTS = ('/odom', 'sfa/pose_with_covariance', 'panorama')
-LARGEST_DOMAIN = 101
-# A heading is unknown when its variance is that of any direction, pi^2 / 3.
+LARGEST_DOMAIN = 101  # ROS domains above it may collide with ephemeral ports
+# An unknown heading has the variance of the uniform distribution, pi^2 / 3 rad^2.
 KNOWN_YAW_VARIANCE = np.pi**2 / 3 - 0.1
-QUEUE = 1000
+QUEUE = 1000  # messages: the recorder must not lose any
+
+
+@dataclass(frozen=True)
+class Timeouts:
+    """How long the processes may take (s)."""
+
+    start_s: float = 60.0  # until all nodes are connected, on a busy machine
+    silence_s: float = 15.0  # of a node during the replay: longer than any pause of its inputs
+    settle_s: float = 2.0  # without an output after the replay, which ends the recording
+    stop_s: float = 10.0  # until a process has ended after a signal
 
 
 class Recorder:
-    """A ROS node that keeps what the three nodes publish, on a context of its own."""
+    """A ROS node that records the outputs of the three nodes, in a context of its own."""
 
     def __init__(self, domain_id: int) -> None:
         self._context = Context()
@@ -64,7 +74,7 @@ class Recorder:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._poses: dict[str, list[tuple[int, Array]]] = {name: [] for name in NODES}
-        self._heard_s = dict.fromkeys(NODES, -np.inf)
+        self._received_s = dict.fromkeys(NODES, -np.inf)
         self._subscribe('omnicam_node', Image, self._keep_panorama)
         self._subscribe('sfa_node', PoseWithCovarianceStamped, self._keep_pose)
         self._subscribe('ekf_node', Odometry, self._keep_odometry)
@@ -80,8 +90,8 @@ class Recorder:
             try:
                 self._poses[name].append(keep(message))
             except LocalizationError as error:
-                raise NodeError(f'{name} published nonsense on {OUTPUTS[name]}: {error}') from None
-            self._heard_s[name] = time.monotonic()
+                raise NodeError(f'{name}: invalid message on {OUTPUTS[name]}: {error}') from None
+            self._received_s[name] = time.monotonic()
 
         self._node.create_subscription(kind, OUTPUTS[name], receive, QoSProfile(depth=QUEUE))
 
@@ -101,30 +111,28 @@ class Recorder:
         return motion.stamp_ns, motion.pose
 
     def spin(self, seconds: float) -> None:
-        """Receive what arrives; raises NodeError for an output that is no pose."""
+        """Receive messages for some time; raises NodeError for an invalid one."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left)
 
     def connected(self) -> bool:
-        """True when every node of the chain publishes and listens."""
-        speaks = all(self._node.count_publishers(topic) for topic in OUTPUTS.values())
-        return speaks and all(self._listened(topic) for topic in INPUTS)
-
-    def _listened(self, topic: str) -> bool:
-        own = topic in OUTPUTS.values()
-        return int(self._node.count_subscribers(topic)) > own
+        """True when every node of the chain has its publisher and its subscriptions."""
+        own = set(OUTPUTS.values())
+        return all(self._node.count_publishers(topic) for topic in own) and all(
+            self._node.count_subscribers(topic) > (topic in own) for topic in INPUTS
+        )
 
     def silence_s(self, name: str) -> float:
-        """Seconds since a node's last output."""
-        return time.monotonic() - self._heard_s[name]
+        """Time (s) since a node's last output."""
+        return time.monotonic() - self._received_s[name]
 
     def count(self, name: str) -> int:
         """Number of a node's outputs so far."""
         return len(self._poses[name])
 
     def trajectory(self, name: str) -> Trajectory:
-        """The poses that a node published, in the order of their stamps."""
+        """The poses that a node published, in order of their stamps."""
         poses = sorted(self._poses[name], key=lambda item: item[0])
         stamps = np.array([stamp for stamp, _ in poses], np.int64)
         return Trajectory(stamps, np.array([pose for _, pose in poses]).reshape(-1, 3))
@@ -140,83 +148,72 @@ def commands(model: Path, bag: Path, rate: float) -> dict[str, list[str]]:
 
 
 def run_live(
-    programs: Mapping[str, Sequence[str]], folder: Path, config: DemoConfig
+    programs: Mapping[str, Sequence[str]], folder: Path, timeouts: Timeouts | None = None
 ) -> dict[str, Trajectory]:
-    """Run the nodes, then the player; return what the nodes published, as 'sfa' and 'ekf'.
+    """Run the nodes, then the player; return the published poses, as 'sfa' and 'ekf'.
 
     `programs` are command lines, see `commands`; logs go to `folder`. Raises NodeError when one
-    ends too soon, does not start, or stays silent. No process is left behind.
+    ends too early, does not start, or stays silent. All processes have ended on return.
     """
+    timeouts = timeouts or Timeouts()
     domain_id = 1 + os.getpid() % LARGEST_DOMAIN
     with (
         _ros_environment(domain_id, folder) as environment,
-        _recording(domain_id) as recorder,
-        Processes(folder, environment, config.stop_timeout) as processes,
+        closing(Recorder(domain_id)) as recorder,
+        Processes(folder, environment, timeouts.stop_s) as processes,
     ):
         for name in NODES:
             processes.start(name, programs[name])
-        _await_nodes(recorder, processes, config)
+        _await_nodes(recorder, processes, timeouts.start_s)
         processes.start(PLAYER, programs[PLAYER])
-        _record(recorder, processes, config)
+        _record(recorder, processes, timeouts)
         return {name: recorder.trajectory(f'{name}_node') for name in ('sfa', 'ekf')}
 
 
 @contextmanager
 def _ros_environment(domain_id: int, folder: Path) -> Iterator[Mapping[str, str]]:
-    """The environment of the processes, in force here too while the recorder is made and used."""
+    """Environment of the processes, also set in this one while the recorder is used."""
     changes = {
         'ROS_DOMAIN_ID': str(domain_id),
         'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         'ROS_LOG_DIR': str(folder.resolve() / 'ros'),
         'PYTHONUNBUFFERED': '1',
     }
-    before = {name: os.environ.get(name) for name in changes}
+    before = dict(os.environ)
     os.environ.update(changes)
     try:
         yield dict(os.environ)
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        os.environ.clear()
+        os.environ.update(before)
 
 
-@contextmanager
-def _recording(domain_id: int) -> Iterator[Recorder]:
-    recorder = Recorder(domain_id)
-    try:
-        yield recorder
-    finally:
-        recorder.close()
-
-
-def _await_nodes(recorder: Recorder, processes: Processes, config: DemoConfig) -> None:
-    """Return when all nodes have found one another. Raises NodeError when that does not happen."""
-    end = time.monotonic() + config.start_timeout
+def _await_nodes(recorder: Recorder, processes: Processes, timeout_s: float) -> None:
+    """Return when all nodes are connected. Raises NodeError after the timeout."""
+    end = time.monotonic() + timeout_s
     while not recorder.connected():
         processes.require_alive(NODES)
         if time.monotonic() > end:
             logs = ', '.join(str(processes.log(name)) for name in NODES)
-            raise NodeError(f'the nodes did not start in {config.start_timeout:g} s; see {logs}')
+            raise NodeError(f'the nodes did not start in {timeout_s:g} s; see {logs}')
         recorder.spin(0.1)
 
 
-def _record(recorder: Recorder, processes: Processes, config: DemoConfig) -> None:
-    """Receive until the replay is over and all is quiet. Raises NodeError for a silent node."""
+def _record(recorder: Recorder, processes: Processes, timeouts: Timeouts) -> None:
+    """Receive until replay and outputs have ended. Raises NodeError for a silent node."""
     start = time.monotonic()
     while not processes.ended(PLAYER):
         recorder.spin(0.2)
         processes.require_alive(NODES)
-        if time.monotonic() - start > config.silence_timeout:
-            _require_speech(recorder, processes, config.silence_timeout)
-    while min(recorder.silence_s(name) for name in NODES) < config.settle_time:
+        if time.monotonic() - start > timeouts.silence_s:
+            _require_output(recorder, processes, timeouts.silence_s)
+    while min(recorder.silence_s(name) for name in NODES) < timeouts.settle_s:
         recorder.spin(0.1)
         processes.require_alive(NODES)
-    _require_speech(recorder, processes, np.inf)
+    _require_output(recorder, processes, np.inf)
 
 
-def _require_speech(recorder: Recorder, processes: Processes, longest_s: float) -> None:
+def _require_output(recorder: Recorder, processes: Processes, longest_s: float) -> None:
     """Raise NodeError for the first node of the chain that is silent."""
     for name in NODES:
         if recorder.count(name) == 0 or recorder.silence_s(name) > longest_s:

@@ -1,33 +1,33 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""How often each reason was met: bounded, for some reasons quote what a sender wrote."""
+"""Rejections counted by reason, in bounded memory, because some reasons quote the sender."""
 
 from __future__ import annotations
 
 from collections import Counter
 
 LONGEST = 240
-"""Characters of a reason."""
+"""Characters of a reason: two lines of a terminal."""
 MOST = 32
-"""Different reasons that are kept apart."""
+"""Different reasons that are counted separately."""
 OTHER = 'other reasons'
 
 
-class ReasonCounter(Counter[str]):
-    """Counts by reason: shortened to LONGEST characters, those after the first MOST together."""
+class RejectionCounter(Counter[str]):
+    """Counts by reason of at most LONGEST characters; those after the first MOST are summed."""
 
     def add(self, reason: str, number: int = 1) -> int:
-        """Count a reason `number` times; returns how often it, or what it is put to, was met."""
-        key = bounded(reason)
+        """Count a reason `number` times; returns its count, or that of OTHER where it is summed."""
+        key = short_line(reason)
         if key not in self and len(self) >= MOST:
             key = OTHER
         self[key] += number
         return self[key]
 
 
-def bounded(text: str) -> str:
+def short_line(text: str) -> str:
     """One printable line of at most LONGEST characters."""
-    # Cut first: what a sender wrote may be very long.
+    # Cut first: the text may be very long.
     line = ' '.join(text[: 2 * LONGEST].split())
     line = ''.join(letter if letter.isprintable() else '?' for letter in line)
     return line if len(line) <= LONGEST else line[: LONGEST - 3] + '...'

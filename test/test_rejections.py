@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What senders write can fill neither the memory nor the diagnostics."""
 
-from sfa_localization.bags.streams import Tally
-from sfa_localization.data.reasons import LONGEST, MOST, OTHER, ReasonCounter, bounded
+from sfa_localization.bags.topic_stream import Tally
+from sfa_localization.data.rejections import LONGEST, MOST, OTHER, RejectionCounter, short_line
 
 
 def test_reasons_are_counted_apart_up_to_a_number_and_then_together():
-    reasons = ReasonCounter()
+    reasons = RejectionCounter()
     for k in range(3000):
         assert reasons.add(f'frame is {k}') == (1 if k < MOST else k - MOST + 1)
     assert len(reasons) == MOST + 1 and reasons[OTHER] == 3000 - MOST
@@ -16,10 +16,10 @@ def test_reasons_are_counted_apart_up_to_a_number_and_then_together():
 
 
 def test_a_reason_is_one_printable_line_of_bounded_length():
-    assert bounded('short') == 'short'
-    assert bounded('a\nb\x1b[31m\tc') == 'a b?[31m c'
-    assert len(bounded('x' * 10**6)) == LONGEST and bounded('x' * 10**6).endswith('...')
-    reasons = ReasonCounter()
+    assert short_line('short') == 'short'
+    assert short_line('a\nb\x1b[31m\tc') == 'a b?[31m c'
+    assert len(short_line('x' * 10**6)) == LONGEST and short_line('x' * 10**6).endswith('...')
+    reasons = RejectionCounter()
     reasons.add('y' * 10**5)
     assert [len(reason) for reason in reasons] == [LONGEST]
 
@@ -28,5 +28,5 @@ def test_reading_a_bag_is_bounded_too():
     tally = Tally('bag', strict=False)
     for k in range(1000):
         tally.skip(f'unsupported encoding {k}')
-        tally.leave(f'other {k}')
+        tally.leave_out(f'other {k}')
     assert len(tally.count.skipped) == MOST + 1 and sum(tally.count.skipped.values()) == 2000

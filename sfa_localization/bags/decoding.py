@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a bag: decoded, and the part of them that is wanted."""
+"""Messages of a bag: decoded by rosbags, and the fields of them that are used."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STAMPED_POSES = (
     'geometry_msgs/msg/TransformStamped',
 )
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
-"""Types that tell where the robot is."""
+"""Types that hold a pose of the robot."""
 
 
 @functools.cache
@@ -39,7 +39,7 @@ class Decoder:
         self._ros2 = typestore(Stores.ROS2_JAZZY)
         self._ros1 = typestore(Stores.ROS1_NOETIC)
 
-    def knows(self, kind: str, serialization: str) -> bool:
+    def can_decode(self, kind: str, serialization: str) -> bool:
         """Whether messages of this type can be decoded."""
         if serialization == 'ros1':
             return kind in self._ros1.fielddefs
@@ -56,30 +56,30 @@ class Decoder:
 
 
 class TransformChooser:
-    """Picks one transform of each TFMessage: that to `child_frame`, or the only one there is."""
+    """Picks one transform of each TFMessage: the one to `child_frame`, or the only one."""
 
     def __init__(self, topic: str, child_frame: str) -> None:
         self._topic, self._wanted = topic, child_frame.lstrip('/')
-        self._seen: set[str] = set()
+        self._child_frames: set[str] = set()
 
     def __call__(self, message: Any) -> Any:
-        """The TransformStamped, or None. Raises BagError when it is not clear which is meant."""
+        """The TransformStamped, or None. Raises BagError when the choice is ambiguous."""
         for transform in message.transforms:
             child_frame = transform.child_frame_id.lstrip('/')
             if child_frame == self._wanted:
                 return transform
-            self._seen.add(child_frame)
+            self._child_frames.add(child_frame)
         if self._wanted:
             return None
-        if len(self._seen) > 1:
-            names = ', '.join(sorted(self._seen))
-            raise BagError(f'{self._topic} tells of several frames: {names}; '
+        if len(self._child_frames) > 1:
+            names = ', '.join(sorted(self._child_frames))
+            raise BagError(f'{self._topic} holds several frames: {names}; '
                            f'choose one as {self._topic}:FRAME')  # fmt: skip
         return message.transforms[0] if message.transforms else None
 
 
 def header_stamp(message: Any) -> int | None:
-    """The stamp in nanoseconds that the sender gave; None of a type that has none.
+    """The sender's stamp in nanoseconds; None of a type without a header.
 
     Raises MessageError.
     """
@@ -90,7 +90,7 @@ def header_stamp(message: Any) -> int | None:
 
 
 def image_of(message: Any) -> Image:
-    """Picture (H, W, 3) BGR of an Image or CompressedImage. Raises MessageError."""
+    """Image (H, W, 3) BGR of an Image or CompressedImage. Raises MessageError."""
     read = read_compressed if message.__msgtype__ == COMPRESSED else read_raw
     return read(message)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays of odometry, yaw rates and poses from the values that the streams of a bag give."""
+"""Odometry, yaw rates and trajectories as arrays, from the stamped values of a bag's streams."""
 
 from __future__ import annotations
 
@@ -11,30 +11,35 @@ import numpy as np
 from sfa_localization.data.geometry import Array, compose, invert, relative
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, differences, integrate
 
-Values = list[tuple[int, Any]]
-"""Stamps in ns, each with what its message tells."""
+StampedValues = list[tuple[int, Any]]
+"""Stamps in ns, each with the value that was read from its message."""
+RESET_M = 2.0
+"""A pose that moved this much farther than its twist was reset (m): more than a robot drives while
+messages are lost for about a second."""
+_DRIVING_MPS = 0.01
+"""A robot this fast is driving (m/s): above the noise of wheel encoders at rest."""
 
 
-def _stamps(values: Values) -> Stamps:
+def _stamps(values: StampedValues) -> Stamps:
     return np.array([stamp for stamp, _ in values], np.int64)
 
 
-def to_trajectory(values: Values) -> Trajectory:
+def to_trajectory(values: StampedValues) -> Trajectory:
     """Poses at stamps."""
     return Trajectory(_stamps(values), np.array([pose for _, pose in values], float).reshape(-1, 3))
 
 
-def to_yaw_rate(values: Values) -> YawRate:
+def to_yaw_rate(values: StampedValues) -> YawRate:
     """Yaw rates at stamps; the values are omega and its variance."""
     rates = np.array([rate for _, rate in values], float).reshape(-1, 2)
     return YawRate(_stamps(values), rates[:, 0], rates[:, 1])
 
 
-def to_odometry(values: Values, jump_m: float) -> tuple[Odometry, int]:
+def to_odometry(values: StampedValues) -> tuple[Odometry, int]:
     """Odometry, and how many resets in it were joined.
 
-    The values are a pose, with v, omega and their variances, or with None where only poses are
-    told: then twists are the poses' differences. A reset is a move of `jump_m` beyond the twist.
+    The values are a pose, with v, omega and their variances, or with None where the messages hold
+    poses only: then twists are the differences of the poses.
     """
     stamps = _stamps(values)
     poses = np.array([pose for _, (pose, _) in values], float).reshape(-1, 3)
@@ -42,25 +47,22 @@ def to_odometry(values: Values, jump_m: float) -> tuple[Odometry, int]:
         twists = differences(stamps, poses)
         return Odometry(stamps, poses, twists, np.zeros_like(twists)), 0
     motion = np.array([twist for _, (_, twist) in values], float).reshape(-1, 4)
-    poses, resets = _rejoined(stamps, poses, motion[:, :2], jump_m)
+    poses, resets = _joined(stamps, poses, motion[:, :2])
     return Odometry(stamps, poses, motion[:, :2], motion[:, 2:]), resets
 
 
-def poses_stand(odometry: Odometry) -> bool:
-    """Whether all poses are one while twists say that the robot drives: no pose is kept."""
+def is_pose_constant(odometry: Odometry) -> bool:
+    """Whether all poses are equal although the twists say that the robot drives."""
     if len(odometry.stamps_ns) < 2 or np.ptp(odometry.poses, axis=0).any():
         return False
-    return bool(np.abs(odometry.twists[:, 0]).max() > _DRIVES_MPS)
+    return bool(np.abs(odometry.twists[:, 0]).max() > _DRIVING_MPS)
 
 
-_DRIVES_MPS = 0.01
-
-
-def _rejoined(stamps: Stamps, poses: Array, twists: Array, jump_m: float) -> tuple[Array, int]:
-    """Poses whose jumps are replaced by what the twist says happened, and their number."""
+def _joined(stamps: Stamps, poses: Array, twists: Array) -> tuple[Array, int]:
+    """Poses whose resets are replaced by the motion of the twist, and the number of resets."""
     step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps) * 1e-9
     speed = np.maximum(np.abs(twists[:-1, 0]), np.abs(twists[1:, 0]))
-    resets = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) > speed * seconds + jump_m) + 1
+    resets = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) > speed * seconds + RESET_M) + 1
     joined = poses.copy()
     for reset in resets:
         before = slice(reset - 1, reset + 1)

@@ -1,0 +1,125 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read recorded drives as runs of panoramas, with their images in a cache on disk."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from tqdm import tqdm
+
+from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S, load_run
+from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.data.run import Run
+
+R = TypeVar('R', bound='ReadingRecipe')
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingRecipe:
+    """Everything that decides how a bag becomes a run of panoramas."""
+
+    topics: TopicNames = field(default_factory=TopicNames)
+    bag: BagConfig = field(default_factory=BagConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
+
+
+@contextmanager
+def image_cache(output: Path) -> Iterator[Path]:
+    """A folder beside `output` for decoded images; also clears those that a killed run left.
+
+    Raises ModelError when it cannot be made.
+    """
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        for stale in output.parent.glob(f'.{output.name}.cache-*'):
+            shutil.rmtree(stale, ignore_errors=True)
+        folder = tempfile.mkdtemp(prefix=f'.{output.name}.cache-', dir=output.parent)
+    except OSError as error:
+        raise ModelError(f'{output}: cannot be written: {error.strerror}') from None
+    try:
+        yield Path(folder)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def read_drives(
+    bags: Sequence[Path],
+    cache: Path,
+    recipe: ReadingRecipe,
+    progress: bool = False,
+    *,
+    strict: bool = False,
+) -> tuple[Run, ...]:
+    """Read different drives with panoramas of one size. Raises BagError or DataError."""
+    runs = tuple(read_drive(bag, cache, recipe, progress, strict=strict) for bag in bags)
+    for k, run in enumerate(runs):
+        for other in runs[:k]:
+            if _same_recording(run, other):
+                raise DataError(
+                    f'{bags[k]}: the same drive as {other.name}: name each drive once, because a '
+                    'part that is left out to check the map must not be learned from its copy'
+                )
+    if len({run.panoramas.shape for run in runs}) > 1:
+        sizes = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)
+        raise DataError(f'the bags hold panoramas of different sizes ({sizes}): train on one size')
+    return runs
+
+
+def _same_recording(run: Run, other: Run) -> bool:
+    """Whether all stamps and the image in the middle are equal."""
+    if not np.array_equal(run.panoramas.stamps_ns, other.panoramas.stamps_ns):
+        return False
+    middle = len(run.panoramas) // 2
+    one, two = (drive.panoramas.read(middle, middle + 1) for drive in (run, other))
+    return np.array_equal(one, two)
+
+
+def read_drive(
+    bag: Path,
+    cache: Path,
+    recipe: ReadingRecipe,
+    progress: bool = False,
+    *,
+    want_truth: bool = False,
+    strict: bool = False,
+    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
+) -> Run:
+    """Read one bag as a run of panoramas; raw camera images are unwrapped. Raises BagError."""
+    with tqdm(desc=f'reading {Path(bag).name}', unit='img', disable=not progress) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return load_run(
+            bag,
+            topics=recipe.topics,
+            unwrap=Unwrapper(recipe.camera, recipe.panorama),
+            cache=cache,
+            progress=show,
+            want_truth=want_truth,
+            strict=strict,
+            config=recipe.bag,
+            odometry_tolerance_s=odometry_tolerance_s,
+        )
+
+
+def as_live(recipe: R, panorama: PanoramaConfig) -> R:
+    """The recipe to read a drive with a model's panorama, as the nodes do.
+
+    Read it with `odometry_tolerance_s` 0: training leaves out images far from any odometry, but
+    the filter fuses them too.
+    """
+    return replace(recipe, panorama=panorama)

@@ -1,0 +1,80 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write a calibration file from images, or from another tool's calibration file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sfa_localization.camera.settings import (
+    CalibrationConfig,
+    CameraConfig,
+    LensCalibration,
+    PanoramaConfig,
+)
+from sfa_localization.commands.options import add_settings, given, numbers, settings
+from sfa_localization.data.errors import LocalizationError
+
+EXAMPLES = """\
+  calibrate drive/*.png --check check.png --output camera.yaml
+  calibrate image.png --model fisheye --field-of-view 190 --check check.png
+  calibrate image.png --calibration calib_results.txt --mirrored yes --axis down \\
+      --check check.png --output camera.yaml
+  calibrate --calibration camchain.yaml --output camera.yaml
+
+The check image marks the assumed FRONT, LEFT, BACK and RIGHT of the robot, and the elevations of
+the panorama. Correct it with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90), --axis and --mirrored.
+omnicam_node reads the file as its parameter calibration_file.
+
+how to get each model:
+  mirror    (most exact) Kalibr, omni-radtan; OpenCV omnidir; camodocal, MEI; a fisheye
+            calibrated in this way needs --mirrored no --axis up
+  fisheye   Kalibr, pinhole-equi; OpenCV fisheye; ROS camera_calibration with its
+            fisheye model; or from the rim alone with --model fisheye
+  ocam      OCamCalib: export calib_results.txt; a mirror needs --mirrored yes --axis down
+  polar     (no calibration) from images, --angle-min and --angle-max"""
+LENS = ('angle_min', 'angle_max', 'axis', 'mirrored')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add images, calibration file, circles, outputs and the mounting of the camera."""
+    parser.add_argument('images', nargs='*', type=Path, metavar='IMAGE', help='raw images')
+    parser.add_argument(
+        '--calibration',
+        type=Path,
+        help='camera_info, OpenCV, Kalibr or camodocal YAML, or OCamCalib calib_results.txt',
+    )
+    parser.add_argument(
+        '--center', type=numbers, help='COLUMNxROW of the mirror (px); default: detected'
+    )
+    parser.add_argument('--radii', type=numbers, help='INNERxOUTER radius (px); default: detected')
+    parser.add_argument('--output', type=Path, help='calibration file to write (YAML)')
+    parser.add_argument('--check', type=Path, help='image to write, for a check by eye (PNG)')
+    add_settings(parser, CalibrationConfig)
+    add_settings(parser, LensCalibration, LENS)
+    add_settings(parser, CameraConfig, ('mount_rpy',))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate; print the calibration."""
+    from sfa_localization.camera import calibration, calibration_files
+    from sfa_localization.camera.panorama import Unwrapper
+
+    images = calibration.read_images(arguments.images)
+    circles = None
+    if arguments.center or arguments.radii:
+        circles = calibration.given_circles(arguments.center, arguments.radii, images)
+    config, known = settings(CalibrationConfig, arguments), given(LensCalibration, arguments)
+    lens = calibration.calibrate(images, arguments.calibration, circles, config, known)
+    camera = settings(CameraConfig, arguments)
+    text = calibration_files.calibration_text(lens, camera.mount_rpy)
+    print(text, end='')
+    if arguments.check:
+        if not images:
+            raise LocalizationError('--check needs an image of the camera to draw in')
+        unwrapper = Unwrapper(camera, PanoramaConfig(), lens)
+        calibration.write_check(arguments.check, calibration.check_image(images[0], unwrapper))
+    if arguments.output:
+        calibration.write_calibration(arguments.output, text)
+    return 0

@@ -1,0 +1,91 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Compare a model with the ground truth of a drive."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.commands.options import (
+    TOPIC_OPTIONS,
+    add_topics,
+    recipe,
+    require_same_panorama,
+    settings,
+)
+from sfa_localization.fusion.settings import FilterConfig
+
+EXAMPLES = """\
+  evaluate garden.npz bags/test --align bags/coverage
+  evaluate garden.npz bags/test --align bags/coverage --report report --json results.json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add model, bags, topics and outputs."""
+    parser.add_argument('model', type=Path, metavar='MODEL.npz')
+    parser.add_argument('bag', type=Path, metavar='BAG', help='drive with ground truth')
+    parser.add_argument(
+        '--align', type=Path, metavar='TRAIN_BAG', help='drive that aligns the map with the truth'
+    )
+    parser.add_argument('--config', type=Path, help='parameter file')
+    parser.add_argument('--report', type=Path, metavar='DIR', help='write figures and the table')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the errors as JSON')
+    add_topics(parser, *TOPIC_OPTIONS)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Evaluate; print the errors, and what was used and rejected."""
+    from sfa_localization import evaluation
+    from sfa_localization.place_model import PlaceModel
+    from sfa_localization.reports.evaluation import heading_table, table, write_report
+
+    model = PlaceModel.load(arguments.model)
+    require_same_panorama(arguments.config, model.panorama)
+    result = evaluation.evaluate(
+        model,
+        arguments.bag,
+        align_bag=arguments.align,
+        recipe=recipe(arguments),
+        config=settings(FilterConfig, arguments, arguments.config),
+        watch=settings(WatchConfig, arguments, arguments.config),
+        progress=sys.stderr.isatty(),
+    )
+    print(table(result.scores), heading_table(result.scores), sep='\n\n')
+    print(*_input_lines(result.counts), *_fusion_lines(result.counts), sep='\n')
+    print(f'aligned on {result.aligned_on}')
+    if arguments.report:
+        places = result.estimates['sfa'].poses[:, :2]
+        results = result.truth, result.estimates, result.scores, places, result.features
+        write_report(arguments.report, *results)
+    if arguments.json:
+        evaluation.write_json(arguments.json, result.as_dict())
+    return 0
+
+
+def _input_lines(counts: Mapping[str, Any]) -> list[str]:
+    """Describe how much of each input was used, and why the rest was skipped."""
+    lines = []
+    for stream in ('images', 'odometry', 'observations'):
+        skipped = sorted(counts[stream]['skipped'].items())
+        reasons = ''.join(f'; {n} skipped: {reason}' for reason, n in skipped)
+        lines.append(f'{stream}: {counts[stream]["used"]} used{reasons}')
+    return lines
+
+
+def _fusion_lines(counts: Mapping[str, Any]) -> list[str]:
+    """Describe what the filter rejected, its time in each state, and the delay of the images."""
+    usual = {'odometry: used', 'measurement: accepted', 'measurement: started'}
+    rejected = {reason: n for reason, n in counts['fusion'].items() if reason not in usual}
+    lines = [f'filter: {n} times {reason}' for reason, n in sorted(rejected.items())]
+    states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
+    lines.append(f'state: {states}')
+    if 'camera_delay_s' in counts:
+        delay = counts['camera_delay_s']
+        late = 'late' if delay > 0 else 'early'
+        lines.append(f'camera: images are stamped {abs(delay):.2f} s {late}')
+    return lines

@@ -1,0 +1,77 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Report what is in bags, and whether they are enough to train on."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sfa_localization.bags.settings import TopicNames
+from sfa_localization.commands.options import add_settings, add_topics, settings
+from sfa_localization.data.errors import BagError
+from sfa_localization.data.files import atomic_write
+from sfa_localization.inspection import BagReport, InspectionConfig, inspect
+
+EXAMPLES = """\
+  inspect bags/coverage bags/test
+  inspect recording_0.mcap --json bag.json --report report
+
+JSON: {"bags": [{"path", "topics": {NAME: {"type", "count", "first_stamp_ns",
+"last_stamp_ns", "rate_hz", "largest_gap_s", "problems"}}, "problems", "lacks", ...}]}"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add bags, outputs, topics and the criteria of a sufficient drive."""
+    parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='folders or single files')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the findings as JSON')
+    parser.add_argument(
+        '--report', type=Path, metavar='DIR', help='write a contact sheet and the path as PNG'
+    )
+    parser.add_argument('--strict', action='store_true', help='reject damaged bags')
+    add_topics(parser, 'image', 'odometry')
+    add_settings(parser, InspectionConfig)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Inspect all bags; an unreadable one is reported and does not stop the others."""
+    topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
+    reports = []
+    for path in arguments.bags:
+        try:
+            reports.append(inspect(path, topics=topics, config=config, strict=arguments.strict))
+        except BagError as error:
+            reports.append(BagReport(str(path), error=str(error)))
+    if arguments.json:
+        write_json(arguments.json, reports)
+    if arguments.report:
+        for number, report in enumerate(reports):
+            prefix = f'{number}_' if len(reports) > 1 else ''
+            _write_figures(report, arguments.report, prefix)
+    for report in reports:
+        print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
+    return 1 if any(report.error for report in reports) else 0
+
+
+def write_json(path: Path, reports: Sequence[BagReport]) -> None:
+    """Write all reports to one file. Raises BagError when that is not possible."""
+    text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
+    with atomic_write(path, BagError, make_folder=True) as file:
+        file.write(f'{text}\n'.encode())
+
+
+def _write_figures(report: BagReport, folder: Path, prefix: str) -> None:
+    from sfa_localization.reports.bag import write_contact_sheet, write_path
+
+    name = Path(report.path).stem
+    images, drive = report.images, report.drive
+    if images is not None:
+        title = f'{name}: {images.topic}, {images.width}x{images.height}, {images.geometry}'
+        write_contact_sheet(images.samples, title, folder / f'{prefix}{name}_pictures.png')
+    if drive is not None:
+        title = f'{name}:{drive.as_text().partition(":")[2]}'
+        target = folder / f'{prefix}{name}_path.png'
+        write_path(drive.odometry.poses, drive.places, title.replace(', along', ',\nalong'), target)

@@ -1,0 +1,117 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Options made from the settings classes, settings made from options, and what commands share."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from sfa_localization.bags.settings import TopicNames
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.config import SECTIONS, load_settings
+from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.settings import Settings
+
+if TYPE_CHECKING:
+    from sfa_localization.training import Recipe
+
+S = TypeVar('S', bound=Settings)
+TOPIC_OPTIONS = {
+    'image': '--image-topic',
+    'odometry': '--odom-topic',
+    'imu': '--imu-topic',
+    'ground_truth': '--ground-truth-topic',
+}
+
+
+def add_settings(
+    parser: argparse.ArgumentParser, group: type[Settings], names: Sequence[str] = ()
+) -> None:
+    """Add an option --some-name for each named setting of the group (none named: for all)."""
+    for item in dataclasses.fields(group):
+        if names and item.name not in names:
+            continue
+        unit = f' ({item.metadata["unit"]})' if item.metadata['unit'] else ''
+        parser.add_argument(
+            f'--{item.name.replace("_", "-")}',
+            dest=destination(group, item.name),
+            metavar=None if item.metadata['choices'] else item.name.upper(),
+            type=numbers if isinstance(item.default, tuple) else type(item.default),
+            choices=item.metadata['choices'] or None,
+            default=argparse.SUPPRESS,
+            help=f'{item.metadata["doc"]}{unit} [{_shown(item.default)}]',
+        )
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """Parse numbers joined by x, as in 16x18."""
+    try:
+        return tuple(float(part) for part in text.split('x'))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text!r} is not like 16x18') from None
+
+
+def _shown(default: object) -> str:
+    return 'x'.join(f'{part:g}' for part in default) if isinstance(default, tuple) else str(default)
+
+
+def add_topics(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add the options that choose topics, by the names of TopicNames."""
+    docs = {item.name: item.metadata['doc'] for item in dataclasses.fields(TopicNames)}
+    for name in names:
+        parser.add_argument(
+            TOPIC_OPTIONS[name],
+            dest=destination(TopicNames, name),
+            metavar='T',
+            default=argparse.SUPPRESS,
+            help=docs[name],
+        )
+
+
+def destination(group: type[Settings], name: str) -> str:
+    """Return the parser's name of a setting, with its group: two groups may share a name."""
+    return f'{group.__name__}.{name}'
+
+
+def given(group: type[Settings], arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of the group that were given on the command line."""
+    names = {destination(group, item.name): item.name for item in dataclasses.fields(group)}
+    return {names[key]: value for key, value in vars(arguments).items() if key in names}
+
+
+def settings(group: type[S], arguments: argparse.Namespace, path: Path | None = None) -> S:
+    """Return the group's settings: defaults, then the parameter file, then the command line."""
+    section = next((name for name, kinds in SECTIONS.items() if group in kinds), '')
+    base = load_settings(path, section, group) if path else group()
+    from_file = {item.name: getattr(base, item.name) for item in dataclasses.fields(group)}
+    return group.from_mapping({**from_file, **given(group, arguments)}, 'command line')
+
+
+def recipe(arguments: argparse.Namespace) -> Recipe:
+    """Return the recipe of --config, with the topics and settings of the command line."""
+    from sfa_localization.training import Recipe
+
+    default, chosen = Recipe(), {}
+    for item in dataclasses.fields(Recipe):
+        group = getattr(default, item.name)
+        if isinstance(group, Settings):
+            chosen[item.name] = settings(type(group), arguments, arguments.config)
+    return Recipe(**chosen)  # type: ignore[arg-type]
+
+
+def require_same_panorama(path: Path | None, trained: PanoramaConfig) -> None:
+    """Reject a parameter file with which sfa_node would reject the panoramas of omnicam_node."""
+    if path is None:
+        return
+    declared = load_settings(path, 'omnicam_node', PanoramaConfig)
+    # Images that are panoramas already keep their own size.
+    declared = dataclasses.replace(declared, width=trained.width, height=trained.height)
+    differences = trained.differences(declared)
+    if differences:
+        raise ConfigError(
+            f'{path}: omnicam_node: panoramas would differ from those of training: {differences}'
+        )

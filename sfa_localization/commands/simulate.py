@@ -1,0 +1,54 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Record a bag with a simulated robot."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.commands.options import add_settings, destination, numbers, settings
+from sfa_localization.data.errors import ConfigError
+from sfa_localization.simulation.settings import SimulationConfig
+
+EXAMPLES = """\
+  simulate bags/coverage --trajectory coverage --seed 1
+  simulate bags/test --trajectory test --seed 2 --compressed
+  simulate bags/tiny --area 8x8 --length 30 --images panorama --size 300x30"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add bag, panorama size and every setting of the simulation."""
+    parser.add_argument('out', type=Path, metavar='OUT_BAG', help='folder of the bag to write')
+    parser.add_argument('--size', type=numbers, help='columns x rows of --images panorama [600x60]')
+    parser.add_argument(
+        '--compressed',
+        action='store_const',
+        dest=destination(SimulationConfig, 'compression'),
+        const='jpeg',
+        default=argparse.SUPPRESS,
+        help='short for --compression jpeg',
+    )
+    add_settings(parser, SimulationConfig)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Simulate; print the number of images and the duration."""
+    from sfa_localization.simulation.drive import simulate
+
+    config = settings(SimulationConfig, arguments)
+    panorama, progress = _panorama(arguments.size), sys.stderr.isatty()
+    drive = simulate(config, arguments.out, panorama, progress=progress)
+    seconds = (drive.truth.stamps_ns[-1] - drive.truth.stamps_ns[0]) * 1e-9
+    print(f'{arguments.out}: {len(drive.image_stamps_ns)} images in {seconds:.0f} s')
+    return 0
+
+
+def _panorama(size: tuple[float, ...] | None) -> PanoramaConfig:
+    if size is None:
+        return PanoramaConfig()
+    if len(size) != 2:
+        raise ConfigError('--size: give columns x rows, as in 300x30')
+    return PanoramaConfig.from_mapping({'width': int(size[0]), 'height': int(size[1])}, '--size')

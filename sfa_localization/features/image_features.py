@@ -1,0 +1,130 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a trained network outputs for all images of the drives, and statistics of it.
+
+The sums over all views are those of section 2.2: features that code for the place vary between
+places, and not over the simulated rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import BATCH, Run
+from sfa_localization.features.agreement import disagreement
+from sfa_localization.features.network import Network
+from sfa_localization.features.novelty import describe
+from sfa_localization.features.rotation import Map
+
+Complex = NDArray[np.complex128]
+
+# Images whose maps are kept for the compass and for novelty, however long the drives: memory.
+SAMPLES = 3000
+
+
+def slow_features(maps: list[Map]) -> Array:
+    """Slow features (T, K) s_j of section 2.2: the top node, averaged over all rotations."""
+    return np.asarray(maps[-1].mean((1, 2), dtype=np.float64))
+
+
+def harmonics(maps: Map) -> Complex:
+    """First harmonic over the columns of maps (T, rows, R, channels): (T, rows * channels)."""
+    columns = maps.shape[2]
+    wave = np.exp(-2j * np.pi * np.arange(columns) / columns).astype(np.complex64)
+    parts = wave @ maps
+    return np.asarray(parts.reshape(len(maps), -1), np.complex128)
+
+
+def layer_harmonics(maps: list[Map], layers: tuple[int, ...]) -> Complex:
+    """Harmonics of the maps of some layers (0-based) side by side, (T, J)."""
+    return np.concatenate([harmonics(maps[layer]) for layer in layers], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFeatures:
+    """Network outputs for all N images, run after run, and more for a sample of S of them."""
+
+    slow: Array
+    """(N, K) slow features."""
+    disagreement: Array
+    """(N,) of the rotated views of each image."""
+    sampled: NDArray[np.int64]
+    """(S,) indices of the sample."""
+    harmonic: Complex
+    """(S, J) of the layers that the compass reads."""
+    descriptions: tuple[Array, ...]
+    """Per layer (S, D), for novelty."""
+    variance_shares: dict[str, list[float]]
+    """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
+
+
+def features_of_runs(
+    network: Network,
+    runs: Sequence[Run],
+    compass_layers: tuple[int, ...],
+    on_images: Callable[[int], object] = lambda count: None,
+) -> ImageFeatures:
+    """Run all images through the network once; `on_images` receives the size of each batch."""
+    total = sum(len(run.panoramas) for run in runs)
+    sampled = np.unique(np.linspace(0, total - 1, min(total, SAMPLES)).round().astype(np.int64))
+    in_sample = np.zeros(total, bool)
+    in_sample[sampled] = True
+    slow, spread, harmonic = [], [], []
+    shares = _VarianceShares(network.architecture.outputs)
+    descriptions: list[list[Array]] = [[] for _ in network.nodes]
+    start = 0
+    for images in (batch for run in runs for batch in run.panoramas.batches(BATCH)):
+        maps = network.maps(images)
+        keep = in_sample[start : start + len(images)]
+        slow.append(slow_features(maps))
+        spread.append(disagreement(maps[-1]))
+        shares.add(maps[-1])
+        harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
+        for layer, of_layer in zip(maps, descriptions, strict=True):
+            of_layer.append(describe(layer[keep]))
+        start += len(images)
+        on_images(len(images))
+    return ImageFeatures(
+        np.concatenate(slow),
+        np.concatenate(spread),
+        sampled,
+        np.concatenate(harmonic),
+        tuple(np.concatenate(d) for d in descriptions),
+        shares.result(),
+    )
+
+
+class _VarianceShares:
+    """Shares of the variance of each slow feature over rotations, and over places.
+
+    eta_phi = variance over the rotation at a place / total, ideally 0; eta_p = variance over the
+    places / total, ideally 1.
+    """
+
+    def __init__(self, outputs: int) -> None:
+        self._count = 0
+        self._mean, self._square, self._place = np.zeros((3, outputs))
+
+    def add(self, top: Map) -> None:
+        """Add top maps (T, 1, R, K)."""
+        views = top.reshape(len(top), -1, top.shape[-1]).astype(np.float64)
+        mean = views.mean(1)
+        self._count += len(top)
+        self._mean += mean.sum(0)
+        self._square += (views**2).mean(1).sum(0)
+        self._place += (mean**2).sum(0)
+
+    def result(self) -> dict[str, list[float]]:
+        mean, square, place = (
+            part / self._count for part in (self._mean, self._square, self._place)
+        )
+        total = np.maximum(square - mean**2, 1e-12)
+        return {
+            'eta_phi': ((square - place) / total).tolist(),
+            'eta_p': ((place - mean**2) / total).tolist(),
+        }

@@ -1,0 +1,137 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the filter believes, and the events that change it: immutable values."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.fusion.inputs import symmetric
+from sfa_localization.fusion.motion import SIZE, State, Twist
+
+LARGEST_STD_M = 100.0
+"""The standard deviation of the position never exceeds this: larger than the places mapped."""
+_NO_DOUBT = (0.0, 0.0, 0.0)
+
+
+class OdometryEvent(NamedTuple):
+    """An odometry reading at its stamp; `pose` is the message's own, in the odometry frame."""
+
+    stamp_ns: int
+    twist: Twist
+    pose: tuple[float, float, float] | None = None
+
+
+class PoseEvent(NamedTuple):
+    """A pose (3,) set from outside, with its covariance (3, 3)."""
+
+    stamp_ns: int
+    pose: Array
+    covariance: Array
+
+
+class MeasurementEvent(NamedTuple):
+    """A position (2,) or pose (3,) from an image, with its covariance.
+
+    `jacobian` (2 or 3, 10) and `white`, the part of the noise that is this image's own, follow
+    from the covariance: see update.measurement_event.
+    """
+
+    stamp_ns: int
+    value: Array
+    covariance: Array
+    jacobian: Array
+    white: Array
+
+
+Event = OdometryEvent | PoseEvent | MeasurementEvent
+
+
+class Update(NamedTuple):
+    """What became of one measurement.
+
+    `d2` is the squared Mahalanobis distance of the full innovation, with `threshold` its gate;
+    both NaN where there was nothing to compare with. `innovation` (2,) or (3,) with its covariance.
+    """
+
+    stamp_ns: int
+    accepted: bool
+    d2: float
+    threshold: float
+    reason: str
+    innovation: Array | None = None
+    covariance: Array | None = None
+
+
+class Evidence(NamedTuple):
+    """A measurement beside the dead-reckoned pose at its stamp; yaw is NaN where unknown."""
+
+    dead_reckoned: tuple[float, float, float]
+    traveled_m: float
+    position: tuple[float, float]
+    yaw: float
+    variance: float
+    yaw_variance: float
+    accepted: bool
+
+
+class Memory(NamedTuple):
+    """The record of measurements: accepted ones, those rejected in a row, and where they lay.
+
+    `support` counts accepted images since the last start, `rejected` those outside the gate in a
+    row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
+    images. `doubt` are variances (x, y, yaw) that the published covariance has on top.
+    """
+
+    support: int = 0
+    rejected: int = 0
+    gate_excess: float = 0.0
+    accepted_ns: int | None = None
+    accepted_m: float = 0.0
+    outage: bool = False
+    doubt: tuple[float, float, float] = _NO_DOUBT
+    evidence: tuple[Evidence, ...] = ()
+    update: Update | None = None
+
+
+class Belief(NamedTuple):
+    """Everything that the next event changes. `located` is False before the first pose."""
+
+    stamp_ns: int
+    mean: Array
+    covariance: Array
+    located: bool
+    dead_reckoned: tuple[float, float, float]
+    traveled_m: float
+    twist: Twist
+    odometry_ns: int | None
+    memory: Memory
+    odometry_pose: tuple[float, float, float] | None = None
+
+    @property
+    def state(self) -> State | None:
+        """The estimate, if there is any.
+
+        Doubt widens the published covariance, not the gate: wrong images must not open it.
+        """
+        if not self.located:
+            return None
+        covariance = symmetric(self.covariance)
+        if self.memory.doubt is not _NO_DOUBT:
+            covariance[:3, :3] += np.diag(self.memory.doubt)
+        return State(self.stamp_ns, self.mean, covariance)
+
+
+def capped(covariance: Array) -> Array:
+    """A covariance (10, 10) with the pose's standard deviations held at LARGEST_STD_M and pi.
+
+    The correlations stay what they are.
+    """
+    stds = np.sqrt(np.diag(covariance)[:3])
+    factor = np.ones(SIZE)
+    factor[:3] = np.minimum(1.0, np.array([LARGEST_STD_M, LARGEST_STD_M, math.pi]) / stds)
+    return np.asarray(covariance * np.outer(factor, factor))

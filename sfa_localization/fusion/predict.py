@@ -1,0 +1,107 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Predict: from a belief to that at a later stamp, with new odometry or without."""
+
+from __future__ import annotations
+
+import math
+
+from sfa_localization.fusion import motion
+from sfa_localization.fusion.belief import Belief, OdometryEvent, capped
+from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.motion import MotionNoise, Step, Twist
+
+ODOMETRY_TIMEOUT_S = 0.5
+"""Odometry silent for longer is a gap: many times the period of any odometry."""
+COAST_S = 2.0
+"""Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
+_BRIDGED_S = 10.0
+"""A longer silence is not bridged by the twist after it: most of it was spent somehow else."""
+
+
+class Prediction:
+    """Moves beliefs on in time by the CTRV model of `motion`."""
+
+    def __init__(self, noise: MotionNoise, kalman: Kalman) -> None:
+        self._noise = noise
+        self._kalman = kalman
+
+    def drive(self, belief: Belief, event: OdometryEvent) -> Belief:
+        """The belief after an odometry reading, which held since the one before it."""
+        if belief.odometry_ns is None and belief.stamp_ns == 0:
+            return belief._replace(
+                stamp_ns=event.stamp_ns,
+                twist=event.twist,
+                odometry_ns=event.stamp_ns,
+                odometry_pose=event.pose,
+            )
+        silence_s = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
+        if silence_s > _BRIDGED_S:
+            belief = self.coast(belief, event.stamp_ns)
+        twist = event.twist
+        if belief.odometry_ns is not None and silence_s > ODOMETRY_TIMEOUT_S:
+            twist = _mean_twist(belief.twist, event.twist)
+        elif belief.odometry_pose is not None and event.pose is not None:
+            twist = motion.twist_from_poses(belief.odometry_pose, event.pose, silence_s, twist)
+            event = event._replace(twist=twist)
+        dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
+        step = motion.drive(belief.mean, twist, dt, self._noise)
+        if silence_s > COAST_S:
+            motion.add_unknown_motion(step.noise, twist, min(dt, silence_s - COAST_S))
+        return self._moved(belief, event.stamp_ns, step, event)
+
+    def coast(self, belief: Belief, stamp_ns: int) -> Belief:
+        """The belief at a later stamp without new odometry: at the last speed, then unknown."""
+        if belief.stamp_ns == 0:
+            return belief._replace(stamp_ns=stamp_ns)
+        coasted_ns = belief.stamp_ns
+        if belief.odometry_ns is not None:
+            coasted_ns = max(coasted_ns, belief.odometry_ns + round(COAST_S * 1e9))
+        end_ns = min(stamp_ns, coasted_ns)
+        if end_ns > belief.stamp_ns:
+            dt = (end_ns - belief.stamp_ns) * 1e-9
+            step = motion.coast(belief.mean, belief.twist, dt, self._noise)
+            belief = self._moved(belief, end_ns, step)
+        if stamp_ns > belief.stamp_ns:
+            dt = (stamp_ns - belief.stamp_ns) * 1e-9
+            step = motion.halt(belief.mean, belief.twist, dt, self._noise)
+            belief = self._moved(belief, stamp_ns, step)
+            belief = belief._replace(covariance=capped(belief.covariance))
+        return belief
+
+    def _moved(
+        self, belief: Belief, stamp_ns: int, step: Step, event: OdometryEvent | None = None
+    ) -> Belief:
+        """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
+        before_x, before_y, before_yaw = belief.mean[:3].tolist()
+        after_x, after_y, after_yaw = step.mean[:3].tolist()
+        dx, dy = after_x - before_x, after_y - before_y
+        x, y, yaw = belief.dead_reckoned
+        c, s = math.cos(yaw - before_yaw), math.sin(yaw - before_yaw)
+        turned = motion.wrap(yaw + after_yaw - before_yaw)
+        located = belief.located
+        # Positional, and not _replace, which would cost half as much as the arithmetic above.
+        return Belief(
+            stamp_ns,
+            step.mean,
+            self._kalman.predicted(belief, step) if located else belief.covariance,
+            located,
+            (x + c * dx - s * dy, y + s * dx + c * dy, turned),
+            belief.traveled_m + math.hypot(dx, dy),
+            event.twist if event else belief.twist,
+            event.stamp_ns if event else belief.odometry_ns,
+            belief.memory,
+            event.pose if event else belief.odometry_pose,
+        )
+
+
+def _mean_twist(a: Twist, b: Twist) -> Twist:
+    """The mean motion over a gap, as uncertain as its ends differ."""
+    # The variance of a uniform distribution between the two is their difference squared over 12.
+    v_variance, omega_variance = (a.v - b.v) ** 2 / 12, (a.omega - b.omega) ** 2 / 12
+    return Twist(
+        (a.v + b.v) / 2,
+        (a.omega + b.omega) / 2,
+        max(a.v_variance, b.v_variance) + v_variance,
+        max(a.omega_variance, b.omega_variance) + omega_variance,
+    )

@@ -1,0 +1,103 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How far an estimate can be trusted, in words."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+from sfa_localization.fusion.belief import Belief
+from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.fusion.evidence import ENOUGH_IMAGES, FEW_IMAGES
+from sfa_localization.fusion.motion import State
+from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
+from sfa_localization.fusion.recover import IMAGE_TIMEOUT_S
+from sfa_localization.fusion.settings import FilterConfig
+
+LOST_EXCESS, LOST_DISTANCE_M = 4.0, 0.5
+"""ENOUGH_IMAGES in a row that contradict mean LOST where they lie outside the gate by this factor
+on d2, or the robot has moved so far: standing, it may see one place where the map is wrong."""
+
+
+class Level(enum.Enum):
+    """How far the estimate can be trusted."""
+
+    UNINITIALISED = 0
+    LOCALISED = 1
+    DEGRADED = 2
+    LOST = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """The level and why it is not better."""
+
+    level: Level
+    reasons: tuple[str, ...] = ()
+
+
+def status_of(
+    belief: Belief, clock: CameraClock, config: FilterConfig, delay_limit_ns: int
+) -> Status:
+    """The status of a belief; a camera whose delay is beyond the limit makes it DEGRADED."""
+    state = belief.state
+    if state is None:
+        return Status(Level.UNINITIALISED, (_missing(belief),))
+    lost = uncertainty(state, config) + _contradictions(belief)
+    degraded = []
+    if config.degraded_std < state.position_std <= config.lost_std:
+        degraded.append(f'position known to {state.position_std:.1f} m only')
+    if belief.memory.rejected >= FEW_IMAGES:
+        degraded.append(f'{belief.memory.rejected} images in a row did not match')
+    degraded += _silences(belief)
+    if abs(clock.delay_ns) > delay_limit_ns:
+        late = 'late' if clock.delay_s > 0 else 'early'
+        degraded.append(
+            f'images are stamped {abs(clock.delay_s):.1f} s {late}: synchronize the clocks'
+        )
+    level = Level.LOST if lost else Level.DEGRADED if degraded else Level.LOCALISED
+    return Status(level, (*lost, *degraded))
+
+
+def uncertainty(state: State, config: FilterConfig) -> list[str]:
+    """Why a state is LOST by its standard deviations alone."""
+    reasons = []
+    if state.position_std > config.lost_std:
+        reasons.append(f'position known to {state.position_std:.1f} m only')
+    if state.yaw_std > config.lost_yaw_std:
+        reasons.append(f'heading known to {math.degrees(state.yaw_std):.0f} deg only')
+    return reasons
+
+
+def _missing(belief: Belief) -> str:
+    if belief.memory.evidence:
+        return 'images show no heading yet: drive on'
+    return 'no odometry and no images yet' if belief.odometry_ns is None else 'no usable image yet'
+
+
+def _contradictions(belief: Belief) -> list[str]:
+    memory = belief.memory
+    moved_m = belief.traveled_m - memory.accepted_m
+    serious = memory.gate_excess > LOST_EXCESS or moved_m > LOST_DISTANCE_M
+    if memory.rejected < ENOUGH_IMAGES or not serious:
+        return []
+    return [f'{memory.rejected} images in a row contradict the estimate']
+
+
+def _silences(belief: Belief) -> list[str]:
+    reasons = []
+    if belief.memory.accepted_ns is None:
+        reasons.append('no image has confirmed the start yet')
+    else:
+        silence_s = (belief.stamp_ns - belief.memory.accepted_ns) * 1e-9
+        if silence_s > IMAGE_TIMEOUT_S:
+            reasons.append(f'no usable image for {silence_s:.0f} s')
+    if belief.odometry_ns is None:
+        reasons.append('no odometry')
+    else:
+        silence_s = (belief.stamp_ns - belief.odometry_ns) * 1e-9
+        if silence_s > ODOMETRY_TIMEOUT_S:
+            reasons.append(f'no odometry for {silence_s:.1f} s')
+    return reasons

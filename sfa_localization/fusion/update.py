@@ -1,0 +1,133 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Update: fuse a measurement that lies inside the gate; hand the others to `recover`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.stats import chi2
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.fusion.belief import Belief, Evidence, MeasurementEvent, Memory, Update
+from sfa_localization.fusion.evidence import (
+    AGREEING_DISTANCE_M,
+    FEW_IMAGES,
+    MANY_IMAGES,
+    consistent,
+    remember,
+)
+from sfa_localization.fusion.inputs import lower_root
+from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.motion import ERROR, SIZE, YAW, X, Y
+from sfa_localization.fusion.recover import Recovery
+
+GATE_PROBABILITY = 0.999
+"""Share of correct measurements that the gate accepts: one in a thousand is rejected."""
+_GATES = {size: float(chi2.ppf(GATE_PROBABILITY, size)) for size in (2, 3)}
+WIDE_GATE = 4.0
+"""A prior of so many times a measurement's variance would follow it anywhere (gain above 0.8)."""
+_OBSERVED = np.eye(3, SIZE)
+_SEEN_BY_POSITION = (X, Y, ERROR, ERROR + 1, ERROR + 2)
+_NOT_SEEN_BY_POSITION = tuple(sorted({*range(SIZE)} - {*_SEEN_BY_POSITION}))
+
+
+def measurement_event(
+    stamp_ns: int, value: Array, covariance: Array, share: float
+) -> MeasurementEvent:
+    """A position (2,) or pose (3,), its covariance split into what neighboring images share.
+
+    z = value + sqrt(share) L ERROR + white, with L L^T the covariance and (1 - share) of it white.
+    """
+    size = len(value)
+    jacobian = _OBSERVED[:size].copy()
+    jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
+    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
+
+
+class Correction:
+    """Fuses measurements by filterpy's equations, inside a chi-square gate."""
+
+    def __init__(self, lost_yaw_std: float, kalman: Kalman, recovery: Recovery) -> None:
+        self._lost_yaw_variance = lost_yaw_std**2
+        self._kalman = kalman
+        self._recovery = recovery
+
+    def measure(self, belief: Belief, event: MeasurementEvent) -> Belief:
+        """The belief, predicted to the event's stamp before, after a measurement."""
+        heading_lost = belief.covariance[YAW, YAW] > self._lost_yaw_variance
+        if belief.located and (event.value.size == 3 or not heading_lost):
+            return self._gated(belief, event)
+        evidence = remember(belief, event, accepted=False)
+        started = self._recovery.started(belief, event, evidence)
+        if started is not None:
+            return started
+        if belief.located:
+            return self._followed(belief, event, evidence)
+        reason = 'heading unknown yet' if event.value.size == 2 else 'too uncertain to start from'
+        update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
+        return belief._replace(memory=belief.memory._replace(evidence=evidence, update=update))
+
+    def _followed(
+        self, belief: Belief, event: MeasurementEvent, evidence: tuple[Evidence, ...]
+    ) -> Belief:
+        """The heading is lost: follow positions, and conclude nothing from them on the heading.
+
+        The correlation of heading and position is meaningful only for small heading errors.
+        """
+        apart = belief.covariance.copy()
+        apart[np.ix_(_SEEN_BY_POSITION, _NOT_SEEN_BY_POSITION)] = 0.0
+        apart[np.ix_(_NOT_SEEN_BY_POSITION, _SEEN_BY_POSITION)] = 0.0
+        mean, covariance, d2 = self._kalman.corrected(belief, apart, event)
+        near = d2 <= _GATES[2]
+        reason = 'position only: heading unknown' if near else 'outside the gate'
+        update = Update(event.stamp_ns, near, d2, _GATES[2], reason)
+        memory = belief.memory._replace(evidence=evidence, update=update)
+        if not near:
+            return belief._replace(memory=memory)
+        memory = memory._replace(accepted_ns=event.stamp_ns, accepted_m=belief.traveled_m)
+        return belief._replace(mean=mean, covariance=covariance, memory=memory)
+
+    def _gated(self, belief: Belief, event: MeasurementEvent) -> Belief:
+        """Accept what lies inside the gate, after an outage only when others confirm it."""
+        mean, covariance, d2 = self._kalman.corrected(belief, belief.covariance, event)
+        threshold, kalman = _GATES[event.value.size], self._kalman
+        update = Update(event.stamp_ns, True, d2, threshold, 'accepted', kalman.y, kalman.S)
+        if d2 > threshold:
+            rejected = update._replace(accepted=False, reason='outside the gate')
+            return self._recovery.rejected(belief, event, rejected)
+        if _pulls_far(belief, event) and not _confirmed(belief, event):
+            reason = 'not confirmed after an outage yet'
+            rejected = update._replace(accepted=False, reason=reason)
+            return self._recovery.rejected(belief, event, rejected)
+        memory = Memory(
+            support=belief.memory.support + 1,
+            accepted_ns=event.stamp_ns,
+            accepted_m=belief.traveled_m,
+            evidence=remember(belief, event, accepted=True),
+            update=update,
+        )
+        return belief._replace(mean=mean, covariance=covariance, memory=memory)
+
+
+def _pulls_far(belief: Belief, event: MeasurementEvent) -> bool:
+    """The gate is wide because the estimate is poor, and the image would move it far."""
+    prior, own = belief.covariance, event.covariance
+    if belief.memory.support == 0:  # whoever sets a pose from outside knows how poor it is
+        return False
+    if max(prior[0, 0], prior[1, 1]) < WIDE_GATE * max(own[0, 0], own[1, 1]):
+        return False
+    offset = event.value[:2] - belief.mean[:2]
+    return bool(offset @ np.linalg.solve(own[:2, :2], offset) > _GATES[2])
+
+
+def _confirmed(belief: Belief, event: MeasurementEvent) -> bool:
+    """Enough images in a row agree with this one along the odometry's path."""
+    evidence = remember(belief, event, accepted=False)
+    turn = float(belief.mean[YAW]) - belief.dead_reckoned[2]
+    count = consistent(evidence, turn, math.sqrt(belief.covariance[YAW, YAW]))
+    if count < FEW_IMAGES:
+        return False
+    distance_m = belief.traveled_m - evidence[-count].traveled_m
+    return distance_m >= AGREEING_DISTANCE_M or count >= MANY_IMAGES

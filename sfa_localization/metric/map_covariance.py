@@ -1,0 +1,98 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How uncertain directions, positions and the map of a fit are, and the map with its covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array, RigidTransform
+from sfa_localization.metric.alternation import MapFit
+from sfa_localization.metric.expansions import MetricMap
+from sfa_localization.metric.phases import angle_hessian, refine
+from sfa_localization.metric.quadratic_form import schur
+
+Complex = NDArray[np.complex128]
+
+# Joint changes of the drive's positions that a map keeps: later ones are smaller than its noise.
+_SWAYS = 24
+
+
+def plane(points: Complex) -> Array:
+    """Points (M, 2) of complex x + i y (M,)."""
+    return np.column_stack([points.real, points.imag])
+
+
+def angle_covariance(fit: MapFit) -> Array:
+    """Covariance (N, N) of the directions, rad^2, relative to the rotation of the whole map."""
+    hessian = angle_hessian(fit.solution.h, refine(fit.solution.h, fit.solution.z))
+    values, vectors = np.linalg.eigh(hessian)
+    n = len(values)
+    common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
+    inverse = np.where(common, 0.0, 1.0 / np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
+    centered = np.eye(n) - 1.0 / n
+    spread = centered @ vectors
+    return np.asarray(fit.link_variance * (spread * inverse) @ spread.T)
+
+
+def sway(fit: MapFit) -> Complex:
+    """Changes (m, r) of the map's weights per standard deviation of the r most uncertain joint
+    changes of the segments' origins and directions, without a motion of the whole map, which is
+    a matter of its frame."""
+    stack, solution, places = fit.stack, fit.solution, fit.places
+    origins, directions = _uncertain_segments(fit)
+    path = stack.corrected(solution.bias)
+    moved = origins[stack.owner] + directions[stack.owner] * path[:, None]
+    around_center = 1j * (places - places.mean())
+    turn = np.real(np.conj(around_center) @ moved) / np.sum(np.abs(around_center) ** 2)
+    moved = moved - moved.mean(0) - around_center[:, None] * turn
+    values, vectors = np.linalg.eigh(np.real(moved.conj().T @ moved))
+    keep = vectors[:, np.argsort(values)[::-1][:_SWAYS]]
+    bias = solution.bias[stack.run][:, None]
+    directions = directions @ keep
+    changes = np.vstack([origins @ keep, directions, -bias * directions])
+    weights = fit.elimination.weights(changes) - 1j * np.outer(fit.map_weights, turn @ keep)
+    weights[-1] -= fit.expanded.mean(0) @ weights
+    return np.asarray(weights)
+
+
+def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
+    """Changes of origins and directions (N, 3N each), one standard deviation a column.
+
+    First those of the directions, which the origins follow; then of the origins along both axes.
+    """
+    solution = fit.solution
+    system = fit.form(fit.elimination).system(solution.bias)
+    follow = schur(system)[1]
+    values, vectors = np.linalg.eigh(angle_covariance(fit))
+    turned = 1j * solution.z[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0)))
+    n = fit.stack.segments
+    values, vectors = np.linalg.eigh(np.real(system[:n, :n]))
+    # Moving all origins together costs nothing, and is no error of the map.
+    fixed = values > 1e-9 * values[-1]
+    scale = np.sqrt(fit.link_variance / np.where(fixed, values, 1.0)) * fixed
+    own = vectors * scale
+    origins = np.hstack([follow @ turned, own, 1j * own])
+    return origins, np.hstack([turned, np.zeros((n, 2 * n))])
+
+
+def metric_map(
+    fit: MapFit, weights_sway: Complex, frame: RigidTransform, inflation: float
+) -> MetricMap:
+    """The map of a fit in the map frame, with the covariance of its weights and their sway."""
+    turn = np.exp(1j * frame.yaw_rad)
+    weights = turn * fit.map_weights
+    weights[-1] += frame.x_m + 1j * frame.y_m
+    factor = fit.elimination.factor
+    inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
+    turned = turn * weights_sway
+    return MetricMap(
+        basis=fit.basis,
+        weights=plane(weights),
+        spread=np.ascontiguousarray(np.sqrt(fit.variance) * inverse.T),
+        sway=np.stack([turned.real, turned.imag], axis=-1),
+        noise_m=float(np.sqrt(fit.variance)),
+        inflation=inflation,
+    )

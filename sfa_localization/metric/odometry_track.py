@@ -1,0 +1,230 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Dead reckoning of one drive: wheels and gyroscope, its breaks, and the errors it accumulates."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array, relative, wrap_angle
+from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
+from sfa_localization.metric.settings import SegmentConfig
+
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+logger = logging.getLogger(__name__)
+
+GAP_MAX_S = 0.5
+"""Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""
+JUMP_MAX_M = 0.3
+YAW_JUMP_MAX_RAD = 0.5
+"""A pose this far from where the twist leads is an odometry reset."""
+# Periods of the odometry that are no pause, however slow it is.
+_PERIODS = 2.5
+# A gyroscope is compared with wheels that have turned this much, rad^2 in steps of a second, and
+# must then agree within this factor: skidding wheels are off by two, degrees by 57.
+_TURNS_TO_JUDGE = 1.0
+_GYRO_RATIO = 5.0
+# Yaw rates are averaged over this long before they are compared with a threshold.
+_SMOOTHING_S = 0.3
+
+# Columns of the accumulated sums: driven meters, radians turned in either direction, yaw variance,
+# and the two parts of the moment of time, the integral of t dp, on which a yaw-rate bias acts.
+LENGTH, TURNED, YAW_VARIANCE, MOMENT = 0, 1, 2, slice(3, 5)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryTrack:
+    """Poses at the N odometry stamps, with running sums of what accumulates along the track."""
+
+    stamps_ns: Stamps
+    poses: Array
+    yaw: Array
+    speed: Array
+    turn_rate: Array
+    part: Indices
+    """(N,) number of the unbroken part that each pose is in."""
+    sums: Array
+    """(N, 5), see the columns above."""
+    count: Count
+
+    @classmethod
+    def of(
+        cls, odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None
+    ) -> OdometryTrack:
+        """From wheel odometry, with the turns of the gyroscope where there is one."""
+        kept, skipped = _usable(odometry)
+        stamps, poses = odometry.stamps_ns[kept], np.array(odometry.poses[kept], float)
+        twists = odometry.twists[kept]
+        # Some drivers publish poses only.
+        twists = twists if np.any(twists) else differences(stamps, poses)
+        breaks = _breaks(stamps, poses, twists, skipped)
+        variances = np.where(odometry.variances[kept, 1] > 0, odometry.variances[kept, 1], 0.0)
+        yaw = np.unwrap(poses[:, 2])
+        gyro = None if config.yaw_source == 'odometry' else _usable_gyro(yaw_rate)
+        if gyro is not None:
+            turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, config, skipped)
+            measured = yaw[0] + np.concatenate([[0.0], np.cumsum(turns)])
+            poses, yaw = _with_yaw(poses, yaw, measured), measured
+            twists = np.column_stack([twists[:, 0], np.gradient(yaw, seconds_since_start(stamps))])
+        elif config.yaw_source == 'gyro':
+            raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
+        sums = _running_sums(stamps, poses, yaw, variances, config.yaw_noise)
+        rate = _smoothed(seconds_since_start(stamps), twists[:, 1])
+        part = np.concatenate([[0], np.cumsum(breaks)])
+        count = Count(int(kept.sum()), skipped)
+        return cls(stamps, poses, yaw, np.abs(twists[:, 0]), rate, part, sums, count)
+
+
+def seconds_since_start(stamps_ns: Stamps) -> Array:
+    return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
+
+
+def _usable(odometry: Odometry) -> tuple[Mask, dict[str, int]]:
+    """Mask of messages with finite numbers and increasing stamps; why others are not used."""
+    finite = np.isfinite(odometry.poses).all(1) & np.isfinite(odometry.twists).all(1)
+    stamps = np.where(finite, odometry.stamps_ns, np.iinfo(np.int64).min)
+    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
+    kept = finite & (stamps > before)
+    if kept.sum() < 2:
+        raise DataError('fewer than two usable odometry messages: check the odometry topic')
+    reasons = {'not finite': int((~finite).sum()), 'out of order': int((finite & ~kept).sum())}
+    return kept, {reason: number for reason, number in reasons.items() if number}
+
+
+def _breaks(stamps: Stamps, poses: Array, twists: Array, skipped: dict[str, int]) -> Mask:
+    """Mask (N - 1,) of the steps that odometry does not bridge: pauses and resets."""
+    dt = np.diff(stamps) * 1e-9
+    step = relative(poses[:-1], poses[1:])
+    speed = np.maximum(np.abs(twists[:-1, 0]), np.abs(twists[1:, 0]))
+    rate = np.maximum(np.abs(twists[:-1, 1]), np.abs(twists[1:, 1]))
+    # Odometry that is always slow does not pause at each message.
+    gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
+    reset = np.hypot(step[:, 0], step[:, 1]) > speed * dt + JUMP_MAX_M
+    reset |= np.abs(step[:, 2]) > rate * dt + YAW_JUMP_MAX_RAD
+    for reason, mask in (('pauses', gap), ('resets', reset & ~gap)):
+        if mask.any():
+            skipped[reason] = int(mask.sum())
+    return np.asarray(gap | reset)
+
+
+def _usable_gyro(yaw_rate: YawRate | None) -> YawRate | None:
+    """The finite readings with increasing stamps; None where they are fewer than two."""
+    if yaw_rate is None:
+        return None
+    omega = np.where(np.isfinite(yaw_rate.omega), yaw_rate.omega, np.nan)
+    stamps = np.where(np.isfinite(omega), yaw_rate.stamps_ns, np.iinfo(np.int64).min)
+    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
+    kept = stamps > before
+    if kept.sum() < 2:
+        return None
+    return YawRate(stamps[kept], omega[kept], np.nan_to_num(yaw_rate.variance[kept]))
+
+
+def _gyro_turns(
+    stamps: Stamps,
+    yaw: Array,
+    variances: Array,
+    unbroken: Mask,
+    gyro: YawRate,
+    config: SegmentConfig,
+    skipped: dict[str, int],
+) -> tuple[Array, Array]:
+    """Turns (N - 1,) between the odometry's stamps, and the variances (N,) of their rate.
+
+    The gyroscope's where it has readings all along a step, else the odometry's: less exact, but
+    a gyroscope that pauses or ends did not measure the turns since. To the odometry's turns the
+    gyroscope's mean offset is added, so that one bias remains for the whole drive.
+    """
+    seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, seconds_since_start(stamps)
+    areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
+    turns = np.diff(np.interp(at, seconds, np.concatenate([[0.0], np.cumsum(areas)])))
+    wheels, dt = np.diff(yaw), np.diff(at)
+    measured = _bridged(stamps, gyro.stamps_ns, round(GAP_MAX_S * 1e9))
+    both = measured & unbroken
+    sign = _gyro_sign(turns[both], wheels[both], at[:-1][both], config)
+    if sign == 0.0 or not both.any():
+        tally(skipped, 'without a usable gyroscope', unbroken)
+        return wheels, variances
+    tally(skipped, 'in a gap of the gyroscope', unbroken & ~measured)
+    turns *= sign
+    offset = float((turns - wheels)[both].sum() / dt[both].sum())
+    own = np.interp(at, seconds, np.maximum(gyro.variance, 0.0))
+    own = np.where(np.append(measured, measured[-1]), own, variances)
+    return np.where(measured, turns, wheels + offset * dt), own
+
+
+def _bridged(stamps: Stamps, readings: Stamps, gap_ns: int) -> Mask:
+    """Mask (N - 1,) of the steps between stamps (N,) along which readings (M,) never pause."""
+    before = np.searchsorted(readings, stamps[:-1], 'right') - 1
+    after = np.searchsorted(readings, stamps[1:], 'left')
+    inside = (before >= 0) & (after < len(readings))
+    pauses = np.concatenate([[0], np.cumsum(np.diff(readings) > gap_ns)])
+    before, after = np.clip([before, after], 0, len(readings) - 1)
+    return np.asarray(inside & (pauses[before] == pauses[after]))
+
+
+def _gyro_sign(turns: Array, wheels: Array, at_s: Array, config: SegmentConfig) -> float:
+    """1, or -1 for a gyroscope mounted upside down, or 0 for one that measures something else.
+
+    Compared over whole seconds with the turns of the wheels, where these turn at all.
+    """
+    second = np.unique(np.floor(at_s), return_inverse=True)[1]
+    gyro, odometry = (np.bincount(second, per_step) for per_step in (turns, wheels))
+    power = float(odometry @ odometry)
+    if config.yaw_source == 'gyro' or power < _TURNS_TO_JUDGE:
+        return 1.0
+    slope = float(gyro @ odometry) / power
+    if not 1 / _GYRO_RATIO < abs(slope) < _GYRO_RATIO:
+        logger.warning(
+            'the gyroscope turns %.2g times as far as the odometry: it is not used; check its '
+            'axis and unit (rad/s), or trust it with yaw_source: gyro', slope
+        )  # fmt: skip
+        return 0.0
+    if slope < 0:
+        logger.warning('the gyroscope turns opposite to the odometry: taken as upside down')
+    return float(np.sign(slope))
+
+
+def _with_yaw(poses: Array, yaw: Array, measured: Array) -> Array:
+    """The same wheel steps driven with another yaw (N,)."""
+    step = np.diff(poses[:, 0] + 1j * poses[:, 1])
+    middle = (yaw[:-1] + yaw[1:]) / 2
+    step = step * np.exp(1j * ((measured[:-1] + measured[1:]) / 2 - middle))
+    place = poses[0, 0] + 1j * poses[0, 1] + np.concatenate([[0.0], np.cumsum(step)])
+    return np.column_stack([place.real, place.imag, wrap_angle(measured)])
+
+
+def _running_sums(
+    stamps: Stamps, poses: Array, yaw: Array, variances: Array, yaw_noise: float
+) -> Array:
+    """Running sums (N, 5); `yaw_noise` (rad per square root of s) where variances (N,) are 0."""
+    t = seconds_since_start(stamps)
+    step = np.diff(poses[:, 0] + 1j * poses[:, 1])
+    moment = step * (t[1:] + t[:-1]) / 2
+    dt = np.diff(t)
+    stated = variances[:-1] * dt**2
+    noise = np.where(stated > 0, stated, yaw_noise**2 * dt)
+    columns = [np.abs(step), np.abs(np.diff(yaw)), noise, moment.real, moment.imag]
+    return np.vstack([np.zeros(5), np.cumsum(np.column_stack(columns), axis=0)])
+
+
+def _smoothed(seconds: Array, rates: Array) -> Array:
+    """Moving average over a fixed time, by the running integral."""
+    total = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(seconds))])
+    low = np.clip(seconds - _SMOOTHING_S / 2, seconds[0], seconds[-1])
+    high = np.clip(seconds + _SMOOTHING_S / 2, seconds[0], seconds[-1])
+    area = np.interp(high, seconds, total) - np.interp(low, seconds, total)
+    return np.asarray(area / np.maximum(high - low, 1e-9))
+
+
+def tally(skipped: dict[str, int], reason: str, mask: Mask) -> None:
+    """Count the entries that were not used for a reason."""
+    if mask.any():
+        skipped[reason] = skipped.get(reason, 0) + int(mask.sum())

@@ -1,0 +1,53 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a training in a few lines of text."""
+
+from __future__ import annotations
+
+from sfa_localization.training import Trained
+
+# s: a smaller delay of the camera is within the period of usual odometry.
+_DELAY_SHOWN_S = 0.02
+
+
+def summary(trained: Trained) -> str:
+    """Amount of data, certificate, expected errors, and what was skipped; without ground truth."""
+    quality = trained.model.quality
+    coverage = quality['coverage']
+    worst = quality['worst']
+    along, across = coverage['extent_m']
+    proof = 'proven optimal' if quality['certified'] else 'NOT proven optimal'
+    lines = [
+        f'images: {quality["pictures"]} in {quality["segments"]} segments of odometry, '
+        f'{coverage["length_m"]:.0f} m driven, about {along:.0f} m x {across:.0f} m covered',
+        f'map: {quality["features_used"]} slow features, directions {proof} '
+        f'(certificate {quality["certificate"]:.1e})',
+        f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image on paths '
+        f'between the trained ones; worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m: '
+        f'{worst["expected_error_m"]:.2f} m',
+    ]
+    if 'expected_yaw_error_deg' in quality:
+        lines.append(
+            f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
+        )
+    for run, delay in zip(trained.runs, quality['camera_delay_s'], strict=True):
+        if delay is not None and abs(delay) > _DELAY_SHOWN_S:
+            late = 'late' if delay > 0 else 'early'
+            lines.append(
+                f'{run.name}: images are stamped {abs(delay):.2f} s {late}: taken into account'
+            )
+    for name, count in _skipped(trained).items():
+        lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
+    return '\n'.join(lines)
+
+
+def _skipped(trained: Trained) -> dict[str, dict[str, int]]:
+    """What was not used, by reason: of every bag, and of the segments."""
+    skipped = {
+        f'{run.name}: {stream}': count.skipped
+        for run in trained.runs
+        for stream, count in run.counts.items()
+    }
+    skipped['metric learning: images'] = trained.segments.images.skipped
+    skipped['metric learning: odometry'] = trained.segments.odometry.skipped
+    return skipped
