@@ -11,6 +11,7 @@ and the shift of the columns is the heading.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -22,7 +23,6 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.agreement import needed_factor
 
 Texture = NDArray[np.float32]
 Spectra = NDArray[np.complex64]
@@ -34,38 +34,101 @@ _BLUR = 1 / 37.5
 # and of its logarithm.
 _DARKEST, _FLATTEST = 8.0, 0.1
 # Textures are stored with one byte a pixel.
-_LARGEST, _STEPS = 4.0, 127 / 4.0
-_MOST = 2000
-_NEIGHBORS = 24
-_REACH_SHARE = 0.6
+_STEPS = 127 / 4.0  # for a standard deviation
+NEIGHBORS = 24
+"""Keyframes about a place whose correlations make its surface."""
+_REACH_SHARE = 0.6  # of the distance to the farthest of them: width of the weights
+# Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
+_COARSE, _CANDIDATES = 15, 64
 # Correlations that unknown places do not reach (foreign and mirrored gardens: 0.40), and the same
 # as a share of what keyframes of other stretches of driving reach.
-_KNOWN, _KNOWN_SHARE = 0.42, 0.5
-_TEMPERATURES = np.geomspace(0.003, 0.1, 12)
-_FLOORS_M = np.geomspace(0.03, 1.0, 15)
-_ROWS_AT_ONCE = 64
-_TRIALS = 400
-_COARSE, _CANDIDATES = 15, 64
-_FAR_M = 3.0
-_HEAVY_TAIL = 4.0
-# Temperature, floor m, yaw's standard deviation rad, factor and lowest correlation where nothing
-# can be learnt.
-_ASSUMED = (0.02, 0.3, 0.03, 1.0, _KNOWN)
+LOWEST, LOWEST_SHARE = 0.42, 0.5
+# Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
+_DOUBT = 4.0
+# Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
+_APART = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class MatchNoise:
+    """How well keyframes of other stretches of driving are found, learned by `fit_keyframes`.
+
+    `temperature` is the difference of correlation that matters, `floor_m` the least standard
+    deviation of a position, `factor` what the variances of positions lack, `yaw_std` rad that of
+    a heading. `lowest` is the correlation below which a place is unknown, `usual` the one that
+    19 of 20 images of known places reach. `joint_factor` is what the variances lack of estimates
+    that slow features and keyframes agree on.
+    """
+
+    temperature: float = 0.02
+    floor_m: float = 0.3
+    factor: float = 1.0
+    yaw_std: float = 0.03
+    lowest: float = LOWEST
+    usual: float = 0.6
+    joint_factor: float = 1.0
+
+    def novelty(self, score: float) -> float:
+        """1 for a correlation that is just usual, 3 for the lowest of a known place, more below."""
+        exponent = (self.usual - score) / (self.usual - self.lowest)
+        return float(3.0 ** min(exponent, 4.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What the keyframes say of an image.
+    """The estimate of the keyframes for an image.
 
     `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
-    with the best keyframe, 1 for the same image; `known` whether that is enough for a place that
-    was seen in training.
+    with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
+    near a guess minus `score`, in temperatures: 0 where the best is among them.
     """
 
     pose: Array
     covariance: Array
     score: float
-    known: bool
+    support: float
+
+    def distance(self, position: Array, covariance: Array) -> float:
+        """Half the squared Mahalanobis distance from another estimate's position (2,) m, with its
+        covariance (2, 2): 1 on average where both variances are right.
+        """
+        apart = position - self.pose[:2]
+        return float(apart @ np.linalg.solve(self.covariance[:2, :2] + covariance, apart)) / 2
+
+    def combined(
+        self, position: Array, yaw: float, covariance: Array, noise: MatchNoise
+    ) -> tuple[Array, float, Array]:
+        """Position (2,) m, yaw rad and covariance (3, 3) from this match and another estimate.
+
+        Of an unknown place the other estimate stays; one that the keyframes contradict is
+        dropped; two that agree are weighted by their information, and their variances grow with
+        their distance.
+        """
+        if self.score < noise.lowest:
+            return position, yaw, covariance
+        if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
+            return self.pose[:2], float(self.pose[2]), self.covariance
+        mine, its = self.covariance[:2, :2], covariance[:2, :2]
+        distance = self.distance(position, its)
+        if self.support < -_DOUBT or distance > _APART:
+            return self.pose[:2], float(self.pose[2]), self.covariance
+        joint = np.zeros((3, 3))
+        gain = mine @ np.linalg.inv(mine + its)
+        joint[:2, :2] = noise.joint_factor * max(1.0, distance) * gain @ its
+        joint[:2, :2] = (joint[:2, :2] + joint[:2, :2].T) / 2
+        found, joint[2, 2] = self._combined_yaw(yaw, float(covariance[2, 2]))
+        return self.pose[:2] + gain @ (position - self.pose[:2]), found, joint
+
+    def _combined_yaw(self, yaw: float, variance: float) -> tuple[float, float]:
+        own = float(self.covariance[2, 2])
+        if not np.isfinite(yaw):
+            return float(self.pose[2]), own
+        apart = float(wrap_angle(yaw - self.pose[2]))
+        spread = max(1.0, apart**2 / (own + variance))
+        if spread > 2 * _APART:
+            return float(self.pose[2]), own
+        gain = own / (own + variance)
+        return float(wrap_angle(self.pose[2] + gain * apart)), gain * variance * spread
 
 
 def texture(panorama: Image) -> Texture:
@@ -89,9 +152,15 @@ def _normalized(image: Texture) -> Texture:
     return np.asarray(centered / max(float(np.linalg.norm(centered)), 1e-6), np.float32)
 
 
-def _spectrum(textures: Texture) -> Spectra:
+def spectrum(textures: Texture) -> Spectra:
     """Fourier coefficients of the columns, (..., rows, F)."""
     return np.asarray(np.fft.rfft(textures, axis=-1), np.complex64)
+
+
+def quantized(textures: Texture) -> NDArray[np.int8]:
+    """Textures (N, rows, columns) with one byte a pixel."""
+    deviation = np.maximum(np.std(textures, axis=(1, 2), keepdims=True), 1e-6)
+    return np.asarray(np.clip(np.rint(textures * (_STEPS / deviation)), -127, 127), np.int8)
 
 
 def _coarse(spectra: Spectra) -> Spectra:
@@ -104,20 +173,11 @@ def _coarse(spectra: Spectra) -> Spectra:
 
 @dataclass(frozen=True, slots=True)
 class Keyframes:
-    """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
-
-    `temperature` is the difference of correlation that matters, `floor_m` the standard deviation
-    of a position at best, `yaw_std` that of a heading, `factor` what the variances of positions
-    lack, `lowest` the correlation of a known place; all learnt from keyframes left out.
-    """
+    """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map."""
 
     textures: NDArray[np.int8]
     poses: Array
-    temperature: float
-    floor_m: float
-    yaw_std: float
-    factor: float
-    lowest: float
+    noise: MatchNoise
     clockwise: bool
     spectra: Spectra
     coarse: Spectra
@@ -125,54 +185,44 @@ class Keyframes:
 
     @classmethod
     def of(
-        cls,
-        textures: NDArray[np.int8],
-        poses: Array,
-        numbers: tuple[float, float, float, float, float],
-        clockwise: bool,
+        cls, textures: NDArray[np.int8], poses: Array, noise: MatchNoise, clockwise: bool
     ) -> Keyframes:
-        """Keyframes ready to be matched."""
-        whole = np.stack([_normalized(t.astype(np.float32)) for t in textures])
-        spectra = _spectrum(whole)
-        coarse = np.ascontiguousarray(_coarse(spectra).transpose(2, 0, 1))
-        return cls(textures, poses, *numbers, clockwise, spectra, coarse, cKDTree(poses[:, :2]))
-
-    @classmethod
-    def fit(
-        cls, textures: Texture, poses: Array, path_m: Array, clockwise: bool = True
-    ) -> Keyframes:
-        """From textures (N, rows, columns) of training images, their poses (N, 3) in the map, and
-        the distance (N,) m driven until each, which must jump between drives.
-
-        Raises DataError for too few images.
-        """
-        if len(textures) < _NEIGHBORS:
+        """Keyframes ready to be matched. Raises DataError for too few."""
+        if len(textures) < NEIGHBORS:
             raise DataError(f'{len(textures)} images are too few for keyframes')
-        kept = _spread(poses)
-        deviation = np.maximum(np.std(textures[kept], axis=(1, 2), keepdims=True), 1e-6)
-        small = np.clip(np.rint(textures[kept] * (_STEPS / deviation)), -127, 127).astype(np.int8)
-        poses = np.asarray(poses[kept], float)
-        raw = cls.of(small, poses, _ASSUMED, clockwise)
-        return cls.of(small, poses, raw._calibrated(path_m[kept]), clockwise)
+        spectra = spectrum(np.stack([_normalized(t.astype(np.float32)) for t in textures]))
+        coarse = np.ascontiguousarray(_coarse(spectra).transpose(2, 0, 1))
+        return cls(textures, poses, noise, clockwise, spectra, coarse, cKDTree(poses[:, :2]))
 
-    def match(self, panorama: Image) -> Match:
-        """Find a panorama (H, W, 3) uint8 BGR among the keyframes: the likeliest by a coarse
-        correlation, these and the neighbors of the best of them by the full one.
+    def match(self, panorama: Image, guess: Array | None = None) -> Match:
+        """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
+        estimate of its place.
+
+        The likeliest by a coarse correlation, their best's neighbors and those of the guess are
+        correlated in full.
         """
-        spectrum = _spectrum(texture(panorama))[None]
+        image = spectrum(texture(panorama))[None]
         scores = np.full(len(self.poses), -np.inf, np.float32)
         shifts = np.zeros(len(self.poses), np.float32)
-        for _ in range(2):
-            if np.isfinite(scores).any():
-                wanted = self._neighbors(int(scores.argmax()))
-            else:
-                wanted = self._candidates(spectrum)
-            wanted = wanted[np.isneginf(scores[wanted])]
-            if len(wanted):
-                scores[wanted], shifts[wanted] = (
-                    part[0] for part in self._correlated(spectrum, self.spectra[wanted])
-                )
-        return self._located(scores, shifts)
+        wanted = [self._candidates(image)]
+        if guess is not None:
+            wanted.append(self.nearest(guess))
+        self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
+        self._add(image, self.nearest(self.poses[int(scores.argmax()), :2]), scores, shifts)
+        return self.located(scores, shifts, guess)
+
+    def _add(
+        self,
+        image: Spectra,
+        wanted: NDArray[np.int64],
+        scores: NDArray[np.float32],
+        shifts: NDArray[np.float32],
+    ) -> None:
+        """Fill in what is still missing of the wanted keyframes' correlations."""
+        wanted = wanted[np.isneginf(scores[wanted])]
+        if len(wanted):
+            found, shift = self.correlate(image, self.spectra[wanted])
+            scores[wanted], shifts[wanted] = found[0], shift[0]
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
         """The keyframes that are likeliest by the coarse structure of the image."""
@@ -182,12 +232,11 @@ class Keyframes:
         number = min(_CANDIDATES, len(scores))
         return np.sort(np.argpartition(-scores, number - 1)[:number])
 
-    def _neighbors(self, best: int) -> NDArray[np.int64]:
-        """The keyframes nearest to one, itself first."""
-        number = min(_NEIGHBORS, len(self.poses))
-        return np.asarray(self.tree.query(self.poses[best, :2], number)[1], np.int64)
+    def nearest(self, place: Array) -> NDArray[np.int64]:
+        """The keyframes nearest to a place (2,) m."""
+        return np.asarray(self.tree.query(place, NEIGHBORS)[1], np.int64)
 
-    def _correlated(
+    def correlate(
         self, spectra: Spectra, keyframes: Spectra
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Largest correlation of T spectra (T, rows, F) with each of K, (T, K), and the shift of
@@ -203,24 +252,36 @@ class Keyframes:
         part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
         return middle, np.asarray(top + part, np.float32)
 
-    def _located(self, scores: NDArray[np.float32], shifts: NDArray[np.float32]) -> Match:
+    def located(
+        self,
+        scores: NDArray[np.float32],
+        shifts: NDArray[np.float32],
+        guess: Array | None = None,
+    ) -> Match:
+        """The match of correlations (K,), -inf where unknown, and shifts (K,) of the columns."""
         best = int(scores.argmax())
         place = self._top_of_surface(scores, best)
-        sign = -1.0 if self.clockwise else 1.0
-        yaw = self.poses[best, 2] + sign * shifts[best] * 2 * np.pi / self.textures.shape[2]
-        scatter, weight = self._scatter(scores, place, self.temperature)
+        turn = (-2 if self.clockwise else 2) * np.pi / self.textures.shape[2]
+        yaws = self.poses[:, 2] + turn * shifts
+        weight = self.likelihood(scores, self.noise.temperature)
         covariance = np.zeros((3, 3))
-        covariance[:2, :2] = self.factor * (scatter + self.floor_m**2 * np.eye(2))
-        yaws = self.poses[:, 2] + sign * shifts * 2 * np.pi / self.textures.shape[2]
-        covariance[2, 2] = self.yaw_std**2 + float(weight @ wrap_angle(yaws - yaw) ** 2)
-        pose = np.array([*place, wrap_angle(yaw)])
-        score = float(scores[best])
-        return Match(pose, covariance, score, score >= self.lowest)
+        floor = self.noise.floor_m**2 * np.eye(2)
+        covariance[:2, :2] = self.noise.factor * (self.scatter(weight, place) + floor)
+        scattered = float(weight @ wrap_angle(yaws - yaws[best]) ** 2)
+        covariance[2, 2] = self.noise.yaw_std**2 + scattered
+        support = 0.0
+        if guess is not None:
+            near = scores[self.nearest(guess)]
+            near = near[np.isfinite(near)]
+            if len(near):
+                support = float(near.max() - scores[best]) / self.noise.temperature
+        pose = np.array([*place, wrap_angle(yaws[best])])
+        return Match(pose, covariance, float(scores[best]), support)
 
     def _top_of_surface(self, scores: NDArray[np.float32], best: int) -> Array:
         """Top of the paraboloid through the correlations with the neighbors of the best."""
         center = self.poses[best, :2]
-        near = self._neighbors(best)
+        near = self.nearest(center)
         near = near[np.isfinite(scores[near])]
         offset = self.poses[near, :2] - center
         square = (offset**2).sum(1)
@@ -233,88 +294,25 @@ class Keyframes:
         step = solution[1:3] / solution[3]
         return np.asarray(center + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9)))
 
-    def _scatter(
-        self, scores: NDArray[np.float32], place: Array, temperature: float
-    ) -> tuple[Array, Array]:
-        """Covariance (2, 2) about a place of the keyframes by how likely each is, and that (K,)."""
+    def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
+        """How likely each keyframe is the place, (K,) of sum 1."""
         weight = np.exp((scores - scores.max()) / temperature, dtype=np.float64)
-        weight /= weight.sum()
+        return np.asarray(weight / weight.sum())
+
+    def scatter(self, weight: Array, place: Array) -> Array:
+        """Covariance (2, 2) m^2 of the keyframes' places about one, by weight (K,)."""
         offset = self.poses[:, :2] - place
-        return (offset * weight[:, None]).T @ offset, weight
-
-    def _calibrated(self, path_m: Array) -> tuple[float, float, float, float, float]:
-        """Temperature, floor and yaw's standard deviation that suit keyframes left out best.
-
-        A keyframe is matched with all but those from the same stretch of driving.
-        """
-        errors, yaws, scatters, correlations = [], [], [], []
-        sample = np.unique(np.linspace(0, len(self.poses) - 1, _TRIALS).round().astype(np.int64))
-        for start in range(0, len(sample), _ROWS_AT_ONCE):
-            rows = sample[start : start + _ROWS_AT_ONCE]
-            scores, shifts = self._correlated(self.spectra[rows], self.spectra)
-            for row, score, shift in zip(rows.tolist(), scores, shifts, strict=True):
-                score[np.abs(path_m - path_m[row]) < _FAR_M] = -np.inf
-                match = self._located(score, shift) if np.isfinite(score).any() else None
-                if match is None or match.score < _KNOWN:
-                    continue
-                correlations.append(match.score)
-                place = match.pose[:2]
-                errors.append(float(((place - self.poses[row, :2]) ** 2).sum()))
-                yaws.append(abs(float(wrap_angle(match.pose[2] - self.poses[row, 2]))))
-                scatters.append(
-                    [np.trace(self._scatter(score, place, t)[0]) / 2 for t in _TEMPERATURES]
-                )
-        if len(errors) < _NEIGHBORS:
-            return _ASSUMED
-        squared, variances = np.array(errors), np.array(scatters)
-        at, floor = _likeliest(squared, variances)
-        ratio = squared / (variances[:, at] + floor**2)
-        factor = max(needed_factor(ratio, 2, np.ones(len(ratio))), 1.0)
-        yaw_std = max(1.4826 * float(np.median(yaws)), 1e-3)
-        lowest = max(_KNOWN, _KNOWN_SHARE * float(np.median(correlations)))
-        return float(_TEMPERATURES[at]), floor, yaw_std, factor, lowest
+        return np.asarray((offset * weight[:, None]).T @ offset)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle."""
-        learnt = self.temperature, self.floor_m, self.yaw_std, self.factor, self.lowest
-        numbers = [*learnt, float(self.clockwise)]
-        return {'textures': self.textures, 'poses': self.poses, 'numbers': np.array(numbers)}
+        noise = np.array([*dataclasses.astuple(self.noise), float(self.clockwise)])
+        return {'textures': self.textures, 'poses': self.poses, 'noise': noise}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Keyframes:
-        """Read what `to_arrays` gave."""
-        *numbers, clockwise = (float(n) for n in np.asarray(arrays['numbers'], float))
-        textures, poses = (
-            np.asarray(arrays['textures'], np.int8),
-            np.asarray(arrays['poses'], float),
-        )
-        temperature, floor_m, yaw_std, factor, lowest = numbers
-        learnt = (temperature, floor_m, yaw_std, factor, lowest)
-        return cls.of(textures, poses, learnt, bool(clockwise))
-
-
-def _spread(poses: Array) -> NDArray[np.int64]:
-    """At most _MOST images, spread over the ground: of each cell of a grid the first ones."""
-    if len(poses) <= _MOST:
-        return np.arange(len(poses))
-    extent = np.ptp(poses[:, :2], axis=0)
-    cell = float(np.sqrt(extent[0] * extent[1] / _MOST)) / 4
-    places = np.floor(poses[:, :2] / max(cell, 1e-6)).astype(np.int64)
-    rank = np.zeros(len(poses), np.int64)
-    seen: dict[tuple[int, int], int] = {}
-    for i, (x, y) in enumerate(places.tolist()):
-        rank[i] = seen[x, y] = seen.get((x, y), -1) + 1
-    return np.sort(np.argsort(rank, kind='stable')[:_MOST])
-
-
-def _likeliest(squared_errors: Array, scatters: Array) -> tuple[int, float]:
-    """Number of the temperature, and floor m, under which errors (M,) are likeliest."""
-    best, found = np.inf, (0, float(_FLOORS_M[0]))
-    for column in range(len(_TEMPERATURES)):
-        for floor in _FLOORS_M:
-            variance = scatters[:, column] + floor**2
-            tails = (_HEAVY_TAIL + 2) / 2 * np.log1p(squared_errors / (variance * _HEAVY_TAIL))
-            surprise = float(np.mean(tails + np.log(variance)))
-            if surprise < best:
-                best, found = surprise, (column, float(floor))
-    return found
+        """Read the arrays of `to_arrays`."""
+        *noise, clockwise = (float(n) for n in np.asarray(arrays['noise'], float))
+        textures = np.asarray(arrays['textures'], np.int8)
+        poses = np.asarray(arrays['poses'], float)
+        return cls.of(textures, poses, MatchNoise(*noise), bool(clockwise))

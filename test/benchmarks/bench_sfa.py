@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import psutil
 from scipy import linalg
+from sfa_localization.features.novelty import Novelty, describe
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError
@@ -41,7 +42,6 @@ from sfa_localization.features.network_training import (
     shards_of,
     train_network,
 )
-from sfa_localization.features.novelty import Novelty, describe
 from sfa_localization.features.sfa import Statistics, solve
 from sfa_localization.metric.compass import Compass, kernel_between
 from sfa_localization.metric.compass_training import (
