@@ -104,10 +104,6 @@ class PlaceModel:
     _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
-    def has_heading(self) -> bool:
-        return self.compass is not None
-
-    @property
     def camera_delay_s(self) -> float:
         """Delay of the image stamps in the training drives; 0 where unknown."""
         known = [delay for delay in self.quality.get('camera_delay_s', ()) if delay is not None]
@@ -138,12 +134,11 @@ class PlaceModel:
         yaw, yaw_variance = self._headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
-        views = zip(
-            panoramas, slow, positions, yaw, _joined(covariances, yaw_variance), strict=True
-        )
+        joined = _joined(covariances, yaw_variance)
+        matches = map(self._matched, panoramas, positions)
         return [
-            View(*view, self._matched(panorama, view[1]), self.keyframes.noise)
-            for panorama, *view in views
+            View(slow[t], positions[t], float(yaw[t]), joined[t], match, self.keyframes.noise)
+            for t, match in enumerate(matches)
         ]
 
     def _matched(self, panorama: Image, guess: Array) -> Match:

@@ -37,6 +37,7 @@ _DARKEST, _FLATTEST = 8.0, 0.1
 _STEPS = 127 / 4.0  # for a standard deviation
 NEIGHBORS = 24
 """Keyframes about a place whose correlations make its surface."""
+_FEWEST = 6  # numbers of a paraboloid
 _REACH_SHARE = 0.6  # of the distance to the farthest of them: width of the weights
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
 _COARSE, _CANDIDATES = 15, 64
@@ -188,7 +189,7 @@ class Keyframes:
         cls, textures: NDArray[np.int8], poses: Array, noise: MatchNoise, clockwise: bool
     ) -> Keyframes:
         """Keyframes ready to be matched. Raises DataError for too few."""
-        if len(textures) < NEIGHBORS:
+        if len(textures) < _FEWEST:
             raise DataError(f'{len(textures)} images are too few for keyframes')
         spectra = spectrum(np.stack([_normalized(t.astype(np.float32)) for t in textures]))
         coarse = np.ascontiguousarray(_coarse(spectra).transpose(2, 0, 1))
@@ -234,7 +235,7 @@ class Keyframes:
 
     def nearest(self, place: Array) -> NDArray[np.int64]:
         """The keyframes nearest to a place (2,) m."""
-        return np.asarray(self.tree.query(place, NEIGHBORS)[1], np.int64)
+        return np.asarray(self.tree.query(place, min(NEIGHBORS, len(self.poses)))[1], np.int64)
 
     def correlate(
         self, spectra: Spectra, keyframes: Spectra
