@@ -175,10 +175,10 @@ def fitting_config(
 
 
 def _told_variance(positions: Table) -> float:
-    """Median of the variances that are told; 0 when none is."""
-    told = positions.columns.get('var_x', np.zeros(0))
-    told = told[np.isfinite(told) & (told > 0)]
-    return float(np.median(told)) if len(told) else 0.0
+    """Median of the variances in the table; 0 without any."""
+    variances = positions.columns.get('var_x', np.zeros(0))
+    variances = variances[np.isfinite(variances) & (variances > 0)]
+    return float(np.median(variances)) if len(variances) else 0.0
 
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:

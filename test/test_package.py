@@ -45,7 +45,7 @@ ROS = {
 }
 # The rooms: which other rooms each may import (always its own), and which packages beyond the
 # standard library. A module belongs to its folder, or is a room of its own; there is no
-# default, so a new one must be added here, and to the picture and the table of CONTRIBUTING.
+# default, so a new one must be added here, and to the diagram and the table of CONTRIBUTING.
 NUMERIC = {'numpy', 'scipy'}
 CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
@@ -191,9 +191,9 @@ def test_contributing_shows_the_same_rooms_and_arrows():
     assert {name: set(re.findall(r'`(\w+)`', others)) for name, others in rows} == {
         name: others for name, (others, _packages) in ROOMS.items()
     }
-    picture = text.split('```')[1]
+    diagram = text.split('```')[1]
     assert [
-        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', picture)
+        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', diagram)
     ] == []
 
 
