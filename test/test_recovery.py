@@ -13,6 +13,7 @@ from sfa_localization.fusion.belief import LARGEST_STD_M, Evidence, PoseEvent, U
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.evidence import Relocation, consistent, relocate, remember
 from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.recover import Recovery, displaced, outweighs, shows_heading
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, status_of
@@ -53,6 +54,22 @@ def seen_along(positions, yaw=math.nan, std=0.1, traveled=None, accepted=False):
     )
 
 
+# The belief before the first message.
+
+
+def test_before_any_image_bias_and_scale_are_those_of_cheap_sensors():
+    """100 m in 10 s with exact odometry: 3 % of the distance, and 0.01 rad/s of the time."""
+    exact = FilterConfig(slip_per_metre=0.0, yaw_per_radian=0.0)
+    fused = PoseFilter(exact, CORRELATION)
+    fused.set_pose(SECOND, np.zeros(3), 1e-8 * np.eye(3))
+    for stamp_ns in range(SECOND, 11 * SECOND + 1, SECOND // 10):
+        fused.add_odometry(stamp_ns, 10.0, 0.0, (1e-6, 1e-6))
+    variance_x, _, variance_yaw = np.diag(fused.state.pose_covariance)
+    assert math.sqrt(variance_x) == pytest.approx(3.0, rel=0.02)
+    # YAW_PER_METER adds 0.005 rad per square root of a meter: 0.05 rad.
+    assert math.sqrt(variance_yaw - 0.05**2) == pytest.approx(0.1, rel=0.03)
+
+
 # Whether agreeing images outweigh the estimate.
 
 ESTABLISHED = {'support': 5}
@@ -66,7 +83,7 @@ NO_YAW = {'yaw_std': math.inf}
     ({'support': 2}, {'images': 3}, {'images': 2}),
     ({'support': 0}, {'images': 2}, {'images': 1}),
     # AGREEING_PER_ACCEPTED
-    (ESTABLISHED, {'contradicting': 1}, {'contradicting': 2}),
+    (ESTABLISHED, {'images': 6, 'contradicting': 2}, {'images': 5, 'contradicting': 2}),
     # START_YAW_STD
     (ESTABLISHED, {'covariance': 0.29**2 * np.eye(3)}, {'covariance': 0.31**2 * np.eye(3)}),
     # No more may disagree than agree.
