@@ -56,8 +56,9 @@ class ErrorCorrelation:
     ) -> ErrorCorrelation:
         """From errors (M, 2) m of images with predicted variances (M,) m^2 per axis.
 
-        `driven_m` (M,) is the distance driven before, `owner` (M,) the segment of each image; images
-        are compared inside one segment. Outliers are limited. With too few images the defaults.
+        `driven_m` (M,) is the distance driven before, `owner` (M,) the segment of each image:
+        images are compared inside one segment. Outliers are limited. With too few images the
+        defaults.
         """
         apart, product = _pairs(_standardized(errors, variances), driven_m, owner)
         if len(apart) < _ENOUGH_PAIRS:
