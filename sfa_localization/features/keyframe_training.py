@@ -76,8 +76,9 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
         best.append(match.score)
         errors.append(float(((match.pose - pose)[:2] ** 2).sum()))
         yaws.append(abs(float(wrap_angle(match.pose[2] - pose[2]))))
-        weights = (keyframes.likelihood(scores, t) for t in _TEMPERATURES)
-        scatters.append([np.trace(keyframes.scatter(w, match.pose[:2])) / 2 for w in weights])
+        known, place = np.flatnonzero(np.isfinite(scores)), match.pose[:2]
+        weights = (keyframes.likelihood(scores[known], t) for t in _TEMPERATURES)
+        scatters.append([np.trace(keyframes.scatter(w, known, place)) / 2 for w in weights])
     if len(errors) < NEIGHBORS:
         return MatchNoise()
     squared, variances = np.array(errors), np.array(scatters)

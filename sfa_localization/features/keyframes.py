@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.spatial import cKDTree
 
 from sfa_localization.data.errors import DataError
@@ -155,7 +156,7 @@ def _normalized(image: Texture) -> Texture:
 
 def spectrum(textures: Texture) -> Spectra:
     """Fourier coefficients of the columns, (..., rows, F)."""
-    return np.asarray(np.fft.rfft(textures, axis=-1), np.complex64)
+    return np.asarray(fft.rfft(textures, axis=-1), np.complex64)
 
 
 def quantized(textures: Texture) -> NDArray[np.int8]:
@@ -228,8 +229,7 @@ class Keyframes:
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
         """The keyframes that are likeliest by the coarse structure of the image."""
         products = self.coarse @ np.conj(_coarse(spectrum)).transpose(2, 1, 0)
-        curves = np.fft.irfft(products[:, :, 0].T, 2 * len(self.coarse), axis=1)
-        scores = curves.max(1)
+        scores = fft.irfft(products[:, :, 0].T, 2 * len(self.coarse), axis=1).max(1)
         number = min(_CANDIDATES, len(scores))
         return np.sort(np.argpartition(-scores, number - 1)[:number])
 
@@ -245,7 +245,7 @@ class Keyframes:
         """
         columns = self.textures.shape[2]
         products = keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0)
-        curves = np.fft.irfft(products.transpose(2, 1, 0), columns, axis=2).astype(np.float32)
+        curves = fft.irfft(products.transpose(2, 1, 0), columns, axis=2)
         top = curves.argmax(2)
         t, k = np.ogrid[: len(spectra), : len(keyframes)]
         left, middle, right = (curves[t, k, (top + step) % columns] for step in (-1, 0, 1))
@@ -260,15 +260,17 @@ class Keyframes:
         guess: Array | None = None,
     ) -> Match:
         """The match of correlations (K,), -inf where unknown, and shifts (K,) of the columns."""
-        best = int(scores.argmax())
+        best, known = int(scores.argmax()), np.flatnonzero(np.isfinite(scores))
         place = self._top_of_surface(scores, best)
         turn = (-2 if self.clockwise else 2) * np.pi / self.textures.shape[2]
-        yaws = self.poses[:, 2] + turn * shifts
-        weight = self.likelihood(scores, self.noise.temperature)
+        yaws = self.poses[known, 2] + turn * shifts[known]
+        yaw = float(self.poses[best, 2] + turn * shifts[best])
+        weight = self.likelihood(scores[known], self.noise.temperature)
         covariance = np.zeros((3, 3))
         floor = self.noise.floor_m**2 * np.eye(2)
-        covariance[:2, :2] = self.noise.factor * (self.scatter(weight, place) + floor)
-        scattered = float(weight @ wrap_angle(yaws - yaws[best]) ** 2)
+        scatter = self.scatter(weight, known, place)
+        covariance[:2, :2] = self.noise.factor * (scatter + floor)
+        scattered = float(weight @ wrap_angle(yaws - yaw) ** 2)
         covariance[2, 2] = self.noise.yaw_std**2 + scattered
         support = 0.0
         if guess is not None:
@@ -276,7 +278,7 @@ class Keyframes:
             near = near[np.isfinite(near)]
             if len(near):
                 support = float(near.max() - scores[best]) / self.noise.temperature
-        pose = np.array([*place, wrap_angle(yaws[best])])
+        pose = np.array([*place, wrap_angle(yaw)])
         return Match(pose, covariance, float(scores[best]), support)
 
     def _top_of_surface(self, scores: NDArray[np.float32], best: int) -> Array:
@@ -296,13 +298,13 @@ class Keyframes:
         return np.asarray(center + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9)))
 
     def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
-        """How likely each keyframe is the place, (K,) of sum 1."""
+        """How likely each keyframe is the place, of sum 1, by its correlation."""
         weight = np.exp((scores - scores.max()) / temperature, dtype=np.float64)
         return np.asarray(weight / weight.sum())
 
-    def scatter(self, weight: Array, place: Array) -> Array:
-        """Covariance (2, 2) m^2 of the keyframes' places about one, by weight (K,)."""
-        offset = self.poses[:, :2] - place
+    def scatter(self, weight: Array, rows: NDArray[np.int64], place: Array) -> Array:
+        """Covariance (2, 2) m^2 of the places of keyframes `rows` about one, by weight."""
+        offset = self.poses[rows, :2] - place
         return np.asarray((offset * weight[:, None]).T @ offset)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
