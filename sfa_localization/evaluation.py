@@ -79,8 +79,8 @@ class _Replay:
     """What model and filter make of a drive, in the map frame.
 
     `sfa` (N, 3) poses of the usable images, of which `features` (N, K) are; `ekf` (T, 3) the
-    filter's at each odometry message, and whether it was LOCALISED there, `sure` (T,); `covariances`
-    (N, 3, 3) and (T, 3, 3) of both; `counts` of messages, observations and states.
+    filter's at each odometry message, and whether it was LOCALISED there, `sure` (T,);
+    `covariances` (N, 3, 3) and (T, 3, 3) of both; `counts` of messages, observations and states.
     """
 
     run: Run
