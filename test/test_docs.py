@@ -275,7 +275,16 @@ def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launched)
     for node in launched:
         _file, given = node['parameters']
         assert set(given) <= parameters()
-        assert {source for source, _ in node['remappings']} <= topics() | {'image_raw', 'odom'}
+        known = topics() | {'image_raw', 'odom', '/tf'}
+        assert {source for source, _ in node['remappings']} <= known
+
+
+def test_the_launched_transform_is_in_the_namespace_unless_asked(actions, launched):
+    """Two robots whose frames have the same names must not meet on /tf; Nav2 looks there too."""
+    given = {a.given[0]: a.named for a in actions if type(a).__name__ == 'DeclareLaunchArgument'}
+    assert given['tf']['default_value'] == 'tf'
+    (target,) = (to for name, to in launched[-1]['remappings'] if name == '/tf')
+    assert target.given == ('tf',)
 
 
 def test_package_manifest_is_of_format_3():

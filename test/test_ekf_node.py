@@ -36,6 +36,7 @@ from sfa_localization.nodes.conversions import (  # noqa: E402
     to_error_correlation,
     to_odometry,
     to_pose_with_covariance,
+    to_turned,
 )
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
@@ -371,8 +372,8 @@ def test_diagnostics_hold_rates_latencies_and_counts(bench):
     assert until(lambda: told().get('odometry: used') == '50')
     values = told()
     assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localized'
-    assert values['odom: received'] == '50' and float(values['odom: rate [Hz]']) > 0
-    assert float(values['odom: latency p99 [ms]']) >= float(values['odom: latency p50 [ms]']) > 0
+    assert values['/odom: received'] == '50' and float(values['/odom: rate [Hz]']) > 0
+    assert float(values['/odom: latency p99 [ms]']) >= float(values['/odom: latency p50 [ms]']) > 0
     assert 'measurement: accepted' in values and 'position std [m]' in values
 
 
@@ -381,8 +382,8 @@ def test_silence_is_told_without_any_clock_moving(bench):
     node = bench.run(EkfNode, silence_timeout=0.2)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive)
-    assert until(lambda: any(s.data.startswith('DEGRADED: nothing on odom') for s in states))
-    assert until(lambda: any(f'nothing on {IMAGE_POSE}' in s.data for s in states))
+    assert until(lambda: any(s.data.startswith('DEGRADED: nothing on /odom') for s in states))
+    assert until(lambda: any(f'nothing on /{IMAGE_POSE}' in s.data for s in states))
 
 
 def test_what_nothing_moves_on_is_lost_in_the_end_by_the_wall_clock(bench):
@@ -500,6 +501,16 @@ def test_the_models_error_correlation_is_what_an_offline_filter_uses(bench):
         told[name] = fused.state.position_std
     assert node._filter.state.position_std == pytest.approx(told['knows'], rel=1e-3)
     assert told['knows'] < 0.9 * told['ignores']
+
+
+def test_turns_of_images_reach_the_filter(bench, monkeypatch):
+    """They show how late images are stamped."""
+    taken = []
+    monkeypatch.setattr(PoseFilter, 'add_turned', lambda _, *turned: taken.append(turned))
+    node = bench.run(EkfNode)
+    bench.publish('sfa/turned', to_turned(0.5, START_NS, 'first_image'))
+    assert until(lambda: node.monitor('sfa/turned').used == 1), node.monitor('sfa/turned').refused
+    assert taken == [(START_NS, pytest.approx(0.5))]
 
 
 @pytest.mark.parametrize('numbers', [[], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]])

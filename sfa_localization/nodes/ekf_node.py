@@ -176,7 +176,7 @@ class EkfNode(LocalizationNode):
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self._filter.add_measurement(stamp_ns, pose, covariance)
-        self._verdict.publish(_verdict(update))
+        self._verdict.publish(_verdict(update, self.status_name('measurement')))
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
@@ -282,7 +282,7 @@ class EkfNode(LocalizationNode):
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
             silent = self.monitor(topic).silent_for_s()
             if math.isfinite(silent) and silent > limit:
-                added.append(f'nothing on {topic} for {silent:.0f} s')
+                added.append(f'nothing on {self.shown(topic)} for {silent:.0f} s')
         if self._paused:
             added.append('paused: images are not fused')
         level = status.level
@@ -339,10 +339,10 @@ class EkfNode(LocalizationNode):
         return _LEVELS[status.level], '; '.join(status.reasons) or 'localized', values
 
 
-def _verdict(update: Update) -> DiagnosticArray:
+def _verdict(update: Update, name: str) -> DiagnosticArray:
     """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
     level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
-    status = DiagnosticStatus(level=level, name='ekf_node: measurement', message=update.reason)
+    status = DiagnosticStatus(level=level, name=name, message=update.reason)
     status.values = [
         KeyValue(key='accepted', value=str(update.accepted).lower()),
         KeyValue(key='d2', value=_number(update.d2)),
