@@ -213,6 +213,9 @@ def test_nav2_uses_our_frames():
     frames = EkfNodeConfig()
     assert navigator['global_frame'] == frames.map_frame
     assert navigator['robot_base_frame'] == frames.base_frame
+    monitor = settings['collision_monitor']['ros__parameters']
+    assert monitor['base_frame_id'] == frames.base_frame, "Nav2's default is base_footprint"
+    assert monitor['odom_frame_id'] == frames.odom_frame
 
 
 def test_nav2_plans_without_a_map():

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from filter_drives import START_NS, Drive
+from transform_buffer import TransformBuffer
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose
@@ -110,9 +111,9 @@ def test_live_is_offline_and_stamps_are_the_inputs(bench):
     assert heard[-1].header.frame_id == 'map' and heard[-1].child_frame_id == 'base_link'
 
 
-def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench):
+def test_map_to_odom_makes_odometry_the_pose_in_the_map(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, initial_pose=[5.0, 0.0, 2.0], transform_tolerance=0.25)
+    node = bench.run(EkfNode, initial_pose=[5.0, 0.0, 2.0])
     heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
     told = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
@@ -122,7 +123,7 @@ def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench)
         map_to_odom = [t.translation.x, t.translation.y, read_yaw(t.rotation)]
         miss = compose(map_to_odom, drive.reckoned[i]) - pose_of(message)
         assert np.hypot(*miss[:2]) < 1e-9 and abs(math.remainder(miss[2], 2 * math.pi)) < 1e-9
-        assert read_stamp(transform.header.stamp) == int(drive.stamps_ns[i]) + 250_000_000
+        assert read_stamp(transform.header.stamp) == int(drive.stamps_ns[i])
         assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')
 
 
@@ -136,17 +137,30 @@ def test_the_transform_is_broadcast_where_tf2_msgs_is_installed(bench):
     assert heard[0].transforms[0].child_frame_id == 'odom'
 
 
-def test_the_broadcast_is_the_published_transform(bench, monkeypatch):
+@pytest.mark.parametrize('tolerance_s', [0.1, 0.25, 0.0])
+def test_a_lookup_in_tf_is_the_pose_of_ekf_odometry_and_there_is_one_ahead(
+    bench, monkeypatch, tolerance_s
+):
+    """Images correct the pose; at odometry's 50 Hz, 0.1 s is a whole number of its periods."""
+    drive = Drive(seconds=4, **NOISY)
+    node = bench.run(EkfNode, initial_pose=[0.3, -0.3, 0.1], transform_tolerance=tolerance_s)
     # tf2_msgs is not in the pip wheels: what would go to /tf is caught here instead.
-    drive = Drive(seconds=0.2)
-    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     monkeypatch.setattr(ekf_node, 'TFMessage', lambda transforms: transforms)
-    sent = []
-    node._tf = type('Publisher', (), {'publish': lambda self, message: sent.append(message)})()
-    heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
+    buffer = TransformBuffer()
+    node._tf = type('Publisher', (), {'publish': lambda _, sent: buffer.add(sent)})()
+    told = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive)
-    assert until(lambda: len(heard) == len(sent) == 10)
-    assert [message[0] for message in sent] == heard
+    assert until(lambda: len(told) == len(drive.stamps_ns))
+    corrections = []
+    for i, message in enumerate(told):
+        found = buffer.lookup(int(drive.stamps_ns[i]))
+        miss = compose(found, drive.reckoned[i]) - pose_of(message)
+        assert np.hypot(*miss[:2]) < 1e-6 and abs(math.remainder(miss[2], 2 * math.pi)) < 1e-6
+        corrections.append(found)
+    assert np.ptp(np.array(corrections), axis=0)[:2].max() > 0.1, 'nothing was corrected'
+    ahead_ns = int(drive.stamps_ns[-1]) + round(tolerance_s * 1e9)
+    assert np.allclose(buffer.lookup(ahead_ns), corrections[-1], atol=0.1)
+    assert buffer.newest_ns - ahead_ns in (0, 500)
 
 
 def test_without_tf2_msgs_the_node_runs_and_says_so(bench, monkeypatch):

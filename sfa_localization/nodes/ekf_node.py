@@ -25,12 +25,13 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.geometry import compose, invert
+from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
+from sfa_localization.nodes.broadcast import Broadcast
 from sfa_localization.nodes.conversions import (
     Motion,
     read_error_correlation,
@@ -86,6 +87,7 @@ class EkfNode(LocalizationNode):
         self._config = self.settings(EkfNodeConfig)
         self._filter = PoseFilter(self.settings(FilterConfig))
         self._paused = False
+        self._broadcast = Broadcast()
         self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_ns = 0
         self._frames = self._config.odom_frame, self._config.base_frame
@@ -230,6 +232,7 @@ class EkfNode(LocalizationNode):
 
     def _forget(self) -> None:
         self._filter.reset()
+        self._broadcast.reset()
         self._path.clear()
 
     # Outputs.
@@ -246,12 +249,17 @@ class EkfNode(LocalizationNode):
                 (frame, self._frames[1]),
             )
         )
-        map_to_odom = compose(state.pose, invert(motion.pose))
-        stamp_ns = motion.stamp_ns + round(self._config.transform_tolerance * 1e9)
-        transform = to_transform(map_to_odom, stamp_ns, (frame, self._frames[0]))
-        self._transform.publish(transform)
+        self._publish_transform(motion.stamp_ns, compose(state.pose, invert(motion.pose)))
+
+    def _publish_transform(self, stamp_ns: int, map_to_odom: Array) -> None:
+        """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
+        frames = self._config.map_frame, self._frames[0]
+        self._transform.publish(to_transform(map_to_odom, stamp_ns, frames))
         if self._tf is not None:
-            self._tf.publish(TFMessage(transforms=[transform]))
+            ahead_ns = round(self._config.transform_tolerance * 1e9)
+            dated = self._broadcast.add(stamp_ns, map_to_odom, ahead_ns)
+            transforms = [to_transform(pose, at_ns, frames) for at_ns, pose in dated]
+            self._tf.publish(TFMessage(transforms=transforms))
 
     def _publish_pose(self, stamp_ns: int) -> None:
         """Publish the estimate at the stamp of an image."""
