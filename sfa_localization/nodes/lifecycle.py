@@ -245,7 +245,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         except InvalidHandle:
             raise
         except Exception as error:
-            self._defect(name, error)  # a node must outlive any message
+            if self.context.ok():  # after a signal nothing can be published
+                self._defect(name, error)  # a node must outlive any message
         else:
             return True
         return False
@@ -378,5 +379,7 @@ def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
         try:
             executor.spin()
         except rclpy_implementation.RCLError as error:
-            # Asking a lifecycle node for a transition that its state does not have ends here.
-            node.get_logger().error(f'request refused: {error}')
+            # Asking a lifecycle node for a transition that its state does not have ends here, and
+            # so does a signal at some moments.
+            if rclpy.ok():
+                node.get_logger().error(f'request refused: {error}')
