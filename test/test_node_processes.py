@@ -114,9 +114,13 @@ def signalled(self):
 EkfNode.setup = signalled
 """,
     'made': """
-import os, signal
 from sfa_localization.nodes.ekf_node import EkfNode
-EkfNode.start = lambda self: (os.kill(os.getpid(), signal.SIGINT), False)[1]
+def signalled(self):
+    send()
+    while self.context.ok():
+        pass
+    return False
+EkfNode.start = signalled
 """,
     'publishing': """
 from sfa_localization.nodes.ekf_node import EkfNode
@@ -202,7 +206,8 @@ def test_a_parameter_file_for_another_namespace_is_warned_of(start, tmp_path, ke
     document = {key: {'ekf_node': section} if key == 'robot1' else section}
     path.write_text(yaml.safe_dump(document))
     arguments = ['--params-file', str(path), '-r', '__ns:=/robot1']
-    process = start('ekf_node', arguments=arguments, before=MOMENTS['made'])
+    before = SEND.format('SIGINT') + MOMENTS['made']
+    process = start('ekf_node', arguments=arguments, before=before)
     _, told = process.communicate(timeout=30)
     assert process.returncode == 0, told
     warned = f'{path}: nothing of {key} is used: this node is /robot1/ekf_node'
