@@ -216,6 +216,9 @@ def test_nav2_uses_our_frames():
     monitor = settings['collision_monitor']['ros__parameters']
     assert monitor['base_frame_id'] == frames.base_frame, "Nav2's default is base_footprint"
     assert monitor['odom_frame_id'] == frames.odom_frame
+    for node in ('bt_navigator', 'controller_server'):
+        topic = settings[node]['ros__parameters']['odom_topic']
+        assert topic == 'odom', 'an absolute topic would be that of another robot'
 
 
 def test_nav2_plans_without_a_map():
