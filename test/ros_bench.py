@@ -65,6 +65,8 @@ class Bench:
             publisher = self.node.create_publisher(type(message), topic, qos or 1000)
             self._publishers[topic] = publisher
             assert until(lambda: publisher.get_subscription_count() > 0), f'nobody hears {topic}'
+            # The subscription knows the publisher a moment later; best effort, it would miss one.
+            time.sleep(0.1)
         self._publishers[topic].publish(message)
 
     def call(self, kind, name, request):

@@ -103,8 +103,7 @@ class SfaNode(LocalizationNode):
             model.locate(np.zeros((size.height, size.width, 3), np.uint8))
         except Exception as error:  # arrays that do not fit each other fail in many ways
             raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
-        heading = 'with heading' if model.has_heading else 'without heading'
-        self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}, {heading}')
+        self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}')
         return model
 
     def _check_model(self, changes: list[Parameter]) -> SetParametersResult:
