@@ -45,9 +45,9 @@ class Bench:
         with contextlib.suppress(ExternalShutdownException):
             self.executor.spin()
 
-    def run(self, kind, start=True, **overrides):
+    def run(self, kind, start=True, *, options=None, **overrides):
         values = [Parameter(name, value=value) for name, value in overrides.items()]
-        node = kind(context=self.context, parameter_overrides=values)
+        node = kind(context=self.context, parameter_overrides=values, **(options or {}))
         self.nodes.append(node)
         if start:
             assert node.start(), node.failure

@@ -270,7 +270,7 @@ def test_waiting_for_images_is_reported(bench, models):
     told = bench.listen(DiagnosticArray, '/diagnostics')
     assert until(lambda: told and 'waiting for images' in told[-1].status[0].message)
     bench.publish('panorama', message())
-    assert until(lambda: 'no image on panorama for' in told[-1].status[0].message)
+    assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
 # What the node says is what it does, in any state.
