@@ -18,6 +18,7 @@ import yaml
 
 from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError, ConfigError
+from sfa_localization.data.files import read_regular
 
 _KNOWN = (
     'known are camera_info, OpenCV, Kalibr and camodocal YAML, OCamCalib calib_results.txt, and '
@@ -36,6 +37,8 @@ _OF_MODEL = {
     'polar': ('angle_min', 'angle_max'),
     'dual_fisheye': ('fx', 'fy', 'distortion', 'second_cx', 'second_cy', 'second_roll'),
 }
+LARGEST_FILE = 1 << 20
+"""Bytes of a calibration file: hundreds of times the largest."""
 _HEAD = """\
 # Calibration of an omnidirectional camera; parameters of omnicam_node that go with it:
 #   calibration_file: name of this file
@@ -66,7 +69,7 @@ def read_calibration(path: Path) -> LensCalibration:
     model that is not supported.
     """
     try:
-        text = path.read_text(encoding='utf-8', errors='replace')
+        text = read_regular(path, LARGEST_FILE).decode('utf-8', errors='replace')
     except OSError as error:
         raise CameraError(f'{path}: {error.strerror or error}') from None
     try:
