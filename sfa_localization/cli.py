@@ -26,6 +26,8 @@ COMMANDS = {
     'config': 'Write the parameter file of nodes and trainer: every parameter, explained.',
     'demo': 'Simulate, train, run the three nodes live, and print their errors (about 5 minutes).',
 }
+LONGEST_ERROR = 4000
+"""Characters of an error: the last lines of a program that failed, or a list of topics."""
 NODES = {
     'omnicam_node': 'ROS 2 node: camera images to panoramas (--ros-args -p NAME:=VALUE).',
     'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
@@ -88,6 +90,12 @@ def _overview() -> argparse.ArgumentParser:
     return parser
 
 
+def _shortened(text: str) -> str:
+    """The text, with the middle left out where it quotes a long one."""
+    half = LONGEST_ERROR // 2
+    return text if len(text) <= LONGEST_ERROR else f'{text[:half]} ... {text[-half:]}'
+
+
 def guarded(run: Callable[[], int]) -> int:
     """Turn expected errors into one line and exit code 1, Ctrl-C into 130."""
     try:
@@ -99,7 +107,7 @@ def guarded(run: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except LocalizationError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print(f'error: {_shortened(str(error))}', file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]

@@ -21,6 +21,8 @@ from sfa_localization.camera.settings import (
 )
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.files import atomic_write
+from sfa_localization.data.plain_yaml import LONGEST, load_yaml
+from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
@@ -108,18 +110,24 @@ def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f'{path}: cannot be read: {error}') from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
+        # Of a pipe too: a shell makes one of `--config <(COMMAND)`.
+        with path.open(encoding='utf-8') as file:
+            document = load_yaml(file.read(LONGEST + 1))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f'{path}: cannot be read: {error.reason}') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read: {error.strerror or error}') from None
+    except ValueError as error:
+        raise ConfigError(f'{path}: {error}') from None
     if document is None:
         return {}
     if not isinstance(document, dict):
         raise ConfigError(f'{path}: must hold sections such as {", ".join(SECTIONS)}')
     for name in document:
         if str(name).lstrip('/') not in SECTIONS and name != _ALL_NODES:
-            raise ConfigError(f'{path}: unknown section {name!r}; known are {", ".join(SECTIONS)}')
+            raise ConfigError(
+                f'{path}: unknown section {quoted(name)}; known are {", ".join(SECTIONS)}'
+            )
     return document
 
 
@@ -138,7 +146,7 @@ def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[s
 def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
     for name in values:
         if name not in known and not _is_of_ros(name):
-            raise ConfigError(f'{where}: unknown parameter {name!r}{nearest(name, known)}')
+            raise ConfigError(f'{where}: unknown parameter {quoted(name)}{nearest(name, known)}')
 
 
 def _value(item: dataclasses.Field[Any], value: Any) -> Any:
@@ -151,7 +159,7 @@ def _value(item: dataclasses.Field[Any], value: Any) -> Any:
     if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)
-        except ValueError:
+        except (ValueError, OverflowError):
             return value
     return value
 

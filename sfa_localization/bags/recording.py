@@ -18,8 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
-import yaml
-
 from sfa_localization.bags import mcap as bag_mcap
 from sfa_localization.bags import ros1 as bag_ros1
 from sfa_localization.bags import sqlite as bag_sqlite
@@ -29,11 +27,11 @@ from sfa_localization.bags.storage import (
     Record,
     Storage,
     inflate_file,
-    load_yaml,
     make_channel,
     one_line,
 )
 from sfa_localization.data.errors import BagError
+from sfa_localization.data.plain_yaml import load_yaml
 
 METADATA = 'metadata.yaml'
 NEWEST_METADATA = 9
@@ -229,6 +227,6 @@ def parse_metadata(text: str) -> Metadata:
             channel = make_channel(*names, qos)
             metadata.channels.append(channel)
             metadata.counts[channel.topic] += int(entry['message_count'])
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(type(error).__name__) from None
     return metadata

@@ -8,17 +8,12 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol
 
-import yaml
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from sfa_localization.bags.zstd import ZstdError, decompressor
 from sfa_localization.data.errors import BagError
-
-try:
-    from yaml import CSafeLoader as YamlLoader
-except ImportError:  # PyYAML was built without libyaml
-    from yaml import SafeLoader as YamlLoader  # type: ignore[assignment]
+from sfa_localization.data.plain_yaml import load_yaml
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 PIECE = 1 << 20
@@ -73,11 +68,6 @@ def message_type(name: str) -> str:
     """Full name of a message type: older recorders leave out the 'msg' in the middle."""
     parts = name.split('/')
     return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else name
-
-
-def load_yaml(text: str) -> Any:
-    """Plain data from YAML, by libyaml where PyYAML was built with it. Raises yaml.YAMLError."""
-    return yaml.load(text, Loader=YamlLoader)
 
 
 def offered_qos(profiles: Any) -> tuple[Qos, ...]:
