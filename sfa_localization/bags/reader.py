@@ -25,7 +25,7 @@ from sfa_localization.bags.motion_arrays import (
 )
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.storage import Channel, Record, inflate_message
+from sfa_localization.bags.storage import Channel, Record, add_problem, inflate_message, room_for
 from sfa_localization.bags.topic_stream import Stream, Tally
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
@@ -263,14 +263,19 @@ class Bag:
 
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
         """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
+        packed_size = unpacked_size = 0
         for record in self.recording.messages(set(topics), start_ns):
             if record[2][:1] != ZSTD_START:
                 yield record
                 continue
+            packed_size += len(record[2])
             try:
-                yield record[0], record[1], inflate_message(record[2])
+                data = inflate_message(record[2], room_for(packed_size) - unpacked_size)
             except BagError as error:
-                self.recording.problems.append(f'{record[0].topic}: {error}')
+                add_problem(self.recording.problems, f'{record[0].topic}: {error}')
+                continue
+            unpacked_size += len(data)
+            yield record[0], record[1], data
 
     def _pushed(self, stream: Stream, record: Record) -> StampedValues:
         """Stamps and values that the stream yields after one more message."""
