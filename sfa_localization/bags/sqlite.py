@@ -112,7 +112,7 @@ class SqliteStorage:
         return {column[1] for column in columns}
 
     def _read_topics_if_cut_off(self) -> dict[int, Channel]:
-        """The topics, even of a file that is shorter than its header says."""
+        """The topics, even of a file that is shorter than its header states."""
         try:
             return self._read_topics()
         except sqlite3.DatabaseError as error:
