@@ -40,8 +40,33 @@ from sfa_localization.metric.expansions import MetricMap
 from sfa_localization.metric.fast_expansions import Predictor, fast_map
 
 FORMAT = 'sfa_localization place model'
-VERSION = 2
-_AGREEMENT = {'numbers': ArrayRule('3', positive=(1,))}
+VERSION = 3
+_AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
+_METRIC = [
+    {
+        'weights': ArrayRule('M2'),
+        'spread': ArrayRule('MR'),
+        'sway': ArrayRule('MS2'),
+        'noise_m': ArrayRule('', all_positive=True),
+        'inflation': ArrayRule('', all_positive=True),
+    }
+]
+_BASIS = [
+    {
+        'kind': ArrayRule('', 'U'),
+        'scale': ArrayRule('K'),
+        'points': ArrayRule('MK'),
+        'whiten': ArrayRule('MM'),
+        'noise': ArrayRule('', all_positive=True),
+    },
+    {
+        'kind': ArrayRule('', 'U'),
+        'center': ArrayRule('M'),
+        'turn': ArrayRule('MR'),
+        'ridge': ArrayRule('P'),
+        'features': ArrayRule('', 'i', all_positive=True),
+    },
+]
 SCHEMA: Schema = {
     'network/#/': [
         {
@@ -52,31 +77,8 @@ SCHEMA: Schema = {
             'delta': ArrayRule('T'),
         }
     ],
-    'metric/': [
-        {
-            'weights': ArrayRule('M2'),
-            'spread': ArrayRule('MR'),
-            'sway': ArrayRule('MS2'),
-            'noise_m': ArrayRule('', all_positive=True),
-            'inflation': ArrayRule('', all_positive=True),
-        }
-    ],
-    'metric/basis_': [
-        {
-            'kind': ArrayRule('', 'U'),
-            'scale': ArrayRule('K'),
-            'points': ArrayRule('MK'),
-            'whiten': ArrayRule('MM'),
-            'noise': ArrayRule('', all_positive=True),
-        },
-        {
-            'kind': ArrayRule('', 'U'),
-            'center': ArrayRule('M'),
-            'turn': ArrayRule('MR'),
-            'ridge': ArrayRule('P'),
-            'features': ArrayRule('', 'i', all_positive=True),
-        },
-    ],
+    'metric/': _METRIC,
+    'metric/basis_': _BASIS,
     'novelty/#/': [
         {
             'mean': ArrayRule('D'),
@@ -85,8 +87,8 @@ SCHEMA: Schema = {
             'scalars': ArrayRule('2', all_positive=True),
         }
     ],
-    'agreement/': [_AGREEMENT],
-    'yaw_agreement/': [_AGREEMENT],
+    'agreement/': _AGREEMENT,
+    'yaw_agreement/': _AGREEMENT,
     'compass/': [
         {
             'features': ArrayRule('MK'),
@@ -226,7 +228,7 @@ class PlaceModel:
             estimates = self.locate_all(np.concatenate([noise, np.zeros_like(noise)]))
         for estimate in estimates:
             known: list[Any] = [estimate.covariance, estimate.position, estimate.novelty]
-            known += [estimate.yaw] if self.has_heading else []
+            known += [estimate.yaw] if self.compass is not None else []
             if not all(np.isfinite(value).all() for value in known):
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:

@@ -34,7 +34,9 @@ MOST_ARRAYS = 1000
 _HEADER, _CHECKSUM = 'header', 'sha256'
 _LONGEST_HEADER = 1 << 20
 """Characters of the header: a thousand times the usual."""
-_TYPES = frozenset(np.dtype(kind) for kind in ('f4', 'f8', 'c8', 'c16', 'i4', 'i8'))
+_TYPES = frozenset(
+    np.dtype(kind) for kind in ('?', 'f2', 'f4', 'f8', 'c8', 'c16', 'i1', 'u1', 'i2', 'i4', 'i8')
+)
 # End of a zip without a comment: signature, disks, entries here and in all, directory, comment.
 _END = struct.Struct('<4s4H2LH')
 _END_MARK, _ZIP64_MARK, _ZIP64_SIZE = b'PK\x05\x06', b'PK\x06\x07', 20

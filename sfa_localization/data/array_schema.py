@@ -19,8 +19,9 @@ class ArrayRule(NamedTuple):
     """What one array must be.
 
     `shape` has a character for each axis: a digit is its length, a letter any length, the same
-    everywhere in the group. `kind` is that of its dtype: f real, c complex, i integer,
-    U text. The numbers at the places `positive`, in order, must be > 0; `all_positive`: all.
+    everywhere in the group. `kind` is that of its dtype: f real, c complex, i integer, u unsigned,
+    b boolean, U text. The numbers at the places `positive`, in order, must be > 0;
+    `all_positive`: all.
     """
 
     shape: str
@@ -86,5 +87,5 @@ def _check(name: str, array: NDArray[Any], rule: ArrayRule, lengths: dict[str, i
     if not fits:
         raise ModelError(f'the array {name} has the shape {array.shape}: train it again')
     numbers = array.ravel() if rule.all_positive else array.ravel()[list(rule.positive)]
-    if rule.kind in 'fi' and not np.all(numbers > 0):
+    if rule.kind in 'fiu' and not np.all(numbers > 0):
         raise ModelError(f'the array {name} holds a number that must be positive: train it again')
