@@ -33,6 +33,7 @@ from sfa_localization.bags import storage as bag_storage
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.recording import METADATA, MOST_FILES
 from sfa_localization.data.errors import BagError
+from sfa_localization.inspection import inspect
 
 NESTED = '[' * 30_000
 
@@ -371,6 +372,14 @@ def test_an_index_of_ros_1_that_lists_a_chunk_twice(messages, tmp_path):
                 if struct.pack('<I', n) in data[info - 120 : info])  # fmt: skip
     path.write_bytes(data + data[start:])
     rejected(path, 'lists a chunk twice')
+
+
+def test_images_serialized_otherwise_are_inspected_by_their_times(messages, tmp_path):
+    path = write_database(tmp_path / 'bag.db3', messages, serialization='protobuf')
+    report = inspect(path)
+    (images,) = [topic for topic in report.topics if topic.name == '/image_raw']
+    assert images.count == len(images.stamps_ns) == COUNTS['/image_raw']
+    assert report.images is None and report.lacks
 
 
 def test_random_bytes_of_every_format_end(tmp_path):

@@ -87,8 +87,12 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         'compass/feature_scale.*must be positive',
     ),
     'enormous weights': (
-        lambda a: {**a, 'metric/weights': 1e308 + a['metric/weights']},
-        'not finite',
+        lambda a: {**a, 'metric/weights': 1e30 * a['metric/weights'] + 1e30},
+        'beyond 1e',
+    ),
+    'enormous weights of a layer that few images see': (
+        lambda a: {**a, 'novelty/2/axes': spoilt(a['novelty/2/axes'], 1e308)},
+        'beyond 1e',
     ),
     'text for numbers': (lambda a: {**a, 'compass/weights': np.array('x')}, 'is of type'),
     'integers for numbers': (

@@ -134,6 +134,12 @@ def test_headers_that_end_early_or_are_unknown(data):
         decode_compressed(data)
 
 
+@pytest.mark.parametrize('height', [2**32 - 1, 2**63])
+def test_raw_images_of_any_height_without_data(height):
+    with pytest.raises(CameraError, match='empty image'):
+        encodings.decode_image(b'', height, 4, 0, 'mono8')
+
+
 @pytest.mark.parametrize('kind', ['pipe', 'long name', 'bomb'])
 def test_masks_that_cannot_be_used(kind, tmp_path):
     path = tmp_path / 'mask.png'

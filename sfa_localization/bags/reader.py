@@ -230,11 +230,11 @@ class Bag:
         return self._stream(topic, chooser if is_tf else lambda message: message, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
-        """A topic of any type, which may be empty; `convert` receives None for unknown types."""
-        stream = self._stream(topic, lambda message: message, convert)
+        """A topic of any type, which may be empty; unknown types have the value None."""
         channel = self.recording.channels[topic]
-        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
-        stream.required = False
+        known = self._decode.can_decode(channel.kind, channel.serialization)
+        stream = self._stream(topic, lambda message: message, convert if known else _nothing)
+        stream.opaque, stream.required = not known, False
         return stream
 
     def _stream(
@@ -308,6 +308,10 @@ class Bag:
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
+
+
+def _nothing(_: Any) -> None:
+    """The value of a message that is not decoded."""
 
 
 def _plain_name(name: str) -> str:

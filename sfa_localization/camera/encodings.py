@@ -93,7 +93,7 @@ def decode_image(
     layout = _LAYOUTS.get(encoding.lower())
     if layout is None:
         raise CameraError(f'unsupported encoding {encoding!r}')
-    if height <= 0 or width <= 0:
+    if min(height, width, step) <= 0:
         raise CameraError('empty image')
     rows = _rows(data, height * layout.rows[0] // layout.rows[1], step)
     return _to_bgr(_pixels(rows, width, layout, is_bigendian), layout)

@@ -31,6 +31,8 @@ LARGEST_FILE = 1 << 30
 """Bytes of a file: a hundred times a model of a large garden."""
 MOST_ARRAYS = 1000
 """Arrays in a file: a model has about ten for each of its parts."""
+LARGEST_NUMBER = 1e30
+"""Magnitude of a number: those of models stay below 1e9, and products of larger ones overflow."""
 _HEADER, _CHECKSUM = 'header', 'sha256'
 _LONGEST_HEADER = 1 << 20
 """Characters of the header: a thousand times the usual."""
@@ -142,4 +144,6 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
     array = array.reshape(shape, order='F' if by_column else 'C')
     if not text and not np.isfinite(array).all():
         raise _Unusable('an array holds values that are not finite')
+    if not text and np.abs([array.real, array.imag]).max(initial=0) > LARGEST_NUMBER:
+        raise _Unusable(f'an array holds numbers beyond {LARGEST_NUMBER:g}')
     return array
