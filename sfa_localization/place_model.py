@@ -26,6 +26,7 @@ from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.agreement import Agreement, disagreement
 from sfa_localization.features.image_features import layer_harmonics, slow_features
+from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
 from sfa_localization.features.network import (
     Architecture,
     Layer,
@@ -33,14 +34,13 @@ from sfa_localization.features.network import (
     Node,
     check_weights,
 )
-from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.expansions import MetricMap
 from sfa_localization.metric.fast_expansions import Predictor, fast_map
 
 FORMAT = 'sfa_localization place model'
-VERSION = 3
+VERSION = 4
 _AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
 _METRIC = [
     {
@@ -79,12 +79,11 @@ SCHEMA: Schema = {
     ],
     'metric/': _METRIC,
     'metric/basis_': _BASIS,
-    'novelty/#/': [
+    'keyframes/': [
         {
-            'mean': ArrayRule('D'),
-            'directions': ArrayRule('DP'),
-            'axes': ArrayRule('DP'),
-            'scalars': ArrayRule('2', all_positive=True),
+            'textures': ArrayRule('NRC', 'i'),
+            'poses': ArrayRule('N3'),
+            'noise': ArrayRule('8', positive=(0, 1, 2, 3, 4, 5, 6)),
         }
     ],
     'agreement/': _AGREEMENT,
@@ -123,8 +122,40 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """What slow features say of an image, `position` (2,), `yaw` and `covariance` (3, 3) as in
+    `Estimate`, and the `match` of the keyframes, which have `noise`.
+    """
+
+    slow_features: Array
+    position: Array
+    yaw: float
+    covariance: Array
+    match: Match
+    noise: MatchNoise
+
+    @property
+    def distance(self) -> float:
+        """How far both are apart, see `Match.distance`; NaN where one of them is unknown."""
+        if self.match.score < self.noise.lowest:
+            return np.nan
+        return self.match.distance(self.position, self.covariance[:2, :2])
+
+    def estimate(self, factor: float = 1.0) -> Estimate:
+        """Both together, with a `factor` on the variances of slow features."""
+        novelty = self.noise.novelty(self.match.score)
+        claimed = self.covariance * factor
+        position, yaw, covariance = self.match.combined(
+            self.position, float(self.yaw), claimed, self.noise
+        )
+        covariance = covariance * max(novelty, 1.0) ** 2
+        covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
+        return Estimate(self.slow_features, position, yaw, covariance, novelty)
+
+
+@dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass and novelty, learned from one place.
+    """Network, metric map, compass and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
@@ -134,7 +165,7 @@ class PlaceModel:
     network: Network
     metric: MetricMap
     panorama: PanoramaConfig
-    novelty: Novelty
+    keyframes: Keyframes
     agreement: Agreement
     compass: Compass | None = None
     yaw_agreement: Agreement | None = None
@@ -142,10 +173,6 @@ class PlaceModel:
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
-
-    @property
-    def has_heading(self) -> bool:
-        return self.compass is not None
 
     @property
     def camera_delay_s(self) -> float:
@@ -166,19 +193,27 @@ class PlaceModel:
 
     def locate_all(self, panoramas: Image) -> list[Estimate]:
         """Estimates of panoramas (T, H, W, 3)."""
+        return [view.estimate() for view in self.views(panoramas)]
+
+    def views(self, panoramas: Image) -> list[View]:
+        """The estimates from panoramas (T, H, W, 3) by slow features and by keyframes."""
         maps = self.network.maps(panoramas)
         slow = slow_features(maps)
-        novelty = self.novelty.per_layer(maps).max(1)
         spread = disagreement(maps[-1])
         positions, covariances = self._predictor().predict(slow)
         covariances = covariances * self.agreement.factor(spread)[:, None, None]
         yaw, yaw_variance = self._headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
+        joined = _joined(covariances, yaw_variance)
+        matches = map(self._matched, panoramas, positions)
         return [
-            Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
-            for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
+            View(slow[t], positions[t], float(yaw[t]), joined[t], match, self.keyframes.noise)
+            for t, match in enumerate(matches)
         ]
+
+    def _matched(self, panorama: Image, guess: Array) -> Match:
+        return self.keyframes.match(panorama, guess if np.isfinite(guess).all() else None)
 
     def _predictor(self) -> Predictor:
         """The metric map's fastest form, compiled once."""
@@ -255,7 +290,7 @@ class PlaceModel:
             parts = {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
-        arrays |= _prefixed('novelty/', self.novelty.to_arrays())
+        arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
         arrays |= _prefixed('agreement/', self.agreement.to_arrays())
         if self.compass is not None:
             arrays |= _prefixed('compass/', self.compass.to_arrays())
@@ -270,7 +305,7 @@ class PlaceModel:
             network_from(arrays, header),
             MetricMap.from_arrays(_under(arrays, 'metric/')),
             PanoramaConfig(**header['panorama']),
-            Novelty.from_arrays(_under(arrays, 'novelty/')),
+            Keyframes.from_arrays(_under(arrays, 'keyframes/')),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
             Compass.from_arrays(compass) if compass else None,
             Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,
@@ -304,12 +339,11 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     return Network(architecture, tuple(nodes), tuple(deltas), ranks)
 
 
-def _joined(covariances: Array, yaw_variance: Array, novelty: Array) -> Array:
-    """Covariances (T, 3, 3); those of unfamiliar images grow with their novelty squared."""
-    inflation = np.maximum(novelty, 1.0) ** 2
+def _joined(covariances: Array, yaw_variance: Array) -> Array:
+    """Covariances (T, 3, 3) of positions (T, 2, 2) and yaw (T,)."""
     joined = np.zeros((len(covariances), 3, 3))
-    joined[:, :2, :2] = covariances * inflation[:, None, None]
-    joined[:, 2, 2] = np.minimum(yaw_variance * inflation, UNKNOWN_YAW_VARIANCE)
+    joined[:, :2, :2] = covariances
+    joined[:, 2, 2] = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
     return joined
 
 

@@ -29,7 +29,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
-from sfa_localization.features.agreement import Agreement, share_within
+from sfa_localization.features.agreement import Agreement
 from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
 from sfa_localization.features.network import Architecture, Network, standard_architecture
@@ -39,12 +39,12 @@ from sfa_localization.features.network_training import (
     in_this_process,
     train_network,
 )
-from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
+from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import MetricResult, correlation_along_drive, learn_metric
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -148,7 +148,7 @@ def _train_hierarchy(
 def learn_place(
     network: Network, runs: Sequence[Run], recipe: Recipe, progress: bool = False
 ) -> Trained:
-    """Steps 3 to 7: metric map, compass and novelty for a trained network. Raises DataError."""
+    """Steps 3 to 7: metric map, compass and keyframes for a trained network. Raises DataError."""
     images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
@@ -207,14 +207,16 @@ def _assemble(
         axes=2,
         weight=result.left_out_weight,
     )
+    clockwise = recipe.panorama.clockwise
+    known = learn_keyframes(runs, images, segments, result, agreement, clockwise)
     # Of each run, s; None where the drive does not show it.
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
-    quality = _quality(network, images, segments, result, agreement)
+    quality = _quality(network, images, segments, result, known)
     return PlaceModel(
         network,
         result.map,
         PanoramaConfig(**{**asdict(recipe.panorama), 'height': height, 'width': width}),
-        Novelty.fit(images.descriptions),
+        known.keyframes,
         agreement,
         heading.compass if heading else None,
         heading.agreement if heading else None,
@@ -229,12 +231,10 @@ def _quality(
     images: ImageFeatures,
     segments: Segments,
     result: MetricResult,
-    agreement: Agreement,
+    known: KeyframeMap,
 ) -> dict[str, Any]:
     """Figures of merit that are stored in the model; plain numbers and lists."""
     x, y, error = result.forecast.worst
-    variance = result.left_out_variance * agreement.factor(images.disagreement[result.images])
-    ratio = (result.left_out**2).sum(1) / variance
     return {
         'delta': network.deltas[-1].tolist(),
         'rank': [list(ranks) for ranks in network.ranks],
@@ -245,9 +245,10 @@ def _quality(
         'certificate': float(result.certificate.eigenvalue),
         'features_used': result.map.features,
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
-        'expected_error_m': result.forecast.expected_m,
-        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
+        'keyframes': len(known.keyframes.poses),
+        'expected_error_m': result.forecast.expected_m * known.improvement,
+        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error * known.improvement},
         'left_out_error_m': result.left_out_error_m,
-        'left_out_within_95': share_within(ratio, 2, 0.95, result.left_out_weight),
+        'left_out_within_95': known.within_95,
         'coverage': result.diagnostics.as_dict(),
     }

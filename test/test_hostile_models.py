@@ -82,6 +82,22 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: {**a, 'agreement/numbers': np.array([1.0, -1.0, 1.0])},
         'agreement/numbers.*must be positive',
     ),
+    'keyframes that are never unfamiliar': (
+        lambda a: {**a, 'keyframes/noise': 0 * a['keyframes/noise']},
+        'keyframes/noise.*must be positive',
+    ),
+    'keyframes of other images': (
+        lambda a: {**a, 'keyframes/textures': a['keyframes/textures'][:, 1:]},
+        'damaged',
+    ),
+    'too few keyframes': (
+        lambda a: {
+            **a,
+            'keyframes/textures': a['keyframes/textures'][:2],
+            'keyframes/poses': a['keyframes/poses'][:2],
+        },
+        'too few for keyframes',
+    ),
     'scale of zero': (
         lambda a: {**a, 'compass/feature_scale': 0 * a['compass/feature_scale']},
         'compass/feature_scale.*must be positive',
@@ -90,14 +106,14 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: {**a, 'metric/weights': 1e30 * a['metric/weights'] + 1e30},
         'beyond 1e',
     ),
-    'enormous weights of a layer that few images see': (
-        lambda a: {**a, 'novelty/2/axes': spoilt(a['novelty/2/axes'], 1e308)},
+    'a place that few images see, out of the world': (
+        lambda a: {**a, 'keyframes/poses': spoilt(a['keyframes/poses'], 1e308)},
         'beyond 1e',
     ),
     'text for numbers': (lambda a: {**a, 'compass/weights': np.array('x')}, 'is of type'),
     'integers for numbers': (
-        lambda a: {**a, 'novelty/0/mean': a['novelty/0/mean'].astype(int)},
-        'novelty/0/mean is of type',
+        lambda a: {**a, 'keyframes/poses': a['keyframes/poses'].astype(int)},
+        'keyframes/poses is of type',
     ),
     'booleans': (lambda a: {**a, 'compass/weights': np.array([True])}, 'is of type'),
     'transposed': (lambda a: {**a, 'network/0/slow': a['network/0/slow'].T}, 'has the shape'),

@@ -63,10 +63,13 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
     turn = (1 if clockwise else -1) * 2 * np.pi * columns / PLACE_SIZE[1]
     for picture in visit(clockwise).panoramas.read(0, 20):
         one, other = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
-        assert abs(wrap_angle(other.yaw - one.yaw - turn)) < 1e-4
-        assert np.abs(other.position - one.position).max() < 1e-4
-        assert np.allclose(other.covariance, one.covariance, rtol=1e-2)
-        assert other.novelty == pytest.approx(one.novelty, rel=1e-3)
+        assert abs(wrap_angle(other.yaw - one.yaw - turn)) < np.radians(2)
+        assert np.abs(other.position - one.position).max() < 0.1
+        assert other.novelty == pytest.approx(one.novelty, abs=0.1)
+        slow, turned = model.views(np.stack([picture, np.roll(picture, columns, axis=1)]))
+        assert abs(wrap_angle(turned.yaw - slow.yaw - turn)) < 1e-4
+        assert np.abs(turned.position - slow.position).max() < 1e-4
+        assert np.allclose(turned.covariance, slow.covariance, rtol=1e-2)
 
 
 @pytest.mark.parametrize('clockwise', [True, False])
@@ -95,12 +98,13 @@ def test_covariance_of_strange_pictures_is_larger(model, pictures):
     assert foreign > 10 * familiar
 
 
-def test_without_a_compass_yaw_is_unknown(model, pictures):
-    estimate = replace(model, compass=None, heading_layers=(), yaw_agreement=None).locate(
-        pictures[0]
-    )
-    assert np.isnan(estimate.yaw)
-    assert estimate.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
+def test_without_a_compass_the_keyframes_show_the_yaw(model, pictures):
+    blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
+    (view,) = blind.views(pictures[:1])
+    assert np.isnan(view.yaw)
+    assert view.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
+    estimate = blind.locate(pictures[0])
+    assert abs(wrap_angle(estimate.yaw - model.locate(pictures[0]).yaw)) < np.radians(5)
     assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=1e-9)
 
 
@@ -175,8 +179,8 @@ class TestFile:
         blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
         blind.save(tmp_path / 'blind.npz')
         again = PlaceModel.load(tmp_path / 'blind.npz')
-        assert not again.has_heading and model.has_heading
-        assert np.isnan(again.locate(pictures[0]).yaw)
+        assert again.compass is None and model.compass is not None
+        assert again.locate(pictures[0]).yaw == blind.locate(pictures[0]).yaw
 
     def test_nothing_but_the_model_is_left(self, saved):
         assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
@@ -227,7 +231,7 @@ class TestFile:
         refused(saved, 'not a sfa_localization place model')
 
     @pytest.mark.parametrize(
-        'name', ['network/1/slow', 'metric/weights', 'novelty/0/scalars', 'compass/weights']
+        'name', ['network/1/slow', 'metric/weights', 'keyframes/noise', 'compass/weights']
     )
     def test_an_array_is_missing(self, saved, name):
         rewrite(saved, without=name)

@@ -105,7 +105,7 @@ def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeyp
     monkeypatch.setattr(image_features, 'SAMPLES', 15)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
     assert 'too few to learn a compass' in caplog.text
-    assert not trained.model.has_heading
+    assert trained.model.compass is None
     assert 'expected_yaw_error_deg' not in trained.model.quality
     assert 'heading' not in summary(trained)
 

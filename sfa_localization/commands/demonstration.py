@@ -24,7 +24,6 @@ from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import (
     Evaluation,
     evaluate,
-    fit_transform,
     moved,
     score,
     write_json,
@@ -100,23 +99,13 @@ def _compare(
 ) -> tuple[Evaluation, float]:
     """Evaluate the live estimates; also return their mean distance (m) from the offline ones."""
     offline = evaluate(trained.model, bags['test'], align_bag=bags['coverage'], progress=progress)
-    with Bag(bags['coverage']) as bag:
-        truth = bag.trajectory()
-    transform = fit_transform(truth, _training_estimate(trained))
-    live_in_truth = {name: moved(estimate, transform) for name, estimate in live.items()}
+    live_in_truth = {name: moved(estimate, offline.transform) for name, estimate in live.items()}
     estimates = {**offline.estimates, **live_in_truth}
     scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}
     counts = {name: count for name, count in offline.counts.items() if name != 'fusion'}
     counts['published'] = {name: len(estimate) for name, estimate in live.items()}
     result = dataclasses.replace(offline, estimates=estimates, scores=scores, counts=counts)
     return result, mean_distance(estimates['ekf'], offline.estimates['ekf'])
-
-
-def _training_estimate(trained: Trained) -> Trajectory:
-    """The model's positions of its training images, in the map."""
-    positions, _ = trained.model.metric.predict(trained.features)
-    stamps = np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
-    return Trajectory(stamps, np.column_stack([positions, np.full(len(stamps), np.nan)]))
 
 
 def mean_distance(a: Trajectory, b: Trajectory) -> float:
@@ -130,6 +119,7 @@ def _write_results(out: Path, result: Evaluation, trained: Trained, coverage: Pa
     write_json(out / 'results.json', result.as_dict())
     with Bag(coverage) as bag:
         truth = bag.trajectory()
-    places = truth.at(_training_estimate(trained).stamps_ns)[:, :2]
+    stamps = np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
+    places = truth.at(stamps)[:, :2]
     shown = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
     write_report(out / 'report', result.truth, shown, result.scores, places, trained.features)

@@ -27,8 +27,8 @@ from sfa_localization.data.rejections import short_line
 
 Arrays = dict[str, NDArray[Any]]
 
-LARGEST_FILE = 1 << 30
-"""Bytes of a file: a hundred times a model of a large garden."""
+LARGEST_FILE = 1 << 28
+"""Bytes of a file: twenty times a model of a large garden. In use a model is ten times its file."""
 MOST_ARRAYS = 1000
 """Arrays in a file: a model has about ten for each of its parts."""
 LARGEST_NUMBER = 1e30

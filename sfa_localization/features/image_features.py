@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
 from sfa_localization.features.agreement import disagreement
+from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.network import Network
-from sfa_localization.features.novelty import describe
 from sfa_localization.features.rotation import Map
 
 Complex = NDArray[np.complex128]
 
-# Images whose maps are kept for the compass and for novelty, however long the drives: memory.
+# Images whose maps and textures are kept for compass and keyframes, however long the drives.
 SAMPLES = 3000
 
 
@@ -57,8 +57,8 @@ class ImageFeatures:
     """(S,) indices of the sample."""
     harmonic: Complex
     """(S, J) of the layers that the compass reads."""
-    descriptions: tuple[Array, ...]
-    """Per layer (S, D), for novelty."""
+    textures: NDArray[np.int8]
+    """(S, rows, columns) local contrast, for keyframes."""
     variance_shares: dict[str, list[float]]
     """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
 
@@ -74,9 +74,8 @@ def features_of_runs(
     sampled = np.unique(np.linspace(0, total - 1, min(total, SAMPLES)).round().astype(np.int64))
     in_sample = np.zeros(total, bool)
     in_sample[sampled] = True
-    slow, spread, harmonic = [], [], []
+    slow, spread, harmonic, textures = [], [], [], []
     shares = _VarianceShares(network.architecture.outputs)
-    descriptions: list[list[Array]] = [[] for _ in network.nodes]
     start = 0
     for images in (batch for run in runs for batch in run.panoramas.batches(BATCH)):
         maps = network.maps(images)
@@ -85,8 +84,7 @@ def features_of_runs(
         spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
-        for layer, of_layer in zip(maps, descriptions, strict=True):
-            of_layer.append(describe(layer[keep]))
+        textures += [quantized(texture(image)[None]) for image in images[keep]]
         start += len(images)
         on_images(len(images))
     return ImageFeatures(
@@ -94,7 +92,7 @@ def features_of_runs(
         np.concatenate(spread),
         sampled,
         np.concatenate(harmonic),
-        tuple(np.concatenate(d) for d in descriptions),
+        np.concatenate(textures),
         shares.result(),
     )
 

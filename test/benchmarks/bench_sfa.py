@@ -33,6 +33,8 @@ from sfa_localization.features import mdp_engine
 from sfa_localization.features import network_training as hierarchy
 from sfa_localization.features.agreement import Agreement
 from sfa_localization.features.image_features import harmonics, layer_harmonics, slow_features
+from sfa_localization.features.keyframe_training import MOST
+from sfa_localization.features.keyframes import Keyframes, MatchNoise, quantized, texture
 from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
     RELATIVE_CUT,
@@ -41,7 +43,6 @@ from sfa_localization.features.network_training import (
     shards_of,
     train_network,
 )
-from sfa_localization.features.novelty import Novelty, describe
 from sfa_localization.features.sfa import Statistics, solve
 from sfa_localization.metric.compass import Compass, kernel_between
 from sfa_localization.metric.compass_training import (
@@ -57,6 +58,8 @@ from sfa_localization.place_model import PlaceModel
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
+CLOSE = 110
+"""Keyframes that an image is compared with in full: the likeliest and two places' neighbors."""
 ARCHITECTURE = standard_architecture(SIZE, 'panorama')
 
 
@@ -195,12 +198,19 @@ def made_up_model(network) -> PlaceModel:
         network,
         map_,
         PanoramaConfig(),
-        Novelty.fit([describe(m) for m in maps]),
+        _keyframes(rng),
         agreement=Agreement(1.0, 1.0, 1.0),
         compass=compass,
         yaw_agreement=Agreement(1.0, 1.0, 1.0),
         heading_layers=layers,
     )
+
+
+def _keyframes(rng: np.random.Generator) -> Keyframes:
+    """As many keyframes as a model holds, of random images at random places."""
+    textures = [texture(rng.integers(0, 256, (*SIZE, 3), np.uint8)) for _ in range(MOST)]
+    poses = np.column_stack([rng.uniform(0, 16, (MOST, 2)), rng.uniform(-3, 3, MOST)])
+    return Keyframes.of(quantized(np.array(textures)), poses, MatchNoise(), True)
 
 
 def _compass(rng: np.random.Generator, count: int, features: int, width: int) -> Compass:
@@ -221,12 +231,14 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
     image = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
     blind = replace(model, compass=None, yaw_agreement=None, heading_layers=())
     products, network_only = bare_products(model, image), bare_network(model)
+    nowhere = np.zeros(2)
     with one_core():
-        whole, bare, without, maps, bare_maps = in_turns(
+        whole, bare, without, matched, maps, bare_maps = in_turns(
             [
                 lambda: model.locate(image),
                 lambda: [product() for product in products],
                 lambda: blind.locate(image),
+                lambda: model.keyframes.match(image, nowhere),
                 lambda: model.network.maps(image[None]),
                 lambda: [product() for product in network_only],
             ],
@@ -242,6 +254,9 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
         'matmul_ms': median * 1e3,
         'network_over_matmul': float(np.median(maps) / np.median(bare_maps)),
         'locate_heading_cost': float(np.median(whole) / np.median(without)) - 1,
+        'locate_keyframes_cost': float(
+            np.median(matched) / (np.median(whole) - np.median(matched))
+        ),
         'locate_growth_mib': grown,
     }
 
@@ -270,10 +285,12 @@ def bare_network(model: PlaceModel) -> list[Callable[[], object]]:
 def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], object]]:
     """All products of a model's equations, on inputs that are ready."""
     made = bare_network(model)
+    keyframes = model.keyframes
+    frequencies, _, rows = keyframes.coarse.shape
+    made.append(_product(keyframes.coarse, np.ones((frequencies, rows, 1), np.complex64)))
+    close = keyframes.spectra[:CLOSE].transpose(2, 0, 1)
+    made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
     maps = model.network.maps(image[None])
-    for layer, m in zip(model.novelty.layers, maps, strict=True):
-        description = describe(m) - layer.mean
-        made += [_product(description, layer.directions), _product(description, layer.axes)]
     fast = model._predictor()
     assert isinstance(fast, FastProcess)
     features = slow_features(maps)[:, : len(fast.scale)] * fast.scale
