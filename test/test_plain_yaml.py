@@ -93,7 +93,7 @@ def test_names_of_any_length_are_quoted_in_part(tmp_path):
     path = tmp_path / 'bad.yaml'
     for text in ('x' * 10**3 + ': 1', 'sfa_node:\n  ros__parameters:\n    ' + 'y' * 10**3 + ': 1'):
         path.write_text(text)
-        with pytest.raises(ConfigError, match='unknown|section') as raised:
+        with pytest.raises(ConfigError, match=r'unknown|section') as raised:
             load_changes(path)
         assert len(str(raised.value)) < 800
 

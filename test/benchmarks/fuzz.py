@@ -113,6 +113,7 @@ class Fuzzer:
                     number = event['number'] + 1
             if lines.late:
                 child.kill()
+            lines.join()
         if number == end:
             return end
         said = (folder / 'errors').read_text(errors='replace')[-300:].strip()
@@ -142,7 +143,12 @@ class _Lines:
                 self._queue.put(line)
             self._queue.put(None)
 
-        threading.Thread(target=read, daemon=True).start()
+        self._thread = threading.Thread(target=read, daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait for the end of the process."""
+        self._thread.join()
 
     def next(self, patience_s: float) -> bytes | None:
         try:
