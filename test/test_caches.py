@@ -115,6 +115,14 @@ def test_a_folder_that_cannot_be_written_is_named():
         raise AssertionError
 
 
+def test_an_output_that_cannot_be_replaced_is_rejected_before_the_training(tmp_path):
+    with pytest.raises(ModelError, match='no regular file'), image_cache(Path('/dev/null')):
+        raise AssertionError
+    (tmp_path / 'link').symlink_to('/dev/null')
+    with pytest.raises(ModelError, match='no regular file'), image_cache(tmp_path / 'link'):
+        raise AssertionError
+
+
 @pytest.mark.parametrize(
     ('error', 'line'),
     [

@@ -23,6 +23,7 @@ from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.run import Run
 
 _LOCK = 'lock'
@@ -43,17 +44,18 @@ class ReadingRecipe:
 def image_cache(output: Path) -> Iterator[Path]:
     """A folder beside `output` for decoded images; also clears those that killed runs left.
 
-    Raises ModelError when it cannot be made.
+    Raises ModelError when it cannot be made, or `output` not be written in the end.
     """
     name = f'.{output.name}.cache-'
     try:
+        replaced_mode(output)
         output.parent.mkdir(parents=True, exist_ok=True)
         for stale in output.parent.glob(f'{glob.escape(name)}*'):
             _clear_unused(stale)
         folder = Path(tempfile.mkdtemp(prefix=name, dir=output.parent))
         lock = _lock(folder, os.O_CREAT)
     except OSError as error:
-        raise ModelError(f'{output}: cannot be written: {error.strerror}') from None
+        raise ModelError(f'{output}: cannot be written: {error.strerror or error}') from None
     try:
         yield folder
     finally:

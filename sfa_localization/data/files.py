@@ -54,7 +54,7 @@ def atomic_write(
         target = Path(os.path.realpath(path))
         if make_folder:
             target.parent.mkdir(parents=True, exist_ok=True)
-        mode = _mode(target)
+        mode = replaced_mode(target)
         handle, temporary = tempfile.mkstemp('.part', f'.{target.name}-', target.parent)
         with os.fdopen(handle, 'wb') as file:
             yield file
@@ -67,7 +67,7 @@ def atomic_write(
             Path(temporary).unlink(missing_ok=True)
 
 
-def _mode(target: Path) -> int:
+def replaced_mode(target: Path) -> int:
     """The permissions of what `target` replaces. Raises OSError where that is no regular file."""
     try:
         there = target.stat()
