@@ -21,7 +21,7 @@ from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD
-from sfa_localization.fusion.pose_filter import PoseFilter, Status
+from sfa_localization.fusion.pose_filter import PoseFilter, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 
@@ -71,10 +71,15 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Filtered:
-    """Poses (N, 3) at the stamps (N,) of odometry, from the start on, and counts of the rows."""
+    """Poses (N, 3) at the stamps (N,) of odometry, from the start on, and counts of the rows.
+
+    `covariances` (N, 3, 3) of [x, y, yaw]; `updates`: what became of each position, in order.
+    """
 
     stamps_ns: Stamps
     poses: Array
+    covariances: Array
+    updates: tuple[Update, ...]
     counts: Counter[str]
     status: Status
     before_start: int
@@ -113,21 +118,21 @@ def run_filter(
     fused = Smoother(config) if smooth else PoseFilter(config)
     if start is not None:
         fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
-    stamps, poses, waiting = [], [], 0
-    for stamp_ns in tqdm(_feed(fused, odometry, positions, shift), disable=not progress,
+    states, updates, waiting = [], list[Update](), 0
+    for stamp_ns in tqdm(_feed(fused, odometry, positions, shift, updates), disable=not progress,
                          total=len(odometry), unit=' rows', desc='filter'):  # fmt: skip
         state = fused.at(stamp_ns)
         if state is None:
             waiting += 1
-            continue
-        stamps.append(stamp_ns - shift)
-        poses.append(state.pose)
+        else:
+            states.append(replace(state, stamp_ns=stamp_ns))
     if isinstance(fused, Smoother):
-        smoothed = fused.smoothed()
-        stamps, poses = [s.stamp_ns - shift for s in smoothed], [s.pose for s in smoothed]
+        states = fused.smoothed()
     return Filtered(
-        np.array(stamps, np.int64),
-        np.reshape(np.array(poses), (-1, 3)),
+        np.array([state.stamp_ns - shift for state in states], np.int64),
+        np.reshape([state.pose for state in states], (-1, 3)),
+        np.reshape([state.pose_covariance for state in states], (-1, 3, 3)),
+        tuple(update._replace(stamp_ns=update.stamp_ns - shift) for update in updates),
         fused.counts,
         fused.status,
         waiting,
@@ -201,8 +206,13 @@ def _seconds(stamp_ns: int) -> str:
     return f'{sign}{seconds}.{rest:09d}'
 
 
-def _feed(fused: PoseFilter, odometry: Table, positions: Table, shift: int) -> Iterator[int]:
-    """Feed both tables to the filter in order of time; yields each odometry stamp once fused."""
+def _feed(
+    fused: PoseFilter, odometry: Table, positions: Table, shift: int, updates: list[Update]
+) -> Iterator[int]:
+    """Feed both tables to the filter in order of time; yields each odometry stamp once fused.
+
+    What becomes of the positions is appended to `updates`.
+    """
     pending: int | None = None
     for stamp_ns, kind, i in merge_by_stamp(
         odometry.stamps_ns + shift, positions.stamps_ns + shift
@@ -211,7 +221,7 @@ def _feed(fused: PoseFilter, odometry: Table, positions: Table, shift: int) -> I
             yield pending
             pending = None
         if kind == IMAGE:
-            fused.add_measurement(stamp_ns, *_measurement(positions.columns, i))
+            updates.append(fused.add_measurement(stamp_ns, *_measurement(positions.columns, i)))
         elif not fused.add_odometry(stamp_ns, *_twist(odometry.columns, i)):
             pending = stamp_ns
     if pending is not None:
