@@ -8,20 +8,22 @@ import csv
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Stamps, Trajectory, integrate
-from sfa_localization.fusion.inputs import POSITION_STD
-from sfa_localization.fusion.pose_filter import PoseFilter, Status, Update
+from sfa_localization.fusion.inputs import POSITION_STD, read_twist
+from sfa_localization.fusion.log_noise import EXPECTED, NEARLY_WHITE, Learned, Log, Noise, learn
+from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 
@@ -29,10 +31,21 @@ _NS = Decimal(1_000_000_000)
 _SECOND_NS = 1_000_000_000
 _STRETCH = 20
 """Positions that are aligned with odometry together: so few that odometry hardly drifts."""
+ENOUGH_POSITIONS = 5 * _STRETCH
+"""With fewer, chance decides on what would be learned from a log."""
 _UNTRUE = 2.0
 """A standard deviation that is too small by more than this factor is replaced."""
 _MEDIAN_OF_RAYLEIGH = 1.1774
 """Median length of a planar vector with unit variance per axis: sqrt(2 ln 2)."""
+# Parameters of the user, each with the noise that it sets.
+_USERS = (
+    ('measurement_factor', 'position'),
+    ('speed_std', 'speed'),
+    ('rate_std', 'turn'),
+    ('yaw_per_radian', 'turn'),
+    ('odometry_factor', 'speed'),
+    ('odometry_factor', 'turn'),
+)
 # Usual names of the columns, in lower case; the first is the one in the documentation.
 _STAMP = ('stamp_s', 'stamp', 't', 'time', 'time_s', 'timestamp', 'timestamp_s', 'sec', 'seconds')
 _STAMP_NS = ('stamp_ns', 'timestamp_ns', 't_ns', 'time_ns')
@@ -105,29 +118,30 @@ def run_filter(
     start: Sequence[float] | None = None,
     progress: bool = False,
     smooth: bool = False,
+    correlation: ErrorCorrelation | None = None,
+    lag_ns: int = 0,
 ) -> Filtered:
     """Fuse two tables as a live filter would: each pose depends on earlier rows only, unless
     `smooth`: then on all rows.
 
-    `start` is x m, y m, yaw rad, if known. Raises DataError when the tables do not overlap.
+    `start` is x m, y m, yaw rad, if known; `correlation` is that of the positions' errors; the
+    robot moves `lag_ns` after the stamps of the odometry. Raises DataError when the tables do not
+    overlap.
     """
     _require_overlap(odometry, positions)
-    # Logs may count from zero, but a stamp of zero means that there is none.
-    first = min(int(table.stamps_ns[0]) for table in (odometry, positions) if len(table))
-    shift = _SECOND_NS - first if first <= 0 else 0
-    fused = Smoother(config) if smooth else PoseFilter(config)
+    shift = _shift(odometry, positions, abs(lag_ns))
+    fused = (Smoother if smooth else PoseFilter)(config, correlation)
     if start is not None:
         fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
-    states, updates, waiting = [], list[Update](), 0
+    odometry = replace(odometry, stamps_ns=odometry.stamps_ns + lag_ns)
+    answers, updates = list[State | None](), list[Update]()
     for stamp_ns in tqdm(_feed(fused, odometry, positions, shift, updates), disable=not progress,
                          total=len(odometry), unit=' rows', desc='filter'):  # fmt: skip
-        state = fused.at(stamp_ns)
-        if state is None:
-            waiting += 1
-        else:
-            states.append(replace(state, stamp_ns=stamp_ns))
+        state = fused.at(stamp_ns - lag_ns)
+        answers.append(state and replace(state, stamp_ns=stamp_ns - lag_ns))
+    states = [state for state in answers if state]
     if isinstance(fused, Smoother):
-        states = fused.smoothed()
+        states = _resampled(fused.smoothed(), lag_ns)
     return Filtered(
         np.array([state.stamp_ns - shift for state in states], np.int64),
         np.reshape([state.pose for state in states], (-1, 3)),
@@ -135,54 +149,177 @@ def run_filter(
         tuple(update._replace(stamp_ns=update.stamp_ns - shift) for update in updates),
         fused.counts,
         fused.status,
-        waiting,
+        answers.count(None),
     )
 
 
-def position_std_of(odometry: Table, positions: Table) -> float | None:
-    """Standard deviation of positions: their residuals after alignment with dead reckoning.
+def _shift(odometry: Table, positions: Table, margin_ns: int) -> int:
+    """What makes all stamps positive: logs may count from zero, but zero means no stamp."""
+    first = min(int(table.stamps_ns[0]) for table in (odometry, positions) if len(table))
+    return max(0, _SECOND_NS + margin_ns - first) if first <= margin_ns else 0
 
-    Each _STRETCH of them is aligned on its own; None where there are too few.
+
+def _resampled(states: list[State], lag_ns: int) -> list[State]:
+    """The states at stamps earlier by a lag, as far as they reach; covariances of the nearest."""
+    if not lag_ns or not states:
+        return states
+    track = Trajectory(np.array([one.stamp_ns for one in states]),
+                       np.array([one.pose for one in states]))  # fmt: skip
+    stamps = track.stamps_ns - lag_ns
+    stamps = stamps[track.covers(stamps)]
+    nearest = np.minimum(np.searchsorted(track.stamps_ns, stamps), len(states) - 1)
+    found = []
+    for stamp_ns, pose, i in zip(stamps.tolist(), track.at(stamps), nearest, strict=True):
+        mean = np.append(pose, states[i].mean[len(pose) :])
+        found.append(State(stamp_ns, mean, states[i].covariance))
+    return found
+
+
+def without_positions(positions: Table) -> Table:
+    """The table without its rows."""
+    return Table(positions.stamps_ns[:0], {key: one[:0] for key, one in positions.columns.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """The settings and the odometry that fit a log, with `remarks` on what was learned.
+
+    The robot moves `lag_ns` after the stamps of the odometry. `fits` is False where odometry and
+    positions do not belong together; then nothing was learned.
     """
-    path = integrate(
-        odometry.stamps_ns, np.column_stack([odometry.columns[n] for n in ('v', 'omega')])
+
+    config: FilterConfig
+    correlation: ErrorCorrelation
+    odometry: Table
+    lag_ns: int = 0
+    remarks: tuple[str, ...] = ()
+    fits: bool = True
+
+
+def fitted(odometry: Table, positions: Table, config: FilterConfig) -> Fitted:
+    """Learn the noise of a log from itself: see `fusion.log_noise`.
+
+    Parameters that differ from their defaults are the user's, and stay. So do all, where the
+    log has too few positions.
+    """
+    inside = (positions.stamps_ns > odometry.stamps_ns[0]) & (
+        positions.stamps_ns < odometry.stamps_ns[-1]
     )
+    if np.count_nonzero(inside) < ENOUGH_POSITIONS:
+        return Fitted(config, ErrorCorrelation(), odometry)
+    columns = positions.columns
+    measured = np.column_stack([columns['x'], columns['y']])[inside]
+    spreads, start = _spreads(positions)[inside], EXPECTED
+    held = frozenset(noise for name, noise in _USERS if _changed(config, name))
+    ratio = position_std_of(odometry, positions) / math.sqrt(float(np.median(spreads)))
+    if _changed(config, 'measurement_factor'):
+        start = start._replace(position=np.array(math.sqrt(config.measurement_factor)))
+    elif _stated_variance(positions) == 0 or ratio > _UNTRUE:
+        start = start._replace(position=np.array(ratio))
+    log = Log(odometry.stamps_ns, _twists(odometry), _twist_variances(odometry, config),
+              positions.stamps_ns[inside], measured, spreads)  # fmt: skip
+    found = learn(log, config, start, held)
+    noise = found.noise
+    if not found.fits:
+        crude = EXPECTED._replace(position=np.maximum(start.position, ratio))
+        return Fitted(_scaled(config, crude), ErrorCorrelation(), odometry, fits=False)
+    config = _scaled(config, noise)
+    remarks = _remarks(found, math.sqrt(config.measurement_factor * float(np.median(spreads))))
+    correlation = ErrorCorrelation(float(noise.share), float(noise.distance_m))
+    lag_ns = round(float(noise.lag_s) * 1e9)
+    return Fitted(config, correlation, _corrected(odometry, found), lag_ns, remarks)
+
+
+def _changed(config: FilterConfig, name: str) -> bool:
+    return bool(getattr(config, name) != getattr(FilterConfig(), name))
+
+
+def _scaled(config: FilterConfig, noise: Noise) -> FilterConfig:
+    """The settings with the factors of a noise, kept inside their ranges."""
+    ranges = {item.name: item.metadata for item in fields(config)}
+    values = {
+        'rate_std': config.rate_std * noise.turn,
+        'yaw_per_radian': config.yaw_per_radian * noise.turn,
+        'speed_std': config.speed_std * noise.speed,
+        'measurement_factor': noise.position**2,
+    }
+    for name, value in values.items():
+        low, high = ranges[name]['low'], ranges[name]['high']
+        config = replace(config, **{name: float(np.clip(value, low, high))})  # type: ignore[arg-type]
+    return config
+
+
+def _corrected(odometry: Table, found: Learned) -> Table:
+    """The odometry with readings held backward, and stated variances with the factors learned."""
+    noise, columns = found.noise, dict(odometry.columns)
+    for name, factor in (('var_v', noise.speed), ('var_omega', noise.turn)):
+        if name in columns:
+            columns[name] = columns[name] * factor**2
+    if found.forward:
+        columns = {name: np.append(one[:1], one[:-1]) for name, one in columns.items()}
+    return replace(odometry, columns=columns)
+
+
+def _remarks(found: Learned, position_std: float) -> tuple[str, ...]:
+    noise = found.noise
+    share = f', {noise.share:.0%} of the variance alike over {noise.distance_m:.1f} m'
+    said = [
+        f'learned from the log: positions err by {position_std:.2f} m'
+        + (share if float(noise.share) > 2 * NEARLY_WHITE else ''),
+        f'noise of the odometry: speed {noise.speed:.2g}, turn {noise.turn:.2g} of the expected',
+    ]
+    if found.forward:
+        said.append('readings of the odometry hold until the next one')
+    if noise.lag_s:
+        late = 'late' if noise.lag_s > 0 else 'early'
+        said.append(f'the robot moves {abs(float(noise.lag_s)):.2f} s {late} by its odometry')
+    return tuple(said)
+
+
+def _twists(odometry: Table) -> Array:
+    return np.column_stack([odometry.columns['v'], odometry.columns['omega']])
+
+
+def _twist_variances(odometry: Table, config: FilterConfig) -> Array:
+    """The variances (N, 2) with which the filter takes readings: see inputs.read_twist."""
+    count = range(len(odometry))
+    twists = (read_twist(*_twist(odometry.columns, i), config) for i in count)
+    return np.array([(one.v_variance, one.omega_variance) for one in twists])
+
+
+def _spreads(positions: Table) -> Array:
+    """Variances (M, 2) of the positions; the filter's own where none is stated."""
+    empty = np.full(len(positions), np.nan)
+    x, y = (positions.columns.get(name, empty) for name in ('var_x', 'var_y'))
+    x, y = (np.where(np.isfinite(one) & (one > 0), one, other) for one, other in ((x, y), (y, x)))
+    both = np.column_stack([x, y])
+    return np.where(np.isfinite(both) & (both > 0), both, POSITION_STD**2)
+
+
+def position_std_of(odometry: Table, positions: Table) -> float:
+    """Standard deviation of positions, roughly: their residuals beside dead reckoning.
+
+    Each _STRETCH of them is aligned with it on its own, without those farthest off.
+    """
+    path = integrate(odometry.stamps_ns, _twists(odometry))
     inside = (positions.stamps_ns >= odometry.stamps_ns[0]) & (
         positions.stamps_ns <= odometry.stamps_ns[-1]
     )
     driven = Trajectory(odometry.stamps_ns, path).at(positions.stamps_ns[inside])[:, :2]
     measured = np.column_stack([positions.columns['x'], positions.columns['y']])[inside]
-    residuals = []
-    for start in range(0, len(measured) - _STRETCH + 1, _STRETCH):
-        part = slice(start, start + _STRETCH)
-        aligned = align(driven[part], measured[part]).apply(driven[part])
-        residuals.append(float(np.median(np.hypot(*(measured[part] - aligned).T))))
-    return float(np.median(residuals)) / _MEDIAN_OF_RAYLEIGH if residuals else None
+    starts = range(0, len(measured) - _STRETCH + 1, _STRETCH)
+    parts = [slice(start, start + _STRETCH) for start in starts]
+    residuals = [_median_residual(driven[part], measured[part]) for part in parts]
+    return float(np.median(residuals)) / _MEDIAN_OF_RAYLEIGH
 
 
-def fitting_config(
-    odometry: Table, positions: Table, config: FilterConfig
-) -> tuple[FilterConfig, str]:
-    """The settings for positions without variances, or with far too small ones; and what was done.
-
-    A `measurement_factor` other than the default is the user's, and stays.
-    """
-    if config.measurement_factor != FilterConfig().measurement_factor:
-        return config, ''
-    found = position_std_of(odometry, positions) if len(positions) else None
-    if found is None:
-        return config, ''
-    claimed = math.sqrt(_stated_variance(positions))
-    if claimed == 0:
-        text = f'positions have no variance: their standard deviation is taken to be {found:.2f} m'
-        return replace(config, measurement_factor=(found / POSITION_STD) ** 2), text
-    if found > _UNTRUE * claimed:
-        text = (
-            f'positions claim a standard deviation of {claimed:.2f} m, but err by {found:.2f} m: '
-            'taken as such'
-        )
-        return replace(config, measurement_factor=(found / claimed) ** 2), text
-    return config, ''
+def _median_residual(driven: Array, measured: Array) -> float:
+    """Median distance (m) of positions (K, 2) from the path (K, 2) laid on most of them."""
+    kept = np.argsort(np.hypot(*(measured - np.median(measured, 0)).T))[: -_STRETCH // 10]
+    for _ in range(3):
+        off = np.hypot(*(align(driven[kept], measured[kept]).apply(driven) - measured).T)
+        kept = off <= 3 * np.median(off)
+    return float(np.median(off))
 
 
 def _stated_variance(positions: Table) -> float:

@@ -61,14 +61,20 @@ def test_the_command_tells_what_the_live_filter_would_have(tmp_path):
     drive = Drive(seconds=20, **NOISY)
     code, (stamps, poses) = run(tmp_path, drive)
     assert code == 0
-    live = PoseFilter(FilterConfig())
+    tables = (
+        filtering.read_odometry_table(tmp_path / 'odom.csv'),
+        filtering.read_position_table(tmp_path / 'positions.csv'),
+    )
+    fit = filtering.fitted(*tables, FilterConfig())
+    live = PoseFilter(fit.config, fit.correlation)
+    read = np.column_stack([fit.odometry.columns[name] for name in ('v', 'omega')])
     told = {}
     for event in drive.events():
         if event[1]:
             seen = drive.seen[event[2], :2]
             live.add_measurement(event[0], seen, 0.04 * np.eye(2))
         else:
-            live.add_odometry(event[0], *drive.read[event[2]])
+            live.add_odometry(event[0], *read[event[2]])
         if live.state is not None:
             told[event[0]] = live.at(event[0]).pose
     assert set(stamps) <= set(told) and len(stamps) > 850
@@ -199,7 +205,7 @@ def test_settings_of_the_user_are_not_second_guessed(tmp_path):
     odometry, positions = write_logs(tmp_path, Drive(seconds=30, **NOISY), variance=False)
     config = FilterConfig(measurement_factor=5.0)
     tables = filtering.read_odometry_table(odometry), filtering.read_position_table(positions)
-    assert filtering.fitting_config(*tables, config) == (config, '')
+    assert filtering.fitted(*tables, config).config.measurement_factor == pytest.approx(5.0)
 
 
 def test_headings_in_the_log_are_fused(tmp_path):

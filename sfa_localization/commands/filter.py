@@ -47,16 +47,21 @@ def run(arguments: argparse.Namespace) -> int:
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
     config = settings(FilterConfig, arguments, arguments.config)
-    config, text = filtering.fitting_config(odometry, positions, config)
-    if text:
-        print(text)
+    fit = filtering.fitted(odometry, positions, config)
+    for remark in fit.remarks:
+        print(remark)
+    if not fit.fits:
+        print('odometry and positions do not belong together: ' + _consequence(arguments))
+        positions = filtering.without_positions(positions) if arguments.initial_pose else positions
     result = filtering.run_filter(
-        odometry,
+        fit.odometry,
         positions,
-        config,
+        fit.config,
         arguments.initial_pose,
         progress=sys.stderr.isatty(),
         smooth=arguments.smooth,
+        correlation=fit.correlation,
+        lag_ns=fit.lag_ns,
     )
     for name, table in (('odometry rows', odometry), ('position rows', positions)):
         for reason, count in sorted(table.skipped.items()):
@@ -73,3 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     waited = f', {result.before_start} rows before the start' if result.before_start else ''
     print(f'{arguments.output}: {len(result.poses)} poses{waited}')
     return 0
+
+
+def _consequence(arguments: argparse.Namespace) -> str:
+    if arguments.initial_pose:
+        return 'positions are left out'
+    return 'check clocks and units, or give --initial-pose X Y YAW to use the odometry alone'

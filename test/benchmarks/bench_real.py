@@ -98,9 +98,11 @@ def compare(log: str) -> dict[str, dict[str, float]]:
     rejected = np.array([stamp_ns for stamp_ns, fits in fates if not fits])
     plain = judged(truth, np.array(stamps), np.array(poses), np.array(covariances), rejected,
                    positions)  # fmt: skip
-    config, _ = filtering.fitting_config(odometry, positions, FilterConfig())
-    found = filtering.run_filter(odometry, positions, config)
-    rejected = np.array([update.stamp_ns for update in found.updates if not update.accepted])
+    fit = filtering.fitted(odometry, positions, FilterConfig())
+    found = filtering.run_filter(fit.odometry, positions, fit.config,
+                                 correlation=fit.correlation, lag_ns=fit.lag_ns)  # fmt: skip
+    judgeable = [update for update in found.updates if np.isfinite(update.d2)]
+    rejected = np.array([update.stamp_ns for update in judgeable if not update.accepted])
     ours = judged(truth, found.stamps_ns, found.poses, found.covariances, rejected, positions)
     return {'plain': plain, 'ours': ours}
 
