@@ -12,6 +12,7 @@ import numpy as np
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import SIZE, State, Twist
+from sfa_localization.fusion.turn_noise import TurnNoise
 
 LARGEST_STD_M = 100.0
 """The standard deviation of the position never exceeds this: larger than the places mapped."""
@@ -114,7 +115,11 @@ class Memory(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """Everything that the next event changes. `located` is False before the first pose."""
+    """Everything that the next event changes. `located` is False before the first pose.
+
+    `added` are the variances that driving has added so far, to the heading (as expected, without
+    the factor of `turns`) and to the position along each axis.
+    """
 
     stamp_ns: int
     mean: Array
@@ -126,6 +131,9 @@ class Belief(NamedTuple):
     odometry_ns: int | None
     memory: Memory
     odometry_pose: tuple[float, float, float] | None = None
+    added: tuple[float, float] = (0.0, 0.0)
+    turns: TurnNoise | None = None
+    turn_factor: float = 1.0
 
     @property
     def state(self) -> State | None:

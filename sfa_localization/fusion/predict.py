@@ -9,7 +9,7 @@ import math
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import Belief, OdometryEvent, capped
 from sfa_localization.fusion.kalman import Kalman
-from sfa_localization.fusion.motion import MotionNoise, Step, Twist
+from sfa_localization.fusion.motion import SIZE, MotionNoise, Step, Twist
 
 ODOMETRY_TIMEOUT_S = 0.5
 """Odometry silent for longer is a gap: many times the period of any odometry."""
@@ -45,7 +45,11 @@ class Prediction:
             twist = motion.twist_from_poses(belief.odometry_pose, event.pose, silence_s, twist)
             event = event._replace(twist=twist)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
-        step = motion.drive(belief.mean, twist, dt, self._noise)
+        factor, noise = belief.turn_factor, self._noise
+        if factor != 1.0:
+            twist = twist._replace(omega_variance=twist.omega_variance * factor**2)
+            noise = noise._replace(yaw_per_radian=noise.yaw_per_radian * factor)
+        step = motion.drive(belief.mean, twist, dt, noise)
         if silence_s > COAST_S:
             motion.add_unknown_motion(step.noise, twist, min(dt, silence_s - COAST_S))
         return self._moved(belief, event.stamp_ns, step, event)
@@ -92,7 +96,18 @@ class Prediction:
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
             event.pose if event else belief.odometry_pose,
+            self._added(belief, step),
+            belief.turns,
+            belief.turn_factor,
         )
+
+    @staticmethod
+    def _added(belief: Belief, step: Step) -> tuple[float, float]:
+        """Without the motion that a turn of the heading adds to the position: it is small."""
+        yaw, variance = belief.added
+        noise = step.noise
+        x, y, turned = noise.item(0), noise.item(SIZE + 1), noise.item(2 * SIZE + 2)
+        return yaw + turned / belief.turn_factor**2, variance + (x + y) / 2
 
 
 def _mean_twist(a: Twist, b: Twist) -> Twist:

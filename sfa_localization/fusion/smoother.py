@@ -27,6 +27,7 @@ from sfa_localization.fusion.motion import YAW, State, Step, wrap
 from sfa_localization.fusion.pose_filter import HISTORY_S, PoseFilter
 from sfa_localization.fusion.rules import Rules
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.update import STARTS
 
 # Keeps the inverse of a covariance of unit diagonal finite.
 _RIDGE = 1e-12
@@ -107,7 +108,7 @@ def _follows(event: Event, belief: Belief) -> bool:
     """Whether the belief after an event rests on the one before it."""
     if isinstance(event, MeasurementEvent):
         update = belief.memory.update
-        return update is None or update.reason not in ('started', 'restarted elsewhere')
+        return update is None or update.reason not in STARTS
     return isinstance(event, OdometryEvent)
 
 

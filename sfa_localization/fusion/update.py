@@ -24,7 +24,10 @@ from sfa_localization.fusion.inputs import lower_root
 from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, X, Y
 from sfa_localization.fusion.recover import Recovery
+from sfa_localization.fusion.turn_noise import Driven, TurnNoise, begun, weighed
 
+STARTS = ('started', 'restarted elsewhere')
+"""Reasons of updates that take a pose from measurements alone."""
 GATE_PROBABILITY = 0.999
 """Share of correct measurements that the gate accepts: one in a thousand is rejected."""
 _GATES = {size: float(chi2.ppf(GATE_PROBABILITY, size)) for size in (2, 3)}
@@ -58,6 +61,27 @@ class Correction:
 
     def fuse(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
+        belief = self._fused(self._weighed(belief, event), event)
+        update = belief.memory.update
+        if belief.located and update is not None and update.reason in STARTS:
+            return belief._replace(turns=self._begun(belief))
+        return belief
+
+    def _begun(self, belief: Belief) -> TurnNoise:
+        """What is known about the noise of turns, from another pose on."""
+        driven = Driven(belief.dead_reckoned, belief.traveled_m / self._recovery.decorrelation_m,
+                        *belief.added)  # fmt: skip
+        return begun(driven, belief.mean, belief.covariance, belief.turns)
+
+    def _weighed(self, belief: Belief, event: MeasurementEvent) -> Belief:
+        """The belief with what a measurement shows about the noise of turns."""
+        if not belief.located or belief.covariance[YAW, YAW] > self._lost_yaw_variance:
+            return belief
+        now = self._begun(belief)
+        turns = weighed(belief.turns or now, now.driven, event.value, event.jacobian, event.white)
+        return belief._replace(turns=turns, turn_factor=turns.factor)
+
+    def _fused(self, belief: Belief, event: MeasurementEvent) -> Belief:
         trust = watched(belief.memory.trust, evidence_of(belief, event, accepted=False))
         belief = belief._replace(memory=belief.memory._replace(trust=trust))
         heading_lost = belief.covariance[YAW, YAW] > self._lost_yaw_variance
