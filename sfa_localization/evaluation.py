@@ -9,6 +9,7 @@ drive and applied unchanged to the drive that is judged; the error is the Euclid
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -178,6 +179,7 @@ def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
     if clock.delay_ns:
         counts['camera_delay_s'] = round(clock.delay_s, 3)
     counts['states_s'] = states
+    counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
     tracks = {'sfa': _located(usable, clock), 'ekf': _Track.of([state for state, _ in fused])}
     if isinstance(localizer.filter, Smoother):
         tracks['smoothed'] = _Track.of(localizer.filter.smoothed())

@@ -66,6 +66,12 @@ _POSITIONS = {
     'var_yaw': ('var_yaw', 'yaw_var', 'cov_yawyaw', 'variance_yaw'),
 }
 
+_TUM = {
+    **{name: _POSITIONS[name] for name in ('x', 'y')},
+    **{name: (name,) for name in ('z', 'qx', 'qy', 'qz', 'qw')},
+    'yaw': _POSITIONS['yaw'],
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
@@ -86,7 +92,8 @@ class Table:
 class Filtered:
     """Poses (N, 3) at the stamps (N,) of odometry, from the start on, and counts of the rows.
 
-    `covariances` (N, 3, 3) of [x, y, yaw]; `updates`: what became of each position, in order.
+    `covariances` (N, 3, 3) of [x, y, yaw]; `updates`: what became of each position, in order;
+    `nis`: see PoseFilter.nis.
     """
 
     stamps_ns: Stamps
@@ -96,6 +103,7 @@ class Filtered:
     counts: Counter[str]
     status: Status
     before_start: int
+    nis: float
 
 
 def read_odometry_table(path: Path | str) -> Table:
@@ -150,6 +158,7 @@ def run_filter(
         fused.counts,
         fused.status,
         answers.count(None),
+        fused.nis,
     )
 
 
@@ -335,6 +344,39 @@ def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:
         for stamp_ns, (x, y, yaw) in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
             turn = f'{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}'
             file.write(f'{_seconds(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n'.encode())
+
+
+def write_covariances(path: Path | str, stamps_ns: Stamps, covariances: Array) -> None:
+    """Write the covariances (N, 3, 3) of [x, y, yaw] as a CSV file, a row for each stamp.
+
+    Raises DataError.
+    """
+    rows, columns = np.triu_indices(3)
+    with atomic_write(Path(path), DataError) as file:
+        file.write(b'stamp_s,var_x,cov_xy,cov_xyaw,var_y,cov_yyaw,var_yaw\n')
+        for stamp_ns, matrix in zip(stamps_ns.tolist(), covariances, strict=True):
+            cells = ','.join(f'{cell:.9g}' for cell in matrix[rows, columns].tolist())
+            file.write(f'{_seconds(stamp_ns)},{cells}\n'.encode())
+
+
+def read_truth(path: Path | str) -> Trajectory:
+    """Read true poses: `stamp_s,x_m,y_m,yaw_rad`, or TUM lines of `stamp x y z qx qy qz qw`.
+
+    Raises DataError.
+    """
+    table = _read_table(Path(path), _TUM, ('x', 'y'))
+    columns, quaternion = table.columns, ('qx', 'qy', 'qz', 'qw')
+    if len(table) == 0:
+        raise DataError(f'{path}: holds no poses')
+    if all(name in columns for name in quaternion):
+        qx, qy, qz, qw = (columns[name] for name in quaternion)
+        yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
+    elif 'yaw' in columns:
+        yaw = columns['yaw']
+    else:
+        raise DataError(f'{path}: no column yaw_rad')
+    stamps, first = np.unique(table.stamps_ns, return_index=True)
+    return Trajectory(stamps, np.column_stack([columns['x'], columns['y'], yaw])[first])
 
 
 def _seconds(stamp_ns: int) -> str:

@@ -349,6 +349,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--config': Case('--config {data}/start.yaml', POSES),
         '--initial-pose': Case('--initial-pose 1 2 3', POSES),
         '--smooth': Case('--smooth', POSES),
+        '--truth': Case('--truth {data}/positions.csv', says('inside 95 % regions')),
         '--output': Case('--output {out}/other.tum', written('other.tum')),
     },
     'tune': {

@@ -254,3 +254,39 @@ def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path):
     with pytest.raises(DataError, match='cannot be written'):
         filtering.write_tum(tmp_path / 'no' / 'out.tum', np.array([1]), np.zeros((1, 3)))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('kind', ['csv', 'tum'])
+def test_with_truth_it_prints_how_right_it_was(tmp_path, capsys, kind):
+    drive = Drive(seconds=60, rate_hz=10, every=5, start=(1.0, 2.0, 0.5), **NOISY)
+    rows = np.column_stack([(drive.stamps_ns - START_NS) * 1e-9 + 1.7e9, drive.poses])
+    if kind == 'tum':
+        half, zero = rows[:, 3] / 2, np.zeros(len(rows))
+        rows = np.column_stack([rows[:, :3], zero, zero, zero, np.sin(half), np.cos(half)])
+    head = 'stamp_s,x_m,y_m,yaw_rad' if kind == 'csv' else ''
+    truth, sep = tmp_path / 'truth', ',' if kind == 'csv' else ' '
+    np.savetxt(truth, rows, '%.6f', sep, header=head, comments='')
+    code, (stamps, poses) = run(tmp_path, drive, '--truth', str(truth))
+    said = capsys.readouterr().out
+    assert code == 0
+    off = errors(drive, (stamps, poses)).mean()
+    mean = float(said.split('error: mean ')[1].split(' m')[0])
+    assert mean == pytest.approx(off, abs=2e-3)
+    inside = float(said.split('regions: ')[1].split('%')[0])
+    assert 70 < inside <= 100
+    assert 0.6 < float(said.split('NIS ')[1].split()[0]) < 1.4
+
+
+def test_covariances_are_written_beside_the_poses(tmp_path):
+    _, (stamps, _) = run(tmp_path, Drive(seconds=5, **NOISY), '--initial-pose', '0', '0', '0')
+    lines = (tmp_path / 'out.covariance.csv').read_text().splitlines()
+    assert lines[0] == 'stamp_s,var_x,cov_xy,cov_xyaw,var_y,cov_yyaw,var_yaw'
+    assert [line.split(',')[0] for line in lines[1:]] == [seconds(stamp) for stamp in stamps]
+    cells = np.array([[float(cell) for cell in line.split(',')[1:]] for line in lines[1:]])
+    assert cells[0, 0] == pytest.approx(0.01, rel=0.2) and np.all(cells[:, [0, 3, 5]] > 0)
+
+
+def test_truth_without_heading_is_named(tmp_path, capsys):
+    (tmp_path / 't.csv').write_text('stamp_s,x_m,y_m\n1,2,3\n')
+    code, _ = run(tmp_path, Drive(seconds=5, **NOISY), '--truth', str(tmp_path / 't.csv'))
+    assert code == 1 and 'no column yaw_rad' in capsys.readouterr().err

@@ -7,10 +7,17 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sfa_localization.commands.options import settings
 from sfa_localization.data.errors import DataError
+from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.settings import FilterConfig
+
+if TYPE_CHECKING:
+    from sfa_localization.filtering import Filtered
 
 EXAMPLES = """\
   filter odom.csv positions.csv --output poses.tum
@@ -19,6 +26,7 @@ EXAMPLES = """\
 
 ODOM.csv: stamp_s,v_mps,omega_radps[,var_v,var_omega]
 POSITIONS.csv: stamp_s,x_m,y_m[,var_x,var_y][,var_xy][,yaw_rad,var_yaw]
+TRUTH: TUM lines, or stamp_s,x_m,y_m,yaw_rad.
 Seconds, meters, radians; variances in their squares; empty: unknown."""
 
 
@@ -37,13 +45,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--smooth', action='store_true', help='use later positions too, for poses after the drive'
     )
-    parser.add_argument('--output', type=Path, required=True, help='TUM file to write')
+    parser.add_argument(
+        '--output', type=Path, required=True, help='TUM file to write; covariances beside it'
+    )
+    parser.add_argument(
+        '--truth', type=Path, metavar='TRUTH.tum', help='true poses to compare with'
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Filter; print what was skipped, rejected and written."""
     from sfa_localization import filtering
 
+    truth = filtering.read_truth(arguments.truth) if arguments.truth else None
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
     config = settings(FilterConfig, arguments, arguments.config)
@@ -75,9 +89,29 @@ def run(arguments: argparse.Namespace) -> int:
             'or give --initial-pose X Y YAW'
         )
     filtering.write_tum(arguments.output, result.stamps_ns, result.poses)
+    beside = arguments.output.with_suffix('.covariance.csv')
+    filtering.write_covariances(beside, result.stamps_ns, result.covariances)
+    if truth is not None:
+        print(_judgement(truth, result))
     waited = f', {result.before_start} rows before the start' if result.before_start else ''
     print(f'{arguments.output}: {len(result.poses)} poses{waited}')
     return 0
+
+
+def _judgement(truth: Trajectory, result: Filtered) -> str:
+    from sfa_localization.evaluation import calibration, score
+
+    found = Trajectory(result.stamps_ns, result.poses)
+    errors = score(truth, found)
+    if not errors['n']:
+        return 'truth and poses have no time in common'
+    shares = calibration(truth, found, np.eye(2), result.covariances)
+    return (
+        f'error: mean {errors["mean"]:.3f} m, 95th percentile {errors["p95"]:.3f} m; '
+        f'heading: mean {errors["yaw_deg"]["mean"]:.1f} deg\n'
+        f'inside 95 % regions: {shares["within_95"]:.1%} of the positions, '
+        f'{shares["yaw_within_95"]:.1%} of the headings; NIS {result.nis:.2f}'
+    )
 
 
 def _consequence(arguments: argparse.Namespace) -> str:

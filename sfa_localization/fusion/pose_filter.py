@@ -61,6 +61,7 @@ class PoseFilter:
         self.config = config or FilterConfig()
         self.correlation = correlation or ErrorCorrelation()
         self.counts: Counter[str] = Counter()
+        self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
         self._rules = Rules(self.config, self.correlation)
         self._history = self._fresh(self._rules.recovery.blank(0))
@@ -169,6 +170,8 @@ class PoseFilter:
         update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
+        if update.d2 <= update.threshold:
+            self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
         return update._replace(stamp_ns=stamp_ns)
 
     def add_turned(self, stamp_ns: int, yaw_rad: float) -> None:
@@ -212,6 +215,14 @@ class PoseFilter:
     def camera_clock(self) -> CameraClock:
         """By how much images are stamped late, as far as turns have shown it."""
         return self._camera.clock
+
+    @property
+    def nis(self) -> float:
+        """Normalized innovation squared over its expectation, of all measurements inside the gate:
+        1 where covariances are right; NaN before any.
+        """
+        total, count = self._nis
+        return total / count if count else math.nan
 
     @property
     def state(self) -> State | None:
