@@ -184,6 +184,38 @@ def _resampled(states: list[State], lag_ns: int) -> list[State]:
     return found
 
 
+def halves(odometry: Table, positions: Table) -> list[tuple[Table, Table]]:
+    """Two logs of one, cut in the middle of the positions."""
+    middle_ns = int(np.median(positions.stamps_ns)) if len(positions) else 0
+    return [
+        (_rows(odometry, (odometry.stamps_ns < middle_ns) == early),
+         _rows(positions, (positions.stamps_ns < middle_ns) == early))
+        for early in (True, False)
+    ]  # fmt: skip
+
+
+def _rows(table: Table, kept: Array) -> Table:
+    return Table(table.stamps_ns[kept], {key: one[kept] for key, one in table.columns.items()})
+
+
+def odometry_arrays(odometry: Table) -> tuple[Stamps, Array, Array]:
+    """Stamps (N,), twists (N, 2) and stated variances (N, 2), 0 where there are none."""
+    given = [_twist(odometry.columns, i) for i in range(len(odometry))]
+    return odometry.stamps_ns, _twists(odometry), np.array([variances for *_, variances in given])
+
+
+def position_arrays(positions: Table) -> tuple[Array, Array]:
+    """Poses (M, 3) and covariances (M, 3, 3); a yaw that is not given is NaN, not certain."""
+    poses = np.full((len(positions), 3), np.nan)
+    covariances = np.zeros((len(positions), 3, 3))
+    covariances[:, 2, 2] = np.inf
+    for i in range(len(positions)):
+        value, covariance = _measurement(positions.columns, i)
+        poses[i, : len(value)] = value
+        covariances[i, : len(value), : len(value)] = covariance
+    return poses, covariances
+
+
 def without_positions(positions: Table) -> Table:
     """The table without its rows."""
     return Table(positions.stamps_ns[:0], {key: one[:0] for key, one in positions.columns.items()})

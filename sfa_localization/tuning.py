@@ -91,6 +91,71 @@ class Outcome:
     cost: float
 
 
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """Mean costs on drives that were not tuned on: of the settings `before`, and `after`."""
+
+    before: float
+    after: float
+
+    @property
+    def better(self) -> bool:
+        return self.after < self.before
+
+
+def validate(
+    parts: Sequence[TuningDrive],
+    config: FilterConfig,
+    found: Callable[[list[int]], FilterConfig],
+    cost: Callable[[Iterable[TuningDrive], FilterConfig], float],
+) -> Validation | None:
+    """Leave one part out, tune on the others (`found` of their indices), and judge on that one.
+
+    None where a part has too few images to decide anything.
+    """
+    if len(parts) < 2 or min(len(part.images.stamps_ns) for part in parts) < MIN_IMAGES:
+        return None
+    costs = []
+    for left_out, part in enumerate(parts):
+        others = [i for i in range(len(parts)) if i != left_out]
+        costs.append((cost([part], config), cost([part], found(others))))
+    before, after = np.mean(costs, axis=0).tolist()
+    return Validation(before, after)
+
+
+def parts_of(drives: Sequence[TuningDrive]) -> list[TuningDrive]:
+    """The drives, or the halves of a single one."""
+    if len(drives) != 1:
+        return list(drives)
+    odometry, images = drives[0].odometry, drives[0].images
+    middle_ns = int(np.median(images.stamps_ns)) if len(images.stamps_ns) else 0
+    halves = []
+    for early in (True, False):
+        rows = (odometry.stamps_ns < middle_ns) == early
+        seen = (images.stamps_ns < middle_ns) == early
+        halves.append(
+            dataclasses.replace(
+                drives[0],
+                odometry=Odometry(
+                    *(getattr(odometry, item.name)[rows] for item in dataclasses.fields(odometry))
+                ),
+                images=ImagePoses(
+                    *(getattr(images, item.name)[seen] for item in dataclasses.fields(images))
+                ),
+            )
+        )
+    return halves
+
+
+def middle(configs: Sequence[FilterConfig], names: Sequence[str]) -> FilterConfig:
+    """The first of some settings, with the geometric means of all for the named numbers."""
+    means = {
+        name: math.exp(float(np.mean([math.log(getattr(one, name) or _LEAST) for one in configs])))
+        for name in names
+    }
+    return dataclasses.replace(configs[0], **means)  # type: ignore[arg-type]
+
+
 def read_drives(
     bags: Sequence[Path],
     model: PlaceModel,

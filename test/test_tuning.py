@@ -9,6 +9,8 @@ import pytest
 from filter_drives import Drive
 
 from sfa_localization import tuning
+from sfa_localization.cli import main
+from sfa_localization.config import load_changes
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import Odometry, Trajectory
@@ -109,3 +111,65 @@ def test_the_models_error_correlation_is_used():
     shared = dataclasses.replace(drive, correlation=ErrorCorrelation(0.7, 0.6))
     config = FilterConfig()
     assert tuning.likelihood_cost([shared], config) < tuning.likelihood_cost([white], config)
+
+
+def test_what_is_worse_on_drives_not_seen_is_noticed():
+    drives = [tuning_drive(claimed=0.1, true=0.4, seed=seed) for seed in range(3)]
+    asked = []
+
+    def found(factor):
+        def of(others):
+            asked.append(others)
+            return FilterConfig(measurement_factor=factor)
+
+        return of
+
+    good = tuning.validate(drives, FilterConfig(), found(16.0), tuning.likelihood_cost)
+    bad = tuning.validate(drives, FilterConfig(), found(0.05), tuning.likelihood_cost)
+    assert asked[:3] == [[1, 2], [0, 2], [0, 1]]
+    assert good.better and not bad.better and good.before == bad.before
+
+
+def test_one_drive_is_judged_by_halves():
+    whole = tuning_drive()
+    first, second = tuning.parts_of([whole])
+    assert len(first.images.stamps_ns) + len(second.images.stamps_ns) == len(whole.images.stamps_ns)
+    assert first.images.stamps_ns[-1] < second.images.stamps_ns[0]
+    assert first.odometry.stamps_ns[-1] < second.odometry.stamps_ns[0]
+    assert tuning.validate([whole], FilterConfig(), lambda _: FilterConfig(), max) is None
+
+
+def log_of(folder, name, seed, claimed):
+    """CSV files of a drive whose positions err by 0.3 m and claim another standard deviation."""
+    drive = Drive(seconds=130, rate_hz=10, every=5, v_std=0.03, omega_std=0.02, position_std=0.3,
+                  seed=seed)  # fmt: skip
+    seconds = (drive.stamps_ns - drive.stamps_ns[0]) * 1e-9 + 100
+    paths = folder / f'{name}_odom.csv', folder / f'{name}_positions.csv'
+    at, seen = seconds[drive.pictures], drive.seen[:, :2]
+    variances = np.full((len(at), 2), claimed**2)
+    np.savetxt(paths[0], np.column_stack([seconds, drive.read]), '%.9f', ',')
+    np.savetxt(paths[1], np.column_stack([at, seen, variances]), '%.9f', ',')
+    return [str(path) for path in paths]
+
+
+@pytest.mark.parametrize('logs', [2, 1])
+def test_logs_without_ros_are_tuned_and_judged(tmp_path, capsys, logs):
+    paths = [path for k in range(logs) for path in log_of(tmp_path, f'log{k}', k, 0.1)]
+    code = main(['tune', *paths, '--output', str(tmp_path / 'tuned.yaml')])
+    said = capsys.readouterr().out
+    assert code == 0 and 'on what it did not see' in said and 'the settings stay' not in said
+    factor = load_changes(tmp_path / 'tuned.yaml')['ekf_node']['measurement_factor']
+    assert factor == pytest.approx(9.0, rel=0.3)
+
+
+def test_a_result_that_is_worse_on_other_logs_is_rejected(tmp_path, capsys):
+    paths = log_of(tmp_path, 'a', 0, 0.05) + log_of(tmp_path, 'b', 1, 1.5)
+    code = main(['tune', *paths, '--output', str(tmp_path / 'tuned.yaml')])
+    assert code == 0 and 'the settings stay' in capsys.readouterr().out
+    assert load_changes(tmp_path / 'tuned.yaml')['ekf_node']['measurement_factor'] == 1.0
+
+
+@pytest.mark.parametrize('paths', [['a.csv'], ['a.csv', 'bag'], ['bag']])
+def test_what_cannot_be_tuned_on_is_named(tmp_path, capsys, paths):
+    assert main(['tune', *paths, '--output', str(tmp_path / 'x.yaml')]) == 1
+    assert ('CSV' in capsys.readouterr().err) == (paths != ['bag'])
