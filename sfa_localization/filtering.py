@@ -129,8 +129,7 @@ def run_filter(
     correlation: ErrorCorrelation | None = None,
     lag_ns: int = 0,
 ) -> Filtered:
-    """Fuse two tables as a live filter would: each pose depends on earlier rows only, unless
-    `smooth`: then on all rows.
+    """Fuse two tables as a live filter would, by earlier rows only; `smooth`: by all rows.
 
     `start` is x m, y m, yaw rad, if known; `correlation` is that of the positions' errors; the
     robot moves `lag_ns` after the stamps of the odometry. Raises DataError when the tables do not

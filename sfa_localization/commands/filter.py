@@ -17,7 +17,7 @@ from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.settings import FilterConfig
 
 if TYPE_CHECKING:
-    from sfa_localization.filtering import Filtered
+    from sfa_localization.filtering import Filtered, Table
 
 EXAMPLES = """\
   filter odom.csv positions.csv --output poses.tum
@@ -77,12 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         correlation=fit.correlation,
         lag_ns=fit.lag_ns,
     )
-    for name, table in (('odometry rows', odometry), ('position rows', positions)):
-        for reason, count in sorted(table.skipped.items()):
-            print(f'{name}: {reason}: {count}')
-    for reason, count in sorted(result.counts.items()):
-        print(f'{reason}: {count}')
-    print(': '.join([result.status.level.name, '; '.join(result.status.reasons)]).rstrip(': '))
+    _print_counts(odometry, positions, result)
     if len(result.poses) == 0:
         raise DataError(
             'the filter never started: positions without heading need some meters of motion; '
@@ -96,6 +91,15 @@ def run(arguments: argparse.Namespace) -> int:
     waited = f', {result.before_start} rows before the start' if result.before_start else ''
     print(f'{arguments.output}: {len(result.poses)} poses{waited}')
     return 0
+
+
+def _print_counts(odometry: Table, positions: Table, result: Filtered) -> None:
+    for name, table in (('odometry rows', odometry), ('position rows', positions)):
+        for reason, count in sorted(table.skipped.items()):
+            print(f'{name}: {reason}: {count}')
+    for reason, count in sorted(result.counts.items()):
+        print(f'{reason}: {count}')
+    print(': '.join([result.status.level.name, '; '.join(result.status.reasons)]).rstrip(': '))
 
 
 def _judgement(truth: Trajectory, result: Filtered) -> str:
