@@ -23,6 +23,8 @@ FACTORS = np.array([1.0, 2.0, 4.0, 8.0])
 _PRIOR = np.array([0.0, -3.0, -4.0, -6.0])
 """Logarithms of the probabilities before: what is expected holds until the drive shows otherwise,
 as clearly as any test at 2 % asks."""
+SPACING_NS = 400_000_000
+"""Measurements closer in time than this show no turn of their own: they are left out."""
 _FORGETTING = 0.999
 """Share of the evidence left after each measurement: floors and loads change within minutes."""
 _OUTLIER_D2 = 12.0
@@ -32,10 +34,11 @@ _SIZE = len(_STATE)
 
 
 class Driven(NamedTuple):
-    """Dead reckoning so far: the pose, the fade of shared errors as the exponent `faded`, and the
-    variances that it has added to the heading and to the position along each axis.
+    """Dead reckoning until a stamp: the pose, the fade of shared errors as the exponent `faded`,
+    and the variances that it has added to the heading and to the position along each axis.
     """
 
+    stamp_ns: int
     pose: tuple[float, float, float]
     faded: float
     yaw_variance: float

@@ -24,7 +24,7 @@ from sfa_localization.fusion.inputs import lower_root
 from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, X, Y
 from sfa_localization.fusion.recover import Recovery
-from sfa_localization.fusion.turn_noise import Driven, TurnNoise, begun, weighed
+from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, begun, weighed
 
 STARTS = ('started', 'restarted elsewhere')
 """Reasons of updates that take a pose from measurements alone."""
@@ -69,16 +69,19 @@ class Correction:
 
     def _begun(self, belief: Belief) -> TurnNoise:
         """What is known about the noise of turns, from another pose on."""
-        driven = Driven(belief.dead_reckoned, belief.traveled_m / self._recovery.decorrelation_m,
-                        *belief.added)  # fmt: skip
+        faded = belief.traveled_m / self._recovery.decorrelation_m
+        driven = Driven(belief.stamp_ns, belief.dead_reckoned, faded, *belief.added)
         return begun(driven, belief.mean, belief.covariance, belief.turns)
 
     def _weighed(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief with what a measurement shows about the noise of turns."""
         if not belief.located or belief.covariance[YAW, YAW] > self._lost_yaw_variance:
             return belief
+        last = belief.turns
+        if last is not None and belief.stamp_ns < last.driven.stamp_ns + SPACING_NS:
+            return belief
         now = self._begun(belief)
-        turns = weighed(belief.turns or now, now.driven, event.value, event.jacobian, event.white)
+        turns = weighed(last or now, now.driven, event.value, event.jacobian, event.white)
         return belief._replace(turns=turns, turn_factor=turns.factor)
 
     def _fused(self, belief: Belief, event: MeasurementEvent) -> Belief:
