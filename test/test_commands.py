@@ -229,6 +229,8 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--trajectory': Case('--trajectory curves', another_drive),
         '--seed': Case('--seed 2', another_drive),
         '--world': Case('--world 2', differ(lambda o: o.bag()['pictures'][0])),
+        '--light': Case('--light evening', of_pictures),
+        '--season': Case('--season winter', of_pictures),
         '--area': Case('--area 9x7', lambda a, b: width(b) > width(a), beside='--length 20'),
         '--length': Case('--length 8', lambda a, b: metres(b) > metres(a) + 2),
         '--images': Case('--images raw', lambda a, b: '/image_raw' in b.bag()['topics']),
@@ -396,12 +398,12 @@ def small_network() -> Iterator[None]:
 
 @pytest.fixture(scope='module', autouse=True)
 def gardens() -> Iterator[None]:
-    """Build a garden once for all drives in it: its seed and its area make it."""
+    """Build a garden once for all drives in it: seed, area, light and season make it."""
     made: dict[Any, simulation.Garden] = {}
     garden = simulation.Garden
 
     def again(seed: int, settings: SimulationConfig) -> simulation.Garden:
-        place = (seed, settings.area)
+        place = (seed, settings.area, settings.light, settings.season)
         if place not in made:
             made[place] = garden(seed, settings)
         return made[place]
