@@ -211,6 +211,7 @@ BASE = {
     'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml --trials 10',
     'config': '',
     'demo': '--out {out}/demo',
+    'reproduce': 'light --out {out}/light',
 }
 DAMAGED = {
     'train': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
@@ -382,6 +383,12 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--seed': Case('--seed 4', noted(('seed', 4))),
         '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
     },
+    'reproduce': {
+        '--out': Case('--out {out}/elsewhere', written('elsewhere/matrix.png')),
+        '--quick': Case('--quick', noted(('area', (8.0, 8.0)))),
+        '--world': Case('--world 3', noted(('world', 3))),
+        '--seed': Case('--seed 40', noted(('seed', 40), ('seed', 41))),
+    },
 }
 SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
 
@@ -415,12 +422,14 @@ def gardens() -> Iterator[None]:
 
 @contextlib.contextmanager
 def watched(name: str, notes: list[Any]) -> Iterator[None]:
-    """Note what no output shows; the demo's minutes of work are left out."""
+    """Note what no output shows; minutes of work of `demo` and `reproduce` are left out."""
     with pytest.MonkeyPatch.context() as patch:
         if name == 'play':
             watch_play(patch, notes)
         if name == 'demo':
             watch_demo(patch, notes)
+        if name == 'reproduce':
+            watch_reproduce(patch, notes)
         if name == 'train':
             watch_cluster(patch, notes)
         yield
@@ -468,6 +477,25 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     patch.setattr(demonstration, 'run_live', run_live)
     patch.setattr(demonstration, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
     patch.setattr(demonstration, '_write_results', lambda *_args: None)
+
+
+def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
+    """Drives are noted instead of simulated, and none is trained on or judged."""
+    from sfa_localization.commands import light_matrix
+
+    def simulated(settings, out, panorama, progress):
+        notes.extend((name, getattr(settings, name)) for name in ('world', 'seed', 'area'))
+
+    def judged(_model, _bag, _align_bag, transform):
+        return {'sfa': {'mean_m': 0.1}, 'localized': 1.0}, transform
+
+    patch.setattr(light_matrix, 'simulate', simulated)
+    patch.setattr(light_matrix, 'train', lambda *_args, **_named: None)
+    patch.setattr(light_matrix.PlaceModel, 'load', lambda _path: None)
+    patch.setattr(light_matrix, '_read', lambda *_args: None)
+    patch.setattr(light_matrix, '_retrieval', lambda _runs: None)
+    patch.setattr(light_matrix, '_retrieved', lambda *_args: {'mean_m': 0.2})
+    patch.setattr(light_matrix, '_judged', judged)
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
