@@ -322,7 +322,7 @@ def _damaged(path: Path, reason: object) -> ModelError:
 def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     """The network of a model file's arrays and header."""
     spec = dict(header['architecture'])
-    spec['size'] = tuple(spec['size'])
+    spec['size'], spec['grid'] = tuple(spec['size']), tuple(spec['grid'])
     spec['layers'] = tuple(
         Layer(**{**layer, 'field': tuple(layer['field']), 'stride': tuple(layer['stride'])})
         for layer in spec['layers']
