@@ -22,16 +22,22 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.agreement import Agreement, disagreement
-from sfa_localization.features.image_features import layer_harmonics, slow_features
+from sfa_localization.features.image_features import (
+    REFINING_LAYER,
+    layer_harmonics,
+    slow_features,
+    spectrum,
+)
 from sfa_localization.features.network import Architecture, Layer, Network, Node
 from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.expansions import MetricMap
 from sfa_localization.metric.fast_expansions import Predictor, fast_map
+from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +58,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass and novelty, learned from one place.
+    """Network, metric map, compass, refinement and novelty, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
@@ -69,6 +75,7 @@ class PlaceModel:
     heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
+    refinement: Refinement | None = None
     _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
@@ -103,6 +110,10 @@ class PlaceModel:
         yaw, yaw_variance = self._headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
+        if self.refinement is not None:
+            positions, covariances = self.refinement.refine(
+                spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, covariances)
+            )
         return [
             Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
             for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
@@ -137,6 +148,8 @@ class PlaceModel:
         except ModelError as error:
             raise ModelError(f'{path}: {error}') from None
         model._predictor()
+        if model.refinement is not None:
+            model.refinement.compile()
         return model
 
     def _header(self) -> dict[str, Any]:
@@ -164,11 +177,15 @@ class PlaceModel:
             arrays |= _prefixed('compass/', self.compass.to_arrays())
         if self.yaw_agreement is not None:
             arrays |= _prefixed('yaw_agreement/', self.yaw_agreement.to_arrays())
+        if self.refinement is not None:
+            arrays |= _prefixed('refinement/', self.refinement.to_arrays())
         return arrays
 
     @classmethod
     def _from_arrays(cls, arrays: Arrays, header: dict[str, Any]) -> PlaceModel:
-        compass, yaw_agreement = (_under(arrays, name) for name in ('compass/', 'yaw_agreement/'))
+        compass, yaw_agreement, refinement = (
+            _under(arrays, name) for name in ('compass/', 'yaw_agreement/', 'refinement/')
+        )
         return cls(
             network_from(arrays, header),
             MetricMap.from_arrays(_under(arrays, 'metric/')),
@@ -180,6 +197,7 @@ class PlaceModel:
             tuple(header['heading_layers']),
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
+            Refinement.from_arrays(refinement) if refinement else None,
         )
 
 

@@ -101,7 +101,21 @@ def test_without_a_compass_yaw_is_unknown(model, pictures):
     )
     assert np.isnan(estimate.yaw)
     assert estimate.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
-    assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=1e-9)
+    unrefined = replace(model, refinement=None).locate(pictures[0])
+    assert np.allclose(estimate.position, unrefined.position, atol=1e-9)
+
+
+def test_turned_maps_refine_what_slow_features_find(model, pictures):
+    truth = visit().odometry.poses[:, :2]
+    coarse = replace(model, refinement=None).locate_all(pictures)
+    finer = model.locate_all(pictures)
+    errors = [
+        np.median(np.hypot(*(np.array([e.position for e in estimates]) - truth).T))
+        for estimates in (coarse, finer)
+    ]
+    assert errors[1] < 0.8 * errors[0]
+    # The heading is the compass's own, in the frame of both maps.
+    assert [e.yaw for e in finer] == [e.yaw for e in coarse]
 
 
 @pytest.mark.parametrize(
@@ -227,7 +241,14 @@ class TestFile:
         refused(saved, 'not a sfa_localization place model')
 
     @pytest.mark.parametrize(
-        'name', ['network/1/slow', 'metric/weights', 'novelty/0/scalars', 'compass/weights']
+        'name',
+        [
+            'network/1/slow',
+            'metric/weights',
+            'novelty/0/scalars',
+            'compass/weights',
+            'refinement/axes',
+        ],
     )
     def test_an_array_is_missing(self, saved, name):
         rewrite(saved, without=name)

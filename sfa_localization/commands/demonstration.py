@@ -20,7 +20,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.commands.live_nodes import commands, run_live
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import atomic_write
-from sfa_localization.data.run import Trajectory
+from sfa_localization.data.run import Stamps, Trajectory
 from sfa_localization.evaluation import (
     Evaluation,
     evaluate,
@@ -29,6 +29,7 @@ from sfa_localization.evaluation import (
     score,
     write_json,
 )
+from sfa_localization.metric.learning import positions
 from sfa_localization.reports.evaluation import write_report
 from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
@@ -113,10 +114,15 @@ def _compare(
 
 
 def _training_estimate(trained: Trained) -> Trajectory:
-    """The model's positions of its training images, in the map."""
-    positions, _ = trained.model.metric.predict(trained.features)
-    stamps = np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
-    return Trajectory(stamps, np.column_stack([positions, np.full(len(stamps), np.nan)]))
+    """The finest map's positions of the training images in segments."""
+    images, places = positions(trained.metric, trained.segments)
+    estimated = places - trained.metric.residuals
+    unknown = np.full(len(images), np.nan)
+    return Trajectory(_image_stamps(trained)[images], np.column_stack([estimated, unknown]))
+
+
+def _image_stamps(trained: Trained) -> Stamps:
+    return np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
 
 
 def mean_distance(a: Trajectory, b: Trajectory) -> float:
@@ -130,6 +136,6 @@ def _write_results(out: Path, result: Evaluation, trained: Trained, coverage: Pa
     write_json(out / 'results.json', result.as_dict())
     with Bag(coverage) as bag:
         truth = bag.trajectory()
-    places = truth.at(_training_estimate(trained).stamps_ns)[:, :2]
+    places = truth.at(_image_stamps(trained))[:, :2]
     shown = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
     write_report(out / 'report', result.truth, shown, result.scores, places, trained.features)

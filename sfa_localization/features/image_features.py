@@ -22,7 +22,12 @@ from sfa_localization.features.novelty import describe
 from sfa_localization.features.rotation import Map
 
 Complex = NDArray[np.complex128]
+Spectrum = NDArray[np.complex64]
 
+REFINING_LAYER = 1
+"""Layer (0-based), below the top, whose map refines positions: it still holds the heading."""
+HARMONICS = 13
+"""Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
 # Images whose maps are kept for the compass and for novelty, however long the drives: memory.
 SAMPLES = 3000
 
@@ -45,6 +50,25 @@ def layer_harmonics(maps: list[Map], layers: tuple[int, ...]) -> Complex:
     return np.concatenate([harmonics(maps[layer]) for layer in layers], axis=1)
 
 
+def spectrum(maps: Map, count: int = HARMONICS) -> Spectrum:
+    """Harmonics 0, 1, ... of maps (T, rows, R, C) over the columns: (T, H, rows * C).
+
+    H is at most `count`, and only harmonics below R / 2, which a turn by a fraction of a column
+    leaves what they are. Scaled so that, with all of an odd R, squared norms are the maps'.
+    """
+    columns = maps.shape[2]
+    order = np.arange(min(count, (columns + 1) // 2))
+    phase = -2j * np.pi / columns * np.outer(order, np.arange(columns))
+    wave = np.exp(phase) * np.sqrt(np.where(order > 0, 2.0, 1.0) / columns)[:, None]
+    parts = wave.astype(np.complex64) @ maps
+    return np.asarray(parts.transpose(0, 2, 1, 3).reshape(len(maps), len(order), -1))
+
+
+def has_refining_layer(network: Network) -> bool:
+    """Whether there is such a layer below the top, whose own maps hardly show the heading."""
+    return len(network.nodes) > REFINING_LAYER + 1
+
+
 @dataclass(frozen=True, slots=True)
 class ImageFeatures:
     """Network outputs for all N images, run after run, and more for a sample of S of them."""
@@ -59,6 +83,8 @@ class ImageFeatures:
     """(S, J) of the layers that the compass reads."""
     descriptions: tuple[Array, ...]
     """Per layer (S, D), for novelty."""
+    spectra: Spectrum | None
+    """(N, H, J) of the layer that refines positions; None in a network without it."""
     variance_shares: dict[str, list[float]]
     """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
 
@@ -75,6 +101,7 @@ def features_of_runs(
     in_sample = np.zeros(total, bool)
     in_sample[sampled] = True
     slow, spread, harmonic = [], [], []
+    spectra: list[Spectrum] = []
     shares = _VarianceShares(network.architecture.outputs)
     descriptions: list[list[Array]] = [[] for _ in network.nodes]
     start = 0
@@ -85,6 +112,8 @@ def features_of_runs(
         spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
+        if has_refining_layer(network):
+            spectra.append(spectrum(maps[REFINING_LAYER]))
         for layer, of_layer in zip(maps, descriptions, strict=True):
             of_layer.append(describe(layer[keep]))
         start += len(images)
@@ -95,6 +124,7 @@ def features_of_runs(
         sampled,
         np.concatenate(harmonic),
         tuple(np.concatenate(d) for d in descriptions),
+        np.concatenate(spectra) if spectra else None,
         shares.result(),
     )
 
