@@ -20,7 +20,6 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
-from sfa_localization.data.threads import one_core
 from sfa_localization.features.agreement import Agreement, disagreement
 from sfa_localization.features.image_features import (
     REFINING_LAYER,
@@ -32,8 +31,7 @@ from sfa_localization.features.network import Architecture, Layer, Network, Node
 from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
-from sfa_localization.metric.expansions import MetricMap
-from sfa_localization.metric.fast_expansions import Predictor, fast_map
+from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
@@ -66,7 +64,7 @@ class PlaceModel:
     """
 
     network: Network
-    metric: MetricMap
+    metric: Predictor
     panorama: PanoramaConfig
     novelty: Novelty
     agreement: Agreement
@@ -76,7 +74,6 @@ class PlaceModel:
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     refinement: Refinement | None = None
-    _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     @property
     def has_heading(self) -> bool:
@@ -105,7 +102,7 @@ class PlaceModel:
         slow = slow_features(maps)
         novelty = self.novelty.per_layer(maps).max(1)
         spread = disagreement(maps[-1])
-        positions, covariances = self._predictor().predict(slow)
+        positions, covariances = self.metric.predict(slow)
         covariances = covariances * self.agreement.factor(spread)[:, None, None]
         yaw, yaw_variance = self._headings(maps, slow)
         if self.yaw_agreement is not None:
@@ -118,13 +115,6 @@ class PlaceModel:
             Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
             for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
         ]
-
-    def _predictor(self) -> Predictor:
-        """The metric map's fastest form, compiled once."""
-        if not self._fast:
-            with one_core():
-                self._fast.append(fast_map(self.metric))
-        return self._fast[0]
 
     def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         if self.compass is None:
@@ -142,15 +132,11 @@ class PlaceModel:
         path = Path(path)
         arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
         try:
-            model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
+            return cls._from_arrays(arrays, json.loads(str(arrays['header'])))
         except (KeyError, ValueError, TypeError, IndexError, ConfigError, DataError) as error:
             raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
         except ModelError as error:
             raise ModelError(f'{path}: {error}') from None
-        model._predictor()
-        if model.refinement is not None:
-            model.refinement.compile()
-        return model
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
@@ -188,7 +174,7 @@ class PlaceModel:
         )
         return cls(
             network_from(arrays, header),
-            MetricMap.from_arrays(_under(arrays, 'metric/')),
+            map_from_arrays(_under(arrays, 'metric/')),
             PanoramaConfig(**header['panorama']),
             Novelty.from_arrays(_under(arrays, 'novelty/')),
             Agreement.from_arrays(_under(arrays, 'agreement/')),

@@ -49,6 +49,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
+from sfa_localization.metric.fast_expansions import fast_map
 from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
@@ -61,6 +62,10 @@ from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
+
+COARSE_POINTS = 700
+"""Inducing points of a first map that is refined: with more, the refined map and the heading are
+no better, and the model file is larger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +167,13 @@ def learn_place(
     images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
-    first = learn_metric(images.slow, segments, recipe.metric, recipe.network.seed)
+    points = COARSE_POINTS if _refines(recipe.metric, images) else None
+    seed = recipe.network.seed
+    first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
     heading = learn_heading(images, segments, first)
     finer = _refine(images, segments, first, heading, recipe)
+    if points is not None and finer is None:
+        first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
     model = _assemble(network, runs, clocks, recipe, images, segments, first, heading, finer)
     result = finer.metric if finer else first
     return Trained(model, tuple(runs), images.slow, segments, result, heading)
@@ -200,6 +209,15 @@ def _cut_odometry(
     return join(parts, [sum(counts[:k]) for k in range(len(runs))])
 
 
+def _refines(config: MetricConfig, images: ImageFeatures) -> bool:
+    """Whether step 7 refines the map, if there is a heading.
+
+    The paper's descent and its monomials stay as they are: they are there for comparison.
+    """
+    article = config.solver == 'paper' or config.metric_map == 'monomials'
+    return images.spectra is not None and not article
+
+
 def _refine(
     images: ImageFeatures,
     segments: Segments,
@@ -207,17 +225,12 @@ def _refine(
     heading: LearnedHeading | None,
     recipe: Recipe,
 ) -> LearnedRefinement | None:
-    """Step 7, where there are a heading and a layer to refine with.
-
-    The paper's descent and its monomials stay as they are: they are there for comparison.
-    """
-    config = recipe.metric
-    article = config.solver == 'paper' or config.metric_map == 'monomials'
-    if heading is None or images.spectra is None or article:
+    """Step 7, where there are a heading and a layer to refine with."""
+    if heading is None or images.spectra is None or not _refines(recipe.metric, images):
         return None
     views, sign, seed = images.disagreement, heading.compass.sign, recipe.network.seed
     try:
-        return learn_refinement(images.spectra, views, segments, first, sign, config, seed)
+        return learn_refinement(images.spectra, views, segments, first, sign, recipe.metric, seed)
     except DataError as error:
         logger.warning('positions are not refined: %s', error)
         return None
@@ -245,7 +258,7 @@ def _assemble(
     quality |= {'features_used': first.map.features, 'refined': finer is not None}
     return PlaceModel(
         network,
-        first.map,
+        fast_map(first.map),
         PanoramaConfig(**{**asdict(recipe.panorama), 'height': height, 'width': width}),
         Novelty.fit(images.descriptions),
         agreement,

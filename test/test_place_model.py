@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
+from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, recipe, visit
 
 from sfa_localization.data.array_files import read_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -16,7 +16,9 @@ from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
+from sfa_localization.metric.expansions import MetricMap
 from sfa_localization.metric.fast_expansions import FastProcess, fast_map
+from sfa_localization.metric.learning import learn_metric
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 
@@ -48,7 +50,8 @@ def test_pictures_are_located(model, pictures):
 def test_one_by_one_equals_all_together(model, pictures):
     for picture, together in zip(pictures, model.locate_all(pictures), strict=True):
         alone = model.locate(picture)
-        assert np.allclose(alone.position, together.position, atol=1e-5)
+        # Float32 rounds their headings differently, and the refined position follows.
+        assert np.allclose(alone.position, together.position, atol=1e-4)
         assert wrap_angle(alone.yaw - together.yaw) == pytest.approx(0, abs=1e-4)
         assert np.allclose(alone.covariance, together.covariance, rtol=1e-2, atol=1e-6)
         assert alone.novelty == pytest.approx(together.novelty, rel=1e-4)
@@ -133,23 +136,28 @@ def test_other_pictures_are_refused(model, picture):
 
 
 class TestFastMap:
-    """The compiled metric map tells what the map tells."""
+    """The compiled metric map predicts what the map predicts."""
 
     def features(self, model: PlaceModel) -> np.ndarray:
         seen = place().features[::7]
         return np.concatenate([seen, 3 * np.random.default_rng(0).normal(size=(20, 8))])
 
+    def slow_map(self) -> MetricMap:
+        """Of slow features; `place` refines it."""
+        trained = place()
+        return learn_metric(trained.features, trained.segments, recipe().metric).map
+
     def test_equals_the_map(self, model):
-        features, fast = self.features(model), fast_map(model.metric)
+        features, fast = self.features(model), fast_map(self.slow_map())
         assert isinstance(fast, FastProcess)
-        positions, covariances = model.metric.predict(features)
+        positions, covariances = self.slow_map().predict(features)
         fast_positions, fast_covariances = fast.predict(features)
         assert np.allclose(fast_positions, positions, atol=1e-6)
         scale = np.trace(covariances, axis1=1, axis2=2)[:, None, None]
         assert (np.abs(fast_covariances - covariances) / scale).max() < 0.02
 
     def test_a_single_row_equals_many(self, model):
-        features, fast = self.features(model), fast_map(model.metric)
+        features, fast = self.features(model), model.metric
         together = fast.predict(features)
         for row, position, covariance in zip(features, *together, strict=True):
             alone = fast.predict(row[None])
@@ -157,7 +165,7 @@ class TestFastMap:
             assert np.allclose(alone[1][0], covariance, rtol=1e-2)
 
     def test_monomials_are_quick_as_they_are(self, model):
-        other = replace(model.metric, basis=_Other())
+        other = replace(place().metric.map, basis=_Other())
         assert fast_map(other) is other
 
 
@@ -244,7 +252,7 @@ class TestFile:
         'name',
         [
             'network/1/slow',
-            'metric/weights',
+            'metric/linear',
             'novelty/0/scalars',
             'compass/weights',
             'refinement/axes',

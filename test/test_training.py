@@ -116,15 +116,24 @@ def test_turned_maps_refine_the_map(bag, tmp_path):
     assert trained.model.quality['refined']
     assert '4 slow features refined by turned maps' in summary(trained)
     # What is expected, and reported, is what the finer map was learned from.
-    assert trained.metric.map is trained.model.refinement.metric
+    finest = trained.metric.map, trained.model.refinement.metric
+    places = [each.predict(np.zeros((1, 32)))[0] for each in finest]
+    np.testing.assert_allclose(*places, atol=1e-6)
 
 
 def test_maps_that_cannot_refine_leave_the_first_map(bag, tmp_path, monkeypatch, caplog):
+    """With all its points, and where the heading was learned."""
+    monkeypatch.setattr(training, 'COARSE_POINTS', 30)
+    refined = train([bag], tmp_path / 'model.npz', RECIPE)
     monkeypatch.setattr(training, 'learn_refinement', _fail)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
     assert 'positions are not refined: the drive cannot fix a map' in caplog.text
     assert trained.model.has_heading and trained.model.refinement is None
     assert 'refined' not in summary(trained)
+    assert len(refined.model.metric.points) == 30
+    assert len(trained.model.metric.points) > 100
+    places = [model.metric.predict(trained.features)[0] for model in (refined.model, trained.model)]
+    assert np.hypot(*np.subtract(*places).T).mean() < 0.1
 
 
 def test_two_layers_have_none_to_refine_with(bag, tmp_path):

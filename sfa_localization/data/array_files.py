@@ -8,7 +8,7 @@ import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from sfa_localization.data.errors import ModelError
 from sfa_localization.data.files import atomic_write
 
 Arrays = dict[str, NDArray[Any]]
+Number = TypeVar('Number', bound=np.generic)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -44,3 +45,16 @@ def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
             f'{path}: version {found_version}, this software reads {version}: {remedy} again'
         )
     return arrays
+
+
+def packed(lower: NDArray[Number]) -> NDArray[Number]:
+    """The lower triangle (N (N + 1) / 2,) of a triangular matrix (N, N), row by row."""
+    return np.asarray(lower[np.tril_indices(len(lower))])
+
+
+def unpacked(triangle: NDArray[Number]) -> NDArray[Number]:
+    """The lower triangular matrix (N, N), in Fortran order, of its packed triangle."""
+    size = (round((8 * len(triangle) + 1) ** 0.5) - 1) // 2
+    lower = np.zeros((size, size), triangle.dtype, order='F')
+    lower[np.tril_indices(size)] = triangle
+    return lower

@@ -85,14 +85,16 @@ def learn_metric(
     config: MetricConfig,
     seed: int = 0,
     *,
+    points: int | None = None,
     scale: Array | None = None,
     onto: MetricResult | None = None,
 ) -> MetricResult:
     """Learn meters from slow features (N, K), one row per image of the runs, and segments.
 
-    A Gaussian process weights the features by their slowness and chooses how many it reads; with
-    `scale` (K,), a unit length being the typical distance of two images, by that, and it reads all.
-    The result lies in its own map frame, or in that of another result of the same segments, `onto`.
+    At most `points` images span a Gaussian process. It weights the features by their slowness and
+    chooses how many it reads; with `scale` (K,), it weights them by that and reads all; a unit
+    length is then the typical distance of two images. The result lies in its own map frame, or in
+    that of `onto`, another result of the same segments.
 
     Raises DataError when the features are unusable, when the drive cannot determine a map (the
     message names what to drive instead), or when optimality is not proven.
@@ -103,7 +105,7 @@ def learn_metric(
     if config.solver == 'paper':
         fit, history = paper_solver.learn(problem)
     else:
-        fit = choose(problem, scale)
+        fit = choose(problem, points, scale)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)

@@ -17,7 +17,7 @@ back is exact also by fractions of a column.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,11 +26,10 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.threads import one_core
 from sfa_localization.features.agreement import Agreement, quantile
 from sfa_localization.features.image_features import Spectrum
-from sfa_localization.metric.expansions import MetricMap
-from sfa_localization.metric.fast_expansions import FastProcess, Predictor, fast_map
+from sfa_localization.metric.expansions import Process
+from sfa_localization.metric.fast_expansions import FastProcess
 from sfa_localization.metric.learning import (
     MetricResult,
     headings,
@@ -105,11 +104,10 @@ class Refinement:
     """
 
     projection: Projection
-    metric: MetricMap
+    metric: FastProcess
     agreement: Agreement
     sign: float
     usual: float
-    _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def predict(self, spectra: Spectrum, yaw: Array, views: Array) -> tuple[Array, Array]:
         """Positions (T, 2) m and covariances (T, 2, 2) by the finer map alone, at exact headings.
@@ -117,7 +115,7 @@ class Refinement:
         Of spectra (T, H, J) at headings yaw (T,) rad, with the disagreement (T,) of the views.
         """
         features = self._features(spectra, yaw)
-        places, covariances = self.compile().predict(features)
+        places, covariances = self.metric.predict(features)
         return places, covariances * self.agreement.factor(views)[:, None, None]
 
     def refine(
@@ -160,20 +158,10 @@ class Refinement:
 
     def _place(self, spectra: Spectrum, yaw: Array) -> Array:
         """Positions (T, 2) without their covariances, for far less work."""
-        features, fast = self._features(spectra, yaw), self.compile()
-        if not isinstance(fast, FastProcess):
-            return fast.predict(features)[0]
-        return fast.positions(features)
+        return self.metric.positions(self._features(spectra, yaw))
 
     def _features(self, spectra: Spectrum, yaw: Array) -> Array:
         return self.projection.features(turned_back(spectra, yaw, self.sign))
-
-    def compile(self) -> Predictor:
-        """The finer map's fastest form, compiled once."""
-        if not self._fast:
-            with one_core():
-                self._fast.append(fast_map(self.metric))
-        return self._fast[0]
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
@@ -184,11 +172,11 @@ class Refinement:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Refinement:
-        """Raises ModelError or KeyError for arrays that are not a refinement's."""
+        """Raises KeyError or ValueError for arrays that are not a refinement's."""
         sign, usual = (float(value) for value in arrays['scalars'])
         return cls(
             Projection(arrays['mean'], arrays['axes']),
-            MetricMap.from_arrays(_under(arrays, 'metric_')),
+            FastProcess.from_arrays(_under(arrays, 'metric_')),
             Agreement.from_arrays(_under(arrays, 'agreement_')),
             sign,
             usual,
@@ -226,10 +214,12 @@ def learn_refinement(
         features[rows] = projection.features(turned)
     # They count by their own size, as principal components do.
     scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
-    own_count = replace(config, slow_features=0)
-    metric = learn_metric(features, segments, own_count, seed, scale=scale, onto=first)
+    process = replace(config, solver='certified', metric_map='gp', slow_features=0)
+    metric = learn_metric(features, segments, process, seed, scale=scale, onto=first)
     agreement = left_out_agreement(disagreement, metric)
-    refinement = Refinement(projection, metric.map, agreement, sign, _usual(first, metric))
+    assert isinstance(metric.map.basis, Process)
+    fast = FastProcess.of(metric.map, metric.map.basis)
+    refinement = Refinement(projection, fast, agreement, sign, _usual(first, metric))
     return LearnedRefinement(refinement, metric)
 
 

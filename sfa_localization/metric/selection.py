@@ -160,14 +160,18 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
     return np.asarray(weights / np.where(std > 0, std, 1.0))
 
 
-def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
+def choose(problem: MetricProblem, points: int | None = None, scale: Array | None = None) -> MapFit:
     """The fit of the best basis of the kind that the settings name.
 
-    A process reads all features with weights `scale` (K,), or the best count by their slowness.
+    A process of at most `points` inducing points reads all features with weights `scale` (K,), or
+    the best count of them by their slowness.
     """
+    size = INDUCING_POINTS if points is None else min(points, INDUCING_POINTS)
     if problem.config.metric_map == 'monomials':
         return _choose_monomials(problem)
-    return _choose_process(problem) if scale is None else _choose_scaled(problem, scale)
+    if scale is None:
+        return _choose_process(problem, size)
+    return _choose_scaled(problem, size, scale)
 
 
 def _counts(problem: MetricProblem) -> list[int]:
@@ -194,7 +198,7 @@ def _choose_monomials(problem: MetricProblem) -> MapFit:
     return problem.fit(best[1].basis, best[1])
 
 
-def _choose_process(problem: MetricProblem) -> MapFit:
+def _choose_process(problem: MetricProblem, size: int) -> MapFit:
     """Length and noise by the evidence, the count of features by what is left out."""
     best: tuple[float, MapFit, tuple[float, float]] | None = None
     hyper = _FIRST_HYPER
@@ -206,15 +210,15 @@ def _choose_process(problem: MetricProblem) -> MapFit:
     assert best is not None
     _, now, (length, noise) = best
     scale = feature_scale(problem.features, problem.stack, now.basis.features) / length
-    basis = Process.fit(problem.features, scale, noise, INDUCING_POINTS)
+    basis = Process.fit(problem.features, scale, noise, size)
     return problem.fit(basis, now)
 
 
-def _choose_scaled(problem: MetricProblem, scale: Array) -> MapFit:
+def _choose_scaled(problem: MetricProblem, size: int, scale: Array) -> MapFit:
     """Length and noise by the evidence, all features at their given weights."""
-    points = min(_SCALED_SEARCH_POINTS, INDUCING_POINTS)
+    points = min(_SCALED_SEARCH_POINTS, size)
     now, (length, noise) = _search(problem, scale, points, _FIRST_HYPER, None)
-    basis = Process.fit(problem.features, scale / length, noise, INDUCING_POINTS)
+    basis = Process.fit(problem.features, scale / length, noise, size)
     return problem.fit(basis, now)
 
 

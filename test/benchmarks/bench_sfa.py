@@ -43,7 +43,7 @@ from sfa_localization.features.network_training import (
 )
 from sfa_localization.features.novelty import Novelty, describe
 from sfa_localization.features.sfa import Statistics, solve
-from sfa_localization.metric.compass import Compass, kernel_between
+from sfa_localization.metric.compass import Compass, kernel_between, triangular
 from sfa_localization.metric.compass_training import (
     INDUCING_IMAGES,
     PLACE_FEATURES,
@@ -51,7 +51,7 @@ from sfa_localization.metric.compass_training import (
     compass_layers,
 )
 from sfa_localization.metric.expansions import MetricMap, Process
-from sfa_localization.metric.fast_expansions import FastProcess
+from sfa_localization.metric.fast_expansions import FastProcess, fast_map
 from sfa_localization.metric.selection import INDUCING_POINTS
 from sfa_localization.place_model import PlaceModel
 
@@ -193,7 +193,7 @@ def made_up_model(network) -> PlaceModel:
         compass = _compass(rng, INDUCING_IMAGES, PLACE_FEATURES, width)
     return PlaceModel(
         network,
-        map_,
+        fast_map(map_),
         PanoramaConfig(),
         Novelty.fit([describe(m) for m in maps]),
         agreement=Agreement(1.0, 1.0, 1.0),
@@ -212,7 +212,10 @@ def _compass(rng: np.random.Generator, count: int, features: int, width: int) ->
     moment = kernel.conj().T @ np.exp(1j * rng.uniform(-3, 3, count))
     solution = _solve(kernel.conj().T @ kernel, moment, kernel, 0.1)
     scales = np.ones(features), np.ones(width)
-    return Compass(s, f, *scales, *solution, 2.0, 0.1, -1.0, np.array([1.0, 1e-3]))
+    weights, uncertainty = solution
+    return Compass(
+        s, f, *scales, weights, triangular(uncertainty), 2.0, 0.1, -1.0, np.array([1.0, 1e-3])
+    )
 
 
 def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
@@ -274,7 +277,7 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
     for layer, m in zip(model.novelty.layers, maps, strict=True):
         description = describe(m) - layer.mean
         made += [_product(description, layer.directions), _product(description, layer.axes)]
-    fast = model._predictor()
+    fast = model.metric
     assert isinstance(fast, FastProcess)
     features = slow_features(maps)[:, : len(fast.scale)] * fast.scale
     kernel = np.ones((1, len(fast.points)))
@@ -286,8 +289,8 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
             wave = np.ones(maps[layer].shape[2], np.complex64)
             made.append(_product(wave, maps[layer].astype(np.complex64)))
         f = np.concatenate([harmonics(maps[layer]) for layer in model.heading_layers], axis=1)
-        made.append(_product(f.astype(np.complex64), compass._factors.adjoint))
-        made.append(_triangular(compass._factors.factor))
+        made.append(_product(f.astype(np.complex64), compass._adjoint))
+        made.append(_triangular(compass.factor))
         made.append(_product(np.ones((1, len(compass.weights)), complex), compass.weights))
     return made
 
