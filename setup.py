@@ -33,7 +33,7 @@ BAGS = ('bags', 'bags/sample', 'bags/sample_test')
 setup(
     name=NAME,
     version='0.1.0',
-    description='Localization from one omnidirectional camera and odometry, learnt without '
+    description='Localization from one omnidirectional camera and odometry, learned without '
     'ground truth',
     long_description='See README.md.',
     author='The sfa_localization authors',

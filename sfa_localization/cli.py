@@ -79,7 +79,7 @@ def _overview() -> argparse.ArgumentParser:
     """Return the parser of --help, --version and wrong commands."""
     parser = argparse.ArgumentParser(
         prog='sfa_localization',
-        description='Localization from one omnidirectional camera, learnt without ground truth.',
+        description='Localization from one omnidirectional camera, learned without ground truth.',
     )
     parser.add_argument('--version', action='version', version=__version__)
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)

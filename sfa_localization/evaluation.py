@@ -48,7 +48,7 @@ _TRUTH_TOLERANCE_NS = 500_000_000
 class Evaluation:
     """A judged drive. `estimates` are in the truth's frame.
 
-    `features` (N, K) are those of the usable pictures, of which `estimates['sfa']` is.
+    `features` (N, K) are those of the usable images, of which `estimates['sfa']` is.
     `aligned_on` names the drive on which the transform was fitted.
     """
 
@@ -65,15 +65,19 @@ class Evaluation:
 
 
 @dataclass(frozen=True, slots=True)
-class _Drive:
-    """A drive as the model sees it: map poses (N, 3) of its usable pictures, features (N, K)."""
+class _Replay:
+    """What model and filter make of a drive, in the map frame.
+
+    `sfa` (N, 3) poses of the usable images, of which `features` (N, K) are; `ekf` (T, 3) the
+    filter's at each odometry message; `counts` of messages, observations and states.
+    """
 
     run: Run
     truth: Trajectory
     sfa: Trajectory
     features: Array
-    observations: Count
-    clock: CameraClock
+    ekf: Trajectory
+    counts: dict[str, Any]
 
 
 def evaluate(
@@ -89,36 +93,43 @@ def evaluate(
     """Judge a model on a drive with ground truth, by what sfa_node and ekf_node would publish.
 
     The transform to the truth is fitted on `align_bag`, a training drive; without one, on the
-    drive itself. Pictures that cannot be believed count as skipped observations. Raises
-    BagError or DataError, also when there is no ground truth.
+    drive itself. Unusable images count as skipped observations. Raises BagError or DataError,
+    also when there is no ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
-    transform, supervised = None, None
+    trained = None
     if align_bag is not None:
-        with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
-            run = _read(align_bag, Path(cache), recipe, progress)
-            trained, _, _ = _replayed(Localizer(model, config, watch), run, progress)
-            transform = fit_transform(trained.truth, trained.sfa)
-            supervised = _supervised_weights(model, trained)
+        trained = _replay(align_bag, Localizer(model, config, watch), recipe, progress)
+    drive = _replay(bag, Localizer(model, config, watch), recipe, progress)
+    reference = trained or drive
+    transform = fit_transform(reference.truth, reference.sfa)
+    estimates = {
+        'odometry': odometry_from_start(drive.truth, drive.run),
+        'sfa': moved(drive.sfa, transform),
+        'ekf': moved(drive.ekf, transform),
+    }
+    if trained is not None:
+        estimates['supervised'] = _supervised(model, trained, drive)
+    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+    aligned_on = str(align_bag or bag)
+    return Evaluation(drive.truth, estimates, scores, drive.counts, drive.features, aligned_on)
+
+
+def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Replay:
+    """Run model and filter over a bag. Raises BagError or DataError."""
     with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
         run = _read(bag, Path(cache), recipe, progress)
-        localizer = Localizer(model, config, watch)
-        drive, ekf, states = _replayed(localizer, run, progress)
-    transform = transform or fit_transform(drive.truth, drive.sfa)
-    estimates = {'odometry': odometry_from_start(drive.truth, run)}
-    estimates['sfa'] = moved(drive.sfa, transform)
-    estimates['ekf'] = moved(ekf, transform)
-    if supervised is not None:
-        estimates['supervised'] = _supervised(model, supervised, drive)
-    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
+        observations, ekf, states = _replayed(localizer, run, progress)
+        clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+    sfa, features, used = _located(run, observations, clock)
     counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
-    counts['observations'] = drive.observations.as_dict()
+    counts['observations'] = used.as_dict()
     counts['fusion'] = dict(localizer.filter.counts)
-    if drive.clock.delay_ns:
-        counts['camera_delay_s'] = round(drive.clock.delay_s, 3)
+    if clock.delay_ns:
+        counts['camera_delay_s'] = round(clock.delay_s, 3)
     counts['states_s'] = states
-    aligned_on = str(align_bag or bag)
-    return Evaluation(drive.truth, estimates, scores, counts, drive.features, aligned_on)
+    assert run.ground_truth is not None
+    return _Replay(run, run.ground_truth, sfa, features, ekf, counts)
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
@@ -130,16 +141,16 @@ def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
 
 def _replayed(
     localizer: Localizer, run: Run, progress: bool
-) -> tuple[_Drive, Trajectory, dict[str, float]]:
-    """What the model makes of a drive, the filter at each odometry message, seconds by state."""
-    seen: list[Observation] = []
+) -> tuple[list[Observation], Trajectory, dict[str, float]]:
+    """Observations of all images, the filter at each odometry message, seconds by state."""
+    observations: list[Observation] = []
     stamps, poses, states = [], [], dict[str, float]()
     before_ns = int(run.odometry.stamps_ns[0])
     title = f'locating {run.name}'
     with tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
             if observation is not None:
-                seen.append(observation)
+                observations.append(observation)
                 bar.update()
                 continue
             level = localizer.status.level.name
@@ -148,29 +159,26 @@ def _replayed(
             if state is not None:
                 stamps.append(stamp_ns)
                 poses.append(state.pose)
-    path = Trajectory(np.array(stamps, np.int64), np.reshape(poses, (-1, 3)))
-    # The map is judged where images were taken; the filter has to find out by itself.
-    return (
-        _drive(
-            run, seen, camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
-        ),
-        path,
-        states,
-    )
+    ekf = Trajectory(np.array(stamps, np.int64), np.reshape(poses, (-1, 3)))
+    return observations, ekf, states
 
 
-def _drive(run: Run, seen: list[Observation], clock: CameraClock) -> _Drive:
-    assert run.ground_truth is not None
-    usable = [one for one in seen if not one.problem]
+def _located(
+    run: Run, observations: list[Observation], clock: CameraClock
+) -> tuple[Trajectory, Array, Count]:
+    """Map poses (N, 3) and features (N, K) of the usable images, and how many were skipped.
+
+    The map is judged where images were taken, by `clock`; the filter has to find out by itself.
+    """
+    usable = [one for one in observations if not one.problem]
     if not usable:
-        raise DataError(f'{run.name}: no picture can be used: {seen[0].problem}')
+        raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
     estimates = [one.estimate for one in usable]
     stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
     poses = np.array([np.append(e.position, e.yaw) for e in estimates])
     features = np.array([e.slow_features for e in estimates])
-    skipped = Counter(one.problem for one in seen if one.problem)
-    count = Count(len(usable), dict(skipped))
-    return _Drive(run, run.ground_truth, Trajectory(stamps, poses), features, count, clock)
+    skipped = Counter(one.problem for one in observations if one.problem)
+    return Trajectory(stamps, poses), features, Count(len(usable), dict(skipped))
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
@@ -182,7 +190,7 @@ def fit_transform(truth: Trajectory, estimate: Trajectory) -> RigidTransform:
     """Rotation and translation that lay the estimates (in the map) on the truth. DataError."""
     mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
     if np.count_nonzero(mask) < 2:
-        raise DataError('the ground truth covers fewer than two pictures: are the clocks the same?')
+        raise DataError('the ground truth covers fewer than two images: are the clocks the same?')
     return align(estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2])
 
 
@@ -234,18 +242,15 @@ def _summary(values: Array) -> dict[str, float]:
     }
 
 
-def _supervised_weights(model: PlaceModel, drive: _Drive) -> Array:
-    """The model's own regression, fitted on the ground truth of a training drive: (m, 2)."""
+def _supervised(model: PlaceModel, trained: _Replay, drive: _Replay) -> Trajectory:
+    """The drive by the model's own regression, fitted on the ground truth of a training drive."""
     basis = model.metric.basis
-    mask = known(drive.truth, drive.sfa.stamps_ns)
-    expanded = basis.expand(drive.features[mask])
-    places = drive.truth.at(drive.sfa.stamps_ns[mask])[:, :2]
+    mask = known(trained.truth, trained.sfa.stamps_ns)
+    expanded = basis.expand(trained.features[mask])
+    places = trained.truth.at(trained.sfa.stamps_ns[mask])[:, :2]
     normal = expanded.T @ expanded + np.diag(basis.ridge)
-    return np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
-
-
-def _supervised(model: PlaceModel, weights: Array, drive: _Drive) -> Trajectory:
-    positions = model.metric.basis.expand(drive.features) @ weights
+    weights = np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
+    positions = basis.expand(drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
     return Trajectory(drive.sfa.stamps_ns, np.column_stack([positions, unknown]))
 

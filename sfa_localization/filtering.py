@@ -161,7 +161,7 @@ def fitting_config(
     found = position_std_of(odometry, positions) if len(positions) else None
     if found is None:
         return config, ''
-    claimed = math.sqrt(_told_variance(positions))
+    claimed = math.sqrt(_stated_variance(positions))
     if claimed == 0:
         text = f'positions have no variance: their standard deviation is taken to be {found:.2f} m'
         return replace(config, measurement_factor=(found / POSITION_STD) ** 2), text
@@ -174,11 +174,11 @@ def fitting_config(
     return config, ''
 
 
-def _told_variance(positions: Table) -> float:
-    """Median of the variances that are told; 0 when none is."""
-    told = positions.columns.get('var_x', np.zeros(0))
-    told = told[np.isfinite(told) & (told > 0)]
-    return float(np.median(told)) if len(told) else 0.0
+def _stated_variance(positions: Table) -> float:
+    """Median of the variances in the table; 0 without any."""
+    variances = positions.columns.get('var_x', np.zeros(0))
+    variances = variances[np.isfinite(variances) & (variances > 0)]
+    return float(np.median(variances)) if len(variances) else 0.0
 
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:

@@ -291,3 +291,25 @@ def test_make_help_lists_every_target():
         ['make', 'help'], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout
     assert set(re.findall(r'make (\w+)', shown)) == targets
+
+
+BRITISH = r'(?:kilo)?metres?|colours?|centres?|neighbours?|behaviours?|learnt|towards'
+BRITISH += r'|(?:normal|initial|organ|optim|minim|maxim|synchron|recogn|local)is(?:e|es|ed|ing)'
+# Of data one says that it is an image, and that it shows, contains or gives something.
+VAGUE = r'pictures?|tells?|told'
+# Keys of JSON, in quotes, and the names of states are interfaces and stay.
+OTHER_WORDS = re.compile(
+    rf"(?<![\w'])(?<!(?<!\")\")(?:{BRITISH}|{VAGUE})(?![\w'\"])", re.IGNORECASE
+)
+STATES = re.compile('UNINITIALISED|LOCALISED')
+PAGES = [
+    *(path for path in DOCUMENTS if path.name != 'CHANGELOG.md'),
+    *sorted((ROOT / 'sfa_localization').rglob('*.py')),
+]
+
+
+@pytest.mark.parametrize('path', PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_words_are_american_and_plain(path):
+    lines = path.read_text('utf-8').splitlines()
+    wrong = [line.strip() for line in lines if OTHER_WORDS.search(STATES.sub('', line))]
+    assert wrong == []

@@ -376,7 +376,7 @@ def test_diagnostics_hold_rates_latencies_and_counts(bench):
     assert 'measurement: accepted' in values and 'position std [m]' in values
 
 
-def test_silence_is_told_without_any_clock_moving(bench):
+def test_silence_is_reported_without_any_clock_moving(bench):
     drive = Drive(seconds=1, **NOISY)
     node = bench.run(EkfNode, silence_timeout=0.2)
     states = bench.listen(String, 'ekf/state', latched_qos())

@@ -121,7 +121,7 @@ def test_live_changes_are_checked_together_and_applied(make):
 
 @pytest.mark.parametrize('change', [{'fixed': 2.0}, {'offset': math.nan}, {'mode': 'c'},
                                     {'gain': 'x'}])  # fmt: skip
-def test_a_wrong_live_change_is_refused_and_changes_nothing(make, change):
+def test_a_wrong_live_change_is_rejected_and_changes_nothing(make, change):
     node = knobs(make)
     (name, value), *_ = change.items()
     assert not node.set_parameters([Parameter(name, value=value)])[0].successful

@@ -93,7 +93,7 @@ def mixed_run(count=3 * BATCH + 5):
     return Run('mixed', PanoramaArray(stamps, np.array(pictures)), still)
 
 
-def test_in_batches_and_one_by_one_pictures_are_judged_alike():
+def test_in_batches_and_one_by_one_images_are_judged_alike():
     run = mixed_run()
     batched = list(Observer(PictureReader()).observe_run(run))
     single = Observer(PictureReader())

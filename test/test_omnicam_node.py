@@ -159,7 +159,7 @@ def bad_pictures():
     return cases
 
 
-def test_it_outlives_every_bad_picture_and_counts_each(bench):
+def test_it_outlives_every_bad_image_and_counts_each(bench):
     run = bench().start()
     run.hear('panorama')
     run.hear('/diagnostics', DiagnosticArray)
@@ -188,7 +188,7 @@ def test_it_outlives_every_bad_picture_and_counts_each(bench):
     run.wait(counted)
 
 
-def test_bad_compressed_pictures(bench):
+def test_bad_compressed_images(bench):
     run = bench(image_transport='compressed').start()
     run.hear('panorama')
     publisher = run.speak('image_raw/compressed', CompressedImage)
@@ -474,7 +474,7 @@ def test_the_life_cycle_goes_round(bench):
     send_until(run, publisher, image_message(raw_picture()))
 
 
-def test_of_pictures_that_come_too_fast_the_newest_is_used(bench):
+def test_of_images_that_come_too_fast_the_newest_is_used(bench):
     """A burst while the node is busy: no more than the depth of one waits for it."""
     run = bench()
     run.hear('panorama')

@@ -5,6 +5,7 @@
 import ast
 import re
 import runpy
+import statistics
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import setuptools
+import yaml
 
 import sfa_localization
 from sfa_localization import cli
@@ -43,7 +45,7 @@ ROS = {
 }
 # The rooms: which other rooms each may import (always its own), and which packages beyond the
 # standard library. A module belongs to its folder, or is a room of its own; there is no
-# default, so a new one must be added here, and to the picture and the table of CONTRIBUTING.
+# default, so a new one must be added here, and to the diagram and the table of CONTRIBUTING.
 NUMERIC = {'numpy', 'scipy'}
 CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
@@ -189,10 +191,48 @@ def test_contributing_shows_the_same_rooms_and_arrows():
     assert {name: set(re.findall(r'`(\w+)`', others)) for name, others in rows} == {
         name: others for name, (others, _packages) in ROOMS.items()
     }
-    picture = text.split('```')[1]
+    diagram = text.split('```')[1]
     assert [
-        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', picture)
+        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', diagram)
     ] == []
+
+
+def test_contributing_names_files_and_folders_that_exist():
+    text = (ROOT / 'CONTRIBUTING.md').read_text('utf-8')
+    names = set(re.findall(r'`([\w.]*\w(?:/\w[\w.]*)*(?:\.(?:py|yaml|xml|md)|/|/run))`', text))
+    assert {'metric/phases.py', 'commands/', 'config.py', '.ci/run'} <= names
+    missing = {name for name in names if not any((top / name).exists() for top in (ROOT, PACKAGE))}
+    assert missing == set()
+
+
+LONGEST_FUNCTION, TYPICAL_FUNCTION = 40, 8
+"""Lines, with signature and docstring: the most that one has, and the most that the median has."""
+
+
+def function_lengths() -> dict[str, int]:
+    """Return the lines of every function of the package, also of nested ones, by its place."""
+    return {
+        f'{module}:{node.lineno} {node.name}': node.end_lineno - node.lineno + 1
+        for module, path in MODULES.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+    }
+
+
+def test_functions_are_short():
+    lengths = function_lengths()
+    assert {name: n for name, n in lengths.items() if n > LONGEST_FUNCTION} == {}
+    assert statistics.median(lengths.values()) <= TYPICAL_FUNCTION
+
+
+MOST_PARAMETERS = 60
+"""In the parameter file: a person can read so many; what nobody would turn is a constant."""
+
+
+def test_the_parameter_file_stays_readable():
+    sections = yaml.safe_load((ROOT / 'config/localization.yaml').read_text('utf-8')).values()
+    names = [name for part in sections for name in part['ros__parameters']]
+    assert 0 < len(names) <= MOST_PARAMETERS
 
 
 @pytest.mark.parametrize('module', sorted(MODULES))

@@ -315,7 +315,7 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'publish_tf': 'test_ekf_node.py::test_frames_are_parameters',
         'transform_tolerance': 'test_ekf_node.py::'
         'test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated',
-        'silence_timeout': 'test_ekf_node.py::test_silence_is_told_without_any_clock_moving',
+        'silence_timeout': 'test_ekf_node.py::test_silence_is_reported_without_any_clock_moving',
     },
 }
 

@@ -38,7 +38,7 @@ def saved(model, tmp_path) -> Path:
     return tmp_path / 'model.npz'
 
 
-def test_pictures_are_located(model, pictures):
+def test_images_are_located(model, pictures):
     truth = visit().odometry.poses
     estimates = model.locate_all(pictures)
     error = np.array([e.position for e in estimates]) - truth[:, :2]

@@ -95,7 +95,7 @@ def test_the_same_messages_give_the_same_bytes():
     assert snapshot(first) == snapshot(second)
 
 
-def test_what_is_older_than_the_history_is_refused_and_counted():
+def test_what_is_older_than_the_history_is_rejected_and_counted():
     drive = Drive(seconds=20)
     fused = known()
     drive.feed(fused)
@@ -107,7 +107,7 @@ def test_what_is_older_than_the_history_is_refused_and_counted():
     assert snapshot(fused) == before
 
 
-def test_duplicate_stamps_are_refused_and_counted():
+def test_duplicate_stamps_are_rejected_and_counted():
     drive = Drive(seconds=2)
     fused = known()
     drive.feed(fused)
@@ -146,7 +146,7 @@ def test_one_stamp_far_ahead_does_no_harm():
     assert all(update.accepted for _, update, _, _ in drive.feed(fused, start=2))
 
 
-def test_a_long_pause_of_the_recording_is_survived_and_told():
+def test_a_long_pause_of_the_recording_is_survived_and_reported():
     drive = Drive(seconds=10)
     fused = known()
     drive.feed(fused, stop=5)
@@ -206,7 +206,7 @@ def white(monkeypatch):
 
 
 @pytest.mark.parametrize('heading', [True, False])
-def test_errors_and_innovations_are_as_large_as_told_over_100_seeds(heading, white):
+def test_errors_and_innovations_are_as_large_as_claimed_over_100_seeds(heading, white):
     nees, nis = [], []
     for seed in range(100):
         rng = np.random.default_rng(1000 + seed)
@@ -275,7 +275,7 @@ def test_bias_and_scale_are_learnt():
     assert learning.state.wheel_scale == pytest.approx(1.03, abs=0.01)
 
 
-def test_it_beats_pictures_and_odometry():
+def test_it_beats_images_and_odometry():
     drive = Drive(seconds=60, **NOISY)
     fused, blind = known(), known()
     errors = [error for _, _, error, _ in drive.feed(fused)]
@@ -291,7 +291,7 @@ def test_it_beats_pictures_and_odometry():
 
 
 @pytest.mark.parametrize('heading', [True, False])
-def test_a_spike_is_refused_and_moves_nothing(heading):
+def test_a_spike_is_rejected_and_moves_nothing(heading):
     drive = Drive(seconds=20, **NOISY)
     drive.seen[100, :2] += [3.0, 3.0]
     found = drive.feed(known(), heading)
@@ -333,7 +333,7 @@ def test_wrong_images_that_contradict_each_other_are_never_believed(heading):
 
 @pytest.mark.parametrize('heading', [True, False])
 @pytest.mark.parametrize('outage', [5.0, 30.0])
-def test_a_cluster_of_wrong_pictures_after_an_outage_is_not_admitted(heading, outage):
+def test_a_cluster_of_wrong_images_after_an_outage_is_not_admitted(heading, outage):
     drive = Drive(seconds=60, **NOISY)
     fused = known()
     drive.feed(fused, heading, stop=15)
@@ -397,7 +397,7 @@ def test_positions_without_motion_show_no_heading():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_kidnapped_robot_recovers_after_five_pictures_with_heading(seed):
+def test_a_kidnapped_robot_recovers_after_five_images_with_heading(seed):
     drive = Drive(seconds=30, **NOISY, seed=seed)
     drive.kidnap(150, (5.0, -4.0, 2.0))
     found = drive.feed(known(), heading=True)
@@ -407,7 +407,7 @@ def test_a_kidnapped_robot_recovers_after_five_pictures_with_heading(seed):
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_kidnapped_robot_recovers_within_three_metres_without_heading(seed):
+def test_a_kidnapped_robot_recovers_within_three_meters_without_heading(seed):
     drive = Drive(seconds=30, **NOISY, seed=seed)
     drive.kidnap(150, (5.0, -4.0, 2.0))
     found = drive.feed(known())
@@ -416,7 +416,7 @@ def test_a_kidnapped_robot_recovers_within_three_metres_without_heading(seed):
 
 
 @pytest.mark.parametrize('heading', [True, False])
-def test_while_lost_the_state_says_so_and_the_covariance_covers_the_error(heading, monkeypatch):
+def test_while_lost_the_state_shows_it_and_the_covariance_covers_the_error(heading, monkeypatch):
     monkeypatch.setattr(recover, 'START_YAW_STD', 0.01)  # no recovery
     drive = Drive(seconds=30, **NOISY)
     drive.kidnap(150, (5.0, -4.0, 2.0))
@@ -541,7 +541,7 @@ def test_silent_odometry_makes_the_estimate_less_and_less_sure():
     assert math.dist(far.pose[:2], fused.state.pose[:2]) < 2.5
 
 
-def test_pictures_alone_carry_it_through_an_outage_of_the_odometry():
+def test_images_alone_carry_it_through_an_outage_of_the_odometry():
     drive = Drive(seconds=30, **NOISY)
     fused = known()
     drive.feed(fused, heading=True, stop=10)

@@ -11,8 +11,9 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.fusion import evidence, recover
 from sfa_localization.fusion.belief import LARGEST_STD_M, Evidence, PoseEvent, Update, capped
 from sfa_localization.fusion.camera_clock import CameraClock
-from sfa_localization.fusion.evidence import Agreement, consistent, relocate, remember
+from sfa_localization.fusion.evidence import Relocation, consistent, relocate, remember
 from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.recover import Recovery, displaced, outweighs, shows_heading
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, status_of
@@ -38,7 +39,7 @@ def image(value, std=0.1, stamp_ns=SECOND):
 
 def agreement(**changes):
     """Enough images with heading that put the robot 10 m away, over 5 m."""
-    usual = Agreement(np.array([10.0, 0.0, 0.0]), 0.01 * np.eye(3), 5, 5.0, 0.1, 0.05, 0, 0)
+    usual = Relocation(np.array([10.0, 0.0, 0.0]), 0.01 * np.eye(3), 5, 5.0, 0.1, 0.05, 0, 0)
     return usual._replace(**changes)
 
 
@@ -51,6 +52,22 @@ def seen_along(positions, yaw=math.nan, std=0.1, traveled=None, accepted=False):
         Evidence((d, 0.0, 0.0), d, (x, y), yaw, std**2, yaw_variance, accepted)
         for d, (x, y) in zip(traveled, positions, strict=True)
     )
+
+
+# The belief before the first message.
+
+
+def test_before_any_image_bias_and_scale_are_those_of_cheap_sensors():
+    """100 m in 10 s with exact odometry: 3 % of the distance, and 0.01 rad/s of the time."""
+    exact = FilterConfig(slip_per_metre=0.0, yaw_per_radian=0.0)
+    fused = PoseFilter(exact, CORRELATION)
+    fused.set_pose(SECOND, np.zeros(3), 1e-8 * np.eye(3))
+    for stamp_ns in range(SECOND, 11 * SECOND + 1, SECOND // 10):
+        fused.add_odometry(stamp_ns, 10.0, 0.0, (1e-6, 1e-6))
+    variance_x, _, variance_yaw = np.diag(fused.state.pose_covariance)
+    assert math.sqrt(variance_x) == pytest.approx(3.0, rel=0.02)
+    # YAW_PER_METER adds 0.005 rad per square root of a meter: 0.05 rad.
+    assert math.sqrt(variance_yaw - 0.05**2) == pytest.approx(0.1, rel=0.03)
 
 
 # Whether agreeing images outweigh the estimate.
@@ -66,7 +83,7 @@ NO_YAW = {'yaw_std': math.inf}
     ({'support': 2}, {'images': 3}, {'images': 2}),
     ({'support': 0}, {'images': 2}, {'images': 1}),
     # AGREEING_PER_ACCEPTED
-    (ESTABLISHED, {'contradicting': 1}, {'contradicting': 2}),
+    (ESTABLISHED, {'images': 6, 'contradicting': 2}, {'images': 5, 'contradicting': 2}),
     # START_YAW_STD
     (ESTABLISHED, {'covariance': 0.29**2 * np.eye(3)}, {'covariance': 0.31**2 * np.eye(3)}),
     # No more may disagree than agree.
@@ -120,7 +137,7 @@ def test_positions_show_the_heading_from_here_on(images, remembered, yaw_std, en
 def reject(belief, d2=20.0, threshold=10.0, innovation=(3.0, 4.0, 0.6)):
     event = image([9.0, 9.0, 1.0], stamp_ns=belief.stamp_ns)
     update = Update(event.stamp_ns, False, d2, threshold, '', np.array(innovation), np.eye(3))
-    return RECOVERY.rejected(belief, event, update)
+    return RECOVERY.weighed(belief, event, update)
 
 
 @pytest.mark.parametrize(('rejected', 'widens'), [(1, False), (2, True)])
@@ -141,7 +158,7 @@ def test_the_variance_grows_with_every_new_place(moved_m, growth):
     # The last measurement must not be forgotten with the distance.
     event = image([9.0, 9.0], std=1.0, stamp_ns=SECOND)
     update = Update(SECOND, False, 20.0, 10.0, '', np.ones(2), np.eye(2))
-    after = RECOVERY.rejected(before, event, update)
+    after = RECOVERY.weighed(before, event, update)
     for i in range(3):
         assert after.covariance[i, i] == pytest.approx(growth * before.covariance[i, i], rel=1e-6)
     assert np.allclose(after.covariance[3:, 3:], before.covariance[3:, 3:])
@@ -266,7 +283,7 @@ def test_silence_makes_the_estimate_degraded(silences_s, level):
 ])  # fmt: skip
 def test_a_wide_gate_needs_confirmation(prior_std, reason):
     # 0.45 m: inside the gate of the prior, beyond that of the image alone (0.37 m).
-    after = CORRECTION.measure(belief_at(std=prior_std, support=5), image([0.45, 0.0]))
+    after = CORRECTION.fuse(belief_at(std=prior_std, support=5), image([0.45, 0.0]))
     assert after.memory.update.reason == reason
 
 
@@ -278,7 +295,7 @@ def test_images_confirm_each_other_from_here_on(count, way, confirmed):
     traveled = np.linspace(-way, 0.0, count)[:-1]
     earlier = seen_along([(1.0 + d, 0.0) for d in traveled], traveled=traveled + 0.0)
     belief = belief_at(std=0.5, support=5, evidence=earlier)
-    after = CORRECTION.measure(belief, image([1.0, 0.0]))
+    after = CORRECTION.fuse(belief, image([1.0, 0.0]))
     assert (after.memory.update.reason == 'accepted') is confirmed
 
 
@@ -288,5 +305,5 @@ def test_the_gate_lets_all_but_one_in_a_thousand_in(d2, accepted):
     reach = math.sqrt(d2 / 10.8 * -2 * math.log(0.001))
     prior, own = 0.1**2, 0.1**2
     event = image([reach * math.sqrt(prior + own), 0.0])
-    after = CORRECTION.measure(belief_at(std=0.1, support=5), event)
+    after = CORRECTION.fuse(belief_at(std=0.1, support=5), event)
     assert after.memory.update.accepted is accepted

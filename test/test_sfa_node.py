@@ -155,7 +155,7 @@ def bad_pictures():
 
 
 @pytest.mark.parametrize('kind', ['dark', 'covered', 'frozen', 'foreign'])
-def test_an_unusable_picture_says_nothing_and_is_told(bench, models, kind):
+def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     node = bench.run(SfaNode, model='a.npz')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
@@ -177,7 +177,7 @@ def test_an_unusable_picture_says_nothing_and_is_told(bench, models, kind):
     )
 
 
-def test_panoramas_of_another_size_are_refused_with_the_remedy(bench, models):
+def test_panoramas_of_another_size_are_rejected_with_the_remedy(bench, models):
     node = bench.run(SfaNode, model='a.npz')
     bench.publish('panorama', message(image=np.zeros((20, 100, 3), np.uint8)))
     assert until(lambda: node.monitor('panorama').refused)
@@ -205,7 +205,7 @@ def malformed():
     ]  # fmt: skip
 
 
-def test_malformed_pictures_are_counted_and_end_nothing(bench, models):
+def test_malformed_images_are_counted_and_end_nothing(bench, models):
     node = bench.run(SfaNode, model='a.npz')
     heard = bench.listen(PoseStamped, 'sfa/pose')
     for count, broken in enumerate(malformed(), 1):
@@ -217,7 +217,7 @@ def test_malformed_pictures_are_counted_and_end_nothing(bench, models):
     assert until(lambda: heard)
 
 
-def test_malformed_compressed_pictures_too(bench, models):
+def test_malformed_compressed_images_too(bench, models):
     node = bench.run(SfaNode, model='a.npz', image_transport='compressed')
     for count, data in enumerate((b'', b'no picture', bytes(100)), 1):
         broken = CompressedImage(format='jpeg', data=data)
@@ -318,7 +318,7 @@ def declare(bench, **changes):
 @pytest.mark.parametrize('changes', [
     {'elevation_min': -20.0}, {'elevation_max': 30.0}, {'clockwise': False},
 ])  # fmt: skip
-def test_panoramas_declared_to_show_something_else_are_refused(bench, models, changes):
+def test_panoramas_declared_to_show_something_else_are_rejected(bench, models, changes):
     node = bench.run(SfaNode, model='a.npz')
     told = bench.listen(DiagnosticArray, '/diagnostics')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')

@@ -383,7 +383,7 @@ def test_every_route_is_a_choice():
 def test_command_records_what_it_is_told(tmp_path, capsys):
     options = '--area 8x7 --length 4 --images panorama --size 120x12 --images-every 0.5 --seed 3'
     assert main(['simulate', str(tmp_path / 'bag'), *options.split(), '--compressed']) == 0
-    assert 'pictures' in capsys.readouterr().out
+    assert 'images' in capsys.readouterr().out
     with AnyReader([tmp_path / 'bag']) as reader:
         connections = [c for c in reader.connections if c.topic == '/panorama/compressed']
         _, _, raw = next(reader.messages(connections))

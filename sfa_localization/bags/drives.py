@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read recorded drives as runs of panoramas, with their images in a cache on disk."""
+"""Read the drives of a training or evaluation as runs, by a recipe: topics, camera, panorama."""
 
 from __future__ import annotations
 

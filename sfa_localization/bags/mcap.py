@@ -46,7 +46,7 @@ _reception = itemgetter(1)
 
 
 class Damage(Exception):
-    """Bytes that contradict the format; the text says how."""
+    """Bytes that contradict the format; the text describes how."""
 
 
 class Block(NamedTuple):

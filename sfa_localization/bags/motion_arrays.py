@@ -52,7 +52,7 @@ def to_odometry(values: StampedValues) -> tuple[Odometry, int]:
 
 
 def is_pose_constant(odometry: Odometry) -> bool:
-    """Whether all poses are equal although the twists say that the robot drives."""
+    """Whether all poses are equal although by the twists the robot drives."""
     if len(odometry.stamps_ns) < 2 or np.ptp(odometry.poses, axis=0).any():
         return False
     return bool(np.abs(odometry.twists[:, 0]).max() > _DRIVING_MPS)

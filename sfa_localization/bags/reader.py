@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read a recorded drive: any ROS 1 or ROS 2 bag as images, odometry, yaw rates and poses.
+"""Read any ROS 1 or ROS 2 bag: its topics by their use, and their messages as stamped values.
 
 Nothing is lost silently: the message counts of the bag are compared with what was read, and every
 message that is not used is counted with its reason. Bags are never written to.

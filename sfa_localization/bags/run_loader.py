@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""From a bag to a run: the images joined to the odometry of one drive, in one pass."""
+"""Load a bag as a run: its panoramas on disk, joined to the odometry of the drive, in one pass."""
 
 from __future__ import annotations
 

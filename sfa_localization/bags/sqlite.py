@@ -72,7 +72,7 @@ class SqliteStorage:
         return {row[1] for row in self._database.execute(f'PRAGMA table_info({table})')}
 
     def _read_topics_if_cut_off(self) -> dict[int, Channel]:
-        """The topics, even of a file that is shorter than its header says."""
+        """The topics, even of a file that is shorter than its header states."""
         try:
             return self._read_topics()
         except sqlite3.DatabaseError as error:

@@ -3,7 +3,7 @@
 """Images from a V4L2 device, a video file or a folder, and a watch over the camera.
 
 A camera that disconnects, goes silent or repeats its last image is closed and opened again,
-with pauses that double. Knows nothing of ROS; time is the steady clock's.
+with pauses that double. Independent of ROS; time is that of the steady clock.
 """
 
 from __future__ import annotations

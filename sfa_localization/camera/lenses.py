@@ -88,7 +88,7 @@ def _radius_and_direction(plane: Array) -> tuple[Array, Array]:
 
 
 def _ray(angle: Array, direction: Array) -> Array:
-    """Unit rays (N, 3) at an angle (N,) from the axis towards directions (N, 2)."""
+    """Unit rays (N, 3) at an angle (N,) from the axis toward directions (N, 2)."""
     return np.column_stack([np.sin(angle)[:, None] * direction, np.cos(angle)])
 
 

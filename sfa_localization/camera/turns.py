@@ -30,7 +30,7 @@ _CONTRAST = np.float32(1.0)
 class VisualGyro:
     """Heading from the shift of neighboring panoramas: fed with images in order, it adds up.
 
-    `sign` is 1 where columns grow clockwise seen from above, -1 where counterclockwise.
+    `clockwise`: whether columns grow clockwise seen from above.
     """
 
     def __init__(self, clockwise: bool = True) -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run the whole chain: simulate, train, run the nodes live, compare with the truth."""
+"""Run the whole chain on a simulated garden, and print its errors."""
 
 from __future__ import annotations
 

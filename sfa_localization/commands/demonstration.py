@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The whole chain: simulate, train, run the nodes live, and compare with the truth."""
+"""The steps of the command demo: simulate, train, run the nodes live, compare with the truth."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _image_stamps(trained: Trained) -> Stamps:
 
 
 def mean_distance(a: Trajectory, b: Trajectory) -> float:
-    """Mean distance in metres at the stamps of `a` that `b` covers."""
+    """Mean distance in meters at the stamps of `a` that `b` covers."""
     stamps = a.stamps_ns[b.covers(a.stamps_ns)]
     return float(np.hypot(*(a.at(stamps) - b.at(stamps))[:, :2].T).mean())
 

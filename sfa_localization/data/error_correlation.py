@@ -52,14 +52,15 @@ class ErrorCorrelation:
 
     @classmethod
     def fit(
-        cls, errors: Array, variances: Array, way_m: Array, owner: NDArray[np.int64]
+        cls, errors: Array, variances: Array, driven_m: Array, owner: NDArray[np.int64]
     ) -> ErrorCorrelation:
         """From errors (M, 2) m of images with predicted variances (M,) m^2 per axis.
 
-        `way_m` (M,) is the distance driven before, `owner` (M,) the segment of each image; images
-        are compared inside one segment. Outliers are limited. With too few images the defaults.
+        `driven_m` (M,) is the distance driven before, `owner` (M,) the segment of each image:
+        images are compared inside one segment. Outliers are limited. With too few images the
+        defaults.
         """
-        apart, product = _pairs(_standardized(errors, variances), way_m, owner)
+        apart, product = _pairs(_standardized(errors, variances), driven_m, owner)
         if len(apart) < _ENOUGH_PAIRS:
             return cls()
         at = np.digitize(apart, _BINS_M)
@@ -79,11 +80,11 @@ def _standardized(errors: Array, variances: Array) -> Array:
     return np.asarray(ratio / max(math.sqrt(float(np.mean(ratio**2))), 1e-12))
 
 
-def _pairs(ratio: Array, way_m: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
+def _pairs(ratio: Array, driven_m: Array, owner: NDArray[np.int64]) -> tuple[Array, Array]:
     """Distance and mean product of all pairs inside a segment and nearer than _FARTHEST_M."""
     apart, product = [np.zeros(0)], [np.zeros(0)]
     for lag in range(1, len(ratio)):
-        distance = way_m[lag:] - way_m[:-lag]
+        distance = driven_m[lag:] - driven_m[:-lag]
         near = (owner[lag:] == owner[:-lag]) & (distance < _FARTHEST_M)
         if not near.any():
             break

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planar geometry: angles, poses in SE(2), rigid alignment.
 
-A pose is (x m, y m, yaw rad): x forward, y left, yaw counter-clockwise (REP-103).
+A pose is (x m, y m, yaw rad): x forward, y left, yaw counterclockwise (REP-103).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def wrap_angle(angle_rad: Array | float) -> Array:
 
 
 def rotation(yaw_rad: float) -> Array:
-    """Rotation matrix (2, 2) of a counter-clockwise rotation."""
+    """Rotation matrix (2, 2) of a counterclockwise rotation."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[c, -s], [s, c]])
 

@@ -60,7 +60,7 @@ class Agreement:
 
         The exponent is the likeliest under heavy tails; the level makes half of the errors fall
         inside the 50 % region and 95 % inside the 95 % region, whichever needs more. `weight`
-        (M,) says how much each image counts; without it, all count alike.
+        (M,) is how much each image counts; without it, all count alike.
         """
         weight = np.ones(len(disagreement)) if weight is None else weight
         typical = quantile(disagreement, 0.5, weight)

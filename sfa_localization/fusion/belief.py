@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the filter believes, and the events that change it: immutable values."""
+"""The belief of the filter, its estimate and record, and the events that change it: immutable."""
 
 from __future__ import annotations
 

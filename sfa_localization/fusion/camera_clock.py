@@ -166,7 +166,7 @@ class CameraClockFinder:
         """The delay of the least cost, unless it lies at the border or the turns do not fix it."""
         side, best = np.unravel_index(int(np.argmin(self._cost)), self._cost.shape)
         turns, size, left = (a[side, best] for a in (self._turns, self._size, self._left))
-        # Columns may grow clockwise or counter-clockwise: the better sign is the right one.
+        # Columns may grow clockwise or counterclockwise: the better sign is the right one.
         if turns < _TURNS_MIN or left > size / 2 or not 0 < best < len(_GRID) - 1:
             return CameraClock()
         scale = max(left / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
@@ -184,7 +184,8 @@ class CameraClockFinder:
 def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float]) -> CameraClock:
     """The delay of a recorded camera whose images, at stamps (N,), show these headings, rad.
 
-    `headings` are what `sfa_localization.camera.turns.headings` reads from the images.
+    `headings` are what `camera.turns.headings` measures between the images; their sign may be
+    either, because the one that agrees better with the odometry is taken.
     """
     finder, image_headings = CameraClockFinder(), iter(headings)
     rates = _turn_rates(odometry).tolist()

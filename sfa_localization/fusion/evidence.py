@@ -41,7 +41,7 @@ BASELINE_STDS = 3.0
 _NEWTON_STEPS = 3  # of a fit that starts within its linear range
 
 
-class Agreement(NamedTuple):
+class Relocation(NamedTuple):
     """Where agreeing measurements put the robot now: pose (3,), covariance (3, 3).
 
     Over the same distance, `contradicting` counts what the filter accepted, `dissenting` what it
@@ -87,7 +87,7 @@ def remember(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[E
     return kept[: CAPACITY // 2 : 2] + kept[CAPACITY // 2 :]
 
 
-def relocate(evidence: Sequence[Evidence], decorrelation_m: float) -> Agreement | None:
+def relocate(evidence: Sequence[Evidence], decorrelation_m: float) -> Relocation | None:
     """The pose at the newest measurement that most others agree with; None without agreement.
 
     Only measurements that the filter rejected count. Hypotheses come from the newest one's own
@@ -102,7 +102,7 @@ def relocate(evidence: Sequence[Evidence], decorrelation_m: float) -> Agreement 
             best, turn = agree, turn_h
     if best is None:
         return None
-    found = table.agreement(best, turn, decorrelation_m)
+    found = table.relocation(best, turn, decorrelation_m)
     oldest = evidence[-1].traveled_m - found.distance_m
     recent = [item for item in evidence if item.traveled_m >= oldest]
     against = sum(item.accepted for item in recent)
@@ -163,7 +163,9 @@ class _Table:
         near = self.yaw_residual(turn) ** 2 <= AGREEING_VARIANCES * allowed_yaw
         return np.asarray(agree & (~self.has_yaw | near))
 
-    def agreement(self, agree: NDArray[np.bool_], turn: float, decorrelation_m: float) -> Agreement:
+    def relocation(
+        self, agree: NDArray[np.bool_], turn: float, decorrelation_m: float
+    ) -> Relocation:
         """Least squares over the agreeing measurements: pose at the newest, and its covariance."""
         has_yaw = agree & self.has_yaw
         weight = agree / (self.variance + self.drift)
@@ -181,7 +183,7 @@ class _Table:
         # Neighboring images err alike and count as fewer.
         dependence = max(1.0, images / (1 + distance_m / decorrelation_m))
         yaw_variance = self.yaw_variance[has_yaw].mean() if has_yaw.any() else math.inf
-        return Agreement(
+        return Relocation(
             pose=np.array([place.real, place.imag, wrap_angle(self.dead_reckoned[-1, 2] + turn)]),
             covariance=np.asarray(np.linalg.inv(normal) * dependence),
             images=images,

@@ -36,7 +36,7 @@ def read_twist(
 ) -> Twist:
     """A reading with the noise to expect of it, from the `variances` (2,) in its message.
 
-    DataError says why it cannot be one.
+    Raises DataError, with the reason, for one that is impossible.
     """
     v, omega = float(v), float(omega)
     if not (math.isfinite(v) and math.isfinite(omega)):
@@ -62,7 +62,7 @@ def _variance(claimed: float, factor: float, floor: float, default: float) -> fl
 def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> tuple[Array, Array]:
     """A position (2,) or pose (3,) and its covariance, times a factor, as they are fused.
 
-    A heading that is not known well enough is left out. DataError says why there is nothing left.
+    A heading too uncertain is left out. Raises DataError, with the reason, where nothing is left.
     """
     given, matrix = np.asarray(value, float), np.asarray(covariance, float)
     if given.shape not in ((2,), (3,)) or matrix.shape != (given.size, given.size):

@@ -43,7 +43,7 @@ DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
-# Standard deviation, s, of a delay learnt with the model: clocks differ from day to day.
+# Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
 _EXPECTED_STD_S = 0.05
 _ODOMETRY, _POSE, _MEASUREMENT = range(3)
 

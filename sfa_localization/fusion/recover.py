@@ -24,7 +24,7 @@ from sfa_localization.fusion.evidence import (
     ENOUGH_IMAGES,
     FEW_IMAGES,
     MANY_IMAGES,
-    Agreement,
+    Relocation,
     relocate,
     remember,
 )
@@ -34,7 +34,7 @@ from sfa_localization.fusion.settings import FilterConfig
 IMAGE_TIMEOUT_S = 3.0
 """Time without an accepted image that counts as an outage: many times any camera's period."""
 BIAS_STD, SCALE_STD = 0.01, 0.03
-"""Standard deviations of turn-rate bias (rad/s) and wheel scale before any is learnt: data sheets
+"""Standard deviations of turn-rate bias (rad/s) and wheel scale before any is learned: data sheets
 of cheap gyroscopes, and the tolerance of a tire's diameter."""
 START_YAW_STD = 0.3
 """rad: what positions alone must determine the heading to; up to there the EKF is linear enough."""
@@ -67,7 +67,7 @@ class Recovery:
         self._correlation = correlation
 
     def blank(self, stamp_ns: int) -> Belief:
-        """What is believed before anything is known."""
+        """The belief before the first message, without a pose."""
         speed_std, rate_std = self._config.speed_std, self._config.rate_std
         return Belief(
             stamp_ns,
@@ -95,18 +95,18 @@ class Recovery:
             config = self._config
             lost = max(x, y) > config.lost_std**2 or yaw > config.lost_yaw_std**2
             return None if lost else self._restarted(belief, event, event, 'started')
-        agreement = relocate(evidence, self._correlation.distance_m)
-        if agreement is None or not shows_heading(agreement, len(evidence)):
+        found = relocate(evidence, self._correlation.distance_m)
+        if found is None or not shows_heading(found, len(evidence)):
             return None
-        return self._restarted(belief, event, agreement, 'started')
+        return self._restarted(belief, event, found, 'started')
 
-    def rejected(self, belief: Belief, event: MeasurementEvent, update: Update) -> Belief:
-        """Reject an image, unless those rejected outweigh the estimate: then start anew there."""
+    def weighed(self, belief: Belief, event: MeasurementEvent, update: Update) -> Belief:
+        """After a rejected image: restarted where those rejected outweigh the estimate."""
         evidence = remember(belief, event, accepted=False)
         if len(evidence) > 1:
-            agreement = relocate(evidence, self._correlation.distance_m)
-            if agreement is not None and outweighs(agreement, belief):
-                return self._restarted(belief, event, agreement, 'restarted elsewhere')
+            found = relocate(evidence, self._correlation.distance_m)
+            if found is not None and outweighs(found, belief):
+                return self._restarted(belief, event, found, 'restarted elsewhere')
         outside = update.d2 > update.threshold
         memory = belief.memory._replace(
             rejected=belief.memory.rejected + int(outside),
@@ -124,10 +124,10 @@ class Recovery:
         self,
         belief: Belief,
         event: MeasurementEvent,
-        found: MeasurementEvent | Agreement,
+        found: MeasurementEvent | Relocation,
         reason: str,
     ) -> Belief:
-        pose = found.pose if isinstance(found, Agreement) else found.value
+        pose = found.pose if isinstance(found, Relocation) else found.value
         memory = Memory(
             support=1,
             accepted_ns=event.stamp_ns,
@@ -147,38 +147,38 @@ class Recovery:
         return belief._replace(covariance=capped(belief.covariance * np.outer(factor, factor)))
 
 
-def shows_heading(agreement: Agreement, remembered: int) -> bool:
+def shows_heading(found: Relocation, remembered: int) -> bool:
     """Whether positions that agree determine the heading, and most of those remembered agree."""
-    certain = agreement.covariance[YAW, YAW] < START_YAW_STD**2
-    enough = agreement.images >= max(FEW_IMAGES, AGREEING_SHARE * remembered)
+    certain = found.covariance[YAW, YAW] < START_YAW_STD**2
+    enough = found.images >= max(FEW_IMAGES, AGREEING_SHARE * remembered)
     return bool(certain and enough)
 
 
-def outweighs(agreement: Agreement, belief: Belief) -> bool:
+def outweighs(found: Relocation, belief: Belief) -> bool:
     """Whether agreeing images outweigh the estimate that they contradict."""
-    memory, images = belief.memory, agreement.images
-    if images < AGREEING_PER_ACCEPTED * agreement.contradicting:
+    memory, images = belief.memory, found.images
+    if images < AGREEING_PER_ACCEPTED * found.contradicting:
         return False
-    if agreement.covariance[YAW, YAW] > START_YAW_STD**2 or agreement.dissenting >= images:
+    if found.covariance[YAW, YAW] > START_YAW_STD**2 or found.dissenting >= images:
         return False
-    # An estimate that rests on fewer images is overruled by one more than these.
+    # A young estimate is overruled by one image more than it rests on.
     enough = images >= min(ENOUGH_IMAGES, max(2, memory.support + 1))
-    distance_m = max(AGREEING_DISTANCE_M, OBVIOUS_STDS * agreement.position_std)
+    distance_m = max(AGREEING_DISTANCE_M, OBVIOUS_STDS * found.position_std)
     distance_m *= OUTAGE_DISTANCE if memory.outage else 1.0
-    far = agreement.distance_m >= distance_m
+    far = found.distance_m >= distance_m
     established = memory.support >= ENOUGH_IMAGES
-    if agreement.has_yaw and (not established or displaced(agreement, belief.mean)):
+    if found.has_yaw and (not established or displaced(found, belief.mean)):
         return enough and (far or images >= MANY_IMAGES or not memory.outage)
-    few = images >= FEW_IMAGES and agreement.distance_m >= FEW_DISTANCE * distance_m
+    few = images >= FEW_IMAGES and found.distance_m >= FEW_DISTANCE * distance_m
     return far and (enough or few)
 
 
-def displaced(agreement: Agreement, mean: Array) -> bool:
+def displaced(found: Relocation, mean: Array) -> bool:
     """The robot is elsewhere, or turned, by so much that no error of images explains it."""
-    jump_m = math.hypot(*(agreement.pose[:2] - mean[:2]))
-    turn = abs(wrap(float(agreement.pose[YAW] - mean[YAW])))
-    elsewhere = jump_m >= max(OBVIOUS_JUMP_M, OBVIOUS_STDS * agreement.position_std)
-    return elsewhere or turn >= max(OBVIOUS_TURN_RAD, OBVIOUS_STDS * agreement.yaw_std)
+    jump_m = math.hypot(*(found.pose[:2] - mean[:2]))
+    turn = abs(wrap(float(found.pose[YAW] - mean[YAW])))
+    elsewhere = jump_m >= max(OBVIOUS_JUMP_M, OBVIOUS_STDS * found.position_std)
+    return elsewhere or turn >= max(OBVIOUS_TURN_RAD, OBVIOUS_STDS * found.yaw_std)
 
 
 def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Belief:

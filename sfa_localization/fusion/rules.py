@@ -35,4 +35,4 @@ class Rules:
         belief = self.prediction.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             return self.recovery.placed(belief, event)
-        return self.correction.measure(belief, event)
+        return self.correction.fuse(belief, event)

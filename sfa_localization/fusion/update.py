@@ -54,7 +54,7 @@ class Correction:
         self._kalman = kalman
         self._recovery = recovery
 
-    def measure(self, belief: Belief, event: MeasurementEvent) -> Belief:
+    def fuse(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
         heading_lost = belief.covariance[YAW, YAW] > self._lost_yaw_variance
         if belief.located and (event.value.size == 3 or not heading_lost):
@@ -96,11 +96,11 @@ class Correction:
         update = Update(event.stamp_ns, True, d2, threshold, 'accepted', kalman.y, kalman.S)
         if d2 > threshold:
             rejected = update._replace(accepted=False, reason='outside the gate')
-            return self._recovery.rejected(belief, event, rejected)
+            return self._recovery.weighed(belief, event, rejected)
         if _pulls_far(belief, event) and not _confirmed(belief, event):
             reason = 'not confirmed after an outage yet'
             rejected = update._replace(accepted=False, reason=reason)
-            return self._recovery.rejected(belief, event, rejected)
+            return self._recovery.weighed(belief, event, rejected)
         memory = Memory(
             support=belief.memory.support + 1,
             accepted_ns=event.stamp_ns,

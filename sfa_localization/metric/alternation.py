@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a map of given expansion: alternate its global solution and the noise that this leaves.
+"""Fit a map for one basis: alternate between the global solution and the noise of its residuals.
 
     expand      slow features to phi(s)                          expansions.py
     eliminate   the map's weights from equation 1                quadratic_form.py
@@ -73,7 +73,7 @@ class MetricProblem:
         return cls(rows, segments, stack, Links.of(segments), config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
-        """Alternate solution and noise until the noise settles; `start` shortens the way."""
+        """Alternate solution and noise until the noise settles; a near `start` saves rounds."""
         expanded = basis.expand(self.features)
         noise_ratio = 1.0 + basis.missing(expanded)
         solution = start.solution if start else None

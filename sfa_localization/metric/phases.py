@@ -65,7 +65,7 @@ def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Ce
 
     Starts from `starts`, then from the smallest eigenvector, from the metric upgrade, and at last
     from the semidefinite relaxation, which the certificate is dual to; the first certified minimum
-    ends the search. What is returned may be uncertified: ask the certificate.
+    ends the search. The result may be uncertified: check the certificate.
     """
     first = [unit(s) for s in starts] or [spectral_start(h)]
     z = min([refine(h, s) for s in first], key=lambda c: phase_cost(h, c))

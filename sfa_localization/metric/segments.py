@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
-from sfa_localization.metric.odometry_track import (
+from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     MOMENT,
     TURNED,

@@ -145,7 +145,7 @@ def read_pose(message: PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
 
 
 def to_pose(pose: ArrayLike, stamp_ns: int, frame: str) -> PoseStamped:
-    """A pose (3,) as a message; an unknown (NaN) yaw becomes 0, as a pose cannot say unknown."""
+    """A pose (3,) as a message; an unknown (NaN) yaw becomes 0, because a pose has none."""
     message = PoseStamped()
     message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
     _fill(message.pose, np.asarray(pose, float))

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes' executables: they mind signals before anything is imported that takes time."""
+"""The nodes' executables: signals are handled before the slow imports begin."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     # What a node fills in.
 
     def setup(self) -> None:
-        """Make publishers and subscriptions; a LocalizationError says why it cannot be done."""
+        """Make publishers and subscriptions; a LocalizationError gives the reason why not."""
 
     def started(self) -> None:
         """Called once the publishers are enabled."""
@@ -348,7 +348,7 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
 
 
 def _initialised(args: Sequence[str] | None) -> bool:
-    """Initialise ROS; False, and why is logged, where its arguments or files cannot be used."""
+    """Initialize ROS; False, and why is logged, where its arguments or files cannot be used."""
     try:
         rclpy.init(args=None if args is None else list(args))
     except RuntimeError as error:  # the base of all that rclpy raises here

@@ -124,8 +124,8 @@ def _declare_converted(node: Node, item: dataclasses.Field[Any], error: Exceptio
         return node.declare_parameter(
             item.name, value, descriptor(item), ignore_override=True
         ).value
-    except ParameterException as refused:
-        raise ConfigError(f'parameter {item.name!r}: {refused}') from None
+    except ParameterException as rejected:
+        raise ConfigError(f'parameter {item.name!r}: {rejected}') from None
 
 
 def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:

@@ -171,7 +171,7 @@ class SfaNode(LocalizationNode):
         self.get_logger().info(
             f'nobody publishes on {self._info} what the panoramas show: assumed are '
             f'{expected.elevation_min:g} to {expected.elevation_max:g} deg, '
-            f'{"clockwise" if expected.clockwise else "counter-clockwise"}, as in training'
+            f'{"clockwise" if expected.clockwise else "counterclockwise"}, as in training'
         )
 
     def _receive(self, message: ImageMessage | CompressedImage) -> None:

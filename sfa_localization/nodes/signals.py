@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT and SIGTERM while ROS does not listen: before it is initialised, and when it has ended.
+"""SIGINT and SIGTERM while ROS does not listen: before it is initialized, and when it has ended.
 
 A launch and its terminal both send SIGINT, at any time. Imports nothing that takes time.
 """

@@ -28,7 +28,7 @@ COLUMNS = ('mean', 'median', 'p95', 'rmse', 'max', 'n')
 YAW_COLUMNS = ('mean', 'median', 'p95')
 LABELS = {
     'odometry': 'wheel odometry',
-    'sfa': 'SFA, one picture each',
+    'sfa': 'SFA, one image each',
     'ekf': 'EKF: SFA + odometry',
     'supervised': 'supervised reference',
 }

@@ -70,7 +70,7 @@ class Light:
 class Dome:
     """Rays of the camera in the robot's axes: `rays` (rows, columns, 3), x ahead, z up.
 
-    Column c looks towards azimuth -(c + 0.5 - columns / 2) * 2 pi / columns, clockwise.
+    Column c looks toward azimuth -(c + 0.5 - columns / 2) * 2 pi / columns, clockwise.
     """
 
     elevations_rad: Array
@@ -172,7 +172,7 @@ class Scene:
     """Triangles with textures under a sun and a sky."""
 
     def __init__(self, shapes: Sequence[Shape], sun: Array, rng: np.random.Generator) -> None:
-        """Index the triangles of `shapes` and light them; `sun` (3,) points towards it."""
+        """Index the triangles of `shapes` and light them; `sun` (3,) points toward it."""
         self._atlas = Atlas.build(rng)
         self._sky = sky(rng)
         offsets = np.cumsum([0] + [len(shape.vertices) for shape in shapes])

@@ -60,7 +60,7 @@ class Lawn:
         return np.asarray(self.free(start + t * (ends - start)).all(0))
 
     def random_points(self, rng: np.random.Generator, count: int) -> Array:
-        """Free points (<= count, 2), denser towards the edge so that its corners are reached."""
+        """Free points (<= count, 2), denser toward the edge so that its corners are reached."""
         points = rng.uniform(-1, 1, (count, 2))
         points = np.sign(points) * np.abs(points) ** 0.6 * self.half
         return np.asarray(points[self.free(points)])
@@ -109,7 +109,7 @@ class Plan:
         self.heading = heading_rad
 
     def straight_to(self, target: Array, images: bool = True) -> None:
-        """Turn towards a point (2,) and drive there."""
+        """Turn toward a point (2,) and drive there."""
         offset = target - self.position
         distance = float(np.hypot(*offset))
         if distance < 1e-3:
