@@ -38,7 +38,7 @@ _LARGEST_SHARE = 0.8
 
 @dataclass(frozen=True, slots=True)
 class MetricResult:
-    """What was learned of N segments, M images in them, R runs. All in the map frame."""
+    """What was learned of N segments, M images in them, R periods. All in the map frame."""
 
     map: MetricMap
     angles: Array
@@ -48,7 +48,7 @@ class MetricResult:
     angle_covariance: Array
     """(N, N) rad^2."""
     yaw_bias: Array
-    """(R,) rad/s: by how much the odometry of each run turned too fast."""
+    """(R,) rad/s: by how much the odometry turned too fast in each period."""
     certificate: Certificate
     """Of the directions; the paper's descent seldom ends close enough to have one."""
     images: Indices
@@ -185,7 +185,7 @@ def headings(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
 
 def _headings(angles: Array, bias: Array, stack: Stack) -> Array:
     """Yaw (M,) rad of the images, from the directions (N,) rad and the biases (R,) rad/s."""
-    own = stack.headings - bias[stack.run[stack.owner]] * stack.times_s
+    own = stack.headings - bias[stack.period[stack.owner]] * stack.times_s
     return wrap_angle(angles[stack.owner] + own)
 
 

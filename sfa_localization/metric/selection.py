@@ -111,7 +111,7 @@ def leave_out(fit: MapFit) -> LeftOut:
         weights[rows] = 0.0
         elimination = eliminate(fit.expanded, fit.basis.ridge, weights, stack)
         solution = fit.form(elimination).solve(fit.solution.z, fit.solution.bias)
-        coefficients = elimination.weights(solution.coefficients(stack.run))
+        coefficients = elimination.weights(solution.coefficients(stack.period))
         left = fit.expanded[rows]
         used = weights > 0
         turn, shift = align_complex(solution.places(stack)[used], places[used])
