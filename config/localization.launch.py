@@ -30,12 +30,16 @@ def generate_launch_description() -> LaunchDescription:
         ),
         DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
         DeclareLaunchArgument(
+            'tf', default_value='tf', description="the transform's topic, in the namespace; or /tf"
+        ),
+        DeclareLaunchArgument(
             'use_sim_time', default_value='false', description='time from /clock (bags, simulators)'
         ),
     ]
     image = LaunchConfiguration('image')
     transport = {'image_transport': LaunchConfiguration('image_transport')}
     images = [('image_raw', image), ('image_raw/compressed', [image, '/compressed'])]
+    odometry = [('odom', LaunchConfiguration('odom'))]
     return LaunchDescription(
         [
             *arguments,
@@ -43,7 +47,8 @@ def generate_launch_description() -> LaunchDescription:
             PushROSNamespace(LaunchConfiguration('namespace')),
             _node('omnicam_node', images, transport),
             _node('sfa_node', [], {'model': LaunchConfiguration('model')}),
-            _node('ekf_node', [('odom', LaunchConfiguration('odom'))], {}),
+            # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
+            _node('ekf_node', [*odometry, ('/tf', LaunchConfiguration('tf'))], {}),
         ]
     )
 

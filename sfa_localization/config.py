@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,14 +53,16 @@ SECTIONS: dict[str, tuple[type[Settings], ...]] = {
     ),
 }
 """The settings of each section; the trainer reads camera and panorama from omnicam_node."""
-_ALL_NODES = '/**'
 _KEY = 'ros__parameters'
+_NODES = tuple(section for section in SECTIONS if section.endswith('_node'))
+_WILDCARDS = {'**': r'(/\w+)*', '*': r'/\w+'}
 _ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 """Parameters that rclpy declares for every node; no settings of this package."""
 _WIDTH = 100
 _HEAD = """\
 # Every parameter of sfa_localization, with its default; all are optional.
 # Nodes read this file with --ros-args --params-file FILE, commands with --config FILE.
+# /**/ stands for any namespace, or none; ROS ignores sections of other namespaces.
 # Written from the code by: python -m sfa_localization config --output FILE
 """
 
@@ -76,22 +79,28 @@ def load_settings(path: Path | str, section: str, kind: type[S]) -> S:
 
 
 def load_section(path: Path, section: str) -> dict[str, Any]:
-    """Return the parameters of one section, and those of `/**` that the section has.
+    """Return the parameters of one section of any namespace, and those of `/**` that it has.
 
-    Parameters of ROS, such as `use_sim_time`, are kept. Raises ConfigError.
+    Parameters of ROS, such as `use_sim_time`, are kept. Raises ConfigError, also for sections of
+    several namespaces that differ: a command cannot choose between robots.
     """
-    document = _read(path)
     known = {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
     anywhere = {item.name for kinds in SECTIONS.values() for kind in kinds
                 for item in dataclasses.fields(kind)}  # fmt: skip
-    shared = _parameters(document, _ALL_NODES, path)
-    own = {name: value for given in (section, f'/{section}')
-           for name, value in _parameters(document, given, path).items()}  # fmt: skip
-    _require_known(shared, anywhere, f'{path}: {_ALL_NODES}')
-    _require_known(own, set(known), f'{path}: {section}')
+    shared: dict[str, Any] = {}
+    robots: dict[str, dict[str, Any]] = {}
+    for key, values in _known_sections(path).items():
+        namespace, _, node = key.strip('/').rpartition('/')
+        if node in _WILDCARDS:
+            _require_known(values, anywhere, f'{path}: {key}')
+            shared.update(values)
+        elif node == section:
+            _require_known(values, set(known), f'{path}: {section}')
+            robots.setdefault(namespace, {}).update(values)
+    given = {**shared, **_of_any_robot(robots, f'{path}: {section}')}
     return {
         name: _value(known[name], value) if name in known else value
-        for name, value in {**shared, **own}.items()
+        for name, value in given.items()
         if name in known or _is_of_ros(name)
     }
 
@@ -106,7 +115,43 @@ def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
     return {section: load_section(Path(path), section) for section in SECTIONS}
 
 
-def _read(path: Path) -> Mapping[str, Any]:
+def ignored_sections(path: Path | str, node: str) -> list[str]:
+    """Return the keys of a file's sections for a node's name, where ROS takes none of them.
+
+    `node` is the full name, such as /robot1/ekf_node. Raises ConfigError for an unreadable file.
+    """
+    name = _node_of(node)
+    keys = [key for key in _sections(Path(path)) if _node_of(key) == name]
+    return [] if any(_matches(key, node) for key in keys) else keys
+
+
+def _node_of(key: str) -> str:
+    return key.rpartition('/')[2]
+
+
+def _matches(key: str, node: str) -> bool:
+    """Whether ROS gives a section to a node of this full name."""
+    parts = (_WILDCARDS.get(part, '/' + re.escape(part)) for part in key.split('/') if part)
+    return re.fullmatch(''.join(parts), node) is not None
+
+
+def _known_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Return `_sections` of a file that holds no others than those of this package."""
+    sections = _sections(path)
+    for key in sections:
+        if _node_of(key) not in (*SECTIONS, *_WILDCARDS):
+            raise ConfigError(
+                f'{path}: unknown section {key!r}; known are {", ".join(SECTIONS)}, also in a '
+                f'namespace, and /**'
+            )
+    return sections
+
+
+def _sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each section by its key; namespaces are joined by slashes.
+
+    As in ROS, `robot1: {ekf_node: ...}` and `/robot1/ekf_node: ...` are the same.
+    """
     try:
         document = yaml.safe_load(path.read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError) as error:
@@ -117,22 +162,47 @@ def _read(path: Path) -> Mapping[str, Any]:
         return {}
     if not isinstance(document, dict):
         raise ConfigError(f'{path}: must hold sections such as {", ".join(SECTIONS)}')
-    for name in document:
-        if str(name).lstrip('/') not in SECTIONS and name != _ALL_NODES:
-            raise ConfigError(f'{path}: unknown section {name!r}; known are {", ".join(SECTIONS)}')
-    return document
+    found: dict[str, dict[str, Any]] = {}
+    for name, part in document.items():
+        _collect(str(name), part, path, found)
+    return found
 
 
-def _parameters(document: Mapping[str, Any], section: str, path: Path) -> dict[str, Any]:
-    part = document.get(section) or {}
-    if not isinstance(part, dict) or (part and set(part) != {_KEY}):
-        raise ConfigError(
-            f'{path}: section {section!r} must hold {_KEY!r}, and parameters below it'
-        )
-    values = part.get(_KEY) or {}
+def _collect(key: str, part: Any, path: Path, found: dict[str, dict[str, Any]]) -> None:
+    """Add the sections below one key: itself, or those of the namespace that it names."""
+    inner = part if isinstance(part, dict) else {}
+    nested = bool(inner) and _node_of(key) not in SECTIONS and _KEY not in inner
+    if nested and all(isinstance(below, dict) for below in inner.values()):
+        for name, below in inner.items():
+            _collect(f'{key}/{str(name).lstrip("/")}', below, path, found)
+        return
+    if part is not None and (not isinstance(part, dict) or (part and set(part) != {_KEY})):
+        raise ConfigError(f'{path}: section {key!r} must hold {_KEY!r}, and parameters below it')
+    values = inner.get(_KEY) or {}
     if not isinstance(values, dict):
-        raise ConfigError(f'{path}: {section}.{_KEY} must hold names and values')
-    return {str(name): value for name, value in values.items()}
+        raise ConfigError(f'{path}: {key}.{_KEY} must hold names and values')
+    found.setdefault(key, {}).update({str(name): value for name, value in values.items()})
+
+
+def _of_any_robot(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[str, Any]:
+    """Return the parameters of {namespace: parameters}; wildcards are those of no robot.
+
+    Raises ConfigError for a parameter that two robots have with different values.
+    """
+    general: dict[str, Any] = {}
+    own: dict[str, Any] = {}
+    for namespace, values in robots.items():
+        if '*' in namespace:
+            general.update(values)
+            continue
+        for name, value in values.items():
+            if name in own and own[name] != value:
+                raise ConfigError(
+                    f'{where}: {name} is {own[name]!r} for one robot and {value!r} for another: '
+                    f'give commands a file of one robot'
+                )
+        own.update(values)
+    return {**general, **own}
 
 
 def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
@@ -160,7 +230,8 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """Return the parameter file: defaults, replaced by `changes` {section: {name: value}}."""
     parts = [_HEAD]
     for section, kinds in SECTIONS.items():
-        parts.append(f'{section}:\n  {_KEY}:\n')
+        prefix = '/**/' if section in _NODES else ''
+        parts.append(f'{prefix}{section}:\n  {_KEY}:\n')
         changed = (changes or {}).get(section, {})
         parts += [_group(kind, changed) for kind in kinds]
         parts.append(_ros_group({n: value for n, value in changed.items() if _is_of_ros(n)}))

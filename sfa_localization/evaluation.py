@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import linalg
+from numpy.typing import NDArray
+from scipy import linalg, stats
 from tqdm import tqdm
 
 from sfa_localization.bags.drives import as_live, read_drive
@@ -31,17 +32,22 @@ from sfa_localization.data.geometry import (
     align,
     compose,
     invert,
+    rotation,
     wrap_angle,
 )
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer, Observation
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
 Scores = dict[str, dict[str, Any]]
 _TRUTH_TOLERANCE_NS = 500_000_000
+WRONG_M = 1.0
+"""A LOCALISED robot that is farther off is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +55,8 @@ class Evaluation:
     """A judged drive. `estimates` are in the truth's frame.
 
     `features` (N, K) are those of the usable images, of which `estimates['sfa']` is.
-    `aligned_on` names the drive on which the transform was fitted.
+    `aligned_on` names the drive on which `transform`, from map to truth, was fitted; `scale` is
+    the factor by which the map would fit the truth best.
     """
 
     truth: Trajectory
@@ -58,10 +65,13 @@ class Evaluation:
     counts: dict[str, Any]
     features: Array
     aligned_on: str
+    transform: RigidTransform
+    scale: float
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers: one entry per estimate, and the counts."""
-        return {**self.scores, 'counts': self.counts, 'aligned_on': self.aligned_on}
+        about = {'counts': self.counts, 'aligned_on': self.aligned_on, 'scale': self.scale}
+        return {**self.scores, **about}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +79,8 @@ class _Replay:
     """What model and filter make of a drive, in the map frame.
 
     `sfa` (N, 3) poses of the usable images, of which `features` (N, K) are; `ekf` (T, 3) the
-    filter's at each odometry message; `counts` of messages, observations and states.
+    filter's at each odometry message, and whether it was LOCALISED there, `sure` (T,);
+    `covariances` (N, 3, 3) and (T, 3, 3) of both; `counts` of messages, observations and states.
     """
 
     run: Run
@@ -77,6 +88,8 @@ class _Replay:
     sfa: Trajectory
     features: Array
     ekf: Trajectory
+    sure: NDArray[np.bool_]
+    covariances: dict[str, Array]
     counts: dict[str, Any]
 
 
@@ -103,33 +116,78 @@ def evaluate(
     drive = _replay(bag, Localizer(model, config, watch), recipe, progress)
     reference = trained or drive
     transform = fit_transform(reference.truth, reference.sfa)
-    estimates = {
+    scale = fit_scale(reference.truth, moved(reference.sfa, transform))
+    estimates = _in_truth(drive, transform)
+    if trained is not None:
+        estimates['supervised'] = _supervised(model, trained, drive)
+    return Evaluation(
+        drive.truth,
+        estimates,
+        _scores(drive, estimates, transform, scale),
+        {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])},
+        drive.features,
+        str(align_bag or bag),
+        transform,
+        scale[0],
+    )
+
+
+def _in_truth(drive: _Replay, transform: RigidTransform) -> dict[str, Trajectory]:
+    return {
         'odometry': odometry_from_start(drive.truth, drive.run),
         'sfa': moved(drive.sfa, transform),
         'ekf': moved(drive.ekf, transform),
     }
-    if trained is not None:
-        estimates['supervised'] = _supervised(model, trained, drive)
+
+
+def _scores(
+    drive: _Replay,
+    estimates: Mapping[str, Trajectory],
+    transform: RigidTransform,
+    scale: tuple[float, Array],
+) -> Scores:
+    """The errors of every estimate; calibration, and errors in the scaled map, of the model's."""
     scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    aligned_on = str(align_bag or bag)
-    return Evaluation(drive.truth, estimates, scores, drive.counts, drive.features, aligned_on)
+    for name, covariances in drive.covariances.items():
+        turn = rotation(transform.yaw_rad)
+        scores[name] |= calibration(drive.truth, estimates[name], turn, covariances)
+        scores[name]['scaled_mean'] = score(drive.truth, scaled(estimates[name], *scale))['mean']
+    return scores
 
 
 def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Replay:
     """Run model and filter over a bag. Raises BagError or DataError."""
     with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
         run = _read(bag, Path(cache), recipe, progress)
-        observations, ekf, states = _replayed(localizer, run, progress)
+        observations, fused, states = _replayed(localizer, run, progress)
         clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
-    sfa, features, used = _located(run, observations, clock)
+    usable = [one for one in observations if not one.problem]
+    if not usable:
+        raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
+    skipped = Counter(one.problem for one in observations if one.problem)
     counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
-    counts['observations'] = used.as_dict()
+    counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
     counts['fusion'] = dict(localizer.filter.counts)
     if clock.delay_ns:
         counts['camera_delay_s'] = round(clock.delay_s, 3)
     counts['states_s'] = states
     assert run.ground_truth is not None
-    return _Replay(run, run.ground_truth, sfa, features, ekf, counts)
+    return _Replay(
+        run,
+        run.ground_truth,
+        _located(usable, clock),
+        np.array([one.estimate.slow_features for one in usable]),
+        Trajectory(
+            np.array([state.stamp_ns for state, _ in fused], np.int64),
+            np.reshape([state.pose for state, _ in fused], (-1, 3)),
+        ),
+        np.array([level is Level.LOCALISED for _, level in fused], bool),
+        {
+            'sfa': np.array([one.estimate.covariance for one in usable]),
+            'ekf': np.reshape([state.pose_covariance for state, _ in fused], (-1, 3, 3)),
+        },
+        counts,
+    )
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
@@ -141,10 +199,10 @@ def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
 
 def _replayed(
     localizer: Localizer, run: Run, progress: bool
-) -> tuple[list[Observation], Trajectory, dict[str, float]]:
+) -> tuple[list[Observation], list[tuple[State, Level]], dict[str, float]]:
     """Observations of all images, the filter at each odometry message, seconds by state."""
     observations: list[Observation] = []
-    stamps, poses, states = [], [], dict[str, float]()
+    fused, states = [], dict[str, float]()
     before_ns = int(run.odometry.stamps_ns[0])
     title = f'locating {run.name}'
     with tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress) as bar:
@@ -153,32 +211,22 @@ def _replayed(
                 observations.append(observation)
                 bar.update()
                 continue
-            level = localizer.status.level.name
-            states[level] = states.get(level, 0.0) + (stamp_ns - before_ns) * 1e-9
+            level = localizer.status.level
+            states[level.name] = states.get(level.name, 0.0) + (stamp_ns - before_ns) * 1e-9
             before_ns = stamp_ns
             if state is not None:
-                stamps.append(stamp_ns)
-                poses.append(state.pose)
-    ekf = Trajectory(np.array(stamps, np.int64), np.reshape(poses, (-1, 3)))
-    return observations, ekf, states
+                fused.append((state, level))
+    return observations, fused, states
 
 
-def _located(
-    run: Run, observations: list[Observation], clock: CameraClock
-) -> tuple[Trajectory, Array, Count]:
-    """Map poses (N, 3) and features (N, K) of the usable images, and how many were skipped.
+def _located(usable: list[Observation], clock: CameraClock) -> Trajectory:
+    """Map poses (N, 3) of the usable images.
 
     The map is judged where images were taken, by `clock`; the filter has to find out by itself.
     """
-    usable = [one for one in observations if not one.problem]
-    if not usable:
-        raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    estimates = [one.estimate for one in usable]
     stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
-    poses = np.array([np.append(e.position, e.yaw) for e in estimates])
-    features = np.array([e.slow_features for e in estimates])
-    skipped = Counter(one.problem for one in observations if one.problem)
-    return Trajectory(stamps, poses), features, Count(len(usable), dict(skipped))
+    estimates = [one.estimate for one in usable]
+    return Trajectory(stamps, np.array([np.append(e.position, e.yaw) for e in estimates]))
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
@@ -192,6 +240,60 @@ def fit_transform(truth: Trajectory, estimate: Trajectory) -> RigidTransform:
     if np.count_nonzero(mask) < 2:
         raise DataError('the ground truth covers fewer than two images: are the clocks the same?')
     return align(estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2])
+
+
+def fit_scale(truth: Trajectory, estimate: Trajectory) -> tuple[float, Array]:
+    """The factor by which estimates in the truth's frame fit the truth best, and the point (2,) m
+    about which they are scaled: a wheel of a wrong radius scales the whole map.
+    """
+    mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
+    found, right = (
+        poses[:, :2] @ np.array([1.0, 1j])
+        for poses in (estimate.poses[mask], truth.at(estimate.stamps_ns[mask]))
+    )
+    center = complex(found.mean())
+    square = float((np.abs(found - center) ** 2).sum())
+    product = float((np.conj(found - center) * right).sum().real)
+    return product / square if square > 0 else 1.0, np.array([center.real, center.imag])
+
+
+def scaled(estimate: Trajectory, scale: float, center: Array) -> Trajectory:
+    """A trajectory scaled about a point (2,)."""
+    places = center + scale * (estimate.poses[:, :2] - center)
+    return Trajectory(estimate.stamps_ns, np.column_stack([places, estimate.poses[:, 2]]))
+
+
+def calibration(
+    truth: Trajectory, estimate: Trajectory, turn: Array, covariances: Array
+) -> dict[str, Any]:
+    """Shares of the errors that regions of 95 % hold: `within_95` of the positions' ellipses,
+    `yaw_within_95` of the headings' intervals; and `nees`, the normalized squared error of the
+    positions over its expectation: 1 where covariances are right.
+
+    `covariances` (N, 3, 3) of [x, y, yaw] are in the map, `turn` (2, 2) rotates it to the truth.
+    """
+    mask = known(truth, estimate.stamps_ns)
+    if not mask.any():
+        return {'within_95': None, 'yaw_within_95': None, 'nees': None}
+    apart = estimate.poses[mask] - truth.at(estimate.stamps_ns[mask])
+    offset, covariances = apart[:, :2] @ turn, covariances[mask]
+    solved = np.linalg.solve(covariances[:, :2, :2], offset[:, :, None])[:, :, 0]
+    squares = (offset * solved).sum(1)
+    yaw = wrap_angle(apart[:, 2]) ** 2 / covariances[:, 2, 2]
+    yaw = yaw[np.isfinite(yaw)]
+    return {
+        'within_95': float((squares <= stats.chi2.ppf(0.95, 2)).mean()),
+        'yaw_within_95': float((yaw <= stats.chi2.ppf(0.95, 1)).mean()) if len(yaw) else None,
+        'nees': float(squares.mean() / 2),
+    }
+
+
+def _false_localised_s(drive: _Replay, ekf: Trajectory) -> float:
+    """Seconds in which the filter was LOCALISED and more than `WRONG_M` off."""
+    stamps = ekf.stamps_ns
+    apart = np.hypot(*(ekf.poses - drive.truth.at(stamps))[:, :2].T)
+    wrong = drive.sure & known(drive.truth, stamps) & (apart > WRONG_M)
+    return float(np.diff(stamps, prepend=stamps[:1])[wrong].sum() * 1e-9)
 
 
 def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:

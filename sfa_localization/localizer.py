@@ -25,10 +25,14 @@ from sfa_localization.data.run import BATCH, Image, Run, Stamps
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
-from sfa_localization.place_model import Estimate, PlaceModel
+from sfa_localization.place_model import Estimate, PlaceModel, View
 
 UNKNOWN_VARIANCE = 1e6
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
+
+
+# The distance of slow features from keyframes is averaged over about ten images, outliers cut.
+_LATELY, _FARTHEST = 0.1, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +61,21 @@ class Observer:
         self.model = model
         self.watch = ImageWatch(config)
         self._gyro = VisualGyro(model.panorama.clockwise)
+        self._apart = 1.0
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""
         self._require_size(panorama)
         problem, turned = self._judge(panorama)
-        return self._observation(stamp_ns, self.model.locate(panorama), problem, turned)
+        (view,) = self.model.views(panorama[None])
+        return self._observation(stamp_ns, self._estimate(view), problem, turned)
 
     def observe_all(self, stamps_ns: Stamps, panoramas: Image) -> list[Observation]:
         """The same for panoramas (T, H, W, 3) with stamps (T,), quicker."""
         for panorama in panoramas[:1]:
             self._require_size(panorama)
         judged = [self._judge(panorama) for panorama in panoramas]
-        estimates = self.model.locate_all(panoramas)
+        estimates = [self._estimate(view) for view in self.model.views(panoramas)]
         return [
             self._observation(int(stamp_ns), estimate, *verdict)
             for stamp_ns, estimate, verdict in zip(stamps_ns, estimates, judged, strict=True)
@@ -81,6 +87,15 @@ class Observer:
         for batch in run.panoramas.batches(BATCH):
             yield from self.observe_all(run.panoramas.stamps_ns[at : at + len(batch)], batch)
             at += len(batch)
+
+    def _estimate(self, view: View) -> Estimate:
+        """Slow features and keyframes together. Where they have lately been farther apart than
+        their covariances allow, the light is another one, and slow features lose their weight.
+        """
+        estimate = view.estimate(max(self._apart, 1.0))
+        if np.isfinite(view.distance):
+            self._apart += _LATELY * (min(view.distance, _FARTHEST) - self._apart)
+        return estimate
 
     def _judge(self, panorama: Image) -> tuple[str, float]:
         """The problem of the next image, and how far the images have turned."""

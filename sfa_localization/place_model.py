@@ -27,15 +27,15 @@ from sfa_localization.features.image_features import (
     slow_features,
     spectrum,
 )
+from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
 from sfa_localization.features.network import Architecture, Layer, Network, Node
-from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,40 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """What slow features say of an image, `position` (2,), `yaw` and `covariance` (3, 3) as in
+    `Estimate`, and the `match` of the keyframes, which have `noise`.
+    """
+
+    slow_features: Array
+    position: Array
+    yaw: float
+    covariance: Array
+    match: Match
+    noise: MatchNoise
+
+    @property
+    def distance(self) -> float:
+        """How far both are apart, see `Match.distance`; NaN where one of them is unknown."""
+        if self.match.score < self.noise.lowest:
+            return np.nan
+        return self.match.distance(self.position, self.covariance[:2, :2])
+
+    def estimate(self, factor: float = 1.0) -> Estimate:
+        """Both together, with a `factor` on the variances of slow features."""
+        novelty = self.noise.novelty(self.match.score)
+        claimed = self.covariance * factor
+        position, yaw, covariance = self.match.combined(
+            self.position, float(self.yaw), claimed, self.noise
+        )
+        covariance = covariance * max(novelty, 1.0) ** 2
+        covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
+        return Estimate(self.slow_features, position, yaw, covariance, novelty)
+
+
+@dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass, refinement and novelty, learned from one place.
+    """Network, metric map, compass, refinement and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
@@ -66,7 +98,7 @@ class PlaceModel:
     network: Network
     metric: Predictor
     panorama: PanoramaConfig
-    novelty: Novelty
+    keyframes: Keyframes
     agreement: Agreement
     compass: Compass | None = None
     yaw_agreement: Agreement | None = None
@@ -74,10 +106,6 @@ class PlaceModel:
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
     refinement: Refinement | None = None
-
-    @property
-    def has_heading(self) -> bool:
-        return self.compass is not None
 
     @property
     def camera_delay_s(self) -> float:
@@ -98,9 +126,12 @@ class PlaceModel:
 
     def locate_all(self, panoramas: Image) -> list[Estimate]:
         """Estimates of panoramas (T, H, W, 3)."""
+        return [view.estimate() for view in self.views(panoramas)]
+
+    def views(self, panoramas: Image) -> list[View]:
+        """The estimates from panoramas (T, H, W, 3) by slow features and by keyframes."""
         maps = self.network.maps(panoramas)
         slow = slow_features(maps)
-        novelty = self.novelty.per_layer(maps).max(1)
         spread = disagreement(maps[-1])
         positions, covariances = self.metric.predict(slow)
         covariances = covariances * self.agreement.factor(spread)[:, None, None]
@@ -111,10 +142,15 @@ class PlaceModel:
             positions, covariances = self.refinement.refine(
                 spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, covariances)
             )
+        joined = _joined(covariances, yaw_variance)
+        matches = map(self._matched, panoramas, positions)
         return [
-            Estimate(slow[t], positions[t], float(yaw[t]), covariance, float(novelty[t]))
-            for t, covariance in enumerate(_joined(covariances, yaw_variance, novelty))
+            View(slow[t], positions[t], float(yaw[t]), joined[t], match, self.keyframes.noise)
+            for t, match in enumerate(matches)
         ]
+
+    def _matched(self, panorama: Image, guess: Array) -> Match:
+        return self.keyframes.match(panorama, guess if np.isfinite(guess).all() else None)
 
     def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         if self.compass is None:
@@ -157,7 +193,7 @@ class PlaceModel:
             parts = {f.name: getattr(node, f.name) for f in dataclasses.fields(node)}
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
-        arrays |= _prefixed('novelty/', self.novelty.to_arrays())
+        arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
         arrays |= _prefixed('agreement/', self.agreement.to_arrays())
         if self.compass is not None:
             arrays |= _prefixed('compass/', self.compass.to_arrays())
@@ -176,7 +212,7 @@ class PlaceModel:
             network_from(arrays, header),
             map_from_arrays(_under(arrays, 'metric/')),
             PanoramaConfig(**header['panorama']),
-            Novelty.from_arrays(_under(arrays, 'novelty/')),
+            Keyframes.from_arrays(_under(arrays, 'keyframes/')),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
             Compass.from_arrays(compass) if compass else None,
             Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,
@@ -205,12 +241,11 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     return Network(architecture, tuple(nodes), tuple(deltas), ranks)
 
 
-def _joined(covariances: Array, yaw_variance: Array, novelty: Array) -> Array:
-    """Covariances (T, 3, 3); those of unfamiliar images grow with their novelty squared."""
-    inflation = np.maximum(novelty, 1.0) ** 2
+def _joined(covariances: Array, yaw_variance: Array) -> Array:
+    """Covariances (T, 3, 3) of positions (T, 2, 2) and yaw (T,)."""
     joined = np.zeros((len(covariances), 3, 3))
-    joined[:, :2, :2] = covariances * inflation[:, None, None]
-    joined[:, 2, 2] = np.minimum(yaw_variance * inflation, UNKNOWN_YAW_VARIANCE)
+    joined[:, :2, :2] = covariances
+    joined[:, 2, 2] = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
     return joined
 
 

@@ -33,7 +33,6 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
-from sfa_localization.features.agreement import Agreement, share_within
 from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
 from sfa_localization.features.network import Architecture, Network, standard_architecture
@@ -43,13 +42,13 @@ from sfa_localization.features.network_training import (
     in_this_process,
     train_network,
 )
-from sfa_localization.features.novelty import Novelty
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.fast_expansions import fast_map
+from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
@@ -163,7 +162,7 @@ def _train_hierarchy(
 def learn_place(
     network: Network, runs: Sequence[Run], recipe: Recipe, progress: bool = False
 ) -> Trained:
-    """Steps 3 to 8: maps, compass and novelty for a trained network. Raises DataError."""
+    """Steps 3 to 8: maps, compass and keyframes for a trained network. Raises DataError."""
     images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
@@ -251,16 +250,17 @@ def _assemble(
     height, width, _ = runs[0].panoramas.shape
     agreement = left_out_agreement(images.disagreement, first)
     result = finer.metric if finer else first
+    finest = finer.refinement.agreement if finer else agreement
+    known = learn_keyframes(runs, images, segments, result, finest, recipe.panorama.clockwise)
     # Of each run, s; None where the drive does not show it.
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
-    finest = finer.refinement.agreement if finer else agreement
-    quality = _quality(network, images, segments, result, finest)
+    quality = _quality(network, images, segments, result, known)
     quality |= {'features_used': first.map.features, 'refined': finer is not None}
     return PlaceModel(
         network,
         fast_map(first.map),
         PanoramaConfig(**{**asdict(recipe.panorama), 'height': height, 'width': width}),
-        Novelty.fit(images.descriptions),
+        known.keyframes,
         agreement,
         heading.compass if heading else None,
         heading.agreement if heading else None,
@@ -276,12 +276,10 @@ def _quality(
     images: ImageFeatures,
     segments: Segments,
     result: MetricResult,
-    agreement: Agreement,
+    known: KeyframeMap,
 ) -> dict[str, Any]:
     """Figures of merit that are stored in the model; plain numbers and lists."""
     x, y, error = result.forecast.worst
-    variance = result.left_out_variance * agreement.factor(images.disagreement[result.images])
-    ratio = (result.left_out**2).sum(1) / variance
     return {
         'delta': network.deltas[-1].tolist(),
         'rank': [list(ranks) for ranks in network.ranks],
@@ -291,9 +289,10 @@ def _quality(
         'certified': bool(result.certificate.certified),
         'certificate': float(result.certificate.eigenvalue),
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
-        'expected_error_m': result.forecast.expected_m,
-        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
+        'keyframes': len(known.keyframes.poses),
+        'expected_error_m': result.forecast.expected_m * known.improvement,
+        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error * known.improvement},
         'left_out_error_m': result.left_out_error_m,
-        'left_out_within_95': share_within(ratio, 2, 0.95, result.left_out_weight),
+        'left_out_within_95': known.within_95,
         'coverage': result.diagnostics.as_dict(),
     }

@@ -36,7 +36,7 @@ class PictureReader:
     """Reads what `panorama` wrote; positions are positive."""
 
     panorama: PanoramaConfig = SIZE
-    has_heading: bool = True
+    heading: bool = True
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     camera_delay_s: float = 0.0
 
@@ -46,11 +46,22 @@ class PictureReader:
         yaw = math.remainder((b[1] + 256 * b[2]) / 65535 * 2 * math.pi, 2 * math.pi)
         # As a model does, it is less sure of pictures that are somewhat new.
         spread = np.diag([0.02, 0.03, 0.002]) * max(novelty[0] / 10, 1.0) ** 2
-        yaw = yaw if self.has_heading else math.nan
+        yaw = yaw if self.heading else math.nan
         return Estimate(np.append(position, yaw), position, yaw, spread, novelty[0] / 10)
 
-    def locate_all(self, images):
-        return [self.locate(image) for image in images]
+    def views(self, images):
+        return [AsLocated(self.locate(image)) for image in images]
+
+
+@dataclasses.dataclass
+class AsLocated:
+    """A view that slow features and keyframes agree on."""
+
+    located: Estimate
+    distance: float = math.nan
+
+    def estimate(self, factor=1.0):
+        return self.located
 
 
 class Recording:

@@ -45,9 +45,9 @@ class Bench:
         with contextlib.suppress(ExternalShutdownException):
             self.executor.spin()
 
-    def run(self, kind, start=True, **overrides):
+    def run(self, kind, start=True, *, options=None, **overrides):
         values = [Parameter(name, value=value) for name, value in overrides.items()]
-        node = kind(context=self.context, parameter_overrides=values)
+        node = kind(context=self.context, parameter_overrides=values, **(options or {}))
         self.nodes.append(node)
         if start:
             assert node.start(), node.failure
@@ -65,6 +65,8 @@ class Bench:
             publisher = self.node.create_publisher(type(message), topic, qos or 1000)
             self._publishers[topic] = publisher
             assert until(lambda: publisher.get_subscription_count() > 0), f'nobody hears {topic}'
+            # The subscription knows the publisher a moment later; best effort, it would miss one.
+            time.sleep(0.1)
         self._publishers[topic].publish(message)
 
     def call(self, kind, name, request):

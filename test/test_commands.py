@@ -97,7 +97,11 @@ class Outcome:
 
     def yaml(self, section: str) -> dict[str, Any]:
         document = yaml.safe_load((self.folder / 'out.yaml').read_text())
-        return document[section]['ros__parameters']
+        return next(
+            part['ros__parameters']
+            for key, part in document.items()
+            if key.rpartition('/')[2] == section
+        )
 
     def camera(self) -> dict[str, Any]:
         """Return the calibration that was printed."""

@@ -11,7 +11,13 @@ import yaml
 from sfa_localization import config as config_file
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.cli import main
-from sfa_localization.config import SECTIONS, load_settings, render, write_config
+from sfa_localization.config import (
+    SECTIONS,
+    ignored_sections,
+    load_settings,
+    render,
+    write_config,
+)
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes.settings import NodeConfig
@@ -24,6 +30,10 @@ def saved(tmp_path, text):
     path = tmp_path / 'c.yaml'
     path.write_text(text)
     return path
+
+
+def key(section):
+    return section if section == 'training' else f'/**/{section}'
 
 
 def test_the_shipped_file_is_what_the_settings_say():
@@ -56,7 +66,7 @@ def test_units_and_ranges_are_written():
 def test_every_value_has_the_type_that_ros_needs():
     document = yaml.safe_load(render())
     for section, kind in EVERY:
-        values = document[section]['ros__parameters']
+        values = document[key(section)]['ros__parameters']
         for item in dataclasses.fields(kind):
             default = list(item.default) if isinstance(item.default, tuple) else item.default
             assert type(values[item.name]) is type(default)
@@ -93,7 +103,7 @@ def test_parameters_of_ros_are_kept(tmp_path):
     write_config(tmp_path / 'new.yaml', changes)
     sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
     ekf, omnicam, sfa, training = (
-        sections[name]['ros__parameters']
+        sections[key(name)]['ros__parameters']
         for name in ('ekf_node', 'omnicam_node', 'sfa_node', 'training')
     )
     assert ekf['use_sim_time'] is omnicam['use_sim_time'] is sfa['use_sim_time'] is True
@@ -117,6 +127,60 @@ def test_parameters_of_all_nodes_apply_to_the_sections_that_have_them(tmp_path):
     assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
 
 
+VALUES = '{ros__parameters: {lost_std: 3.0}}'
+SPELLINGS = {
+    f'ekf_node: {VALUES}': ['/ekf_node'],
+    f'/ekf_node: {VALUES}': ['/ekf_node'],
+    f'/**/ekf_node: {VALUES}': ['/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'],
+    f'/*/ekf_node: {VALUES}': ['/robot1/ekf_node'],
+    f'/robot1/ekf_node: {VALUES}': ['/robot1/ekf_node'],
+    f'robot1: {{ekf_node: {VALUES}}}': ['/robot1/ekf_node'],
+    f'/a: {{robot1: {{ekf_node: {VALUES}}}}}': ['/a/robot1/ekf_node'],
+    f'/**: {{ekf_node: {VALUES}}}': ['/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'],
+    f'/**: {VALUES}': ['/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'],
+}
+"""A section, and which of these nodes ROS gives it to."""
+
+
+@pytest.mark.parametrize('text', SPELLINGS)
+def test_commands_read_a_section_of_any_namespace(tmp_path, text):
+    assert load_settings(saved(tmp_path, text), 'ekf_node', FilterConfig).lost_std == 3.0
+
+
+@pytest.mark.parametrize('text', SPELLINGS)
+def test_the_sections_that_ros_ignores_are_those_it_gives_no_node(tmp_path, text):
+    path = saved(tmp_path, text)
+    for node in ('/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'):
+        assert bool(ignored_sections(path, node)) == (node not in SPELLINGS[text])
+    assert ignored_sections(path, '/robot2/sfa_node') == []
+
+
+@pytest.mark.parametrize('text', SPELLINGS)
+def test_ros_agrees_on_which_nodes_a_section_is_for(tmp_path, text):
+    rclpy = pytest.importorskip('rclpy')
+    path, context = saved(tmp_path, text), rclpy.Context()
+    rclpy.init(context=context, domain_id=70, args=['--ros-args', '--params-file', str(path)])
+    taken = []
+    for namespace in ('', 'robot1', 'a/robot1'):
+        node = rclpy.create_node(
+            'ekf_node', namespace=namespace, context=context,
+            automatically_declare_parameters_from_overrides=True,
+        )  # fmt: skip
+        if node.has_parameter('lost_std'):
+            taken.append(node.get_fully_qualified_name())
+        node.destroy_node()
+    rclpy.try_shutdown(context=context)
+    assert taken == SPELLINGS[text]
+
+
+def test_a_robot_of_its_own_comes_before_all_robots(tmp_path):
+    path = saved(tmp_path, f'/robot1/ekf_node: {VALUES}\n'
+                           '/**/ekf_node: {ros__parameters: {lost_std: 4.0, speed_std: 0.5}}\n'
+                           '/robot2/ekf_node: {ros__parameters: {rate_std: 0.5}}\n')  # fmt: skip
+    settings = load_settings(path, 'ekf_node', FilterConfig)
+    assert (settings.lost_std, settings.speed_std, settings.rate_std) == (3.0, 0.5, 0.5)
+
+
 @pytest.mark.parametrize(('text', 'why'), [
     ('ekf_node: [1', 'is not YAML'), ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
     ('efk_node: {}\n', "unknown section 'efk_node'"),
@@ -128,6 +192,10 @@ def test_parameters_of_all_nodes_apply_to_the_sections_that_have_them(tmp_path):
     ('ekf_node: {ros__parameters: {lost_std: .nan}}\n', 'finite'),
     ('ekf_node: {ros__parameters: {width: 300}}\n', "unknown parameter 'width'"),
     ('/**: {ros__parameters: {nonsense: 1}}\n', "unknown parameter 'nonsense'"),
+    ('/**/efk_node: {ros__parameters: {lost_std: 3}}\n', "unknown section '/\\*\\*/efk_node'"),
+    ('robot1: {ekf_node: {lost_std: 3}}\n', "'robot1/ekf_node' must hold 'ros__parameters'"),
+    ('robot1: {ekf_node: {ros__parameters: {lost_std: 3}}}\n'
+     '/robot2/ekf_node: {ros__parameters: {lost_std: 4}}\n', 'a file of one robot'),
 ])  # fmt: skip
 def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path, text, why):
     path = saved(tmp_path, text)

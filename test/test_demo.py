@@ -9,7 +9,6 @@ import json
 
 import numpy as np
 import pytest
-from cylinder_worlds import place, wander
 
 pytest.importorskip('rclpy')
 from sfa_localization.commands import demonstration
@@ -66,11 +65,3 @@ def test_distance_of_two_paths_by_hand():
     a = Trajectory(stamps, np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], float))
     b = Trajectory(stamps[:2], np.array([[0, 3, 0], [1, 5, 0]], float))
     assert demonstration.mean_distance(a, b) == pytest.approx(4.0)
-
-
-def test_the_training_is_aligned_by_the_finest_map():
-    trained, drive = place(), wander(400, 2, hz=4.0)
-    estimate = demonstration._training_estimate(trained)
-    truth = drive.poses[np.searchsorted(drive.stamps_ns, estimate.stamps_ns), :2]
-    assert len(estimate) == len(trained.metric.images) > 100
-    assert np.hypot(*(estimate.poses[:, :2] - truth).T).mean() < 0.1

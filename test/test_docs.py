@@ -213,6 +213,12 @@ def test_nav2_uses_our_frames():
     frames = EkfNodeConfig()
     assert navigator['global_frame'] == frames.map_frame
     assert navigator['robot_base_frame'] == frames.base_frame
+    monitor = settings['collision_monitor']['ros__parameters']
+    assert monitor['base_frame_id'] == frames.base_frame, "Nav2's default is base_footprint"
+    assert monitor['odom_frame_id'] == frames.odom_frame
+    for node in ('bt_navigator', 'controller_server'):
+        topic = settings[node]['ros__parameters']['odom_topic']
+        assert topic == 'odom', 'an absolute topic would be that of another robot'
 
 
 def test_nav2_plans_without_a_map():
@@ -275,7 +281,16 @@ def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launched)
     for node in launched:
         _file, given = node['parameters']
         assert set(given) <= parameters()
-        assert {source for source, _ in node['remappings']} <= topics() | {'image_raw', 'odom'}
+        known = topics() | {'image_raw', 'odom', '/tf'}
+        assert {source for source, _ in node['remappings']} <= known
+
+
+def test_the_launched_transform_is_in_the_namespace_unless_asked(actions, launched):
+    """Two robots whose frames have the same names must not meet on /tf; Nav2 looks there too."""
+    given = {a.given[0]: a.named for a in actions if type(a).__name__ == 'DeclareLaunchArgument'}
+    assert given['tf']['default_value'] == 'tf'
+    (target,) = (to for name, to in launched[-1]['remappings'] if name == '/tf')
+    assert target.given == ('tf',)
 
 
 def test_package_manifest_is_of_format_3():

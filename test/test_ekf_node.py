@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from filter_drives import START_NS, Drive
+from transform_buffer import TransformBuffer
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose
@@ -36,6 +37,7 @@ from sfa_localization.nodes.conversions import (  # noqa: E402
     to_error_correlation,
     to_odometry,
     to_pose_with_covariance,
+    to_turned,
 )
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
@@ -109,9 +111,9 @@ def test_live_is_offline_and_stamps_are_the_inputs(bench):
     assert heard[-1].header.frame_id == 'map' and heard[-1].child_frame_id == 'base_link'
 
 
-def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench):
+def test_map_to_odom_makes_odometry_the_pose_in_the_map(bench):
     drive = Drive(seconds=1, **NOISY)
-    node = bench.run(EkfNode, initial_pose=[5.0, 0.0, 2.0], transform_tolerance=0.25)
+    node = bench.run(EkfNode, initial_pose=[5.0, 0.0, 2.0])
     heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
     told = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive, [e for e in drive.events() if e[1] == 0])
@@ -121,7 +123,7 @@ def test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated(bench)
         map_to_odom = [t.translation.x, t.translation.y, read_yaw(t.rotation)]
         miss = compose(map_to_odom, drive.reckoned[i]) - pose_of(message)
         assert np.hypot(*miss[:2]) < 1e-9 and abs(math.remainder(miss[2], 2 * math.pi)) < 1e-9
-        assert read_stamp(transform.header.stamp) == int(drive.stamps_ns[i]) + 250_000_000
+        assert read_stamp(transform.header.stamp) == int(drive.stamps_ns[i])
         assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')
 
 
@@ -135,17 +137,30 @@ def test_the_transform_is_broadcast_where_tf2_msgs_is_installed(bench):
     assert heard[0].transforms[0].child_frame_id == 'odom'
 
 
-def test_the_broadcast_is_the_published_transform(bench, monkeypatch):
+@pytest.mark.parametrize('tolerance_s', [0.1, 0.25, 0.0])
+def test_a_lookup_in_tf_is_the_pose_of_ekf_odometry_and_there_is_one_ahead(
+    bench, monkeypatch, tolerance_s
+):
+    """Images correct the pose; at odometry's 50 Hz, 0.1 s is a whole number of its periods."""
+    drive = Drive(seconds=4, **NOISY)
+    node = bench.run(EkfNode, initial_pose=[0.3, -0.3, 0.1], transform_tolerance=tolerance_s)
     # tf2_msgs is not in the pip wheels: what would go to /tf is caught here instead.
-    drive = Drive(seconds=0.2)
-    node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     monkeypatch.setattr(ekf_node, 'TFMessage', lambda transforms: transforms)
-    sent = []
-    node._tf = type('Publisher', (), {'publish': lambda self, message: sent.append(message)})()
-    heard = bench.listen(TransformStamped, 'ekf/map_to_odom')
+    buffer = TransformBuffer()
+    node._tf = type('Publisher', (), {'publish': lambda _, sent: buffer.add(sent)})()
+    told = bench.listen(Odometry, 'ekf/odometry')
     play(bench, node, drive)
-    assert until(lambda: len(heard) == len(sent) == 10)
-    assert [message[0] for message in sent] == heard
+    assert until(lambda: len(told) == len(drive.stamps_ns))
+    corrections = []
+    for i, message in enumerate(told):
+        found = buffer.lookup(int(drive.stamps_ns[i]))
+        miss = compose(found, drive.reckoned[i]) - pose_of(message)
+        assert np.hypot(*miss[:2]) < 1e-6 and abs(math.remainder(miss[2], 2 * math.pi)) < 1e-6
+        corrections.append(found)
+    assert np.ptp(np.array(corrections), axis=0)[:2].max() > 0.1, 'nothing was corrected'
+    ahead_ns = int(drive.stamps_ns[-1]) + round(tolerance_s * 1e9)
+    assert np.allclose(buffer.lookup(ahead_ns), corrections[-1], atol=0.1)
+    assert buffer.newest_ns - ahead_ns in (0, 500)
 
 
 def test_without_tf2_msgs_the_node_runs_and_says_so(bench, monkeypatch):
@@ -371,8 +386,8 @@ def test_diagnostics_hold_rates_latencies_and_counts(bench):
     assert until(lambda: told().get('odometry: used') == '50')
     values = told()
     assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localized'
-    assert values['odom: received'] == '50' and float(values['odom: rate [Hz]']) > 0
-    assert float(values['odom: latency p99 [ms]']) >= float(values['odom: latency p50 [ms]']) > 0
+    assert values['/odom: received'] == '50' and float(values['/odom: rate [Hz]']) > 0
+    assert float(values['/odom: latency p99 [ms]']) >= float(values['/odom: latency p50 [ms]']) > 0
     assert 'measurement: accepted' in values and 'position std [m]' in values
 
 
@@ -381,8 +396,8 @@ def test_silence_is_reported_without_any_clock_moving(bench):
     node = bench.run(EkfNode, silence_timeout=0.2)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive)
-    assert until(lambda: any(s.data.startswith('DEGRADED: nothing on odom') for s in states))
-    assert until(lambda: any(f'nothing on {IMAGE_POSE}' in s.data for s in states))
+    assert until(lambda: any(s.data.startswith('DEGRADED: nothing on /odom') for s in states))
+    assert until(lambda: any(f'nothing on /{IMAGE_POSE}' in s.data for s in states))
 
 
 def test_what_nothing_moves_on_is_lost_in_the_end_by_the_wall_clock(bench):
@@ -500,6 +515,16 @@ def test_the_models_error_correlation_is_what_an_offline_filter_uses(bench):
         told[name] = fused.state.position_std
     assert node._filter.state.position_std == pytest.approx(told['knows'], rel=1e-3)
     assert told['knows'] < 0.9 * told['ignores']
+
+
+def test_turns_of_images_reach_the_filter(bench, monkeypatch):
+    """They show how late images are stamped."""
+    taken = []
+    monkeypatch.setattr(PoseFilter, 'add_turned', lambda _, *turned: taken.append(turned))
+    node = bench.run(EkfNode)
+    bench.publish('sfa/turned', to_turned(0.5, START_NS, 'first_image'))
+    assert until(lambda: node.monitor('sfa/turned').used == 1), node.monitor('sfa/turned').refused
+    assert taken == [(START_NS, pytest.approx(0.5))]
 
 
 @pytest.mark.parametrize('numbers', [[], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]])

@@ -5,6 +5,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from picture_readers import PictureReader, Recording
 
@@ -12,7 +13,8 @@ from sfa_localization import evaluation, tuning
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
-from sfa_localization.data.run import PanoramaArray
+from sfa_localization.data.geometry import rotation
+from sfa_localization.data.run import PanoramaArray, Trajectory
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -92,6 +94,79 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(bag, tmp_p
     seconds = figures['counts']['states_s']
     assert seconds['LOCALISED'] > 1.0
     assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
+
+
+class Torn(PictureReader):
+    """Reads positions beyond x = 7 m as ten meters farther: half of its map is apart."""
+
+    def locate(self, image):
+        found = super().locate(image)
+        shift = np.array([10.0 if found.position[0] > 7 else 0.0, 0.0])
+        return replace(found, position=found.position + shift)
+
+
+def test_seconds_in_which_the_filter_was_sure_and_wrong_are_counted(
+    bag, tmp_path, monkeypatch, capsys
+):
+    assert evaluated(bag, tmp_path)['counts']['false_localised_s'] == 0.0
+    assert 'an error of more than a meter' not in capsys.readouterr().out
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: Torn()))
+    counts = evaluated(bag, tmp_path)['counts']
+    wrong, localised = counts['false_localised_s'], counts['states_s']['LOCALISED']
+    assert 0.5 * localised < wrong <= localised
+    line = f'state: LOCALISED for {wrong:.1f} s with an error of more than a meter'
+    assert line in capsys.readouterr().out
+
+
+def spread_out(seed, covariance, yaw_std=0.1, count=4000):
+    """A true path, and estimates of it whose errors have a covariance, in a turned map."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(count) * 100_000_000
+    truth = np.column_stack([rng.uniform(0, 9, (count, 2)), rng.uniform(-3, 3, count)])
+    error = rng.multivariate_normal([0.0, 0.0], covariance, count)
+    yaw = rng.normal(0, yaw_std, count)
+    poses = truth + np.column_stack([error, yaw])
+    return Trajectory(stamps, truth), Trajectory(stamps, poses)
+
+
+def test_regions_of_95_percent_hold_what_they_say_in_a_turned_map():
+    inside_map = np.diag([0.09, 0.0009])
+    turn = rotation(1.0)
+    truth, estimate = spread_out(0, turn @ inside_map @ turn.T)
+    claimed = np.zeros((4000, 3, 3))
+    claimed[:, :2, :2], claimed[:, 2, 2] = inside_map, 0.01
+    right = evaluation.calibration(truth, estimate, turn, claimed)
+    assert right['within_95'] == pytest.approx(0.95, abs=0.015)
+    assert right['yaw_within_95'] == pytest.approx(0.95, abs=0.015)
+    assert right['nees'] == pytest.approx(1.0, abs=0.08)
+    sure = evaluation.calibration(truth, estimate, turn, claimed / 9)
+    assert sure['within_95'] < 0.4 and sure['yaw_within_95'] < 0.6 and sure['nees'] > 8
+    unturned = evaluation.calibration(truth, estimate, rotation(0.0), claimed)
+    assert unturned['within_95'] < 0.7
+
+
+def test_no_heading_and_no_truth_give_no_shares():
+    truth, estimate = spread_out(1, 0.01 * np.eye(2), count=50)
+    poses = estimate.poses.copy()
+    poses[:, 2] = np.nan
+    claimed = np.broadcast_to(np.diag([0.01, 0.01, 3.3]), (50, 3, 3))
+    blind = Trajectory(estimate.stamps_ns, poses)
+    assert evaluation.calibration(truth, blind, np.eye(2), claimed)['yaw_within_95'] is None
+    later = Trajectory(estimate.stamps_ns + 10**12, poses)
+    assert evaluation.calibration(truth, later, np.eye(2), claimed)['within_95'] is None
+
+
+def test_a_map_from_wheels_of_a_wrong_radius_is_scaled_to_the_truth():
+    truth, estimate = spread_out(2, 1e-6 * np.eye(2))
+    small = Trajectory(
+        estimate.stamps_ns,
+        np.column_stack([0.97 * estimate.poses[:, :2], estimate.poses[:, 2]]),
+    )
+    laid = evaluation.moved(small, evaluation.fit_transform(truth, small))
+    scale, center = evaluation.fit_scale(truth, laid)
+    assert scale == pytest.approx(1 / 0.97, abs=1e-3)
+    assert evaluation.score(truth, laid)['mean'] > 0.05
+    assert evaluation.score(truth, evaluation.scaled(laid, scale, center))['mean'] < 0.005
 
 
 @pytest.mark.slow

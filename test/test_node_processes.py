@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+import yaml
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -112,6 +113,25 @@ def signalled(self):
     setup(self)
 EkfNode.setup = signalled
 """,
+    'made': """
+from sfa_localization.nodes.ekf_node import EkfNode
+def signalled(self):
+    send()
+    while self.context.ok():
+        pass
+    return False
+EkfNode.start = signalled
+""",
+    'publishing': """
+from sfa_localization.nodes.ekf_node import EkfNode
+health = EkfNode.health
+def signalled(self):
+    send()
+    while self.context.ok():
+        pass
+    return health(self)
+EkfNode.health = signalled
+""",
     'ending': """
 from sfa_localization.nodes.ekf_node import EkfNode
 started, destroy = EkfNode.started, EkfNode.destroy_node
@@ -133,7 +153,7 @@ def test_a_signal_at_any_moment_ends_with_exit_code_0(start, moment, name):
     process = start('ekf_node', before=SEND.format(name) + MOMENTS[moment])
     _, told = process.communicate(timeout=30)
     assert process.returncode == 0, told
-    assert 'Traceback' not in told
+    assert 'Traceback' not in told and 'internal error' not in told and 'refused' not in told
 
 
 @pytest.mark.parametrize(('node', 'parameter', 'why'), [
@@ -174,6 +194,24 @@ def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arg
     _, told = process.communicate(timeout=30)
     assert process.returncode == 1
     assert why in told and 'Traceback' not in told
+
+
+@pytest.mark.parametrize(('key', 'ignored'), [
+    ('ekf_node', True), ('/robot2/ekf_node', True), ('/**/ekf_node', False), ('robot1', False),
+    ('/**', False), ('sfa_node', False),
+])  # fmt: skip
+def test_a_parameter_file_for_another_namespace_is_warned_of(start, tmp_path, key, ignored):
+    path = tmp_path / 'robot.yaml'
+    section = {'ros__parameters': {'autostart': False}}
+    document = {key: {'ekf_node': section} if key == 'robot1' else section}
+    path.write_text(yaml.safe_dump(document))
+    arguments = ['--params-file', str(path), '-r', '__ns:=/robot1']
+    before = SEND.format('SIGINT') + MOMENTS['made']
+    process = start('ekf_node', arguments=arguments, before=before)
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == 0, told
+    warned = f'{path}: nothing of {key} is used: this node is /robot1/ekf_node'
+    assert (warned in told) == ignored and ('/**/ekf_node:' in told) == ignored
 
 
 def test_an_impossible_transition_does_not_end_the_node(bench, start):

@@ -301,6 +301,11 @@ def test_yaw_survives_the_round_trip(yaw):
     assert abs(math.remainder(back - yaw, 2 * math.pi)) < 1e-12
 
 
+def test_turns_of_images_survive_the_round_trip():
+    stamp_ns, yaw = convert.read_turned(convert.to_turned(-2.5, 1_700_000_000_123_456_789, 'first'))
+    assert stamp_ns == 1_700_000_000_123_456_789 and abs(yaw + 2.5) < 1e-12
+
+
 def test_odometry_is_read():
     message = odometry(twist__twist__linear__x=0.5, twist__twist__angular__z=-0.2)
     message.twist.covariance[0], message.twist.covariance[35] = 4e-4, -1.0

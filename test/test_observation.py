@@ -56,7 +56,7 @@ def test_a_believed_picture_gives_the_models_pose_and_covariance():
 
 
 def test_without_a_compass_the_yaw_is_zero_as_on_the_topic():
-    reader = PictureReader(has_heading=False)
+    reader = PictureReader(heading=False)
     reader.locate = lambda image: dataclasses.replace(PictureReader().locate(image), yaw=math.nan)
     assert Observer(reader).observe(7, panorama((3.0, 4.0, 1.0))).pose.tolist() == [3.0, 4.0, 0.0]
 

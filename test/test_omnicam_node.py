@@ -183,7 +183,7 @@ def test_it_outlives_every_bad_image_and_counts_each(bench):
         values = {
             pair.key: pair.value for pair in run.received['/diagnostics'][-1].status[0].values
         }
-        return 'image_raw: refused: empty image' in values
+        return '/image_raw: refused: empty image' in values
 
     run.wait(counted)
 

@@ -314,7 +314,7 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'base_frame': 'test_ekf_node.py::test_frames_are_parameters',
         'publish_tf': 'test_ekf_node.py::test_frames_are_parameters',
         'transform_tolerance': 'test_ekf_node.py::'
-        'test_map_to_odom_makes_odometry_the_pose_in_the_map_and_is_post_dated',
+        'test_a_lookup_in_tf_is_the_pose_of_ekf_odometry_and_there_is_one_ahead',
         'silence_timeout': 'test_ekf_node.py::test_silence_is_reported_without_any_clock_moving',
     },
 }

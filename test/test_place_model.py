@@ -66,10 +66,13 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
     turn = (1 if clockwise else -1) * 2 * np.pi * columns / PLACE_SIZE[1]
     for picture in visit(clockwise).panoramas.read(0, 20):
         one, other = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
-        assert abs(wrap_angle(other.yaw - one.yaw - turn)) < 1e-4
-        assert np.abs(other.position - one.position).max() < 1e-4
-        assert np.allclose(other.covariance, one.covariance, rtol=1e-2)
-        assert other.novelty == pytest.approx(one.novelty, rel=1e-3)
+        assert abs(wrap_angle(other.yaw - one.yaw - turn)) < np.radians(2)
+        assert np.abs(other.position - one.position).max() < 0.1
+        assert other.novelty == pytest.approx(one.novelty, abs=0.1)
+        slow, turned = model.views(np.stack([picture, np.roll(picture, columns, axis=1)]))
+        assert abs(wrap_angle(turned.yaw - slow.yaw - turn)) < 1e-4
+        assert np.abs(turned.position - slow.position).max() < 1e-4
+        assert np.allclose(turned.covariance, slow.covariance, rtol=1e-2)
 
 
 @pytest.mark.parametrize('clockwise', [True, False])
@@ -98,27 +101,29 @@ def test_covariance_of_strange_pictures_is_larger(model, pictures):
     assert foreign > 10 * familiar
 
 
-def test_without_a_compass_yaw_is_unknown(model, pictures):
-    estimate = replace(model, compass=None, heading_layers=(), yaw_agreement=None).locate(
-        pictures[0]
-    )
-    assert np.isnan(estimate.yaw)
-    assert estimate.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
-    unrefined = replace(model, refinement=None).locate(pictures[0])
-    assert np.allclose(estimate.position, unrefined.position, atol=1e-9)
+def test_without_a_compass_the_keyframes_show_the_yaw(model, pictures):
+    blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
+    (view,) = blind.views(pictures[:1])
+    assert np.isnan(view.yaw)
+    assert view.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
+    (unrefined,) = replace(model, refinement=None).views(pictures[:1])
+    assert np.allclose(view.position, unrefined.position, atol=1e-9)
+    estimate = blind.locate(pictures[0])
+    assert abs(wrap_angle(estimate.yaw - model.locate(pictures[0]).yaw)) < np.radians(5)
+    assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=0.05)
 
 
 def test_turned_maps_refine_what_slow_features_find(model, pictures):
     truth = visit().odometry.poses[:, :2]
-    coarse = replace(model, refinement=None).locate_all(pictures)
-    finer = model.locate_all(pictures)
+    coarse = replace(model, refinement=None).views(pictures)
+    finer = model.views(pictures)
     errors = [
-        np.median(np.hypot(*(np.array([e.position for e in estimates]) - truth).T))
-        for estimates in (coarse, finer)
+        np.median(np.hypot(*(np.array([v.position for v in views]) - truth).T))
+        for views in (coarse, finer)
     ]
     assert errors[1] < 0.8 * errors[0]
     # The heading is the compass's own, in the frame of both maps.
-    assert [e.yaw for e in finer] == [e.yaw for e in coarse]
+    assert [v.yaw for v in finer] == [v.yaw for v in coarse]
 
 
 @pytest.mark.parametrize(
@@ -197,8 +202,8 @@ class TestFile:
         blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
         blind.save(tmp_path / 'blind.npz')
         again = PlaceModel.load(tmp_path / 'blind.npz')
-        assert not again.has_heading and model.has_heading
-        assert np.isnan(again.locate(pictures[0]).yaw)
+        assert again.compass is None and model.compass is not None
+        assert again.locate(pictures[0]).yaw == blind.locate(pictures[0]).yaw
 
     def test_nothing_but_the_model_is_left(self, saved):
         assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
@@ -253,7 +258,7 @@ class TestFile:
         [
             'network/1/slow',
             'metric/linear',
-            'novelty/0/scalars',
+            'keyframes/noise',
             'compass/weights',
             'refinement/axes',
         ],

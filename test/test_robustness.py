@@ -13,6 +13,7 @@ import threading
 
 import numpy as np
 import pytest
+from picture_readers import AsLocated
 from robustness import TABLE, robustness_table
 
 from sfa_localization.camera.settings import PanoramaConfig
@@ -71,7 +72,6 @@ class ReadsPixels:
     """A model whose position is the first pixel's blue and green; it can be held up."""
 
     panorama: PanoramaConfig = SIZE
-    has_heading: bool = True
     error_correlation: ErrorCorrelation = dataclasses.field(default_factory=ErrorCorrelation)
     camera_delay_s: float = 0.0
     free: threading.Event = dataclasses.field(default_factory=threading.Event)
@@ -82,6 +82,9 @@ class ReadsPixels:
         assert self.free.wait(15.0)
         spread = np.diag([0.04, 0.04, 0.0025])
         return Estimate(np.arange(1.0, 9.0), image[0, 0, :2].astype(float), 0.25, spread, 0.5)
+
+    def views(self, images):
+        return [AsLocated(self.locate(image)) for image in images]
 
 
 @pytest.fixture

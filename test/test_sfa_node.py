@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from picture_readers import AsLocated
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import FROZEN_IMAGES
@@ -60,16 +61,15 @@ class FakeModel:
     error_correlation: ErrorCorrelation = KNOWN
     camera_delay_s: float = 0.0
 
-    @property
-    def has_heading(self):
-        return self.heading
-
     def locate(self, image):
         yaw = 0.25 if self.heading else math.nan
         variance = 0.01 if self.heading else math.pi**2 / 3
         position = image[0, 0, :2].astype(float) + self.shift
         spread = np.diag([0.04, 0.09, variance])
         return Estimate(np.arange(1.0, 9.0), position, yaw, spread, self.novelty)
+
+    def views(self, images):
+        return [AsLocated(self.locate(image)) for image in images]
 
 
 @pytest.fixture
@@ -270,7 +270,7 @@ def test_waiting_for_images_is_reported(bench, models):
     told = bench.listen(DiagnosticArray, '/diagnostics')
     assert until(lambda: told and 'waiting for images' in told[-1].status[0].message)
     bench.publish('panorama', message())
-    assert until(lambda: 'no image on panorama for' in told[-1].status[0].message)
+    assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
 # What the node says is what it does, in any state.

@@ -105,7 +105,7 @@ def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeyp
     monkeypatch.setattr(image_features, 'SAMPLES', 15)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
     assert 'too few to learn a compass' in caplog.text
-    assert not trained.model.has_heading
+    assert trained.model.compass is None
     assert trained.model.refinement is None and not trained.model.quality['refined']
     assert 'expected_yaw_error_deg' not in trained.model.quality
     assert 'heading' not in summary(trained)
@@ -128,7 +128,7 @@ def test_maps_that_cannot_refine_leave_the_first_map(bag, tmp_path, monkeypatch,
     monkeypatch.setattr(training, 'learn_refinement', _fail)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
     assert 'positions are not refined: the drive cannot fix a map' in caplog.text
-    assert trained.model.has_heading and trained.model.refinement is None
+    assert trained.model.compass is not None and trained.model.refinement is None
     assert 'refined' not in summary(trained)
     assert len(refined.model.metric.points) == 30
     assert len(trained.model.metric.points) > 100
@@ -140,7 +140,7 @@ def test_two_layers_have_none_to_refine_with(bag, tmp_path):
     bottom, _, top = ARCHITECTURE.layers
     two = replace(ARCHITECTURE, layers=(bottom, replace(top, field=(3, 6))))
     trained = train([bag], tmp_path / 'model.npz', replace(RECIPE, architecture=two))
-    assert trained.model.has_heading and trained.model.refinement is None
+    assert trained.model.compass is not None and trained.model.refinement is None
 
 
 def test_monomials_are_not_refined(bag, tmp_path):

@@ -20,16 +20,14 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.commands.live_nodes import commands, run_live
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import atomic_write
-from sfa_localization.data.run import Stamps, Trajectory
+from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import (
     Evaluation,
     evaluate,
-    fit_transform,
     moved,
     score,
     write_json,
 )
-from sfa_localization.metric.learning import positions
 from sfa_localization.reports.evaluation import write_report
 from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
@@ -101,28 +99,13 @@ def _compare(
 ) -> tuple[Evaluation, float]:
     """Evaluate the live estimates; also return their mean distance (m) from the offline ones."""
     offline = evaluate(trained.model, bags['test'], align_bag=bags['coverage'], progress=progress)
-    with Bag(bags['coverage']) as bag:
-        truth = bag.trajectory()
-    transform = fit_transform(truth, _training_estimate(trained))
-    live_in_truth = {name: moved(estimate, transform) for name, estimate in live.items()}
+    live_in_truth = {name: moved(estimate, offline.transform) for name, estimate in live.items()}
     estimates = {**offline.estimates, **live_in_truth}
     scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}
     counts = {name: count for name, count in offline.counts.items() if name != 'fusion'}
     counts['published'] = {name: len(estimate) for name, estimate in live.items()}
     result = dataclasses.replace(offline, estimates=estimates, scores=scores, counts=counts)
     return result, mean_distance(estimates['ekf'], offline.estimates['ekf'])
-
-
-def _training_estimate(trained: Trained) -> Trajectory:
-    """The finest map's positions of the training images in segments."""
-    images, places = positions(trained.metric, trained.segments)
-    estimated = places - trained.metric.residuals
-    unknown = np.full(len(images), np.nan)
-    return Trajectory(_image_stamps(trained)[images], np.column_stack([estimated, unknown]))
-
-
-def _image_stamps(trained: Trained) -> Stamps:
-    return np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
 
 
 def mean_distance(a: Trajectory, b: Trajectory) -> float:
@@ -136,6 +119,7 @@ def _write_results(out: Path, result: Evaluation, trained: Trained, coverage: Pa
     write_json(out / 'results.json', result.as_dict())
     with Bag(coverage) as bag:
         truth = bag.trajectory()
-    places = truth.at(_image_stamps(trained))[:, :2]
+    stamps = np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
+    places = truth.at(stamps)[:, :2]
     shown = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
     write_report(out / 'report', result.truth, shown, result.scores, places, trained.features)

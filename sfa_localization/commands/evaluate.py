@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate; print the errors, and what was used and rejected."""
     from sfa_localization import evaluation
     from sfa_localization.place_model import PlaceModel
-    from sfa_localization.reports.evaluation import heading_table, table, write_report
+    from sfa_localization.reports.evaluation import heading_table, table, trust_lines, write_report
 
     model = PlaceModel.load(arguments.model)
     require_same_panorama(arguments.config, model.panorama)
@@ -56,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress=sys.stderr.isatty(),
     )
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
+    print(*trust_lines(result.scores, result.scale), sep='\n')
     print(*_input_lines(result.counts), *_fusion_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}')
     if arguments.report:
@@ -84,6 +85,9 @@ def _fusion_lines(counts: Mapping[str, Any]) -> list[str]:
     lines = [f'filter: {n} times {reason}' for reason, n in sorted(rejected.items())]
     states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
     lines.append(f'state: {states}')
+    if counts['false_localised_s'] > 0:
+        wrong = counts['false_localised_s']
+        lines.append(f'state: LOCALISED for {wrong:.1f} s with an error of more than a meter')
     if 'camera_delay_s' in counts:
         delay = counts['camera_delay_s']
         late = 'late' if delay > 0 else 'early'

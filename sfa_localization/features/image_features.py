@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
 from sfa_localization.features.agreement import disagreement
+from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.network import Network
-from sfa_localization.features.novelty import describe
 from sfa_localization.features.rotation import Map
 
 Complex = NDArray[np.complex128]
@@ -28,7 +28,7 @@ REFINING_LAYER = 1
 """Layer (0-based), below the top, whose map refines positions: it still holds the heading."""
 HARMONICS = 13
 """Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
-# Images whose maps are kept for the compass and for novelty, however long the drives: memory.
+# Images whose maps and textures are kept for compass and keyframes, however long the drives.
 SAMPLES = 3000
 
 
@@ -81,8 +81,8 @@ class ImageFeatures:
     """(S,) indices of the sample."""
     harmonic: Complex
     """(S, J) of the layers that the compass reads."""
-    descriptions: tuple[Array, ...]
-    """Per layer (S, D), for novelty."""
+    textures: NDArray[np.int8]
+    """(S, rows, columns) local contrast, for keyframes."""
     spectra: Spectrum | None
     """(N, H, J) of the layer that refines positions; None in a network without it."""
     variance_shares: dict[str, list[float]]
@@ -100,10 +100,9 @@ def features_of_runs(
     sampled = np.unique(np.linspace(0, total - 1, min(total, SAMPLES)).round().astype(np.int64))
     in_sample = np.zeros(total, bool)
     in_sample[sampled] = True
-    slow, spread, harmonic = [], [], []
+    slow, spread, harmonic, textures = [], [], [], []
     spectra: list[Spectrum] = []
     shares = _VarianceShares(network.architecture.outputs)
-    descriptions: list[list[Array]] = [[] for _ in network.nodes]
     start = 0
     for images in (batch for run in runs for batch in run.panoramas.batches(BATCH)):
         maps = network.maps(images)
@@ -112,10 +111,9 @@ def features_of_runs(
         spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
+        textures += [quantized(texture(image)[None]) for image in images[keep]]
         if has_refining_layer(network):
             spectra.append(spectrum(maps[REFINING_LAYER]))
-        for layer, of_layer in zip(maps, descriptions, strict=True):
-            of_layer.append(describe(layer[keep]))
         start += len(images)
         on_images(len(images))
     return ImageFeatures(
@@ -123,7 +121,7 @@ def features_of_runs(
         np.concatenate(spread),
         sampled,
         np.concatenate(harmonic),
-        tuple(np.concatenate(d) for d in descriptions),
+        np.concatenate(textures),
         np.concatenate(spectra) if spectra else None,
         shares.result(),
     )

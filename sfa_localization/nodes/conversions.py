@@ -214,7 +214,7 @@ def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> QuaternionStamped:
 
 def read_turned(message: QuaternionStamped) -> tuple[int, float]:
     """Stamp ns and yaw rad. Raises MessageError."""
-    return read_stamp(message), read_yaw(message.quaternion)
+    return read_stamp(message.header.stamp), read_yaw(message.quaternion)
 
 
 def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:

@@ -25,12 +25,13 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.geometry import compose, invert
+from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
+from sfa_localization.nodes.broadcast import Broadcast
 from sfa_localization.nodes.conversions import (
     Motion,
     read_error_correlation,
@@ -86,6 +87,7 @@ class EkfNode(LocalizationNode):
         self._config = self.settings(EkfNodeConfig)
         self._filter = PoseFilter(self.settings(FilterConfig))
         self._paused = False
+        self._broadcast = Broadcast()
         self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_ns = 0
         self._frames = self._config.odom_frame, self._config.base_frame
@@ -176,7 +178,7 @@ class EkfNode(LocalizationNode):
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self._filter.add_measurement(stamp_ns, pose, covariance)
-        self._verdict.publish(_verdict(update))
+        self._verdict.publish(_verdict(update, self.status_name('measurement')))
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
@@ -230,6 +232,7 @@ class EkfNode(LocalizationNode):
 
     def _forget(self) -> None:
         self._filter.reset()
+        self._broadcast.reset()
         self._path.clear()
 
     # Outputs.
@@ -246,12 +249,17 @@ class EkfNode(LocalizationNode):
                 (frame, self._frames[1]),
             )
         )
-        map_to_odom = compose(state.pose, invert(motion.pose))
-        stamp_ns = motion.stamp_ns + round(self._config.transform_tolerance * 1e9)
-        transform = to_transform(map_to_odom, stamp_ns, (frame, self._frames[0]))
-        self._transform.publish(transform)
+        self._publish_transform(motion.stamp_ns, compose(state.pose, invert(motion.pose)))
+
+    def _publish_transform(self, stamp_ns: int, map_to_odom: Array) -> None:
+        """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
+        frames = self._config.map_frame, self._frames[0]
+        self._transform.publish(to_transform(map_to_odom, stamp_ns, frames))
         if self._tf is not None:
-            self._tf.publish(TFMessage(transforms=[transform]))
+            ahead_ns = round(self._config.transform_tolerance * 1e9)
+            dated = self._broadcast.add(stamp_ns, map_to_odom, ahead_ns)
+            transforms = [to_transform(pose, at_ns, frames) for at_ns, pose in dated]
+            self._tf.publish(TFMessage(transforms=transforms))
 
     def _publish_pose(self, stamp_ns: int) -> None:
         """Publish the estimate at the stamp of an image."""
@@ -282,7 +290,7 @@ class EkfNode(LocalizationNode):
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
             silent = self.monitor(topic).silent_for_s()
             if math.isfinite(silent) and silent > limit:
-                added.append(f'nothing on {topic} for {silent:.0f} s')
+                added.append(f'nothing on {self.shown(topic)} for {silent:.0f} s')
         if self._paused:
             added.append('paused: images are not fused')
         level = status.level
@@ -339,10 +347,10 @@ class EkfNode(LocalizationNode):
         return _LEVELS[status.level], '; '.join(status.reasons) or 'localized', values
 
 
-def _verdict(update: Update) -> DiagnosticArray:
+def _verdict(update: Update, name: str) -> DiagnosticArray:
     """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
     level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
-    status = DiagnosticStatus(level=level, name='ekf_node: measurement', message=update.reason)
+    status = DiagnosticStatus(level=level, name=name, message=update.reason)
     status.values = [
         KeyValue(key='accepted', value=str(update.accepted).lower()),
         KeyValue(key='d2', value=_number(update.d2)),

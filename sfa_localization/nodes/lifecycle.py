@@ -8,6 +8,7 @@ A node written on it declares its Settings classes, makes its publishers and sub
 
 from __future__ import annotations
 
+import sys
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
@@ -66,6 +67,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self.active = False
         self.failure = ''
         self.monitors: dict[str, Monitor] = {}
+        self._resolved: dict[str, str] = {}
         self._settings: dict[type[Settings], Settings] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -107,6 +109,14 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """The values in force."""
         return cast(S, self._settings[kind])
 
+    def shown(self, topic: str) -> str:
+        """An input by its full name, after remapping; what is no topic, as it is."""
+        return self._resolved.get(topic, topic)
+
+    def status_name(self, part: str) -> str:
+        """The name of a diagnostic status: the node's with its namespace, and what it is about."""
+        return f'{self.get_fully_qualified_name().lstrip("/")}: {part}'
+
     def monitor(self, name: str) -> Monitor:
         """The counts of one input, made at its first use."""
         return self.monitors.setdefault(name, Monitor())
@@ -146,8 +156,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._entities.append((self.destroy_subscription, made))
 
     def require_input(self, topic: str) -> None:
-        """Raise ConfigError for a topic that this node has a publisher on: it would feed itself."""
-        resolved = self.resolve_topic_name(topic)
+        """Take a topic as an input. Raises ConfigError where this node itself publishes on it."""
+        resolved = self._resolved[topic] = self.resolve_topic_name(topic)
         outputs = [made for _, made in self._entities if isinstance(made, Publisher)]
         if any(made.topic_name == resolved for made in outputs):
             raise ConfigError(
@@ -202,7 +212,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """
         count = self.monitor(topic).refuse(reason)
         if count == 1 or count % 1000 == 0:
-            self.get_logger().warning(f'{topic}: {short_line(reason)} ({count} so far)')
+            self.get_logger().warning(f'{self.shown(topic)}: {short_line(reason)} ({count} so far)')
         return count
 
     def _defect(self, name: str, error: Exception) -> str:
@@ -235,7 +245,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         except InvalidHandle:
             raise
         except Exception as error:
-            self._defect(name, error)  # a node must outlive any message
+            if self.context.ok():  # after a signal nothing can be published
+                self._defect(name, error)  # a node must outlive any message
         else:
             return True
         return False
@@ -292,6 +303,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             destroy(entity)
         self._entities.clear()
         self.monitors.clear()
+        self._resolved.clear()
 
     def _publish_health(self) -> None:
         if not self.active:
@@ -301,9 +313,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be determined', {}))
         level, text, values = found[0]
         for topic, monitor in self.monitors.items():
-            values.update(monitor.values(f'{topic}: '))
+            values.update(monitor.values(f'{self.shown(topic)}: '))
         status = DiagnosticStatus(
-            level=level, name=f'{self.get_name()}: status', hardware_id='sfa_localization'
+            level=level, name=self.status_name('status'), hardware_id='sfa_localization'
         )
         status.message = text
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
@@ -326,6 +338,7 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
+        parameters.warn_of_ignored_files(node, sys.argv if args is None else args)
         if not node.start():
             return int(rclpy.ok())  # a signal is no failure
         with one_core():
@@ -366,5 +379,7 @@ def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
         try:
             executor.spin()
         except rclpy_implementation.RCLError as error:
-            # Asking a lifecycle node for a transition that its state does not have ends here.
-            node.get_logger().error(f'request refused: {error}')
+            # Asking a lifecycle node for a transition that its state does not have ends here, and
+            # so does a signal at some moments.
+            if rclpy.ok():
+                node.get_logger().error(f'request refused: {error}')

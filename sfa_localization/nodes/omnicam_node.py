@@ -222,7 +222,7 @@ class OmnicamNode(LocalizationNode):
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
         if silent_s > self._source.silence_timeout:
-            return _ERROR, f'no image on {self._input} for {silent_s:.0f} s'
+            return _ERROR, f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
         return _OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import array
 import dataclasses
+import itertools
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -20,7 +21,7 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import SECTIONS
+from sfa_localization.config import SECTIONS, ignored_sections
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, nearest
 
@@ -98,6 +99,26 @@ def warn_of_unknown(node: Node) -> None:
     for name in sorted(set(given) - set(known) - others):
         if not name.startswith('qos_overrides.'):  # declared with their topics
             node.get_logger().warning(f'unknown parameter {name!r}{nearest(name, known)}')
+
+
+def warn_of_ignored_files(node: Node, arguments: Sequence[str]) -> None:
+    """Warn of each parameter file among the arguments whose sections for the node are not its.
+
+    ROS takes `ekf_node:` for a node without namespace, and gives /robot1/ekf_node nothing of it.
+    """
+    name = node.get_fully_qualified_name()
+    for flag, path in itertools.pairwise(arguments):
+        if flag != '--params-file':
+            continue
+        try:
+            keys = ignored_sections(path, name)
+        except ConfigError:  # read by ROS, which is less strict
+            continue
+        if keys:
+            node.get_logger().warning(
+                f'{path}: nothing of {", ".join(keys)} is used: this node is {name}; '
+                f'write /**/{node.get_name()}: for any namespace'
+            )
 
 
 def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:

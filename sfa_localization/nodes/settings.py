@@ -54,7 +54,7 @@ class EkfNodeConfig(Settings):
     base_frame: str = setting('base_link', "the robot's frame, where odometry messages have none")
     publish_tf: bool = setting(True, 'broadcast map -> odom (needs tf2_msgs)')
     transform_tolerance: float = setting(
-        0.1, 'how far ahead the transform is dated', unit='s', low=0.0, high=10.0, live=True
+        0.1, 'how long map -> odom holds beyond odometry', unit='s', low=0.0, high=10.0, live=True
     )
     silence_timeout: float = setting(
         1.0,

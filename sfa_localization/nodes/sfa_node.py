@@ -103,8 +103,7 @@ class SfaNode(LocalizationNode):
             model.locate(np.zeros((size.height, size.width, 3), np.uint8))
         except Exception as error:  # arrays that do not fit each other fail in many ways
             raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
-        heading = 'with heading' if model.has_heading else 'without heading'
-        self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}, {heading}')
+        self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}')
         return model
 
     def _check_model(self, changes: list[Parameter]) -> SetParametersResult:
@@ -169,7 +168,7 @@ class SfaNode(LocalizationNode):
             return
         self._undeclared_logged = True
         self.get_logger().info(
-            f'nobody publishes on {self._info} what the panoramas show: assumed are '
+            f'nobody publishes on {self.shown(self._info)} what the panoramas show: assumed are '
             f'{expected.elevation_min:g} to {expected.elevation_max:g} deg, '
             f'{"clockwise" if expected.clockwise else "counterclockwise"}, as in training'
         )
@@ -204,9 +203,9 @@ class SfaNode(LocalizationNode):
         values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
         silent = self.monitor(self._topic).silent_for_s()
         if math.isinf(silent):
-            return _WARN, f'waiting for images on {self._topic}', values
+            return _WARN, f'waiting for images on {self.shown(self._topic)}', values
         if silent > self._config.silence_timeout:
-            return _ERROR, f'no image on {self._topic} for {silent:.0f} s', values
+            return _ERROR, f'no image on {self.shown(self._topic)} for {silent:.0f} s', values
         declared = self._declared_problem(self._observer.model) if self._observer else ''
         if declared:
             return _ERROR, declared, values

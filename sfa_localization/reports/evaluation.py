@@ -157,6 +157,23 @@ def heading_table(scores: Scores) -> str:
     return _markdown('heading error (degrees)', YAW_COLUMNS, rows)
 
 
+def trust_lines(scores: Scores, scale: float) -> list[str]:
+    """Whether the covariances are right, and the errors left when the map is scaled to the truth;
+    of the estimates that have these scores.
+    """
+    lines, means = [], []
+    for name, one in scores.items():
+        shares = {'positions': one.get('within_95'), 'headings': one.get('yaw_within_95')}
+        held = [f'{100 * share:.1f} % of the {of}' for of, share in shares.items() if share]
+        if held:
+            lines.append(f'{_label(name)}: regions of 95 % hold {" and ".join(held)}')
+        if one.get('scaled_mean') is not None:
+            means.append(f'{_label(name)} {one["scaled_mean"]:.3f} m')
+    if means:
+        lines.append(f'map scaled by {scale:.4f} to the truth: {", ".join(means)}')
+    return lines
+
+
 def _markdown(corner: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
     """A table with padded columns, so that it is readable as plain text too."""
     labels = {name: _label(name) for name in rows}

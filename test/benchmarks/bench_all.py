@@ -51,7 +51,7 @@ def benches(folder: Path, quick: bool, model: Path | None) -> Iterator[tuple[str
     yield 'bench_panorama', lambda m: {**m.bench_unwrap(), **m.bench_roundtrip()}
     yield 'bench_panorama', lambda m: m.bench_omnicam()
     if model is not None:
-        yield 'bench_chain', lambda m: m.bench_chain(str(model))
+        yield 'bench_chain', lambda m: {**m.bench_chain(str(model)), **m.bench_robots(str(model))}
 
 
 def flat(figures: Figures, prefix: str = '') -> dict[str, float]:

@@ -4,6 +4,9 @@
 
 Both run as three processes each, with pictures at 30 Hz and odometry at 50 Hz, in turns, in one
 run. A latency is the time from sending a picture to receiving what the third process makes of it.
+
+Then the CPU of each node at camera rates of 10 and 30 Hz, for one, two and four robots that share
+the machine and the domain, each in its namespace.
 """
 
 from __future__ import annotations
@@ -44,6 +47,7 @@ PICTURES_HZ, ODOMETRY_HZ = 30.0, 50.0
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEADLINE_S = 20.0
+ROBOTS, RATES_HZ = (1, 2, 4), (10.0, 30.0)
 
 
 class Relay(Node):
@@ -172,7 +176,9 @@ def start(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen([sys.executable, *command], env=environment)
 
 
-def chain(model_path: Path, model: PlaceModel, folder: Path) -> list[subprocess.Popen[bytes]]:
+def chain(
+    model_path: Path, model: PlaceModel, folder: Path, namespace: str = '/'
+) -> list[subprocess.Popen[bytes]]:
     """The three nodes; the pictures are panoramas already, so that both sides carry the same."""
     size = model.panorama
     parameters = {
@@ -189,12 +195,134 @@ def chain(model_path: Path, model: PlaceModel, folder: Path) -> list[subprocess.
                 '-c',
                 code.format(node),
                 '--ros-args',
+                '-r',
+                f'__ns:={namespace}',
                 *(p for v in parameters[node] for p in ('-p', v)),
             ],
             folder,
         )
         for node in NODES
     ]
+
+
+class Fleet:
+    """Robots that stand: sends pictures and odometry to each, and counts the poses of each."""
+
+    def __init__(self, panorama: np.ndarray, names: list[str]) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN)
+        self.node = rclpy.create_node('fleet', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.panorama = panorama
+        self.answers = dict.fromkeys(names, 0)
+        make = self.node.create_publisher
+        self.images = [make(Image, f'/{name}/image_raw', 10) for name in names]
+        self.odometry = [make(Odometry, f'/{name}/odom', 10) for name in names]
+        for name in names:
+            self.node.create_subscription(
+                PoseWithCovarianceStamped, f'/{name}/ekf/pose', self.counter(name), 10
+            )
+
+    def counter(self, name: str) -> Any:
+        """What to do with a pose of this robot."""
+
+        def count(_: PoseWithCovarianceStamped) -> None:
+            self.answers[name] += 1
+
+        return count
+
+    def send(self) -> None:
+        """Send one picture to each robot, never the same twice."""
+        self.panorama[3::6, ::3, 0] ^= 1
+        stamp_ns = time.time_ns()
+        self.panorama[0, 0] = stamp_ns % 251
+        message = to_image(self.panorama, stamp_ns, 'omnicam')
+        for publisher in self.images:
+            publisher.publish(message)
+
+    def move(self) -> None:
+        """Send one odometry message to each robot."""
+        zero, frames = np.zeros(3), ('odom', 'base_link')
+        message = to_odometry(zero, np.eye(3), zero[:2], np.eye(2) * 1e-4, time.time_ns(), frames)
+        for publisher in self.odometry:
+            publisher.publish(message)
+
+    def run(self, seconds: float, rate_hz: float) -> int:
+        """Send for some seconds; how many pictures each robot got."""
+        start, pictures, moves = time.perf_counter(), 0, 0
+        while (now := time.perf_counter() - start) < seconds:
+            if now >= moves / ODOMETRY_HZ:
+                self.move()
+                moves += 1
+            elif now >= pictures / rate_hz:
+                self.send()
+                pictures += 1
+            else:
+                self.executor.spin_once(timeout_sec=0.0005)
+        return pictures
+
+    def wait(self) -> None:
+        """Until each robot has answered."""
+        end = time.monotonic() + 3 * DEADLINE_S
+        while not all(self.answers.values()):
+            self.run(0.5, 10.0)
+            if time.monotonic() > end:
+                raise RuntimeError(f'robots do not answer: {self.answers}')
+
+    def close(self) -> None:
+        """End the node."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def bench_robots(model_path: Path | str, seconds: float = 8.0) -> dict[str, float]:
+    """CPU shares of each node (1: one core), the mean of the robots, by robots and camera rate."""
+    model = PlaceModel.load(model_path)
+    figures: dict[str, float] = {}
+    for count in ROBOTS:
+        figures |= _bench_fleet(Path(model_path).resolve(), model, count, seconds)
+    return figures
+
+
+def _bench_fleet(
+    model_path: Path, model: PlaceModel, count: int, seconds: float
+) -> dict[str, float]:
+    names = [f'robot{k + 1}' for k in range(count)]
+    processes: list[subprocess.Popen[bytes]] = []
+    fleet = Fleet(some_panorama(model), names)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            for name in names:
+                processes += chain(model_path, model, Path(folder), f'/{name}')
+            fleet.wait()
+            figures: dict[str, float] = {}
+            for rate_hz in RATES_HZ:
+                figures |= _fleet_figures(fleet, processes, rate_hz, seconds)
+            return figures
+        finally:
+            fleet.close()
+            _end(processes)
+
+
+def _fleet_figures(
+    fleet: Fleet, processes: list[subprocess.Popen[bytes]], rate_hz: float, seconds: float
+) -> dict[str, float]:
+    before, answered = cpu_seconds(processes), sum(fleet.answers.values())
+    pictures = fleet.run(seconds, rate_hz)
+    shares = ((cpu_seconds(processes) - before) / seconds).reshape(-1, len(NODES)).mean(axis=0)
+    robots = len(fleet.answers)
+    prefix = f'robots_{robots}_at_{rate_hz:.0f}_hz'
+    named = {f'{prefix}_cpu_{n}': float(s) for n, s in zip(NODES, shares, strict=True)}
+    share = (sum(fleet.answers.values()) - answered) / (pictures * robots)
+    return {**named, f'{prefix}_answered': share}
+
+
+def some_panorama(model: PlaceModel) -> np.ndarray:
+    """A picture of the model's size, of random dots."""
+    size = (model.panorama.height, model.panorama.width, 3)
+    return np.random.default_rng(1).integers(40, 215, size, np.uint8)
 
 
 def cpu_seconds(processes: list[subprocess.Popen[bytes]]) -> np.ndarray:
@@ -206,10 +334,8 @@ def cpu_seconds(processes: list[subprocess.Popen[bytes]]) -> np.ndarray:
 def bench_chain(model_path: Path | str, rounds: int = 3, seconds: float = 8.0) -> dict[str, float]:
     """Median latency over the relay's, the chain's p99 in ms, and its CPU share (1: one core)."""
     model = PlaceModel.load(model_path)
-    rng = np.random.default_rng(1)
-    panorama = rng.integers(40, 215, (model.panorama.height, model.panorama.width, 3), np.uint8)
     sides: dict[str, list[subprocess.Popen[bytes]]] = {'chain': [], 'relay': []}
-    driver = Driver(panorama)
+    driver = Driver(some_panorama(model))
     with tempfile.TemporaryDirectory() as folder:
         try:
             sides['chain'] = chain(Path(model_path).resolve(), model, Path(folder))
@@ -271,4 +397,5 @@ if __name__ == '__main__':
     if sys.argv[1] == '--relay':
         relay(int(sys.argv[2]))
     else:
-        sys.stdout.write(json.dumps(bench_chain(sys.argv[1]), indent=2) + '\n')
+        measured = {**bench_chain(sys.argv[1]), **bench_robots(sys.argv[1])}
+        sys.stdout.write(json.dumps(measured, indent=2) + '\n')

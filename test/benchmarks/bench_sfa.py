@@ -39,6 +39,8 @@ from sfa_localization.features.image_features import (
     slow_features,
     spectrum,
 )
+from sfa_localization.features.keyframe_training import MOST
+from sfa_localization.features.keyframes import Keyframes, MatchNoise, quantized, texture
 from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
     RELATIVE_CUT,
@@ -47,7 +49,6 @@ from sfa_localization.features.network_training import (
     shards_of,
     train_network,
 )
-from sfa_localization.features.novelty import Novelty, describe
 from sfa_localization.features.sfa import Statistics, solve
 from sfa_localization.metric.compass import Compass, kernel_between, triangular
 from sfa_localization.metric.compass_training import (
@@ -65,6 +66,8 @@ from sfa_localization.training import COARSE_POINTS
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
+CLOSE = 110
+"""Keyframes that an image is compared with in full: the likeliest and two places' neighbors."""
 ARCHITECTURE = standard_architecture(SIZE, 'panorama')
 
 
@@ -199,7 +202,7 @@ def made_up_model(network) -> PlaceModel:
         network,
         _map(rng, COARSE_POINTS, 16),
         PanoramaConfig(),
-        Novelty.fit([describe(m) for m in maps]),
+        _keyframes(rng),
         agreement=Agreement(1.0, 1.0, 1.0),
         compass=compass,
         yaw_agreement=Agreement(1.0, 1.0, 1.0),
@@ -218,6 +221,13 @@ def _map(rng: np.random.Generator, count: int, features: int) -> FastProcess:
     sway = 1e-3 * rng.normal(size=(count + 1, 12, 2))
     metric = MetricMap(basis, rng.normal(size=(count + 1, 2)), spread, sway, 0.05, 1.0)
     return FastProcess.of(metric, basis)
+
+
+def _keyframes(rng: np.random.Generator) -> Keyframes:
+    """As many keyframes as a model holds, of random images at random places."""
+    textures = [texture(rng.integers(0, 256, (*SIZE, 3), np.uint8)) for _ in range(MOST)]
+    poses = np.column_stack([rng.uniform(0, 16, (MOST, 2)), rng.uniform(-3, 3, MOST)])
+    return Keyframes.of(quantized(np.array(textures)), poses, MatchNoise(), True)
 
 
 def _compass(rng: np.random.Generator, count: int, features: int, width: int) -> Compass:
@@ -242,13 +252,15 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
     coarse = replace(model, refinement=None)
     blind = replace(coarse, compass=None, yaw_agreement=None)
     products, network_only = bare_products(model, image), bare_network(model)
+    nowhere = np.zeros(2)
     with one_core():
-        whole, bare, unrefined, without, maps, bare_maps = in_turns(
+        whole, bare, unrefined, without, matched, maps, bare_maps = in_turns(
             [
                 lambda: model.locate(image),
                 lambda: [product() for product in products],
                 lambda: coarse.locate(image),
                 lambda: blind.locate(image),
+                lambda: model.keyframes.match(image, nowhere),
                 lambda: model.network.maps(image[None]),
                 lambda: [product() for product in network_only],
             ],
@@ -265,6 +277,9 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
         'network_over_matmul': float(np.median(maps) / np.median(bare_maps)),
         'locate_heading_cost': float(np.median(unrefined) / np.median(without)) - 1,
         'locate_refinement_cost': float(np.median(whole) / np.median(unrefined)) - 1,
+        'locate_keyframes_cost': float(
+            np.median(matched) / (np.median(whole) - np.median(matched))
+        ),
         'locate_growth_mib': grown,
     }
 
@@ -293,10 +308,12 @@ def bare_network(model: PlaceModel) -> list[Callable[[], object]]:
 def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], object]]:
     """All products of a model's equations, on inputs that are ready."""
     made = bare_network(model)
+    keyframes = model.keyframes
+    frequencies, _, rows = keyframes.coarse.shape
+    made.append(_product(keyframes.coarse, np.ones((frequencies, rows, 1), np.complex64)))
+    close = keyframes.spectra[:CLOSE].transpose(2, 0, 1)
+    made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
     maps = model.network.maps(image[None])
-    for layer, m in zip(model.novelty.layers, maps, strict=True):
-        description = describe(m) - layer.mean
-        made += [_product(description, layer.directions), _product(description, layer.axes)]
     assert isinstance(model.metric, FastProcess)
     made += bare_process(model.metric, slow_features(maps))
     if model.refinement is not None:

@@ -1,0 +1,120 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Choose keyframes among the training images, and learn how well they are found."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.features.agreement import needed_factor, quantile
+from sfa_localization.features.keyframes import (
+    LOWEST,
+    LOWEST_SHARE,
+    NEIGHBORS,
+    Keyframes,
+    MatchNoise,
+)
+
+Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
+
+MOST = 2000
+"""Keyframes of a model: 4 MB."""
+# Keyframes that are left out in turn: enough for quantiles of 5 %.
+_TRIALS = 400
+# A keyframe is matched without those of the same stretch of driving: they are too alike.
+_STRETCH_M = 3.0
+_AT_ONCE = 64  # bounds the memory
+_TEMPERATURES = np.geomspace(0.003, 0.1, 12)
+_FLOORS_M = np.geomspace(0.03, 1.0, 15)
+_HEAVY_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
+_USUAL_SHARE = 0.05
+_LEAST_YAW_STD = 1e-3
+# Keeps novelty's scale finite where all images look alike.
+_LEAST_RANGE = 0.05
+
+
+def fit_keyframes(
+    textures: NDArray[np.int8], poses: Array, path_m: Array, clockwise: bool = True
+) -> Keyframes:
+    """From textures (N, rows, columns) of training images, their poses (N, 3) in the map, and the
+    distance (N,) m driven until each, which must jump between drives.
+
+    Raises DataError for too few images.
+    """
+    kept = spread(poses)
+    keyframes = Keyframes.of(
+        textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise
+    )
+    return dataclasses.replace(keyframes, noise=_noise(keyframes, path_m[kept]))
+
+
+def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
+    """Some keyframes, each correlated with those of other stretches: index, (K,) correlations,
+    -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance driven until each.
+    """
+    count = len(keyframes.poses)
+    sample = np.unique(np.linspace(0, count - 1, min(_TRIALS, count)).round().astype(np.int64))
+    for start in range(0, len(sample), _AT_ONCE):
+        rows = sample[start : start + _AT_ONCE]
+        found = keyframes.correlate(keyframes.spectra[rows], keyframes.spectra)
+        for row, scores, shifts in zip(rows.tolist(), *found, strict=True):
+            scores[np.abs(path_m - path_m[row]) < _STRETCH_M] = -np.inf
+            if np.isfinite(scores).sum() >= NEIGHBORS and scores.max() >= LOWEST:
+                yield row, scores, shifts
+
+
+def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
+    """What the errors of keyframes that are left out are like; the default for too few."""
+    errors, yaws, scatters, best = [], [], [], []
+    for row, scores, shifts in left_out(keyframes, path_m):
+        match, pose = keyframes.located(scores, shifts), keyframes.poses[row]
+        best.append(match.score)
+        errors.append(float(((match.pose - pose)[:2] ** 2).sum()))
+        yaws.append(abs(float(wrap_angle(match.pose[2] - pose[2]))))
+        known, place = np.flatnonzero(np.isfinite(scores)), match.pose[:2]
+        weights = (keyframes.likelihood(scores[known], t) for t in _TEMPERATURES)
+        scatters.append([np.trace(keyframes.scatter(w, known, place)) / 2 for w in weights])
+    if len(errors) < NEIGHBORS:
+        return MatchNoise()
+    squared, variances = np.array(errors), np.array(scatters)
+    at, floor = _likeliest(squared, variances)
+    alike = np.ones(len(squared))
+    factor = needed_factor(squared / (variances[:, at] + floor**2), 2, alike)
+    lowest = max(LOWEST, LOWEST_SHARE * float(np.median(best)))
+    usual = max(quantile(np.array(best), _USUAL_SHARE, alike), lowest + _LEAST_RANGE)
+    yaw_std = max(1.4826 * float(np.median(yaws)), _LEAST_YAW_STD)
+    return MatchNoise(float(_TEMPERATURES[at]), floor, max(factor, 1.0), yaw_std, lowest, usual)
+
+
+def spread(poses: Array) -> NDArray[np.int64]:
+    """At most `MOST` of N images, by their poses (N, 3), spread over the ground: of each cell of
+    a grid the first ones.
+    """
+    if len(poses) <= MOST:
+        return np.arange(len(poses))
+    extent = np.ptp(poses[:, :2], axis=0)
+    cell = float(np.sqrt(extent[0] * extent[1] / MOST)) / 4
+    places = np.floor(poses[:, :2] / max(cell, 1e-6)).astype(np.int64)
+    rank = np.zeros(len(poses), np.int64)
+    filled: dict[tuple[int, int], int] = {}
+    for i, (x, y) in enumerate(places.tolist()):
+        rank[i] = filled[x, y] = filled.get((x, y), -1) + 1
+    return np.sort(np.argsort(rank, kind='stable')[:MOST])
+
+
+def _likeliest(squared_errors: Array, scatters: Array) -> tuple[int, float]:
+    """Number of the temperature, and floor m, under which errors (M,) are likeliest."""
+    best, found = np.inf, (0, float(_FLOORS_M[0]))
+    for column in range(len(_TEMPERATURES)):
+        for floor in _FLOORS_M:
+            variance = scatters[:, column] + floor**2
+            tails = (_HEAVY_TAIL + 2) / 2 * np.log1p(squared_errors / (variance * _HEAVY_TAIL))
+            surprise = float(np.mean(tails + np.log(variance)))
+            if surprise < best:
+                best, found = surprise, (column, float(floor))
+    return found

@@ -1,0 +1,321 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes: small training images with known poses, matched by correlation over all rotations.
+
+Slow features are regressed to a pose, and a regression always has an answer. A correlation with
+the training images says whether the place was seen at all: local contrast survives another light
+and season, and what matches nothing is unknown. The match is a pose of its own: the correlation
+with the neighbors of the best keyframe is a surface over the ground whose top is the position,
+and the shift of the columns is the heading.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.spatial import cKDTree
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.run import Image
+
+Texture = NDArray[np.float32]
+Spectra = NDArray[np.complex64]
+
+_COLUMNS, _ROWS = 100, 20
+# Standard deviation of the blur that takes light and its slow changes out, of the columns: 10 deg.
+_BLUR = 1 / 37.5
+# Keeps the noise of dark and of plain surfaces small beside texture: of the brightness (8 bit),
+# and of its logarithm.
+_DARKEST, _FLATTEST = 8.0, 0.1
+# Textures are stored with one byte a pixel.
+_STEPS = 127 / 4.0  # for a standard deviation
+NEIGHBORS = 24
+"""Keyframes about a place whose correlations make its surface."""
+_FEWEST = 6  # numbers of a paraboloid
+_REACH_SHARE = 0.6  # of the distance to the farthest of them: width of the weights
+# Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
+_COARSE, _CANDIDATES = 15, 64
+# Correlations that unknown places do not reach (foreign and mirrored gardens: 0.40), and the same
+# as a share of what keyframes of other stretches of driving reach.
+LOWEST, LOWEST_SHARE = 0.42, 0.5
+# Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
+_DOUBT = 4.0
+# Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
+_APART = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class MatchNoise:
+    """How well keyframes of other stretches of driving are found, learned by `fit_keyframes`.
+
+    `temperature` is the difference of correlation that matters, `floor_m` the least standard
+    deviation of a position, `factor` what the variances of positions lack, `yaw_std` rad that of
+    a heading. `lowest` is the correlation below which a place is unknown, `usual` the one that
+    19 of 20 images of known places reach. `joint_factor` is what the variances lack of estimates
+    that slow features and keyframes agree on.
+    """
+
+    temperature: float = 0.02
+    floor_m: float = 0.3
+    factor: float = 1.0
+    yaw_std: float = 0.03
+    lowest: float = LOWEST
+    usual: float = 0.6
+    joint_factor: float = 1.0
+
+    def novelty(self, score: float) -> float:
+        """1 for a correlation that is just usual, 3 for the lowest of a known place, more below."""
+        exponent = (self.usual - score) / (self.usual - self.lowest)
+        return float(3.0 ** min(exponent, 4.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """The estimate of the keyframes for an image.
+
+    `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
+    with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
+    near a guess minus `score`, in temperatures: 0 where the best is among them.
+    """
+
+    pose: Array
+    covariance: Array
+    score: float
+    support: float
+
+    def distance(self, position: Array, covariance: Array) -> float:
+        """Half the squared Mahalanobis distance from another estimate's position (2,) m, with its
+        covariance (2, 2): 1 on average where both variances are right.
+        """
+        apart = position - self.pose[:2]
+        return float(apart @ np.linalg.solve(self.covariance[:2, :2] + covariance, apart)) / 2
+
+    def combined(
+        self, position: Array, yaw: float, covariance: Array, noise: MatchNoise
+    ) -> tuple[Array, float, Array]:
+        """Position (2,) m, yaw rad and covariance (3, 3) from this match and another estimate.
+
+        Of an unknown place the other estimate stays; one that the keyframes contradict is
+        dropped; two that agree are weighted by their information, and their variances grow with
+        their distance.
+        """
+        if self.score < noise.lowest:
+            return position, yaw, covariance
+        if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
+            return self.pose[:2], float(self.pose[2]), self.covariance
+        mine, its = self.covariance[:2, :2], covariance[:2, :2]
+        distance = self.distance(position, its)
+        if self.support < -_DOUBT or distance > _APART:
+            return self.pose[:2], float(self.pose[2]), self.covariance
+        joint = np.zeros((3, 3))
+        gain = mine @ np.linalg.inv(mine + its)
+        joint[:2, :2] = noise.joint_factor * max(1.0, distance) * gain @ its
+        joint[:2, :2] = (joint[:2, :2] + joint[:2, :2].T) / 2
+        found, joint[2, 2] = self._combined_yaw(yaw, float(covariance[2, 2]))
+        return self.pose[:2] + gain @ (position - self.pose[:2]), found, joint
+
+    def _combined_yaw(self, yaw: float, variance: float) -> tuple[float, float]:
+        own = float(self.covariance[2, 2])
+        if not np.isfinite(yaw):
+            return float(self.pose[2]), own
+        apart = float(wrap_angle(yaw - self.pose[2]))
+        spread = max(1.0, apart**2 / (own + variance))
+        if spread > 2 * _APART:
+            return float(self.pose[2]), own
+        gain = own / (own + variance)
+        return float(wrap_angle(self.pose[2] + gain * apart)), gain * variance * spread
+
+
+def texture(panorama: Image) -> Texture:
+    """Local contrast of a panorama (H, W, 3) uint8, small: (rows, columns), zero mean, unit norm.
+
+    The logarithm of the brightness minus its surroundings, over their standard deviation: what is
+    left of an image after its light.
+    """
+    height, width = min(panorama.shape[0], _ROWS), min(panorama.shape[1], _COLUMNS)
+    grey = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
+    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    margin = max(width // 6, 1)
+    light = np.log(np.pad(small, ((0, 0), (margin, margin)), 'wrap') + np.float32(_DARKEST))
+    detail = light - cv2.GaussianBlur(light, (0, 0), width * _BLUR)
+    contrast = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), width * _BLUR))
+    return _normalized((detail / (contrast + np.float32(_FLATTEST)))[:, margin:-margin])
+
+
+def _normalized(image: Texture) -> Texture:
+    centered = image - image.mean()
+    return np.asarray(centered / max(float(np.linalg.norm(centered)), 1e-6), np.float32)
+
+
+def spectrum(textures: Texture) -> Spectra:
+    """Fourier coefficients of the columns, (..., rows, F)."""
+    return np.asarray(fft.rfft(textures, axis=-1), np.complex64)
+
+
+def quantized(textures: Texture) -> NDArray[np.int8]:
+    """Textures (N, rows, columns) with one byte a pixel."""
+    deviation = np.maximum(np.std(textures, axis=(1, 2), keepdims=True), 1e-6)
+    return np.asarray(np.clip(np.rint(textures * (_STEPS / deviation)), -127, 127), np.int8)
+
+
+def _coarse(spectra: Spectra) -> Spectra:
+    """Low frequencies of spectra (T, rows, F), in pairs of rows, of unit norm."""
+    low = spectra[:, : spectra.shape[1] // 2 * 2, 1 : _COARSE + 1]
+    low = low[:, ::2] + low[:, 1::2] if low.shape[1] else spectra[:, :, 1 : _COARSE + 1]
+    low = np.concatenate([np.zeros_like(low[:, :, :1]), low], axis=2)
+    return np.asarray(low / np.maximum(np.linalg.norm(low, axis=(1, 2), keepdims=True), 1e-9))
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframes:
+    """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map."""
+
+    textures: NDArray[np.int8]
+    poses: Array
+    noise: MatchNoise
+    clockwise: bool
+    spectra: Spectra
+    coarse: Spectra
+    tree: cKDTree
+
+    @classmethod
+    def of(
+        cls, textures: NDArray[np.int8], poses: Array, noise: MatchNoise, clockwise: bool
+    ) -> Keyframes:
+        """Keyframes ready to be matched. Raises DataError for too few."""
+        if len(textures) < _FEWEST:
+            raise DataError(f'{len(textures)} images are too few for keyframes')
+        spectra = spectrum(np.stack([_normalized(t.astype(np.float32)) for t in textures]))
+        coarse = np.ascontiguousarray(_coarse(spectra).transpose(2, 0, 1))
+        return cls(textures, poses, noise, clockwise, spectra, coarse, cKDTree(poses[:, :2]))
+
+    def match(self, panorama: Image, guess: Array | None = None) -> Match:
+        """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
+        estimate of its place.
+
+        The likeliest by a coarse correlation, their best's neighbors and those of the guess are
+        correlated in full.
+        """
+        image = spectrum(texture(panorama))[None]
+        scores = np.full(len(self.poses), -np.inf, np.float32)
+        shifts = np.zeros(len(self.poses), np.float32)
+        wanted = [self._candidates(image)]
+        if guess is not None:
+            wanted.append(self.nearest(guess))
+        self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
+        self._add(image, self.nearest(self.poses[int(scores.argmax()), :2]), scores, shifts)
+        return self.located(scores, shifts, guess)
+
+    def _add(
+        self,
+        image: Spectra,
+        wanted: NDArray[np.int64],
+        scores: NDArray[np.float32],
+        shifts: NDArray[np.float32],
+    ) -> None:
+        """Fill in what is still missing of the wanted keyframes' correlations."""
+        wanted = wanted[np.isneginf(scores[wanted])]
+        if len(wanted):
+            found, shift = self.correlate(image, self.spectra[wanted])
+            scores[wanted], shifts[wanted] = found[0], shift[0]
+
+    def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
+        """The keyframes that are likeliest by the coarse structure of the image."""
+        products = self.coarse @ np.conj(_coarse(spectrum)).transpose(2, 1, 0)
+        scores = fft.irfft(products[:, :, 0].T, 2 * len(self.coarse), axis=1).max(1)
+        number = min(_CANDIDATES, len(scores))
+        return np.sort(np.argpartition(-scores, number - 1)[:number])
+
+    def nearest(self, place: Array) -> NDArray[np.int64]:
+        """The keyframes nearest to a place (2,) m."""
+        return np.asarray(self.tree.query(place, min(NEIGHBORS, len(self.poses)))[1], np.int64)
+
+    def correlate(
+        self, spectra: Spectra, keyframes: Spectra
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Largest correlation of T spectra (T, rows, F) with each of K, (T, K), and the shift of
+        columns, to a part of a column, at which it is reached.
+        """
+        columns = self.textures.shape[2]
+        products = keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0)
+        curves = fft.irfft(products.transpose(2, 1, 0), columns, axis=2)
+        top = curves.argmax(2)
+        t, k = np.ogrid[: len(spectra), : len(keyframes)]
+        left, middle, right = (curves[t, k, (top + step) % columns] for step in (-1, 0, 1))
+        bend = left - 2 * middle + right
+        part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
+        return middle, np.asarray(top + part, np.float32)
+
+    def located(
+        self,
+        scores: NDArray[np.float32],
+        shifts: NDArray[np.float32],
+        guess: Array | None = None,
+    ) -> Match:
+        """The match of correlations (K,), -inf where unknown, and shifts (K,) of the columns."""
+        best, known = int(scores.argmax()), np.flatnonzero(np.isfinite(scores))
+        place = self._top_of_surface(scores, best)
+        turn = (-2 if self.clockwise else 2) * np.pi / self.textures.shape[2]
+        yaws = self.poses[known, 2] + turn * shifts[known]
+        yaw = float(self.poses[best, 2] + turn * shifts[best])
+        weight = self.likelihood(scores[known], self.noise.temperature)
+        covariance = np.zeros((3, 3))
+        floor = self.noise.floor_m**2 * np.eye(2)
+        scatter = self.scatter(weight, known, place)
+        covariance[:2, :2] = self.noise.factor * (scatter + floor)
+        scattered = float(weight @ wrap_angle(yaws - yaw) ** 2)
+        covariance[2, 2] = self.noise.yaw_std**2 + scattered
+        support = 0.0
+        if guess is not None:
+            near = scores[self.nearest(guess)]
+            near = near[np.isfinite(near)]
+            if len(near):
+                support = float(near.max() - scores[best]) / self.noise.temperature
+        pose = np.array([*place, wrap_angle(yaw)])
+        return Match(pose, covariance, float(scores[best]), support)
+
+    def _top_of_surface(self, scores: NDArray[np.float32], best: int) -> Array:
+        """Top of the paraboloid through the correlations with the neighbors of the best."""
+        center = self.poses[best, :2]
+        near = self.nearest(center)
+        near = near[np.isfinite(scores[near])]
+        offset = self.poses[near, :2] - center
+        square = (offset**2).sum(1)
+        reach = max(_REACH_SHARE * float(np.sqrt(square.max())), 1e-6)
+        weight = np.exp(-square / (2 * reach**2))
+        terms = np.column_stack([np.ones(len(near)), offset, -0.5 * square]) * weight[:, None]
+        solution = np.linalg.lstsq(terms, scores[near] * weight, rcond=None)[0]
+        if solution[3] <= 0:
+            return np.array(center)
+        step = solution[1:3] / solution[3]
+        return np.asarray(center + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9)))
+
+    def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
+        """How likely each keyframe is the place, of sum 1, by its correlation."""
+        weight = np.exp((scores - scores.max()) / temperature, dtype=np.float64)
+        return np.asarray(weight / weight.sum())
+
+    def scatter(self, weight: Array, rows: NDArray[np.int64], place: Array) -> Array:
+        """Covariance (2, 2) m^2 of the places of keyframes `rows` about one, by weight."""
+        offset = self.poses[rows, :2] - place
+        return np.asarray((offset * weight[:, None]).T @ offset)
+
+    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Arrays to save, without pickle."""
+        noise = np.array([*dataclasses.astuple(self.noise), float(self.clockwise)])
+        return {'textures': self.textures, 'poses': self.poses, 'noise': noise}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Keyframes:
+        """Read the arrays of `to_arrays`."""
+        *noise, clockwise = (float(n) for n in np.asarray(arrays['noise'], float))
+        textures = np.asarray(arrays['textures'], np.int8)
+        poses = np.asarray(arrays['poses'], float)
+        return cls.of(textures, poses, MatchNoise(*noise), bool(clockwise))

@@ -1,0 +1,97 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes at the places of the certified map, and how well they and slow features do together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Run
+from sfa_localization.features.agreement import Agreement, needed_factor, share_within
+from sfa_localization.features.image_features import ImageFeatures
+from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
+from sfa_localization.features.keyframes import Keyframes
+from sfa_localization.metric.learning import MetricResult, headings, positions
+from sfa_localization.metric.segments import Segments
+
+# Between the drives: farther than any stretch.
+_ANOTHER_DRIVE_M = 1e6
+_ENOUGH = 50
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeMap:
+    """Keyframes of a map; from parts of the drive that both were learned without:
+    `improvement`, the mean error of slow features and keyframes together over that of slow
+    features alone, and `within_95`, the share of errors in the ellipses of 95 %.
+    """
+
+    keyframes: Keyframes
+    improvement: float = 1.0
+    within_95: float = 0.95
+
+
+def learn_keyframes(
+    runs: Sequence[Run],
+    images: ImageFeatures,
+    segments: Segments,
+    result: MetricResult,
+    agreement: Agreement,
+    clockwise: bool,
+) -> KeyframeMap:
+    """Keyframes where the certified solution puts their images. Raises DataError for too few."""
+    labeled, places = positions(result, segments)
+    known, in_sample, row = np.intersect1d(images.sampled, labeled, return_indices=True)
+    poses = np.column_stack([places, headings(result, segments)[1]])[row]
+    path = _path(runs)[known]
+    keyframes = fit_keyframes(images.textures[in_sample], poses, path, clockwise)
+    kept = spread(poses)
+    variance = result.left_out_variance * agreement.factor(images.disagreement[labeled])
+    return _judged(keyframes, path[kept], row[kept], result, variance)
+
+
+def _path(runs: Sequence[Run]) -> Array:
+    """Distance (N,) m that odometry had driven at each image, far apart between drives."""
+    parts = []
+    for number, run in enumerate(runs):
+        places = run.odometry.trajectory.at(run.panoramas.stamps_ns)[:, :2]
+        steps = np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T)
+        parts.append(number * _ANOTHER_DRIVE_M + np.cumsum(steps))
+    return np.concatenate(parts)
+
+
+def _judged(
+    keyframes: Keyframes,
+    path_m: Array,
+    rows: NDArray[np.int64],
+    result: MetricResult,
+    variance: Array,
+) -> KeyframeMap:
+    """Errors of both together where both were left out; keyframe k is row `rows[k]` (K,)."""
+    errors, variances, alone, weights = [], [], [], []
+    for k, scores, shifts in left_out(keyframes, path_m):
+        row, place = rows[k], keyframes.poses[k, :2]
+        guess = place + result.left_out[row]
+        match = keyframes.located(scores, shifts, guess)
+        claimed = np.diag([variance[row], variance[row], 1.0])
+        found, _, covariance = match.combined(guess, np.nan, claimed, keyframes.noise)
+        errors.append(found - place)
+        variances.append(np.trace(covariance[:2, :2]) / 2)
+        alone.append(result.left_out[row])
+        weights.append(result.left_out_weight[row])
+    if len(errors) < _ENOUGH or not sum(weights) > 0:
+        return KeyframeMap(keyframes)
+    weight, ratio = np.array(weights), (np.array(errors) ** 2).sum(1) / np.array(variances)
+    factor = max(needed_factor(ratio, 2, weight), 1.0)
+    joint, single = (np.average(np.hypot(*np.array(e).T), weights=weight) for e in (errors, alone))
+    noise = replace(keyframes.noise, joint_factor=factor)
+    return KeyframeMap(
+        replace(keyframes, noise=noise),
+        float(joint / max(single, 1e-9)),
+        share_within(ratio / factor, 2, 0.95, weight),
+    )

@@ -1,0 +1,179 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes: found in any light, from any heading; unknown places are known to be unknown."""
+
+import cv2
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres
+
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.features.keyframe_training import fit_keyframes
+from sfa_localization.features.keyframes import Keyframes, quantized, texture
+
+CONFIG = PanoramaConfig(width=120, height=24)
+COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)
+
+
+def drive(step: float = 0.25) -> np.ndarray:
+    """Poses (N, 3) up and down a square of 4 m, each lane headed the other way."""
+    lanes = np.arange(-2.0, 2.01, step)
+    poses = []
+    for number, y in enumerate(lanes):
+        xs = np.arange(-2.0, 2.01, step)[:: 1 if number % 2 == 0 else -1]
+        poses += [(x, y, 0.0 if number % 2 == 0 else np.pi) for x in xs]
+    return np.array(poses)
+
+
+def path(poses: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+
+
+def learnt(world: Spheres, config: PanoramaConfig = CONFIG) -> Keyframes:
+    poses = drive()
+    textures = np.stack([texture(image) for image in world.panoramas(poses, config)])
+    return fit_keyframes(quantized(textures), poses, path(poses), config.clockwise)
+
+
+def unseen(number: int = 60) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return np.column_stack(
+        [rng.uniform(-1.8, 1.8, (number, 2)), rng.uniform(-np.pi, np.pi, number)]
+    )
+
+
+def errors(keyframes: Keyframes, images: np.ndarray, poses: np.ndarray):
+    found = [keyframes.match(image) for image in images]
+    difference = np.array([match.pose for match in found]) - poses
+    return np.hypot(*difference[:, :2].T), np.abs(wrap_angle(difference[:, 2])), found
+
+
+@pytest.mark.parametrize('config', [CONFIG, COUNTER])
+def test_an_unseen_pose_is_found(config):
+    world, poses = Spheres.about(0), unseen()
+    far, turned, found = errors(learnt(world, config), world.panoramas(poses, config), poses)
+    assert np.median(far) < 0.1 and np.mean(far) < 0.2
+    assert np.median(turned) < np.radians(2)
+    assert min(match.score for match in found) > 0.5
+
+
+def test_the_ellipses_hold_what_they_promise():
+    world, poses = Spheres.about(1), unseen(150)
+    keyframes = learnt(world)
+    found = [keyframes.match(image) for image in world.panoramas(poses, CONFIG)]
+    ratio = [
+        (m.pose - p)[:2] @ np.linalg.solve(m.covariance[:2, :2], (m.pose - p)[:2])
+        for m, p in zip(found, poses, strict=True)
+    ]
+    assert np.mean(np.array(ratio) < 5.99) > 0.85
+
+
+@pytest.mark.parametrize('columns', [1, 7, 60])
+def test_a_turn_of_the_robot_is_a_turn_of_the_match(columns):
+    world, poses = Spheres.about(0), unseen(8)
+    keyframes, turn = learnt(world), 2 * np.pi * columns / CONFIG.width
+    for image in world.panoramas(poses, CONFIG):
+        plain, turned = keyframes.match(image), keyframes.match(np.roll(image, columns, axis=1))
+        assert np.allclose(turned.pose[:2], plain.pose[:2], atol=0.1)
+        assert abs(wrap_angle(turned.pose[2] - plain.pose[2] - turn)) < np.radians(1.5)
+
+
+LIGHTS = {
+    'darker': lambda i: i * 0.5,
+    'gamma': lambda i: 255 * (i / 255) ** 1.6,
+    'sun': lambda i: (
+        i * (1 + 0.4 * np.cos(np.arange(i.shape[2]) * 2 * np.pi / i.shape[2]))[:, None]
+    ),
+    'color': lambda i: i * np.array([0.6, 1.0, 1.3]),
+}
+
+
+@pytest.mark.parametrize('light', LIGHTS)
+def test_light_does_not_matter(light):
+    world, poses = Spheres.about(0), unseen()
+    images = world.panoramas(poses, CONFIG)
+    other = np.clip(LIGHTS[light](images.astype(float)), 0, 255).astype(np.uint8)
+    keyframes = learnt(world)
+    usual, _, _ = errors(keyframes, images, poses)
+    far, turned, found = errors(keyframes, other, poses)
+    assert np.mean(far) < np.mean(usual) + 0.07
+    assert np.median(turned) < np.radians(2)
+    assert min(match.score for match in found) > 0.5
+
+
+def test_a_covered_part_is_survived_or_doubted():
+    world, poses = Spheres.about(0), unseen()
+    images = world.panoramas(poses, CONFIG)
+    images[:, :, :30] = 0
+    far, _, found = errors(learnt(world), images, poses)
+    sure = np.array([np.sqrt(np.trace(m.covariance[:2, :2]) / 2) < 0.3 for m in found])
+    assert sure.mean() > 0.5 and np.mean(far[sure] > 1.0) < 0.05
+
+
+def strange_images():
+    rng = np.random.default_rng(5)
+    poses = unseen(30)
+    home = Spheres.about(0).panoramas(poses, CONFIG)
+    return {
+        'foreign': Spheres.about(9).panoramas(poses, CONFIG),
+        'mirrored': home[:, :, ::-1],
+        'upside down': home[:, ::-1],
+        'noise': rng.integers(0, 255, home.shape).astype(np.uint8),
+        'black': np.zeros_like(home),
+        'grey': np.full_like(home, 128),
+    }
+
+
+@pytest.mark.parametrize('kind', ['foreign', 'mirrored', 'upside down', 'noise', 'black', 'grey'])
+def test_what_was_never_seen_is_not_believed(kind):
+    keyframes = learnt(Spheres.about(0))
+    found = [keyframes.match(image) for image in strange_images()[kind]]
+    assert all(np.isfinite(m.pose).all() and np.isfinite(m.covariance).all() for m in found)
+    lowest = keyframes.noise.lowest
+    sure = [m.score >= lowest and np.trace(m.covariance[:2, :2]) < 0.18 for m in found]
+    assert np.mean(sure) < 0.1
+
+
+def test_a_symmetric_world_is_ambiguous():
+    world, poses = Spheres.about(2).symmetric(), unseen(20)
+    keyframes = learnt(world)
+    wide = [
+        np.sqrt(np.trace(keyframes.match(image).covariance[:2, :2]) / 2) > 0.5
+        for image in world.panoramas(poses, CONFIG)
+    ]
+    assert np.mean(wide) > 0.7
+
+
+def test_they_are_saved_and_read():
+    world = Spheres.about(0)
+    keyframes = learnt(world)
+    again = Keyframes.from_arrays(keyframes.to_arrays())
+    for image in world.panoramas(unseen(5), CONFIG):
+        a, b = keyframes.match(image), again.match(image)
+        assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
+
+
+def test_many_images_are_thinned_evenly():
+    rng = np.random.default_rng(0)
+    poses = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.zeros(4000)])
+    textures = rng.normal(size=(4000, 8, 24)).astype(np.float32)
+    keyframes = fit_keyframes(quantized(textures), poses, np.arange(4000) * 0.1)
+    assert len(keyframes.poses) == 2000
+    counts, _, _ = np.histogram2d(*keyframes.poses[:, :2].T, bins=5)
+    assert counts.min() > 50
+
+
+def test_too_few_images_are_rejected():
+    with pytest.raises(DataError, match='too few'):
+        fit_keyframes(np.zeros((3, 4, 8), np.int8), np.zeros((3, 3)), np.arange(3.0))
+
+
+@pytest.mark.parametrize('shape', [(4, 16), (8, 60), (60, 600), (128, 1024)])
+def test_any_size_has_a_texture(shape):
+    image = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
+    small = texture(image)
+    assert small.shape == (min(shape[0], 20), min(shape[1], 100))
+    assert abs(small.mean()) < 1e-6 and np.linalg.norm(small) == pytest.approx(1, abs=1e-4)
+    assert np.allclose(texture(cv2.convertScaleAbs(image, alpha=1.0)), small)

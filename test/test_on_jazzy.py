@@ -1,0 +1,245 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The package as its users run it: `ros2 run`, launch, param, lifecycle and bag, and tf2.
+
+Skipped where there is no `ros2`, and where it does not find the package: source the workspace.
+"""
+
+import contextlib
+import math
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip('rclpy')
+if shutil.which('ros2') is None:
+    pytest.skip('there is no ros2 command', allow_module_level=True)
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+
+try:
+    get_package_prefix('sfa_localization')
+except PackageNotFoundError:
+    pytest.skip('ros2 does not find sfa_localization', allow_module_level=True)
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
+from rclpy.time import Time
+from ros_bench import Bench, until
+from std_msgs.msg import String
+
+from sfa_localization.data.geometry import compose
+from sfa_localization.data.messages import read_planar, read_stamp, read_yaw
+from sfa_localization.nodes.conversions import to_pose_with_covariance
+from sfa_localization.nodes.lifecycle import latched_qos
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+DOMAIN = 72
+ROOT = Path(__file__).parents[1]
+DRIVE, MODEL_DRIVE = ROOT / 'bags' / 'sample_test', ROOT / 'bags' / 'sample'
+COMMAND_S = 60
+"""A command of ros2 imports for seconds, and more on a busy machine."""
+DIRECT = ['--no-daemon', '--spin-time', '3']
+"""Without the daemon of ros2, which would outlive the tests."""
+
+
+@pytest.fixture
+def bench():
+    made = Bench(DOMAIN)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope='module')
+def environment(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('ros_log')
+    return {
+        **os.environ,
+        'ROS_DOMAIN_ID': str(DOMAIN),
+        'ROS_LOG_DIR': str(folder),
+        'PYTHONUNBUFFERED': '1',
+    }
+
+
+@pytest.fixture
+def start(environment, tmp_path):
+    """Start `ros2 ...` as in a terminal of its own: Ctrl-C reaches the whole of it."""
+    running = []
+
+    def begin(*words):
+        log = tmp_path / f'{len(running)}.log'
+        with open(log, 'w') as output:
+            process = subprocess.Popen(
+                ['ros2', *map(str, words)], env=environment, stdin=subprocess.DEVNULL,
+                stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
+        process.log = log
+        running.append(process)
+        return process
+
+    yield begin
+    for process in running:
+        for number in (signal.SIGINT, signal.SIGKILL):
+            with contextlib.suppress(ProcessLookupError):  # it and its children have ended
+                os.killpg(process.pid, number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(15)
+
+
+@pytest.fixture
+def ros2(environment):
+    """Return a function that runs `ros2 ...` to its end: its output; only `refused` may fail."""
+
+    def call(*words, refused=False):
+        done = subprocess.run(
+            ['ros2', *map(str, words)], env=environment, stdin=subprocess.DEVNULL,
+            capture_output=True, text=True, timeout=COMMAND_S,
+        )  # fmt: skip
+        assert refused or done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return call
+
+
+def interrupted(process):
+    """End it by Ctrl-C; its exit code and what it printed."""
+    os.killpg(process.pid, signal.SIGINT)
+    return process.wait(COMMAND_S), process.log.read_text()
+
+
+def states(bench, namespace=''):
+    """What ekf_node says of its state from now on; waits until it has said so once."""
+    heard = []
+    bench.node.create_subscription(String, f'{namespace}/ekf/state', heard.append, latched_qos())
+    assert until(lambda: heard, COMMAND_S), 'ekf_node does not start'
+    return heard
+
+
+def planar(pose):
+    return np.array(read_planar(pose.position, pose.orientation))
+
+
+def test_a_node_of_ros2_run_ends_at_ctrl_c(bench, start):
+    process = start('run', 'sfa_localization', 'ekf_node')
+    assert states(bench)[0].data.startswith('UNINITIALISED')
+    code, told = interrupted(process)
+    assert code == 0 and 'Traceback' not in told, told
+    assert until(lambda: 'ekf_node' not in bench.node.get_node_names())
+
+
+def test_a_parameter_dump_can_be_read_back(bench, start, ros2, tmp_path):
+    first = start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-p', 'lost_std:=1.25')
+    states(bench)
+    dumped = ros2('param', 'dump', '/ekf_node', *DIRECT)
+    values = yaml.safe_load(dumped)['/ekf_node']['ros__parameters']
+    assert values['lost_std'] == 1.25
+    interrupted(first)
+    assert until(lambda: 'ekf_node' not in bench.node.get_node_names())
+    path = tmp_path / 'dumped.yaml'
+    path.write_text(dumped)
+    start('run', 'sfa_localization', 'ekf_node', '--ros-args', '--params-file', path)
+    states(bench)
+    assert '1.25' in ros2('param', 'get', '/ekf_node', 'lost_std', *DIRECT)
+
+
+def test_a_live_parameter_is_set_and_a_wrong_value_is_refused(bench, start, ros2):
+    start('run', 'sfa_localization', 'ekf_node')
+    states(bench)
+    assert 'successful' in ros2('param', 'set', '/ekf_node', 'lost_std', '1.5', *DIRECT)
+    ros2('param', 'set', '/ekf_node', 'lost_std', '-1.5', *DIRECT, refused=True)
+    assert '1.5' in ros2('param', 'get', '/ekf_node', 'lost_std', *DIRECT).split()
+
+
+def test_the_life_cycle_is_driven_from_the_command_line(bench, start, ros2):
+    start('run', 'sfa_localization', 'ekf_node')
+    states(bench)
+    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('active')
+    ros2('lifecycle', 'set', '/ekf_node', 'deactivate', *DIRECT)
+    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('inactive')
+    ros2('lifecycle', 'set', '/ekf_node', 'activate', *DIRECT)
+    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('active')
+
+
+class Corrector:
+    """Publishes poses beside the odometry now and then, so that map -> odom jumps."""
+
+    def __init__(self, bench):
+        self.odometry, self.fused = {}, {}
+        self._publisher = bench.node.create_publisher(
+            PoseWithCovarianceStamped, 'sfa/pose_with_covariance', 10
+        )
+        bench.node.create_subscription(Odometry, 'odom', self._hear, 1000)
+        bench.node.create_subscription(Odometry, 'ekf/odometry', self._fuse, 1000)
+
+    def _hear(self, message):
+        stamp_ns = read_stamp(message.header.stamp)
+        self.odometry[stamp_ns] = planar(message.pose.pose)
+        if len(self.odometry) % 20 == 0:
+            side = 0.3 if len(self.odometry) % 40 else -0.3
+            seen = self.odometry[stamp_ns] + [side, 0.0, 0.0]
+            spread = np.diag([0.04, 0.04, 0.01])
+            self._publisher.publish(to_pose_with_covariance(seen, spread, stamp_ns, 'map'))
+
+    def _fuse(self, message):
+        self.fused[read_stamp(message.header.stamp)] = planar(message.pose.pose)
+
+
+def test_a_lookup_of_tf2_during_bag_play_is_ekf_odometry(bench, start):
+    tf2_ros = pytest.importorskip('tf2_ros')
+    buffer = tf2_ros.Buffer(cache_time=Duration(seconds=100))
+    tf2_ros.TransformListener(buffer, bench.node, spin_thread=False)
+    start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-p', 'initial_pose:=[0.0,0.0,0.0]')
+    states(bench)
+    corrector = Corrector(bench)
+    player = start('bag', 'play', DRIVE, '--topics', '/odom', '--rate', '4',
+                   '--disable-keyboard-controls')  # fmt: skip
+    assert player.wait(COMMAND_S) == 0, player.log.read_text()
+    assert until(lambda: len(corrector.fused) > 700), 'ekf_node did not follow the bag'
+    found, missed = [], []
+    for stamp_ns, fused in sorted(corrector.fused.items())[:-1]:
+        t = buffer.lookup_transform('map', 'odom', Time(nanoseconds=stamp_ns)).transform
+        found.append([t.translation.x, t.translation.y, read_yaw(t.rotation)])
+        if stamp_ns in corrector.odometry:
+            missed.append(compose(found[-1], corrector.odometry[stamp_ns]) - fused)
+    assert len(missed) > 600
+    assert np.hypot(*np.array(missed).T[:2]).max() < 1e-3
+    assert max(abs(math.remainder(miss[2], 2 * math.pi)) for miss in missed) < 1e-3
+    assert np.ptp(found, axis=0)[0] > 0.05, 'nothing was corrected'
+
+
+def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, ros2, tmp_path):
+    model = tmp_path / 'model.npz'
+    trainer = start('run', 'sfa_localization', 'train', MODEL_DRIVE, '--output', model)
+    assert trainer.wait(600) == 0, trainer.log.read_text()
+    chain = start(
+        'launch', 'sfa_localization', 'localization.launch.py', f'model:={model}',
+        'namespace:=robot1', 'image_transport:=compressed',
+    )  # fmt: skip
+    heard = states(bench, '/robot1')
+    nodes = ros2('node', 'list', *DIRECT).split()
+    assert {f'/robot1/{name}_node' for name in ('omnicam', 'sfa', 'ekf')} <= set(nodes)
+    assert until(lambda: bench.node.count_publishers('/robot1/tf') == 1)
+    assert bench.node.count_publishers('/tf') == 0
+    assert until(lambda: bench.node.count_subscribers('/robot1/image_raw/compressed'), COMMAND_S)
+    player = start(
+        'bag', 'play', DRIVE, '--disable-keyboard-controls', '--remap', '/odom:=/robot1/odom',
+        '/panorama/compressed:=/robot1/image_raw/compressed',
+    )  # fmt: skip
+    assert player.wait(COMMAND_S + 60) == 0, player.log.read_text()
+    assert any(state.data.startswith('LOCALISED') for state in heard)
+    _, told = interrupted(chain)
+    assert 'process has died' not in told and 'Traceback' not in told
+
+
+def test_a_launch_with_a_missing_parameter_file_fails(start):
+    chain = start(
+        'launch', 'sfa_localization', 'localization.launch.py', 'model:=none', 'config:=/none.yaml'
+    )
+    assert chain.wait(COMMAND_S) != 0
+    assert 'there is no such parameter file' in chain.log.read_text()
