@@ -35,8 +35,8 @@ from sfa_localization.metric.expansions import (
 # Error of the variance, over the variance of a point, that float32 may make.
 _TOLERANCE = 2e-3
 # Factors of more points are rounded to float32, half of the model file: standard deviations
-# change by 0.5 % at most where the map is surest.
-_EXACT_POINTS = 700
+# change by 0.5 % at most where the map is surest. Fewer points are of maps that may be exact.
+_EXACT_POINTS = 300
 
 
 class Predictor(Protocol):
