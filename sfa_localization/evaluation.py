@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,9 @@ from sfa_localization.data.geometry import (
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import State
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer, Observation
 from sfa_localization.place_model import PlaceModel
@@ -55,8 +57,7 @@ class Evaluation:
     """A judged drive. `estimates` are in the truth's frame.
 
     `features` (N, K) are those of the usable images, of which `estimates['sfa']` is.
-    `aligned_on` names the drive on which `transform`, from map to truth, was fitted; `scale` is
-    the factor by which the map would fit the truth best.
+    `aligned_on` names the drive on which `transform`, from map to truth, was fitted.
     """
 
     truth: Trajectory
@@ -66,30 +67,42 @@ class Evaluation:
     features: Array
     aligned_on: str
     transform: RigidTransform
-    scale: float
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers: one entry per estimate, and the counts."""
-        about = {'counts': self.counts, 'aligned_on': self.aligned_on, 'scale': self.scale}
-        return {**self.scores, **about}
+        return {**self.scores, 'counts': self.counts, 'aligned_on': self.aligned_on}
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """Estimates in the map: `poses` with their `covariances` (N, 3, 3)."""
+
+    poses: Trajectory
+    covariances: Array
+
+    @classmethod
+    def of(cls, states: Sequence[State]) -> _Track:
+        """The estimates of the filter."""
+        stamps = np.array([state.stamp_ns for state in states], np.int64)
+        poses = np.reshape([state.pose for state in states], (-1, 3))
+        covariances = np.reshape([state.pose_covariance for state in states], (-1, 3, 3))
+        return cls(Trajectory(stamps, poses), covariances)
 
 
 @dataclass(frozen=True, slots=True)
 class _Replay:
-    """What model and filter make of a drive, in the map frame.
+    """What model and filter make of a drive.
 
-    `sfa` (N, 3) poses of the usable images, of which `features` (N, K) are; `ekf` (T, 3) the
-    filter's at each odometry message, and whether it was LOCALISED there, `sure` (T,);
-    `covariances` (N, 3, 3) and (T, 3, 3) of both; `counts` of messages, observations and states.
+    `tracks` holds 'sfa', the usable images, of which `features` (N, K) are; 'ekf', the filter at
+    each odometry message, and whether it was LOCALISED there, `sure` (T,); and 'smoothed', if
+    wanted. `counts` are those of messages, observations and states.
     """
 
     run: Run
     truth: Trajectory
-    sfa: Trajectory
     features: Array
-    ekf: Trajectory
     sure: NDArray[np.bool_]
-    covariances: dict[str, Array]
+    tracks: dict[str, _Track]
     counts: dict[str, Any]
 
 
@@ -102,56 +115,50 @@ def evaluate(
     config: FilterConfig | None = None,
     watch: WatchConfig | None = None,
     progress: bool = False,
+    smooth: bool = False,
 ) -> Evaluation:
     """Judge a model on a drive with ground truth, by what sfa_node and ekf_node would publish.
 
     The transform to the truth is fitted on `align_bag`, a training drive; without one, on the
-    drive itself. Unusable images count as skipped observations. Raises BagError or DataError,
-    also when there is no ground truth.
+    drive itself. `smooth` adds the filter's estimates smoothed after the drive. Unusable images
+    count as skipped observations. Raises BagError or DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
     trained = None
     if align_bag is not None:
         trained = _replay(align_bag, Localizer(model, config, watch), recipe, progress)
-    drive = _replay(bag, Localizer(model, config, watch), recipe, progress)
+    kind = Smoother if smooth else PoseFilter
+    drive = _replay(bag, Localizer(model, config, watch, kind), recipe, progress)
     reference = trained or drive
-    transform = fit_transform(reference.truth, reference.sfa)
-    scale = fit_scale(reference.truth, moved(reference.sfa, transform))
+    transform = fit_transform(reference.truth, reference.tracks['sfa'].poses)
     estimates = _in_truth(drive, transform)
     if trained is not None:
         estimates['supervised'] = _supervised(model, trained, drive)
     return Evaluation(
         drive.truth,
         estimates,
-        _scores(drive, estimates, transform, scale),
+        _scores(drive, estimates, transform),
         {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])},
         drive.features,
         str(align_bag or bag),
         transform,
-        scale[0],
     )
 
 
 def _in_truth(drive: _Replay, transform: RigidTransform) -> dict[str, Trajectory]:
-    return {
-        'odometry': odometry_from_start(drive.truth, drive.run),
-        'sfa': moved(drive.sfa, transform),
-        'ekf': moved(drive.ekf, transform),
-    }
+    tracks = {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
+    return {'odometry': odometry_from_start(drive.truth, drive.run), **tracks}
 
 
 def _scores(
-    drive: _Replay,
-    estimates: Mapping[str, Trajectory],
-    transform: RigidTransform,
-    scale: tuple[float, Array],
+    drive: _Replay, estimates: Mapping[str, Trajectory], transform: RigidTransform
 ) -> Scores:
-    """The errors of every estimate; calibration, and errors in the scaled map, of the model's."""
+    """The errors of every estimate; of the model's also calibration and similarity."""
     scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    for name, covariances in drive.covariances.items():
+    for name, track in drive.tracks.items():
         turn = rotation(transform.yaw_rad)
-        scores[name] |= calibration(drive.truth, estimates[name], turn, covariances)
-        scores[name]['scaled_mean'] = score(drive.truth, scaled(estimates[name], *scale))['mean']
+        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
     return scores
 
 
@@ -171,21 +178,16 @@ def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
     if clock.delay_ns:
         counts['camera_delay_s'] = round(clock.delay_s, 3)
     counts['states_s'] = states
+    tracks = {'sfa': _located(usable, clock), 'ekf': _Track.of([state for state, _ in fused])}
+    if isinstance(localizer.filter, Smoother):
+        tracks['smoothed'] = _Track.of(localizer.filter.smoothed())
     assert run.ground_truth is not None
     return _Replay(
         run,
         run.ground_truth,
-        _located(usable, clock),
         np.array([one.estimate.slow_features for one in usable]),
-        Trajectory(
-            np.array([state.stamp_ns for state, _ in fused], np.int64),
-            np.reshape([state.pose for state, _ in fused], (-1, 3)),
-        ),
         np.array([level is Level.LOCALISED for _, level in fused], bool),
-        {
-            'sfa': np.array([one.estimate.covariance for one in usable]),
-            'ekf': np.reshape([state.pose_covariance for state, _ in fused], (-1, 3, 3)),
-        },
+        tracks,
         counts,
     )
 
@@ -219,14 +221,15 @@ def _replayed(
     return observations, fused, states
 
 
-def _located(usable: list[Observation], clock: CameraClock) -> Trajectory:
-    """Map poses (N, 3) of the usable images.
+def _located(usable: list[Observation], clock: CameraClock) -> _Track:
+    """The usable images in the map.
 
     The map is judged where images were taken, by `clock`; the filter has to find out by itself.
     """
     stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
     estimates = [one.estimate for one in usable]
-    return Trajectory(stamps, np.array([np.append(e.position, e.yaw) for e in estimates]))
+    poses = np.array([np.append(e.position, e.yaw) for e in estimates])
+    return _Track(Trajectory(stamps, poses), np.array([e.covariance for e in estimates]))
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
@@ -242,25 +245,20 @@ def fit_transform(truth: Trajectory, estimate: Trajectory) -> RigidTransform:
     return align(estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2])
 
 
-def fit_scale(truth: Trajectory, estimate: Trajectory) -> tuple[float, Array]:
-    """The factor by which estimates in the truth's frame fit the truth best, and the point (2,) m
-    about which they are scaled: a wheel of a wrong radius scales the whole map.
+def similarity(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
+    """`mean` error (m) that is left when rotation, translation and `scale` are fitted on the
+    estimate itself: what remains when the wheels' radius and the map's place do not matter.
     """
     mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
-    found, right = (
-        poses[:, :2] @ np.array([1.0, 1j])
-        for poses in (estimate.poses[mask], truth.at(estimate.stamps_ns[mask]))
-    )
-    center = complex(found.mean())
-    square = float((np.abs(found - center) ** 2).sum())
-    product = float((np.conj(found - center) * right).sum().real)
-    return product / square if square > 0 else 1.0, np.array([center.real, center.imag])
-
-
-def scaled(estimate: Trajectory, scale: float, center: Array) -> Trajectory:
-    """A trajectory scaled about a point (2,)."""
-    places = center + scale * (estimate.poses[:, :2] - center)
-    return Trajectory(estimate.stamps_ns, np.column_stack([places, estimate.poses[:, 2]]))
+    if np.count_nonzero(mask) < 2:
+        return {'mean': None, 'scale': None}
+    found, right = estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2]
+    laid = align(found, right).apply(found)
+    offset, center = laid - laid.mean(0), right.mean(0)
+    square = float((offset**2).sum())
+    scale = float((offset * (right - center)).sum()) / square if square > 0 else 1.0
+    errors = np.hypot(*(scale * offset + center - right).T)
+    return {'mean': float(errors.mean()), 'scale': scale}
 
 
 def calibration(
@@ -347,14 +345,16 @@ def _summary(values: Array) -> dict[str, float]:
 def _supervised(model: PlaceModel, trained: _Replay, drive: _Replay) -> Trajectory:
     """The drive by the model's own regression, fitted on the ground truth of a training drive."""
     basis = model.metric.basis
-    mask = known(trained.truth, trained.sfa.stamps_ns)
+    stamps = trained.tracks['sfa'].poses.stamps_ns
+    mask = known(trained.truth, stamps)
     expanded = basis.expand(trained.features[mask])
-    places = trained.truth.at(trained.sfa.stamps_ns[mask])[:, :2]
+    places = trained.truth.at(stamps[mask])[:, :2]
     normal = expanded.T @ expanded + np.diag(basis.ridge)
     weights = np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
     positions = basis.expand(drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
-    return Trajectory(drive.sfa.stamps_ns, np.column_stack([positions, unknown]))
+    stamps = drive.tracks['sfa'].poses.stamps_ns
+    return Trajectory(stamps, np.column_stack([positions, unknown]))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -23,6 +23,7 @@ from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, Status
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.smoother import Smoother
 
 _NS = Decimal(1_000_000_000)
 _SECOND_NS = 1_000_000_000
@@ -98,8 +99,10 @@ def run_filter(
     config: FilterConfig,
     start: Sequence[float] | None = None,
     progress: bool = False,
+    smooth: bool = False,
 ) -> Filtered:
-    """Fuse two tables as a live filter would: each pose depends on earlier rows only.
+    """Fuse two tables as a live filter would: each pose depends on earlier rows only, unless
+    `smooth`: then on all rows.
 
     `start` is x m, y m, yaw rad, if known. Raises DataError when the tables do not overlap.
     """
@@ -107,7 +110,7 @@ def run_filter(
     # Logs may count from zero, but a stamp of zero means that there is none.
     first = min(int(table.stamps_ns[0]) for table in (odometry, positions) if len(table))
     shift = _SECOND_NS - first if first <= 0 else 0
-    fused = PoseFilter(config)
+    fused = Smoother(config) if smooth else PoseFilter(config)
     if start is not None:
         fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
     stamps, poses, waiting = [], [], 0
@@ -119,6 +122,9 @@ def run_filter(
             continue
         stamps.append(stamp_ns - shift)
         poses.append(state.pose)
+    if isinstance(fused, Smoother):
+        smoothed = fused.smoothed()
+        stamps, poses = [s.stamp_ns - shift for s in smoothed], [s.pose for s in smoothed]
     return Filtered(
         np.array(stamps, np.int64),
         np.reshape(np.array(poses), (-1, 3)),

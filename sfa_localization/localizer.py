@@ -151,9 +151,10 @@ class Localizer:
         model: PlaceModel,
         config: FilterConfig | None = None,
         watch: WatchConfig | None = None,
+        kind: type[PoseFilter] = PoseFilter,
     ) -> None:
         self.observer = Observer(model, watch)
-        self.filter = PoseFilter(config, model.error_correlation)
+        self.filter = kind(config, model.error_correlation)
         self.filter.expect_delay(model.camera_delay_s)
 
     def add_odometry(

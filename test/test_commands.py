@@ -292,6 +292,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
     'evaluate': {
         '--align': Case('--align {data}/bag', differ(lambda o: o.text.splitlines()[-1])),
         '--config': Case('--config {data}/start.yaml', PRINTED),
+        '--smooth': Case('--smooth', PRINTED),
         '--report': Case('--report {out}/report', written('report/report.md')),
         '--json': Case('--json {out}/figures.json', written('figures.json')),
         '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
@@ -347,6 +348,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
     'filter': {
         '--config': Case('--config {data}/start.yaml', POSES),
         '--initial-pose': Case('--initial-pose 1 2 3', POSES),
+        '--smooth': Case('--smooth', POSES),
         '--output': Case('--output {out}/other.tum', written('other.tum')),
     },
     'tune': {

@@ -156,17 +156,16 @@ def test_no_heading_and_no_truth_give_no_shares():
     assert evaluation.calibration(truth, later, np.eye(2), claimed)['within_95'] is None
 
 
-def test_a_map_from_wheels_of_a_wrong_radius_is_scaled_to_the_truth():
+def test_a_map_from_wheels_of_a_wrong_radius_fits_the_truth_when_scaled():
     truth, estimate = spread_out(2, 1e-6 * np.eye(2))
-    small = Trajectory(
-        estimate.stamps_ns,
-        np.column_stack([0.97 * estimate.poses[:, :2], estimate.poses[:, 2]]),
-    )
+    places = 0.97 * estimate.poses[:, :2] @ rotation(0.4) + [3.0, 1.0]
+    small = Trajectory(estimate.stamps_ns, np.column_stack([places, estimate.poses[:, 2]]))
     laid = evaluation.moved(small, evaluation.fit_transform(truth, small))
-    scale, center = evaluation.fit_scale(truth, laid)
-    assert scale == pytest.approx(1 / 0.97, abs=1e-3)
     assert evaluation.score(truth, laid)['mean'] > 0.05
-    assert evaluation.score(truth, evaluation.scaled(laid, scale, center))['mean'] < 0.005
+    for one in (small, laid):
+        found = evaluation.similarity(truth, one)
+        assert found['scale'] == pytest.approx(1 / 0.97, abs=1e-3)
+        assert found['mean'] < 0.005
 
 
 @pytest.mark.slow

@@ -33,6 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--align', type=Path, metavar='TRAIN_BAG', help='drive that aligns the map with the truth'
     )
     parser.add_argument('--config', type=Path, help='parameter file')
+    parser.add_argument(
+        '--smooth',
+        action='store_true',
+        help='add the filter smoothed after the drive: of use on drives that were not trained on',
+    )
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures and the table')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the errors as JSON')
     add_topics(parser, *TOPIC_OPTIONS)
@@ -54,9 +59,10 @@ def run(arguments: argparse.Namespace) -> int:
         config=settings(FilterConfig, arguments, arguments.config),
         watch=settings(WatchConfig, arguments, arguments.config),
         progress=sys.stderr.isatty(),
+        smooth=arguments.smooth,
     )
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
-    print(*trust_lines(result.scores, result.scale), sep='\n')
+    print(*trust_lines(result.scores), sep='\n')
     print(*_input_lines(result.counts), *_fusion_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}')
     if arguments.report:

@@ -34,6 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=('X', 'Y', 'YAW'),
         help='initial pose (m, m, rad), where it is known',
     )
+    parser.add_argument(
+        '--smooth', action='store_true', help='use later positions too, for poses after the drive'
+    )
     parser.add_argument('--output', type=Path, required=True, help='TUM file to write')
 
 
@@ -48,7 +51,12 @@ def run(arguments: argparse.Namespace) -> int:
     if text:
         print(text)
     result = filtering.run_filter(
-        odometry, positions, config, arguments.initial_pose, progress=sys.stderr.isatty()
+        odometry,
+        positions,
+        config,
+        arguments.initial_pose,
+        progress=sys.stderr.isatty(),
+        smooth=arguments.smooth,
     )
     for name, table in (('odometry rows', odometry), ('position rows', positions)):
         for reason, count in sorted(table.skipped.items()):

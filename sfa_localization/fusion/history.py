@@ -21,13 +21,20 @@ _SLACK = 64  # events added between two clean-ups, which cost a copy of the list
 class History(Generic[E, B]):
     """Events by (stamp_ns, rank), each with the belief after it; `step` makes the next belief.
 
-    `start` is the belief at `start_ns`, before which no event can be placed.
+    `start` is the belief at `start_ns`, before which no event can be placed. Events that are
+    older than `span_ns` are forgotten, or moved to the `archive`, in order, where there is one.
     """
 
     def __init__(
-        self, span_ns: int, start: B, step: Callable[[B, E], B], start_ns: int | None = None
+        self,
+        span_ns: int,
+        start: B,
+        step: Callable[[B, E], B],
+        start_ns: int | None = None,
+        archive: list[E] | None = None,
     ) -> None:
         self._span_ns = span_ns
+        self._archive = archive
         self._step = step
         self._base = start
         self._horizon_ns = start_ns
@@ -46,6 +53,11 @@ class History(Generic[E, B]):
     @property
     def newest_ns(self) -> int | None:
         return self._keys[-1][0] if self._keys else self._horizon_ns
+
+    @property
+    def events(self) -> list[E]:
+        """All events in order, as far as they are not forgotten."""
+        return [*(self._archive or ()), *self._events]
 
     def holds(self, key: Key) -> bool:
         """Whether there is an event of this stamp and rank."""
@@ -99,4 +111,6 @@ class History(Generic[E, B]):
             return
         self._base = self._beliefs[cut - 1]
         self._horizon_ns = self._keys[cut - 1][0]
+        if self._archive is not None:
+            self._archive += self._events[:cut]
         del self._keys[:cut], self._events[:cut], self._beliefs[:cut]

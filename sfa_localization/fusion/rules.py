@@ -21,9 +21,11 @@ from sfa_localization.fusion.update import Correction
 class Rules:
     """How a belief follows from the one before and an event, under some settings."""
 
-    def __init__(self, config: FilterConfig, correlation: ErrorCorrelation) -> None:
+    def __init__(
+        self, config: FilterConfig, correlation: ErrorCorrelation, kalman: Kalman | None = None
+    ) -> None:
         noise = MotionNoise(config.slip_per_metre, config.yaw_per_radian, correlation.distance_m)
-        kalman = Kalman()
+        kalman = kalman or Kalman()
         self.prediction = Prediction(noise, kalman)
         self.recovery = Recovery(config, correlation)
         self.correction = Correction(config.lost_yaw_std, kalman, self.recovery)

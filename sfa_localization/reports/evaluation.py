@@ -30,6 +30,7 @@ LABELS = {
     'odometry': 'wheel odometry',
     'sfa': 'SFA, one image each',
     'ekf': 'EKF: SFA + odometry',
+    'smoothed': 'EKF, smoothed',
     'supervised': 'supervised reference',
 }
 # Lines above dots above the truth; dots for estimates from single images.
@@ -38,6 +39,7 @@ STYLES: dict[str, dict[str, Any]] = {
     'sfa': {'color': '#56B4E9', 'linestyle': '', 'marker': 'o', 'markersize': 2.6, 'zorder': 2},
     'supervised': {'color': '#009E73', 'linestyle': '', 'marker': 'x', 'markersize': 3},
     'ekf': {'color': '#0072B2', 'linestyle': '-', 'linewidth': 1.7, 'zorder': 4},
+    'smoothed': {'color': '#D55E00', 'linestyle': '-', 'linewidth': 1.2, 'zorder': 5},
 }
 OTHER: dict[str, Any] = {'color': '#CC79A7', 'linestyle': '-', 'linewidth': 1.2}
 TRUTH: dict[str, Any] = {'color': '0.72', 'linewidth': 5.0, 'solid_capstyle': 'round', 'zorder': 1}
@@ -157,20 +159,20 @@ def heading_table(scores: Scores) -> str:
     return _markdown('heading error (degrees)', YAW_COLUMNS, rows)
 
 
-def trust_lines(scores: Scores, scale: float) -> list[str]:
-    """Whether the covariances are right, and the errors left when the map is scaled to the truth;
-    of the estimates that have these scores.
+def trust_lines(scores: Scores) -> list[str]:
+    """Whether the covariances are right, and the errors left after a similarity alignment on the
+    drive itself; of the estimates that have these scores.
     """
-    lines, means = [], []
+    lines = []
     for name, one in scores.items():
         shares = {'positions': one.get('within_95'), 'headings': one.get('yaw_within_95')}
-        held = [f'{100 * share:.1f} % of the {of}' for of, share in shares.items() if share]
-        if held:
-            lines.append(f'{_label(name)}: regions of 95 % hold {" and ".join(held)}')
-        if one.get('scaled_mean') is not None:
-            means.append(f'{_label(name)} {one["scaled_mean"]:.3f} m')
-    if means:
-        lines.append(f'map scaled by {scale:.4f} to the truth: {", ".join(means)}')
+        held = [f'{100 * share:.1f} % of {of}' for of, share in shares.items() if share]
+        parts = [f'regions of 95 % hold {" and ".join(held)}'] if held else []
+        best = one.get('similarity') or {}
+        if best.get('mean') is not None:
+            parts.append(f'scaled by {best["scale"]:.4f} it errs by {best["mean"]:.3f} m')
+        if parts:
+            lines.append(f'{_label(name)}: {"; ".join(parts)}')
     return lines
 
 
