@@ -29,8 +29,8 @@ test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 robustness: $(READY)  ## run the tests of test/README.md: bad input, time, loss, overload
 	$(PY) -m pytest -m robustness $(ARGS)
 
-fuzz: $(READY)  ## read thousands of damaged bags (ARGS='-k messages' for some kinds)
-	FUZZ_EXAMPLES=300 $(PY) -m pytest test/test_bag_fuzz.py $(ARGS)
+fuzz: $(READY)  ## 10,000 hostile messages, models, bags, YAML and image files each (ARGS='--kinds bags')
+	$(PY) test/benchmarks/fuzz.py $(ARGS)
 
 soak: $(READY)  ## run the three nodes for an hour at 20x; memory must not grow (ARGS='--seconds 800')
 	PYTHONPATH=. $(PY) test/benchmarks/soak.py $(ARGS)

@@ -9,9 +9,11 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from sfa_localization import __version__
+from sfa_localization.commands.processes import terminable
 from sfa_localization.data.errors import LocalizationError
 
 COMMANDS = {
@@ -26,6 +28,10 @@ COMMANDS = {
     'config': 'Write the parameter file of nodes and trainer: every parameter, explained.',
     'demo': 'Simulate, train, run the three nodes live, and print their errors (about 5 minutes).',
 }
+LONGEST_ERROR = 4000
+"""Characters of an error: the last lines of a program that failed, or a list of topics."""
+ROS_COMMANDS = ('play',)
+"""Commands that ROS ends at a signal; the others end at SIGTERM as at Ctrl-C, and clean up."""
 NODES = {
     'omnicam_node': 'ROS 2 node: camera images to panoramas (--ros-args -p NAME:=VALUE).',
     'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
@@ -52,7 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return guarded(lambda: int(node.main(words)))
     if name in COMMANDS:
         arguments = command_parser(name).parse_args(words[1:])
-        return guarded(lambda: int(arguments.run(arguments)))
+        with nullcontext() if name in ROS_COMMANDS else terminable():
+            return guarded(lambda: int(arguments.run(arguments)))
     _overview().parse_args(words)  # prints help, version or error, and exits
     return 2
 
@@ -88,6 +95,12 @@ def _overview() -> argparse.ArgumentParser:
     return parser
 
 
+def _shortened(text: str) -> str:
+    """The text, with the middle left out where it quotes a long one."""
+    half = LONGEST_ERROR // 2
+    return text if len(text) <= LONGEST_ERROR else f'{text[:half]} ... {text[-half:]}'
+
+
 def guarded(run: Callable[[], int]) -> int:
     """Turn expected errors into one line and exit code 1, Ctrl-C into 130."""
     try:
@@ -99,7 +112,7 @@ def guarded(run: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except LocalizationError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print(f'error: {_shortened(str(error))}', file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]
@@ -107,6 +120,11 @@ def guarded(run: Callable[[], int]) -> int:
             raise
         remedy = f'pip install {OPTIONAL[package]}'
         print(f'error: {package} is not installed; this needs it: {remedy}', file=sys.stderr)
+        return 1
+    except (OSError, MemoryError) as error:
+        # Of the machine: a full disk, too many open files.
+        reason = ' '.join(str(error).split()) or 'not enough memory'
+        print(f'error: {_shortened(reason)}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)

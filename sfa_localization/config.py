@@ -22,6 +22,8 @@ from sfa_localization.camera.settings import (
 )
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.files import atomic_write
+from sfa_localization.data.plain_yaml import LONGEST, load_yaml
+from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
@@ -141,8 +143,8 @@ def _known_sections(path: Path) -> dict[str, dict[str, Any]]:
     for key in sections:
         if _node_of(key) not in (*SECTIONS, *_WILDCARDS):
             raise ConfigError(
-                f'{path}: unknown section {key!r}; known are {", ".join(SECTIONS)}, also in a '
-                f'namespace, and /**'
+                f'{path}: unknown section {quoted(key)}; known are {", ".join(SECTIONS)}, also in '
+                f'a namespace, and /**'
             )
     return sections
 
@@ -153,11 +155,15 @@ def _sections(path: Path) -> dict[str, dict[str, Any]]:
     As in ROS, `robot1: {ekf_node: ...}` and `/robot1/ekf_node: ...` are the same.
     """
     try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f'{path}: cannot be read: {error}') from None
-    except yaml.YAMLError as error:
-        raise ConfigError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
+        # Of a pipe too: a shell makes one of `--config <(COMMAND)`.
+        with path.open(encoding='utf-8') as file:
+            document = load_yaml(file.read(LONGEST + 1))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f'{path}: cannot be read: {error.reason}') from None
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read: {error.strerror or error}') from None
+    except ValueError as error:
+        raise ConfigError(f'{path}: {error}') from None
     if document is None:
         return {}
     if not isinstance(document, dict):
@@ -177,7 +183,9 @@ def _collect(key: str, part: Any, path: Path, found: dict[str, dict[str, Any]]) 
             _collect(f'{key}/{str(name).lstrip("/")}', below, path, found)
         return
     if part is not None and (not isinstance(part, dict) or (part and set(part) != {_KEY})):
-        raise ConfigError(f'{path}: section {key!r} must hold {_KEY!r}, and parameters below it')
+        raise ConfigError(
+            f'{path}: section {quoted(key)} must hold {_KEY!r}, and parameters below it'
+        )
     values = inner.get(_KEY) or {}
     if not isinstance(values, dict):
         raise ConfigError(f'{path}: {key}.{_KEY} must hold names and values')
@@ -198,8 +206,8 @@ def _of_any_robot(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[s
         for name, value in values.items():
             if name in own and own[name] != value:
                 raise ConfigError(
-                    f'{where}: {name} is {own[name]!r} for one robot and {value!r} for another: '
-                    f'give commands a file of one robot'
+                    f'{where}: {name} is {quoted(own[name])} for one robot and {quoted(value)} '
+                    f'for another: give commands a file of one robot'
                 )
         own.update(values)
     return {**general, **own}
@@ -208,7 +216,7 @@ def _of_any_robot(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[s
 def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
     for name in values:
         if name not in known and not _is_of_ros(name):
-            raise ConfigError(f'{where}: unknown parameter {name!r}{nearest(name, known)}')
+            raise ConfigError(f'{where}: unknown parameter {quoted(name)}{nearest(name, known)}')
 
 
 def _value(item: dataclasses.Field[Any], value: Any) -> Any:
@@ -221,7 +229,7 @@ def _value(item: dataclasses.Field[Any], value: Any) -> Any:
     if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)
-        except ValueError:
+        except (ValueError, OverflowError):
             return value
     return value
 

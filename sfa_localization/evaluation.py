@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 from tqdm import tqdm
 
-from sfa_localization.bags.drives import as_live, read_drive
+from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
@@ -164,8 +164,8 @@ def _scores(
 
 def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Replay:
     """Run model and filter over a bag. Raises BagError or DataError."""
-    with tempfile.TemporaryDirectory(prefix='sfa_localization-') as cache:
-        run = _read(bag, Path(cache), recipe, progress)
+    with image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate') as cache:
+        run = _read(bag, cache, recipe, progress)
         observations, fused, states = _replayed(localizer, run, progress)
         clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
     usable = [one for one in observations if not one.problem]

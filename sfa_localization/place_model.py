@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,9 +17,11 @@ from numpy.typing import NDArray
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
+from sfa_localization.data.array_schema import ArrayRule, Schema, check_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.errors import ConfigError, DataError, ModelError
+from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Image
 from sfa_localization.features.agreement import Agreement, disagreement
 from sfa_localization.features.image_features import (
@@ -28,14 +31,90 @@ from sfa_localization.features.image_features import (
     spectrum,
 )
 from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
-from sfa_localization.features.network import Architecture, Layer, Network, Node
+from sfa_localization.features.network import (
+    Architecture,
+    Layer,
+    Network,
+    Node,
+    check_weights,
+)
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 4
+VERSION = 5
+_AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
+_PROCESS = {
+    'kind': ArrayRule('', 'U'),
+    'scale': ArrayRule('K'),
+    'points': ArrayRule('MK'),
+    'linear': ArrayRule('MC'),
+    'constant': ArrayRule('C'),
+    'factor': ArrayRule('T'),
+    'in_double': ArrayRule('', 'b'),
+    'scalars': ArrayRule('3', all_positive=True),
+}
+_MONOMIALS = {
+    'kind': ArrayRule('', 'U'),
+    'weights': ArrayRule('M2'),
+    'spread': ArrayRule('MR'),
+    'sway': ArrayRule('MS2'),
+    'noise_m': ArrayRule('', all_positive=True),
+    'inflation': ArrayRule('', all_positive=True),
+}
+_BASIS = {
+    'center': ArrayRule('M'),
+    'turn': ArrayRule('MR'),
+    'ridge': ArrayRule('P'),
+    'features': ArrayRule('', 'i', all_positive=True),
+}
+SCHEMA: Schema = {
+    'network/#/': [
+        {
+            'linear': ArrayRule('DL'),
+            'linear_offset': ArrayRule('L'),
+            'slow': ArrayRule('EK'),
+            'slow_offset': ArrayRule('K'),
+            'delta': ArrayRule('T'),
+        }
+    ],
+    'metric/': [_PROCESS, _MONOMIALS],
+    'metric/basis_': [_BASIS],
+    'keyframes/': [
+        {
+            'textures': ArrayRule('NRC', 'i'),
+            'poses': ArrayRule('N3'),
+            'noise': ArrayRule('8', positive=(0, 1, 2, 3, 4, 5, 6)),
+        }
+    ],
+    'agreement/': _AGREEMENT,
+    'yaw_agreement/': _AGREEMENT,
+    'compass/': [
+        {
+            'features': ArrayRule('MK'),
+            'harmonic': ArrayRule('MJ', 'c'),
+            'feature_scale': ArrayRule('K', all_positive=True),
+            'harmonic_scale': ArrayRule('J', all_positive=True),
+            'weights': ArrayRule('M', 'c'),
+            'factor': ArrayRule('T', 'c'),
+            'scalars': ArrayRule('3', positive=(0, 1)),
+            'calibration': ArrayRule('2', positive=(0,)),
+        }
+    ],
+    'refinement/': [
+        {
+            'mean': ArrayRule('D'),
+            'axes': ArrayRule('DK'),
+            'scalars': ArrayRule('2', positive=(1,)),
+            **{f'metric_{name}': rule for name, rule in _PROCESS.items()},
+            **{f'agreement_{name}': rule for name, rule in _AGREEMENT[0].items()},
+        }
+    ],
+    'header': [{'': ArrayRule('', 'U')}],
+}
+"""The arrays of a model file. A part that is added to the model has its group here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,11 +247,39 @@ class PlaceModel:
         path = Path(path)
         arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
         try:
-            return cls._from_arrays(arrays, json.loads(str(arrays['header'])))
-        except (KeyError, ValueError, TypeError, IndexError, ConfigError, DataError) as error:
-            raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
-        except ModelError as error:
-            raise ModelError(f'{path}: {error}') from None
+            check_arrays(arrays, SCHEMA)
+            model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
+            model._prove()
+        except LocalizationError as error:
+            raise _damaged(path, error) from None
+        except Exception as error:  # arrays that do not fit each other fail in many ways
+            raise _damaged(path, f'{type(error).__name__}: {error}') from None
+        return model
+
+    def _prove(self) -> None:
+        """Locate two images, so that the first of a drive neither fails nor waits.
+
+        Raises ModelError where the results are not finite, or certain beyond reason.
+        """
+        check_weights(self.network)
+        turned = [part for part in (self.compass, self.refinement) if part is not None]
+        if any(abs(part.sign) != 1.0 for part in turned):
+            raise ModelError('it turns neither way')
+        height, width = self.network.architecture.size
+        if (height, width) != (self.panorama.height, self.panorama.width):
+            raise ModelError('network and panorama are of different sizes')
+        noise = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
+        with np.errstate(all='ignore'):
+            estimates = self.locate_all(np.concatenate([noise, np.zeros_like(noise)]))
+        for estimate in estimates:
+            known: list[Any] = [estimate.covariance, estimate.position, estimate.novelty]
+            known += [estimate.yaw] if self.compass is not None else []
+            if not all(np.isfinite(value).all() for value in known):
+                raise ModelError('its estimates are not finite')
+            if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
+                raise ModelError('its covariances are not positive')
+        if not math.isfinite(self.camera_delay_s):
+            raise ModelError('its camera delay is not finite')
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
@@ -223,6 +330,10 @@ class PlaceModel:
         )
 
 
+def _damaged(path: Path, reason: object) -> ModelError:
+    return ModelError(f'{path}: the model is damaged ({short_line(str(reason))}): train it again')
+
+
 def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     """The network of a model file's arrays and header."""
     spec = dict(header['architecture'])
@@ -232,6 +343,8 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
         for layer in spec['layers']
     )
     architecture = Architecture(**spec)
+    if sum(name.endswith('/linear_offset') for name in arrays) != len(architecture.layers):
+        raise ModelError('its layers are not those of its weights')
     nodes, deltas = [], []
     for depth in range(len(architecture.layers)):
         part = _under(arrays, f'network/{depth}/')

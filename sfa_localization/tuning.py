@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from sfa_localization.bags.drives import as_live, read_drive
+from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
@@ -102,10 +102,10 @@ def read_drives(
     """Each bag's odometry, and the poses of its images by the model. Raises BagError."""
     drives = []
     for bag in bags:
-        with TemporaryDirectory(prefix='sfa_localization_tune_') as cache:
+        with image_cache(Path(gettempdir()) / 'sfa_localization_tune') as cache:
             run = read_drive(
                 bag,
-                Path(cache),
+                cache,
                 as_live(recipe, model.panorama),
                 progress,
                 want_truth=want_truth,

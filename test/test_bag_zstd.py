@@ -99,9 +99,9 @@ def test_a_cut_off_message_is_no_message(cut):
     import bag_formats
 
     data = bag_formats.zstd.compress(bytes(range(256)) * 40)
-    assert bag_storage.inflate_message(data) == bytes(range(256)) * 40
+    assert bag_storage.inflate_message(data, 1 << 20) == bytes(range(256)) * 40
     with pytest.raises(bag_storage.BagError, match='cut off'):
-        bag_storage.inflate_message(data[:cut])
+        bag_storage.inflate_message(data[:cut], 1 << 20)
 
 
 def test_without_any_the_remedy_is_named(monkeypatch, capsys):

@@ -257,7 +257,7 @@ def test_what_is_written_is_read_again(tmp_path, model):
     [
         ('', 'no camera calibration'),
         ('just words', 'no camera calibration'),
-        ('a: [1, 2', 'not valid YAML'),
+        ('a: [1, 2', 'is not YAML'),
         ('a: 1', 'camera_matrix'),
         (CAMERA_INFO.format(model='plumb_bob', n=5, coefficients=[1, 2, 3, 4, 5]), 'only 4'),
         (CAMERA_INFO.format(model='strange', n=4, coefficients=[0, 0, 0, 0]), 'strange'),

@@ -5,6 +5,8 @@
 import ast
 import errno
 import io
+import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +108,38 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         atomic_write(tmp_path / 'missing' / 'a.txt', DataError),
     ):
         raise AssertionError
+
+
+def test_a_symbolic_link_stays_and_its_target_is_replaced(tmp_path):
+    (tmp_path / 'folder').mkdir()
+    target, link = tmp_path / 'folder' / 'target.txt', tmp_path / 'link.txt'
+    link.symlink_to(Path('folder') / 'target.txt')
+    for text in (b'new', b'newer'):
+        with atomic_write(link) as file:
+            file.write(text)
+        assert link.is_symlink() and target.read_bytes() == text
+    assert [p.name for p in target.parent.iterdir()] == ['target.txt']
+
+
+@pytest.mark.parametrize('mode', [0o600, 0o755, 0o664])
+def test_a_file_keeps_its_permissions(tmp_path, mode):
+    path = tmp_path / 'a.txt'
+    path.write_bytes(b'old')
+    path.chmod(mode)
+    with atomic_write(path) as file:
+        file.write(b'new')
+    assert path.read_bytes() == b'new' and path.stat().st_mode & 0o777 == mode
+
+
+def test_what_is_no_regular_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'link').symlink_to('/dev/null')
+    for path in (tmp_path / 'pipe', tmp_path / 'folder', tmp_path / 'link', Path('/dev/null')):
+        with pytest.raises(DataError, match='it is no regular file'), atomic_write(path, DataError):
+            raise AssertionError
+    assert stat.S_ISFIFO((tmp_path / 'pipe').stat().st_mode)
+    assert stat.S_ISCHR(Path('/dev/null').stat().st_mode)
 
 
 @pytest.mark.parametrize('name', WRITERS)

@@ -397,3 +397,10 @@ def test_an_array_names_its_dimension():
     message = convert.to_array([1, 2, 3], 'slow features')
     assert message.layout.dim[0].label == 'slow features' and message.layout.dim[0].size == 3
     assert list(message.data) == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.7, -3.0])
+def test_turns_of_images_are_read_as_they_were_written(yaw):
+    stamp_ns = 1_700_000_000_123_456_789
+    read_ns, read = convert.read_turned(convert.to_turned(yaw, stamp_ns, 'map'))
+    assert read_ns == stamp_ns and read == pytest.approx(yaw)

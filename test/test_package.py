@@ -51,12 +51,12 @@ CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__init__': (set(), set()),
     '__main__': ({'cli'}, set()),
-    'data': (set(), {'numpy', 'threadpoolctl'}),
+    'data': (set(), {'numpy', 'threadpoolctl', 'yaml'}),
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
     'features': ({'data'}, NUMERIC | {'cv2', 'mdp', 'dask', 'distributed'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
     # With tqdm, as bags.drives shows the progress of reading.
-    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'yaml', 'lz4', 'tqdm'}),
+    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'lz4', 'tqdm'}),
     'metric': ({'data', 'features'}, NUMERIC),
     'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'fusion', 'metric', 'place_model'}, {'numpy'}),

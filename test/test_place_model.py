@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, recipe, visit
 
-from sfa_localization.data.array_files import read_arrays
+from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
@@ -281,7 +281,7 @@ def rewrite(path: Path, without: str = '', **header) -> None:
     """Change the header of a saved model, or leave an array out."""
     arrays = read_arrays(path, FORMAT, VERSION, '')
     arrays['header'] = np.array(json.dumps({**json.loads(str(arrays['header'])), **header}))
-    np.savez(path, **{name: array for name, array in arrays.items() if name != without})
+    write_arrays(path, {name: array for name, array in arrays.items() if name != without})
 
 
 def refused(path: Path, told: str) -> None:

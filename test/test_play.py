@@ -41,6 +41,8 @@ from sfa_localization.commands.pace import (
 )
 from sfa_localization.data.errors import BagError
 
+ROOT = Path(__file__).parents[1]
+
 DEADLINE_S = 30.0
 DOMAIN = 67
 FAST = PlayConfig(rate=20.0, wait=20.0)
@@ -441,3 +443,43 @@ def test_signals_end_it_cleanly(
             process.wait()
     assert 'Traceback' not in errors
     assert process.returncode == code, errors
+
+
+@ROS
+@pytest.mark.parametrize('place', ['', '.', 'folder'])
+def test_nothing_is_imported_from_the_folder_of_a_bag(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ('evil_msgs', 'sensor_msgs_of_a_stranger'):
+        package = tmp_path / name / 'msg'
+        package.mkdir(parents=True)
+        for file in (package / '__init__.py', package.parent / '__init__.py'):
+            file.write_text('raise AssertionError("code of the folder ran")')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path) if place == 'folder' else place)
+    assert message_class('evil_msgs/msg/Imu') is None
+    assert message_class('sensor_msgs/msg/Imu') is Imu
+
+
+@ROS
+@pytest.mark.parametrize('kind', ['antigravity/msg/X', 'this/msg/X', 'sensor_msgs/msg/_imu'])
+def test_what_is_no_package_of_messages_is_not_imported(kind: str) -> None:
+    package = kind.partition('/')[0]
+    loaded = package in sys.modules
+    assert message_class(kind) is None
+    assert (package in sys.modules) == loaded
+
+
+def test_a_command_in_a_downloaded_folder_runs_none_of_its_code(tmp_path: Path) -> None:
+    for name in ('yaml', 'argparse', 'numpy', 'rosbags'):
+        (tmp_path / f'{name}.py').write_text('raise AssertionError("code of the folder ran")')
+    result = subprocess.run(
+        [sys.executable, '-m', 'sfa_localization', 'inspect', 'nothing'],
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == 1
+    assert result.stderr == 'error: nothing: no such bag; check the path\n'

@@ -7,14 +7,16 @@ import math
 
 import numpy as np
 import pytest
+from cylinder_worlds import place
 from picture_readers import AsLocated
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import FROZEN_IMAGES
+from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.localizer import UNKNOWN_VARIANCE
-from sfa_localization.place_model import Estimate, PlaceModel
+from sfa_localization.place_model import FORMAT, VERSION, Estimate, PlaceModel
 
 SIZE = PanoramaConfig(width=60, height=12)
 KNOWN = ErrorCorrelation(0.25, 1.5)
@@ -299,15 +301,21 @@ def test_a_model_is_checked_in_every_state_and_the_one_reported_is_in_use(bench,
     assert {v.key: v.value for v in told[-1].status[0].values}['model'] == 'b.npz'
 
 
-def test_a_model_whose_arrays_do_not_fit_is_refused_live(bench, models):
-    node = bench.run(SfaNode, model='a.npz')
-
-    def broken(image):
-        raise ValueError('shapes do not match')
-
-    models['b.npz'].locate = broken
-    refused = node.set_parameters([Parameter('model', value='b.npz')])[0]
-    assert not refused.successful and 'b.npz: the model is damaged' in refused.reason
+def test_a_hostile_model_is_refused_live_and_ends_nothing(bench, tmp_path):
+    whole, bad = tmp_path / 'whole.npz', tmp_path / 'bad.npz'
+    place().model.save(whole)
+    arrays = read_arrays(whole, FORMAT, VERSION, '')
+    broken = {**arrays, 'compass/features': arrays['compass/features'][:, :3]}
+    write_arrays(bad, broken)
+    node = bench.run(SfaNode, model=str(whole))
+    for path, reason in ((bad, 'is damaged'), (300 * 'x', 'no such'), ('/dev/zero', 'no such')):
+        refused = node.set_parameters([Parameter('model', value=str(path))])[0]
+        assert not refused.successful and reason in refused.reason
+    whole.write_bytes(bad.read_bytes())
+    answer = bench.call(Trigger, 'sfa_node/reload_model', Trigger.Request())
+    assert not answer.success and 'is damaged' in answer.message
+    assert node.get_parameter('model').value == str(whole)
+    assert node._observer.model.compass.features.shape[1] > 3, 'the old model is in use'
 
 
 def declare(bench, **changes):

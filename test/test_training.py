@@ -222,6 +222,7 @@ def test_a_killed_training_s_pictures_are_cleared(bag, tmp_path):
     stale = tmp_path / '.model.npz.cache-1234'
     stale.mkdir()
     (stale / 'panoramas.u8').write_bytes(b'x')
+    (stale / 'lock').touch()
     train([bag], tmp_path / 'model.npz', RECIPE)
     assert names(tmp_path) == ['model.npz']
 

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -20,8 +23,10 @@ from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.data.files import replaced_mode
 from sfa_localization.data.run import Run
 
+_LOCK = 'lock'
 R = TypeVar('R', bound='ReadingRecipe')
 
 
@@ -37,21 +42,49 @@ class ReadingRecipe:
 
 @contextmanager
 def image_cache(output: Path) -> Iterator[Path]:
-    """A folder beside `output` for decoded images; also clears those that a killed run left.
+    """A folder beside `output` for decoded images; also clears those that killed runs left.
 
-    Raises ModelError when it cannot be made.
+    Raises ModelError when it cannot be made, or `output` not be written in the end.
     """
+    name = f'.{output.name}.cache-'
     try:
+        replaced_mode(output)
         output.parent.mkdir(parents=True, exist_ok=True)
-        for stale in output.parent.glob(f'.{output.name}.cache-*'):
-            shutil.rmtree(stale, ignore_errors=True)
-        folder = tempfile.mkdtemp(prefix=f'.{output.name}.cache-', dir=output.parent)
+        for stale in output.parent.glob(f'{glob.escape(name)}*'):
+            _clear_unused(stale)
+        folder = Path(tempfile.mkdtemp(prefix=name, dir=output.parent))
+        lock = _lock(folder, os.O_CREAT)
     except OSError as error:
-        raise ModelError(f'{output}: cannot be written: {error.strerror}') from None
+        raise ModelError(f'{output}: cannot be written: {error.strerror or error}') from None
     try:
-        yield Path(folder)
+        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _lock(folder: Path, flags: int = 0) -> int:
+    """A handle that locks the folder until it is closed, or its process ends.
+
+    Raises OSError where another process has it.
+    """
+    handle = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o600)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
+
+
+def _clear_unused(folder: Path) -> None:
+    """Remove a cache whose process has ended; one without a lock is just being made."""
+    try:
+        lock = _lock(folder)
+    except OSError:
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    os.close(lock)
 
 
 def read_drives(

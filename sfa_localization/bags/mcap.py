@@ -29,17 +29,32 @@ from typing import NamedTuple
 
 from lz4.frame import LZ4FrameDecompressor
 
-from sfa_localization.bags.storage import Channel, Record, make_channel
+from sfa_localization.bags.storage import (
+    MOST_TOPICS,
+    Channel,
+    Record,
+    TooLargeError,
+    add_problem,
+    make_channel,
+    one_line,
+    pieces,
+    room_for,
+)
 from sfa_localization.bags.zstd import ZstdError, decompressor
 from sfa_localization.data.errors import BagError
+from sfa_localization.data.rejections import short_line
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 8, 11
 DATA_END = 15
 SPAN = 1 << 20
 """Bytes of bare records that make one block."""
-PIECE = 1 << 16
-"""Bytes of a cut-off chunk that are decompressed at a time: an error costs the last piece."""
+LARGEST_CHUNK = 1 << 28
+"""Bytes of a decompressed chunk: one message of the largest camera, and room for others."""
+MOST_PENDING = 1 << 29
+"""Bytes of messages that wait because chunks overlap in time: a recorder's overlap by a second."""
+MOST_QOS = 1 << 22
+"""Characters of the QoS profiles of a file: ten thousand publishers."""
 _RECORD, _MESSAGE = struct.Struct('<BQ'), struct.Struct('<HIQQ')
 _FOOTER_SIZE = _RECORD.size + 20 + len(MAGIC)
 _reception = itemgetter(1)
@@ -98,6 +113,7 @@ class McapStorage:
     def __init__(self, path: Path) -> None:
         self._path, self.problems, self.notes = path, list[str](), list[str]()
         self._size = path.stat().st_size
+        self._room = room_for(self._size)  # what chunks may become in one reading of the file
         self._file = path.open('rb')
         self._clear()
         if not self._read_index():
@@ -118,6 +134,7 @@ class McapStorage:
         self._channels: dict[int, Channel] = {}
         self._blocks: list[Block] = []
         self._counts: Counter[int] = Counter()
+        self._qos_room = MOST_QOS
 
     def _read_index(self) -> bool:
         """Read channels, chunks and counts from the summary; False when it lacks some."""
@@ -155,9 +172,18 @@ class McapStorage:
                 self._read_counts(Fields(body))
             else:
                 self._define(opcode, Fields(body))
-        if any(block.offset + block.length > self._size for block in self._blocks):
-            raise Damage('its index points outside the file')
+        self._check_blocks()
         return statistics
+
+    def _check_blocks(self) -> None:
+        """Every chunk of the index must lie in the file, and there once."""
+        end = 0
+        for block in sorted(self._blocks, key=itemgetter(2)):
+            if block.offset < end:
+                raise Damage('its index lists bytes twice')
+            end = block.offset + max(block.length, 1)
+        if end > self._size:
+            raise Damage('its index points outside the file')
 
     def _read_counts(self, fields: Fields) -> None:
         fields.numbers('QHIIIIQQ')
@@ -170,15 +196,25 @@ class McapStorage:
         """Register a schema or a channel."""
         if opcode == SCHEMA:
             (key,) = fields.numbers('H')
-            self._schemas[key] = fields.text()
+            self._schemas[key] = one_line(fields.text())
         elif opcode == CHANNEL:
             key, schema = fields.numbers('HH')
+            if key in self._channels:
+                return  # repeated in every chunk, and the same by the format
             topic, encoding, metadata = fields.text(), fields.text(), Fields(fields.sized())
-            kind, qos = self._schemas.get(schema, ''), _qos_text(metadata)
+            kind, qos = self._schemas.get(schema, ''), self._bounded(_qos_text(metadata))
             self._channels[key] = make_channel(topic, kind, encoding, qos)
+            if len(self._channels) > MOST_TOPICS:
+                raise BagError(f'{self._path}: has more than {MOST_TOPICS} topics')
+
+    def _bounded(self, qos: str) -> str:
+        """QoS profiles; none once those of the file are too many."""
+        self._qos_room -= len(qos)
+        return qos if self._qos_room >= 0 else ''
 
     def _rebuild_index(self) -> None:
         """Decode every block of the file once, for its channels, counts and times of reception."""
+        self._room = room_for(self._size)
         for offset, end in self._block_bounds():
             try:
                 self._index_block(offset, end - offset)
@@ -221,14 +257,14 @@ class McapStorage:
 
     def _skip_damaged(self, offset: int, damage: Damage) -> None:
         text = f'{self._path.name}: the chunk at byte {offset} is damaged ({damage}); skipped'
-        if text not in self.problems:
-            self.problems.append(text)
+        add_problem(self.problems, text)
 
     def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
         """Messages in order of reception; a damaged chunk is skipped."""
         wanted = {
             key: channel for key, channel in self._channels.items() if channel.topic in topics
         }
+        self._room = room_for(self._size)
         pending: list[Record] = []
         for block in self._blocks:
             if block.end_ns < start_ns:
@@ -237,6 +273,11 @@ class McapStorage:
             yield from pending[:ready]
             pending = pending[ready:] + self._block_messages(block, wanted, start_ns)
             pending.sort(key=_reception)
+            if sum(len(data) for _, _, data in pending) > MOST_PENDING:
+                raise BagError(
+                    f'{self._path}: more than {MOST_PENDING} bytes of messages in chunks of the '
+                    'same time; record it again'
+                )
         yield from pending
 
     def _block_messages(
@@ -262,7 +303,10 @@ class McapStorage:
         compression = fields.text()
         (packed_size,) = fields.numbers('Q')
         packed = fields.rest() if cut_off else fields.take(packed_size)
-        plain = _inflated(packed, compression, cut_off)
+        if size > LARGEST_CHUNK:
+            raise Damage(f'it has {size} bytes, more than {LARGEST_CHUNK}')
+        plain = _inflated(packed, compression, cut_off, min(size, self._room))
+        self._room -= len(plain)
         if not cut_off and (len(plain) != size or (checksum and crc32(plain) != checksum)):
             raise Damage('checksum or size is wrong')
         return plain
@@ -305,18 +349,19 @@ def _messages(data: bytes, wanted: dict[int, Channel], start_ns: int) -> list[Re
     return found
 
 
-def _inflated(packed: bytes, compression: str, cut_off: bool) -> bytes:
+def _inflated(packed: bytes, compression: str, cut_off: bool, room: int) -> bytes:
     """Decompressed chunk; of a cut-off one the bytes before the cut. Raises Damage."""
     if not compression:
         return packed
     if compression not in ('zstd', 'lz4'):
-        raise Damage(f'unknown compression {compression!r}')
+        raise Damage(f'unknown compression {short_line(compression)!r}')
     inflater = decompressor() if compression == 'zstd' else LZ4FrameDecompressor()
     plain: list[bytes] = []
-    step = PIECE if cut_off else max(len(packed), 1)
     try:
-        for start in range(0, len(packed), step):
-            plain.append(inflater.decompress(packed[start : start + step]))
+        for piece in pieces(inflater.decompress, packed, room):
+            plain.append(piece)
+    except TooLargeError:
+        raise Damage(f'it becomes larger than {room} bytes') from None
     except (ZstdError, RuntimeError, EOFError, MemoryError):
         if not cut_off:
             raise Damage(f'{compression} cannot decompress it') from None

@@ -25,7 +25,7 @@ from sfa_localization.bags.motion_arrays import (
 )
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.storage import Channel, Record, inflate_message
+from sfa_localization.bags.storage import Channel, Record, add_problem, inflate_message, room_for
 from sfa_localization.bags.topic_stream import Stream, Tally
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
@@ -230,11 +230,11 @@ class Bag:
         return self._stream(topic, chooser if is_tf else lambda message: message, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
-        """A topic of any type, which may be empty; `convert` receives None for unknown types."""
-        stream = self._stream(topic, lambda message: message, convert)
+        """A topic of any type, which may be empty; unknown types have the value None."""
         channel = self.recording.channels[topic]
-        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
-        stream.required = False
+        known = self._decode.can_decode(channel.kind, channel.serialization)
+        stream = self._stream(topic, lambda message: message, convert if known else _nothing)
+        stream.opaque, stream.required = not known, False
         return stream
 
     def _stream(
@@ -263,14 +263,19 @@ class Bag:
 
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
         """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
+        packed_size = unpacked_size = 0
         for record in self.recording.messages(set(topics), start_ns):
             if record[2][:1] != ZSTD_START:
                 yield record
                 continue
+            packed_size += len(record[2])
             try:
-                yield record[0], record[1], inflate_message(record[2])
+                data = inflate_message(record[2], room_for(packed_size) - unpacked_size)
             except BagError as error:
-                self.recording.problems.append(f'{record[0].topic}: {error}')
+                add_problem(self.recording.problems, f'{record[0].topic}: {error}')
+                continue
+            unpacked_size += len(data)
+            yield record[0], record[1], data
 
     def _pushed(self, stream: Stream, record: Record) -> StampedValues:
         """Stamps and values that the stream yields after one more message."""
@@ -303,6 +308,10 @@ class Bag:
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
+
+
+def _nothing(_: Any) -> None:
+    """The value of a message that is not decoded."""
 
 
 def _plain_name(name: str) -> str:

@@ -10,6 +10,7 @@ missing or its metadata is damaged or newer, opens no compressed file without me
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from collections import Counter
@@ -17,8 +18,6 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
-
-import yaml
 
 from sfa_localization.bags import mcap as bag_mcap
 from sfa_localization.bags import ros1 as bag_ros1
@@ -28,15 +27,20 @@ from sfa_localization.bags.storage import (
     Channel,
     Record,
     Storage,
+    add_problem,
     inflate_file,
-    load_yaml,
     make_channel,
     one_line,
 )
 from sfa_localization.data.errors import BagError
+from sfa_localization.data.files import is_regular, read_regular
+from sfa_localization.data.plain_yaml import LONGEST, load_yaml
+from sfa_localization.data.rejections import short_line
 
 METADATA = 'metadata.yaml'
 NEWEST_METADATA = 9
+MOST_FILES = 10_000
+"""Files of a bag: a week of a new one every minute."""
 SUFFIXES = ('.db3', '.mcap', '.bag', '.db3.zstd', '.mcap.zstd')
 READERS: dict[bytes, type[Storage]] = {
     bag_sqlite.MAGIC: bag_sqlite.SqliteStorage,
@@ -104,18 +108,20 @@ class Recording:
         return min(storage.start_ns for storage in self.storages)
 
     def _read_metadata(self) -> Metadata:
-        if not self.path.exists():
-            raise BagError(f'{self.path}: no such bag; check the path')
-        if self.path.is_file():
+        if not os.path.exists(self.path):
+            raise BagError(f'{short_line(str(self.path))}: no such bag; check the path')
+        if is_regular(self.path):
             return Metadata([self.path.name])
+        if not self.path.is_dir():
+            raise BagError(f'{self.path}: is neither a file nor a folder; copy it to a file')
         file = self.path / METADATA
         if not file.exists():
             self.notes.append(f'no {METADATA}; rebuilt from the files')
             return self._rebuilt()
         try:
-            metadata = parse_metadata(file.read_text(encoding='utf-8', errors='replace'))
+            metadata = parse_metadata(read_regular(file, LONGEST).decode(errors='replace'))
         except OSError as error:
-            raise BagError(f'{file}: cannot be read: {error.strerror}') from None
+            raise BagError(f'{file}: cannot be read: {error.strerror or error}') from None
         except ValueError as error:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files')
             return self._rebuilt()
@@ -135,14 +141,20 @@ class Recording:
     def _open_files(self) -> None:
         folder = self.path if self.path.is_dir() else self.path.parent
         failures: list[BagError] = []
-        for name in self.metadata.files:
+        files = list(dict.fromkeys(self.metadata.files))
+        if len(files) < len(self.metadata.files):
+            self.problems.append(f'{METADATA} lists files twice; each is read once')
+        if len(files) > MOST_FILES:
+            raise BagError(f'{self.path}: has {len(files)} files, more than {MOST_FILES}')
+        for name in files:
             try:
                 self._open_file(folder / name)
             except BagError as failure:
                 failures.append(failure)
         if not self.storages:
             raise failures[0] if failures else BagError(f'{self.path}: {METADATA} names no files')
-        self.problems += [str(failure) for failure in failures]
+        for reason in map(str, failures):
+            add_problem(self.problems, reason)
         if not self.metadata.counts:
             self.storages.sort(key=lambda storage: storage.start_ns)
 
@@ -160,7 +172,9 @@ class Recording:
             raise BagError(f'{path}: cannot be read: {error.strerror}') from None
 
     def _decompressed(self, path: Path) -> Path:
-        """The file itself, or a decompressed copy of it."""
+        """The file itself, or a decompressed copy of it. Raises OSError, or BagError."""
+        if path.exists() and not is_regular(path):
+            raise BagError(f'{path}: is no regular file; copy it to one')
         with path.open('rb') as file:
             if file.read(len(ZSTD_MAGIC)) != ZSTD_MAGIC:
                 return path
@@ -180,7 +194,7 @@ class Recording:
                 known = merged.get(channel.topic)
                 if known is not None and known.kind and known.kind != channel.kind:
                     text = f'{channel.topic} is {known.kind} and elsewhere {channel.kind}'
-                    self.notes.append(text)
+                    add_problem(self.notes, text)
                 qos = known.qos if known is not None and not channel.qos else channel.qos
                 merged[channel.topic] = channel._replace(qos=qos)
         return merged
@@ -229,6 +243,6 @@ def parse_metadata(text: str) -> Metadata:
             channel = make_channel(*names, qos)
             metadata.channels.append(channel)
             metadata.counts[channel.topic] += int(entry['message_count'])
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(type(error).__name__) from None
     return metadata

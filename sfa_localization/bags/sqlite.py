@@ -17,10 +17,24 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sfa_localization.bags.storage import Channel, Record, make_channel, one_line
+from sfa_localization.bags.storage import (
+    MOST_TOPICS,
+    Channel,
+    Record,
+    add_problem,
+    make_channel,
+    one_line,
+)
 from sfa_localization.data.errors import BagError
 
 MAGIC = b'SQLite format 3\x00'
+_STEPS, _STEPS_PER_BYTE = 50_000_000, 16
+"""Instructions of SQLite that one query may take, and more for each byte of the file: reading a row
+takes about 20. Damaged pages can lead in circles."""
+_STEPS_AT_ONCE = 1 << 16
+"""Instructions between two looks at their number."""
+_SMALLEST_ROW = 8
+"""Bytes of a row without its data."""
 
 
 class SqliteStorage:
@@ -28,8 +42,11 @@ class SqliteStorage:
 
     def __init__(self, path: Path) -> None:
         self._path, self.problems, self.notes = path, list[str](), list[str]()
+        self._size = path.stat().st_size
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         self._database = self._connect()
+        self._steps, self._repeats = 0, False
+        self._database.set_progress_handler(self._step, _STEPS_AT_ONCE)
         try:
             self._by_id = self._read_topics_if_cut_off()
         except (sqlite3.Error, ValueError, TypeError) as error:
@@ -51,10 +68,23 @@ class SqliteStorage:
             for file in (self._path, *logs):
                 target = path.with_name(file.name)
                 shutil.copyfile(file, target)
+            self._size = sum(file.stat().st_size for file in (self._path, *logs))
             self.notes.append(f'{self._path.name}: was not closed; its {logs[0].name} is read too')
         access = 'mode=rw' if logs else 'mode=ro&immutable=1'
         uri = f'{path.absolute().as_uri()}?{access}'
         return sqlite3.connect(uri, uri=True, check_same_thread=False)
+
+    def _step(self) -> bool:
+        """True, which ends the query, when it has taken more steps than the file can be worth."""
+        self._steps += _STEPS_AT_ONCE
+        return self._is_slow()
+
+    def _is_slow(self) -> bool:
+        return self._steps > _STEPS + _STEPS_PER_BYTE * self._size
+
+    def _query(self, text: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
+        self._steps = 0
+        return self._database.execute(text, values)
 
     def _or_damaged(self, read: Callable[[], Any], otherwise: Any) -> Any:
         try:
@@ -65,11 +95,21 @@ class SqliteStorage:
 
     def _damaged(self, error: Exception) -> None:
         text = f'{self._path.name}: damaged database ({one_line(error)}); intact pages are read'
-        if text not in self.problems:
-            self.problems.append(text)
+        add_problem(self.problems, text)
 
     def _columns(self, table: str) -> set[str]:
-        return {row[1] for row in self._database.execute(f'PRAGMA table_info({table})')}
+        """Columns of a table. Raises ValueError where its rows are not what the file holds.
+
+        A view, a generated column or a default makes any number of bytes of a few.
+        """
+        query = 'SELECT type, rootpage FROM sqlite_master WHERE name = ? COLLATE NOCASE'
+        for kind, page in self._query(query, (table,)):
+            if kind != 'table' or not page:
+                raise ValueError(f'{table} is a {one_line(kind)} without rows of its own')
+        columns = list(self._query(f'PRAGMA table_xinfo({table})'))
+        if any(hidden or default is not None for *_, default, _key, hidden in columns):
+            raise ValueError(f'{table} has columns that are not stored')
+        return {column[1] for column in columns}
 
     def _read_topics_if_cut_off(self) -> dict[int, Channel]:
         """The topics, even of a file that is shorter than its header states."""
@@ -86,20 +126,32 @@ class SqliteStorage:
         if not columns or not self._columns('messages'):
             raise ValueError('it has no tables of topics and messages')
         qos = 'offered_qos_profiles' if 'offered_qos_profiles' in columns else "''"
-        rows = self._database.execute(
-            f'SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id'
+        rows = self._query(
+            f'SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id '
+            f'LIMIT {MOST_TOPICS + 1}'
         )
-        return {
+        channels = {
             int(key): make_channel(topic, kind, serial, qos)
             for key, topic, kind, serial, qos in rows
         }
+        if len(channels) > MOST_TOPICS:
+            raise ValueError(f'it has more than {MOST_TOPICS} topics')
+        return channels
 
     def _read_counts(self) -> dict[str, int]:
         counts = {channel.topic: 0 for channel in self.channels}
-        query = 'SELECT topic_id, count(*) FROM messages GROUP BY topic_id'
-        for key, count in self._database.execute(query):
+        query = (
+            "SELECT topic_id, count(*), sum(iif(typeof(data) = 'blob', length(data), 0)) "
+            'FROM messages GROUP BY topic_id'
+        )
+        held = 0
+        for key, count, size in self._query(query):
+            held += size + count * _SMALLEST_ROW
             if key in self._by_id:
                 counts[self._by_id[key].topic] += count
+        if held > self._size:
+            self._repeats = True  # pages that several others lead to: sorting would copy them
+            raise sqlite3.DatabaseError('its rows are more than the file holds')
         return counts
 
     def _count_reachable(self) -> dict[str, int]:
@@ -116,16 +168,19 @@ class SqliteStorage:
     def _rows(self, ids: Iterable[int], columns: str) -> Iterator[tuple[Any, ...]]:
         """The rows of the messages that are on intact pages."""
         query = f'SELECT {columns} FROM messages NOT INDEXED WHERE id = ?'
+        self._steps = 0
         for row in ids:
             try:
                 found = self._database.execute(query, (row,)).fetchone()
             except (sqlite3.Error, OverflowError):
+                if self._is_slow():
+                    return
                 continue
             if found is not None:
                 yield found
 
     def _read_start(self) -> int:
-        (start,) = self._database.execute('SELECT min(timestamp) FROM messages').fetchone()
+        (start,) = self._query('SELECT min(timestamp) FROM messages').fetchone()
         return int(start or 0)
 
     def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
@@ -134,34 +189,45 @@ class SqliteStorage:
         query = (
             'SELECT topic_id, timestamp, data, id FROM messages '
             f'WHERE topic_id IN ({",".join(map(str, wanted))}) AND timestamp >= {start_ns} '
-            'ORDER BY timestamp'
+            "AND typeof(data) = 'blob' ORDER BY timestamp"
         )
         last: tuple[int, int] | None = None
+        read = 0
         try:
-            for key, stamp, data, row in self._database.execute(query):
+            for key, stamp, data, row in () if self._repeats else self._query(query):
                 if type(stamp) is int and type(data) is bytes:
+                    read += len(data) + _SMALLEST_ROW
+                    if read > self._size:
+                        raise sqlite3.DatabaseError('its rows are more than the file holds')
+                    self._steps = 0
                     last = stamp, row
                     yield wanted[key], stamp, data
         except (sqlite3.Error, OverflowError) as error:
             self._damaged(error)
             yield from self._salvaged(wanted, start_ns, last)
+        if self._repeats:
+            yield from self._salvaged(wanted, start_ns, None)
 
     def _salvaged(
         self, wanted: dict[int, Channel], start_ns: int, last: tuple[int, int] | None
     ) -> Iterator[Record]:
         """The messages on intact pages, row by row, without those up to `last` (stamp, row)."""
         rows = self._rows(range(1, self._last_row() + 1), 'topic_id, timestamp, data, id')
+        read = 0
         for key, stamp, data, row in rows:
             if key not in wanted or type(stamp) is not int or type(data) is not bytes:
                 continue
+            read += len(data) + _SMALLEST_ROW
+            if read > self._size:
+                return
             if stamp >= start_ns and (last is None or (stamp, row) > last):
                 yield wanted[key], stamp, data
 
     def _last_row(self) -> int:
         """The number of the last row, limited by the size of the file."""
-        room = self._path.stat().st_size // 8
+        room = self._size // _SMALLEST_ROW
         last = self._or_damaged(
-            lambda: self._database.execute('SELECT max(id) FROM messages').fetchone()[0], room
+            lambda: self._query('SELECT max(id) FROM messages').fetchone()[0], room
         )
         return min(int(last or 0), room)
 

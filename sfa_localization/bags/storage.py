@@ -4,25 +4,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import functools
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol
 
-import yaml
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
 from sfa_localization.bags.zstd import ZstdError, decompressor
 from sfa_localization.data.errors import BagError
-
-try:
-    from yaml import CSafeLoader as YamlLoader
-except ImportError:  # PyYAML was built without libyaml
-    from yaml import SafeLoader as YamlLoader  # type: ignore[assignment]
+from sfa_localization.data.plain_yaml import load_yaml
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-PIECE = 1 << 20
-"""Bytes that are decompressed at a time."""
+STEP = 1 << 12
+"""Compressed bytes that are decompressed at a time: of zstd they become 128 MB at most."""
+ALWAYS_ALLOWED, LARGEST_RATIO = 1 << 24, 1000
+"""A bag may always decompress to 16 MB, and to 1000 times its size: a camera that stands still in
+the dark compresses less, and a bomb more."""
+MOST_TOPICS = 10_000
+"""Topics of a file: a hundred times those of a large robot."""
+LONGEST_QOS = 1 << 16
+"""Characters of the QoS profiles of one topic: two hundred publishers."""
+LONGEST_NAME = 1000
+"""Characters of the name of a topic or type: ROS allows 255."""
+MOST_PROBLEMS = 50
+"""Problems of a file that are described; more are mentioned."""
+
+
+def add_problem(problems: list[str], text: str) -> None:
+    """Describe a problem of a file, once, among at most MOST_PROBLEMS."""
+    if len(problems) <= MOST_PROBLEMS and text not in problems:
+        problems.append(text if len(problems) < MOST_PROBLEMS else 'there are more problems')
 
 
 class Channel(NamedTuple):
@@ -39,8 +52,8 @@ Record = tuple[Channel, int, bytes]
 
 
 def one_line(text: object) -> str:
-    """Text of a bag, perhaps damaged, as one printable line."""
-    return ''.join(c if c.isprintable() else '?' for c in str(text))
+    """Text of a bag, perhaps damaged, as one printable line of at most LONGEST_NAME characters."""
+    return ''.join(c if c.isprintable() else '?' for c in str(text)[:LONGEST_NAME])
 
 
 def make_channel(topic: object, kind: object, serialization: object, qos: Any) -> Channel:
@@ -75,28 +88,57 @@ def message_type(name: str) -> str:
     return f'{parts[0]}/msg/{parts[1]}' if len(parts) == 2 else name
 
 
-def load_yaml(text: str) -> Any:
-    """Plain data from YAML, by libyaml where PyYAML was built with it. Raises yaml.YAMLError."""
-    return yaml.load(text, Loader=YamlLoader)
-
-
 def offered_qos(profiles: Any) -> tuple[Qos, ...]:
     """QoS profiles from the text or list of a recorder; none where it is unreadable."""
+    if isinstance(profiles, str):
+        return _read_qos(profiles) if len(profiles) <= LONGEST_QOS else ()
     try:
-        return tuple(parse_qos(load_yaml(profiles) if isinstance(profiles, str) else profiles))
+        return tuple(parse_qos(profiles))
     except Exception:  # foreign text; a bag is not rejected because of its QoS
         return ()
 
 
-def inflate_message(data: bytes) -> bytes:
-    """Undo the recorder's compression of single messages. Raises BagError."""
+@functools.lru_cache(maxsize=256)
+def _read_qos(text: str) -> tuple[Qos, ...]:
+    """QoS profiles from text, which many topics and chunks repeat."""
+    try:
+        return tuple(parse_qos(load_yaml(text)))
+    except Exception:  # as above
+        return ()
+
+
+class TooLargeError(Exception):
+    """Compressed data becomes larger than any recording does; the text says the limit."""
+
+
+def room_for(packed_size: int) -> int:
+    """Bytes that data of this compressed size may become."""
+    return ALWAYS_ALLOWED + LARGEST_RATIO * packed_size
+
+
+def pieces(decompress: Callable[[bytes], bytes], packed: bytes, room: int) -> Iterator[bytes]:
+    """Decompress in small steps. Raises TooLargeError beyond `room` bytes."""
+    for start in range(0, len(packed), STEP):
+        plain = decompress(packed[start : start + STEP])
+        room -= len(plain)
+        if room < 0:
+            raise TooLargeError(
+                f'it becomes more than {LARGEST_RATIO} times as large when decompressed'
+            )
+        yield plain
+
+
+def inflate_message(data: bytes, room: int) -> bytes:
+    """Undo the recorder's compression of a message, to at most `room` bytes. Raises BagError."""
     if data[:4] != ZSTD_MAGIC:
         return data
     inflater = decompressor()
     try:
-        plain = bytes(inflater.decompress(data))
-    except ZstdError:
+        plain = b''.join(pieces(inflater.decompress, data, room))
+    except (ZstdError, EOFError):
         raise BagError('a compressed message is damaged') from None
+    except TooLargeError as error:
+        raise BagError(f'a compressed message is a bomb: {error}') from None
     if not inflater.eof:
         raise BagError('a compressed message is cut off')
     return plain
@@ -105,18 +147,21 @@ def inflate_message(data: bytes) -> bytes:
 def inflate_file(source: Path, target: Path) -> str:
     """Decompress a file; return its damage ('' when there is none). Raises OSError."""
     with source.open('rb') as packed, target.open('wb') as plain:
-        return _inflate(packed, plain)
+        return _inflate(packed, plain, room_for(source.stat().st_size))
 
 
-def _inflate(packed: IO[bytes], plain: IO[bytes]) -> str:
+def _inflate(packed: IO[bytes], plain: IO[bytes], room: int) -> str:
     inflater = decompressor()
-    while piece := packed.read(PIECE):
+    while piece := packed.read(STEP):
         while piece:
             if inflater.eof:
                 inflater = decompressor()
             try:
-                plain.write(inflater.decompress(piece))
+                written = plain.write(inflater.decompress(piece))
             except ZstdError:
                 return 'damaged zstd data; read up to the damage'
+            room -= written
+            if room < 0:
+                return f'becomes more than {LARGEST_RATIO} times as large; read up to there'
             piece = inflater.unused_data
     return '' if inflater.eof else 'cut-off zstd data; read up to the cut'

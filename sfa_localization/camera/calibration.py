@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.calibration_files import read_calibration
-from sfa_localization.camera.encodings import decode_compressed, encode_png
+from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed, encode_png
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import (
@@ -24,7 +24,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -62,7 +62,7 @@ def read_images(paths: Sequence[Path]) -> list[Image]:
     images = []
     for path in paths:
         try:
-            images.append(decode_compressed(path.read_bytes()))
+            images.append(decode_compressed(read_regular(path, LARGEST_FILE)))
         except OSError as error:
             raise CameraError(f'{path}: {error.strerror or error}') from None
         except CameraError as error:

@@ -18,6 +18,9 @@ import yaml
 
 from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError, ConfigError
+from sfa_localization.data.files import read_regular
+from sfa_localization.data.plain_yaml import load_yaml
+from sfa_localization.data.rejections import short_line
 
 _KNOWN = (
     'known are camera_info, OpenCV, Kalibr and camodocal YAML, OCamCalib calib_results.txt, and '
@@ -36,6 +39,8 @@ _OF_MODEL = {
     'polar': ('angle_min', 'angle_max'),
     'dual_fisheye': ('fx', 'fy', 'distortion', 'second_cx', 'second_cy', 'second_roll'),
 }
+LARGEST_FILE = 1 << 20
+"""Bytes of a calibration file: hundreds of times the largest."""
 _HEAD = """\
 # Calibration of an omnidirectional camera; parameters of omnicam_node that go with it:
 #   calibration_file: name of this file
@@ -66,14 +71,15 @@ def read_calibration(path: Path) -> LensCalibration:
     model that is not supported.
     """
     try:
-        text = path.read_text(encoding='utf-8', errors='replace')
+        text = read_regular(path, LARGEST_FILE).decode('utf-8', errors='replace')
     except OSError as error:
         raise CameraError(f'{path}: {error.strerror or error}') from None
     try:
         fields = _from_yaml(text) if path.suffix.lower() != '.txt' else _from_ocam(text)
         return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **fields})
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise CameraError(f'{path}: no camera calibration ({error}); {_KNOWN}') from None
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
+        reason = short_line(str(error))
+        raise CameraError(f'{path}: no camera calibration ({reason}); {_KNOWN}') from None
     except (CameraError, ConfigError) as error:
         raise CameraError(f'{path}: {error}') from None
 
@@ -111,9 +117,9 @@ def _from_yaml(text: str) -> dict[str, Any]:
     text = re.sub(r'\A%YAML:1\.0\s*', '', text)
     try:
         # A topic that is echoed ends each message with a document mark.
-        content = next(iter(yaml.load_all(text, _Loader)), None)
-    except yaml.YAMLError:
-        raise CameraError(f'not valid YAML; {_KNOWN}') from None
+        content = load_yaml(text, _Loader, first=True)
+    except ValueError as error:
+        raise CameraError(f'{error}; {_KNOWN}') from None
     if not isinstance(content, Mapping):
         raise CameraError(f'no camera calibration; {_KNOWN}')
     if 'camera_model' in content:

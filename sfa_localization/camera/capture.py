@@ -9,6 +9,7 @@ with pauses that double. Independent of ROS; time is that of the steady clock.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -19,10 +20,11 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from sfa_localization.camera.encodings import decode_compressed
+from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed
 from sfa_localization.camera.settings import CaptureConfig
 from sfa_localization.camera.watch import FROZEN_S, FrozenWatch
 from sfa_localization.data.errors import CameraError
+from sfa_localization.data.files import is_regular, read_regular
 from sfa_localization.data.run import Image
 
 logger = logging.getLogger(__name__)
@@ -73,7 +75,7 @@ class Device:
 
     def __init__(self, config: CaptureConfig) -> None:
         self._path = path = config.source_path
-        if not path.isdigit() and not Path(path).exists():
+        if not path.isdigit() and not os.path.exists(path):
             raise CameraError(f'device {path} is not there')
         self._capture = cv2.VideoCapture(int(path) if path.isdigit() else path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
@@ -120,9 +122,13 @@ class Video:
 
     def __init__(self, config: CaptureConfig) -> None:
         self._path = config.source_path
+        # Asked first: a pipe never ends, and of a missing file OpenCV would warn on its own.
+        missing = f'video {self._path} is missing, or of a kind OpenCV cannot read'
+        if not is_regular(self._path):
+            raise CameraError(missing)
         self._capture = cv2.VideoCapture(self._path)
-        if not Path(self._path).is_file() or not self._capture.isOpened():
-            raise CameraError(f'video {self._path} is missing, or of a kind OpenCV cannot read')
+        if not self._capture.isOpened():
+            raise CameraError(missing)
         own = self._capture.get(cv2.CAP_PROP_FPS)
         self._pacer = _Pacer(config.source_rate or (own if 0.1 < own < 1000 else _USUAL_RATE_HZ))
 
@@ -142,7 +148,7 @@ class Folder:
 
     def __init__(self, config: CaptureConfig) -> None:
         folder = Path(config.source_path)
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise CameraError(f'folder {folder} is missing')
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
         if not files:
@@ -156,7 +162,7 @@ class Folder:
             return None
         self._pacer.wait()
         try:
-            return decode_compressed(path.read_bytes())
+            return decode_compressed(read_regular(path, LARGEST_FILE))
         except (CameraError, OSError) as error:
             raise CameraError(f'image {path.name}: {error}') from None
 

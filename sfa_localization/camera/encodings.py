@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.camera.image_headers import check_size
 from sfa_localization.data.errors import CameraError, MessageError
 from sfa_localization.data.run import Image
 
@@ -70,6 +71,8 @@ _LAYOUTS = {
     **{f'{name}8': _Layout(1, 1, code) for name, code in _BAYER.items()},
     **{f'{name}16': _Layout(1, 2, code) for name, code in _BAYER.items()},
 }
+LARGEST_FILE = 1 << 28
+"""Bytes of a file that a camera or its operator writes: as many as its pixels may have."""
 ENCODINGS = tuple(_LAYOUTS)
 """The encodings that `decode_image` understands, in lower case."""
 
@@ -90,7 +93,7 @@ def decode_image(
     layout = _LAYOUTS.get(encoding.lower())
     if layout is None:
         raise CameraError(f'unsupported encoding {encoding!r}')
-    if height <= 0 or width <= 0:
+    if min(height, width, step) <= 0:
         raise CameraError('empty image')
     rows = _rows(data, height * layout.rows[0] // layout.rows[1], step)
     return _to_bgr(_pixels(rows, width, layout, is_bigendian), layout)
@@ -134,10 +137,11 @@ def _checked(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def decode_compressed(data: Any, format: str = '') -> Image:
-    """Decode a JPEG, PNG or other file that OpenCV reads to BGR (H, W, 3) uint8.
+    """Decode a JPEG, PNG, BMP, PNM, TIFF or WebP file to BGR (H, W, 3) uint8.
 
     `format` is that of ``sensor_msgs/CompressedImage``; it matters only for a Bayer mosaic that
-    was compressed as it is. A truncated JPEG is rejected, because OpenCV would fill it with gray.
+    was compressed as it is. A truncated JPEG is rejected, because OpenCV would fill it with gray,
+    and an image of more than MOST_PIXELS before it is decoded.
     Raises CameraError with the reason in a few words.
     """
     if 'compresseddepth' in format.lower():
@@ -160,6 +164,7 @@ def _is_truncated_jpeg(buffer: NDArray[np.uint8]) -> bool:
 
 
 def _decoded(buffer: NDArray[np.uint8], flags: int) -> Image:
+    check_size(buffer.tobytes())
     image = _checked(cv2.imdecode, buffer, flags)
     if image is None:
         raise CameraError('not an image file that OpenCV reads')

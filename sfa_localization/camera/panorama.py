@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.calibration_files import calibration_of
+from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import (
     UNCALIBRATED,
@@ -22,6 +22,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
+from sfa_localization.data.files import read_regular
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -192,10 +193,11 @@ def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
 
 def read_mask(path: str, size: tuple[int, int]) -> Mask:
     """Read a mask image for images of `size` (rows, columns): True where it is not black."""
-    exists = Path(path).is_file()  # else OpenCV would warn on its own
-    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE) if exists else None
-    if mask is None:
-        raise CameraError(f'mask_file {path} is missing or is no image')
+    try:
+        image = decode_compressed(read_regular(path, LARGEST_FILE))
+    except (CameraError, OSError) as error:
+        raise CameraError(f'mask_file {path} is missing or is no image ({error})') from None
+    mask = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     resized = cv2.resize(mask, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized) >= 128
 

@@ -9,10 +9,12 @@ unchanged; the time of reception sets the pace.
 from __future__ import annotations
 
 import importlib
+import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -312,14 +314,30 @@ class Ros1Converter:
 
 
 def message_class(kind: str) -> Callable[..., Any] | None:
-    """The Python class of a message type, or None where it is not installed."""
+    """The Python class of a message type, or None where it is not installed.
+
+    Bags name types as they like: nothing is imported but a package `msg` within another, and
+    nothing from the current folder.
+    """
     package, _, name = kind.partition('/msg/')
-    if not (package.isidentifier() and name.isidentifier()):
+    if not (package.isidentifier() and name.isidentifier() and _is_installed(package)):
         return None
     try:
-        return getattr(importlib.import_module(f'{package}.msg'), name, None)
+        found = getattr(importlib.import_module(f'{package}.msg'), name, None)
     except ImportError:
         return None
+    return found if isinstance(found, type) else None
+
+
+def _is_installed(package: str) -> bool:
+    """Whether a package with messages is found, and that outside the current folder."""
+    here = Path.cwd()
+    folders = [folder for folder in sys.path if folder and Path(folder).resolve() != here]
+    outer = PathFinder.find_spec(package, folders)
+    if outer is None or outer != PathFinder.find_spec(package):
+        return False
+    inner = PathFinder.find_spec(f'{package}.msg', outer.submodule_search_locations or [])
+    return inner is not None
 
 
 def qos_profile(offered: Collection[Qos]) -> QoSProfile:

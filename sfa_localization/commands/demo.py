@@ -34,10 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the demonstration; print the errors."""
     from sfa_localization.commands.demonstration import demonstrate
-    from sfa_localization.commands.processes import terminable
     from sfa_localization.reports.evaluation import heading_table, table
 
-    with terminable():
-        result = demonstrate(arguments.out, settings(DemoConfig, arguments), progress=True)
+    result = demonstrate(arguments.out, settings(DemoConfig, arguments), progress=True)
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
     return 0

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,30 @@ from typing import IO
 
 from sfa_localization.data.errors import LocalizationError
 
+NEW_FILE_MODE = 0o644
+"""Permissions of a file that was not there before."""
+
+
+def is_regular(path: Path | str) -> bool:
+    """Whether there is a regular file; False for any path that the system cannot have."""
+    return os.path.isfile(path)
+
+
+def read_regular(path: Path | str, largest: int) -> bytes:
+    """The bytes of a regular file of at most `largest` bytes. Raises OSError.
+
+    A pipe or device is no regular file: reading it may never end.
+    """
+    if '\0' in str(path):
+        raise OSError('a path with a zero byte')
+    if os.path.exists(path) and not is_regular(path):
+        raise OSError('it is no regular file')
+    with open(path, 'rb') as file:
+        data = file.read(largest + 1)
+    if len(data) > largest:
+        raise OSError(f'larger than {largest} bytes')
+    return data
+
 
 @contextmanager
 def atomic_write(
@@ -20,19 +45,34 @@ def atomic_write(
 ) -> Iterator[IO[bytes]]:
     """Write to a temporary file that becomes `path` at the end, or is removed after any error.
 
-    `make_folder` creates missing folders first. Raises `error`, naming the path.
+    Of a symbolic link the file that it leads to is replaced; a file keeps its permissions.
+    `make_folder` creates missing folders first. Raises `error`, naming the path, also where it is
+    a folder, a device or a pipe.
     """
     temporary = None
     try:
+        target = Path(os.path.realpath(path))
         if make_folder:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp('.part', f'.{path.name}-', path.parent)
+            target.parent.mkdir(parents=True, exist_ok=True)
+        mode = replaced_mode(target)
+        handle, temporary = tempfile.mkstemp('.part', f'.{target.name}-', target.parent)
         with os.fdopen(handle, 'wb') as file:
             yield file
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        os.chmod(temporary, mode)
+        os.replace(temporary, target)
     except OSError as reason:
         raise error(f'{path}: cannot be written: {reason.strerror or reason}') from None
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def replaced_mode(target: Path) -> int:
+    """The permissions of what `target` replaces. Raises OSError where that is no regular file."""
+    try:
+        there = target.stat()
+    except FileNotFoundError:
+        return NEW_FILE_MODE
+    if not stat.S_ISREG(there.st_mode):
+        raise OSError('it is no regular file')
+    return stat.S_IMODE(there.st_mode)

@@ -31,3 +31,8 @@ def short_line(text: str) -> str:
     line = ' '.join(text[: 2 * LONGEST].split())
     line = ''.join(letter if letter.isprintable() else '?' for letter in line)
     return line if len(line) <= LONGEST else line[: LONGEST - 3] + '...'
+
+
+def quoted(value: object) -> str:
+    """A value of anyone's as Python writes it, in one line of bounded length."""
+    return short_line(repr(value))

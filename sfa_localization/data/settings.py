@@ -16,8 +16,11 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.rejections import quoted
 
 S = TypeVar('S', bound='Settings')
+_LONGEST_NAME = 100
+"""Characters of a wrong name that are compared with those of the parameters."""
 
 
 def setting(
@@ -59,7 +62,7 @@ class Settings:
         for name in mapping:
             if name not in known:
                 raise ConfigError(
-                    f'{where}: unknown parameter {name!r}'
+                    f'{where}: unknown parameter {quoted(name)}'
                     f'{nearest(name, known) or "; known are " + ", ".join(sorted(known))}'
                 )
         try:
@@ -70,7 +73,7 @@ class Settings:
 
 def nearest(name: str, known: Collection[str]) -> str:
     """The end of a message about an unknown name: the most similar known one, or ''."""
-    close = difflib.get_close_matches(name, sorted(known), n=1)
+    close = difflib.get_close_matches(name[:_LONGEST_NAME], sorted(known), n=1)
     return f'; did you mean {close[0]!r}?' if close else ''
 
 
@@ -92,21 +95,30 @@ def _converted(where: str, default: Any, value: Any) -> Any:
     if isinstance(default, bool) or isinstance(value, bool):
         matches = isinstance(default, bool) and isinstance(value, bool)
     elif isinstance(default, float) and isinstance(value, (int, float)):
-        return float(value)
+        return _float(where, value)
     else:
         matches = isinstance(value, type(default))
     if not matches:
-        raise ConfigError(f'{where}: {value!r} is not of type {type(default).__name__}')
+        raise ConfigError(f'{where}: {quoted(value)} is not of type {type(default).__name__}')
     return value
+
+
+def _float(where: str, value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise ConfigError(f'{where}: {quoted(value)} is too large') from None
 
 
 def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
     if metadata['choices'] and value not in metadata['choices']:
-        raise ConfigError(f'{where}: {value!r} is not one of {", ".join(metadata["choices"])}')
+        raise ConfigError(
+            f'{where}: {quoted(value)} is not one of {", ".join(metadata["choices"])}'
+        )
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return
     if not math.isfinite(value):
         raise ConfigError(f'{where}: {value!r} is not a finite number')
     low, high = metadata['low'], metadata['high']
     if (low is not None and value < low) or (high is not None and value > high):
-        raise ConfigError(f'{where}: {value!r} is outside [{low}, {high}] {metadata["unit"]}')
+        raise ConfigError(f'{where}: {quoted(value)} is outside [{low}, {high}] {metadata["unit"]}')

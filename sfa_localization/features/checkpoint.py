@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.errors import ModelError
+from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Run
 from sfa_localization.features.network import Architecture, Node
 from sfa_localization.features.network_training import Partial
@@ -67,7 +68,7 @@ class Checkpoint:
 
     def read(self, architecture: Architecture) -> Partial | None:
         """The stages finished so far; None when there are none. Raises ModelError."""
-        if not self.path.is_file():
+        if not is_regular(self.path):
             return None
         remedy = 'train without --resume'
         arrays = read_arrays(self.path, FORMAT, VERSION, remedy)

@@ -10,6 +10,7 @@ shifts with the robot's rotation (see rotation.py).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import cv2
@@ -59,6 +60,7 @@ class Architecture:
     layers: tuple[Layer, ...]
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         _check_binning(self.size, self.binning)
         _check_columns(self)
         for depth, rows in enumerate(self.map_rows[:-1]):
@@ -98,6 +100,26 @@ class Architecture:
     @property
     def outputs(self) -> int:
         return self.layers[-1].outputs
+
+
+LARGEST_NUMBER = 1 << 16
+"""Of pixels, strides and features: more than any panorama has columns."""
+LARGEST_SIGNAL = 1 << 28
+"""Bytes of one layer's signals of one image: hundreds of times those of the standard networks."""
+
+
+def _check_numbers(architecture: Architecture) -> None:
+    """All sizes must be whole and positive, and the limit of the signals too."""
+    numbers: list[object] = [*architecture.size, architecture.binning]
+    for layer in architecture.layers:
+        numbers += [*layer.field, *layer.stride, layer.linear, layer.outputs]
+    whole = all(isinstance(n, int) and 1 <= n <= LARGEST_NUMBER for n in numbers)
+    if not architecture.layers or not whole:
+        raise ConfigError(f'a network has layers whose sizes are from 1 to {LARGEST_NUMBER}')
+    if not all(0.0 < layer.clip < math.inf for layer in architecture.layers):
+        raise ConfigError('the limit (clip) of a layer must be positive and finite')
+    if architecture.normalization not in _NORMALIZATIONS:
+        raise ConfigError(f'unknown normalization: use {", ".join(NORMALIZATIONS)}')
 
 
 def _check_binning(size: tuple[int, int], binning: int) -> None:
@@ -356,3 +378,29 @@ class Network:
             below = self.layer(below, depth)
             made.append(below)
         return made
+
+
+def check_weights(network: Network) -> None:
+    """Require weights of the sizes that the architecture has, and signals that fit into memory.
+
+    Raises ModelError.
+    """
+    architecture = network.architecture
+    if math.prod(architecture.size) * 3 * np.dtype(np.float32).itemsize > LARGEST_SIGNAL:
+        raise ModelError(f'a panorama of its size exceeds {LARGEST_SIGNAL} bytes')
+    levels = zip(
+        network.nodes,
+        architecture.layers,
+        architecture.fields,
+        architecture.channels,
+        architecture.map_rows[1:],
+        strict=True,
+    )
+    for depth, (node, layer, receptive, channels, rows) in enumerate(levels):
+        inputs = receptive.rows * receptive.columns * channels
+        linear, slow = (inputs, layer.linear), (layer.expanded, layer.outputs)
+        if (node.linear.shape, node.slow.shape) != (linear, slow):
+            raise ModelError(f'the weights of layer {depth + 1} do not fit its sizes')
+        wide = max(inputs, layer.expanded, layer.outputs)
+        if rows * architecture.rotations * wide * node.linear.itemsize > LARGEST_SIGNAL:
+            raise ModelError(f'the signals of layer {depth + 1} exceed {LARGEST_SIGNAL} bytes')

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import NOVELTY_WARNING
-from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError, ModelError
+from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError
 from sfa_localization.data.settings import Settings
 from sfa_localization.localizer import Observation, Observer
 from sfa_localization.nodes.conversions import (
@@ -91,7 +91,7 @@ class SfaNode(LocalizationNode):
     # The model.
 
     def _load(self, path: str) -> PlaceModel:
-        """Read a model, and locate once so that the first image does not wait."""
+        """Read a model. Raises LocalizationError where it is missing or damaged."""
         if not path:
             raise ConfigError(
                 "parameter 'model' is empty: name the file that the train command wrote "
@@ -99,10 +99,6 @@ class SfaNode(LocalizationNode):
             )
         model = PlaceModel.load(Path(path))
         size = model.panorama
-        try:
-            model.locate(np.zeros((size.height, size.width, 3), np.uint8))
-        except Exception as error:  # arrays that do not fit each other fail in many ways
-            raise ModelError(f'{path}: the model is damaged ({error}): train it again') from None
         self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}')
         return model
 
