@@ -79,12 +79,26 @@ class Evidence(NamedTuple):
     accepted: bool
 
 
+class Trust(NamedTuple):
+    """Images over the last meters, and how they contradict the odometry's motion, '' if not.
+
+    `moves` counts how often images moved an established estimate lately, `moved_m` is the distance
+    traveled when they did it last.
+    """
+
+    recent: tuple[Evidence, ...] = ()
+    problem: str = ''
+    moves: int = 0
+    moved_m: float = 0.0
+
+
 class Memory(NamedTuple):
     """The record of measurements: accepted ones, those rejected in a row, and where they lay.
 
     `support` counts accepted images since the last start, `rejected` those outside the gate in a
     row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
-    images. `doubt` are variances (x, y, yaw) that the published covariance has on top.
+    images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`
+    outlives restarts.
     """
 
     support: int = 0
@@ -96,6 +110,7 @@ class Memory(NamedTuple):
     doubt: tuple[float, float, float] = _NO_DOUBT
     evidence: tuple[Evidence, ...] = ()
     update: Update | None = None
+    trust: Trust = Trust()
 
 
 class Belief(NamedTuple):

@@ -64,19 +64,9 @@ class Relocation(NamedTuple):
 
 def remember(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Evidence, ...]:
     """The evidence with a measurement more, without what lies far behind; the rest thinned out."""
-    variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
-    variance = (variances[0] + variances[1]) / 2
-    newest = Evidence(
-        belief.dead_reckoned,
-        belief.traveled_m,
-        (x, y),
-        yaw[0] if yaw else math.nan,
-        variance,
-        variances[2] if yaw else math.inf,
-        accepted,
-    )
-    evidence = belief.memory.evidence
-    oldest_m = belief.traveled_m - max(REMEMBERED_M, REMEMBERED_STDS * math.sqrt(variance))
+    newest = evidence_of(belief, event, accepted)
+    evidence, std = belief.memory.evidence, math.sqrt(newest.variance)
+    oldest_m = belief.traveled_m - max(REMEMBERED_M, REMEMBERED_STDS * std)
     start = 0
     while start < len(evidence) and evidence[start].traveled_m < oldest_m:
         start += 1
@@ -85,6 +75,20 @@ def remember(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[E
         return kept
     # The newer half stays complete: it is what the next decision counts.
     return kept[: CAPACITY // 2 : 2] + kept[CAPACITY // 2 :]
+
+
+def evidence_of(belief: Belief, event: MeasurementEvent, accepted: bool) -> Evidence:
+    """A measurement beside the pose by dead reckoning."""
+    variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
+    return Evidence(
+        belief.dead_reckoned,
+        belief.traveled_m,
+        (x, y),
+        yaw[0] if yaw else math.nan,
+        (variances[0] + variances[1]) / 2,
+        variances[2] if yaw else math.inf,
+        accepted,
+    )
 
 
 def relocate(evidence: Sequence[Evidence], decorrelation_m: float) -> Relocation | None:

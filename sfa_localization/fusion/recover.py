@@ -16,9 +16,11 @@ from sfa_localization.fusion.belief import (
     MeasurementEvent,
     Memory,
     PoseEvent,
+    Trust,
     Update,
     capped,
 )
+from sfa_localization.fusion.consistency import moved
 from sfa_localization.fusion.evidence import (
     AGREEING_DISTANCE_M,
     ENOUGH_IMAGES,
@@ -128,11 +130,13 @@ class Recovery:
         reason: str,
     ) -> Belief:
         pose = found.pose if isinstance(found, Relocation) else found.value
+        trust, established = belief.memory.trust, belief.memory.support >= ENOUGH_IMAGES
         memory = Memory(
             support=1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
+            trust=moved(trust, belief.traveled_m) if established or trust.moves else Trust(),
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
         return placed._replace(memory=memory)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from sfa_localization.fusion.belief import Belief
 from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.fusion.consistency import doubts
 from sfa_localization.fusion.evidence import ENOUGH_IMAGES, FEW_IMAGES
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
@@ -51,6 +52,7 @@ def status_of(
         degraded.append(f'position known to {state.position_std:.1f} m only')
     if belief.memory.rejected >= FEW_IMAGES:
         degraded.append(f'{belief.memory.rejected} images in a row did not match')
+    degraded += doubts(belief.memory.trust, belief.traveled_m)
     degraded += _silences(belief)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'

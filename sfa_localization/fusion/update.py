@@ -11,11 +11,13 @@ from scipy.stats import chi2
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.belief import Belief, Evidence, MeasurementEvent, Memory, Update
+from sfa_localization.fusion.consistency import watched
 from sfa_localization.fusion.evidence import (
     AGREEING_DISTANCE_M,
     FEW_IMAGES,
     MANY_IMAGES,
     consistent,
+    evidence_of,
     remember,
 )
 from sfa_localization.fusion.inputs import lower_root
@@ -56,6 +58,8 @@ class Correction:
 
     def fuse(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
+        trust = watched(belief.memory.trust, evidence_of(belief, event, accepted=False))
+        belief = belief._replace(memory=belief.memory._replace(trust=trust))
         heading_lost = belief.covariance[YAW, YAW] > self._lost_yaw_variance
         if belief.located and (event.value.size == 3 or not heading_lost):
             return self._gated(belief, event)
@@ -107,6 +111,7 @@ class Correction:
             accepted_m=belief.traveled_m,
             evidence=remember(belief, event, accepted=True),
             update=update,
+            trust=belief.memory.trust,
         )
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 

@@ -1,0 +1,115 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether images and odometry show the same motion, and whether the estimate had to be moved.
+
+An image that repeats, a camera that was knocked or a clock that is seconds off gives poses that
+pass the gate now and then. Over some meters they show: laid on the odometry's path, which is
+turned and shifted as one piece, the images lie beside it, or look into another direction than the
+one in which they move. An estimate that was moved once has to be confirmed by driving, and one
+that is moved again and again by driving far.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.fusion.belief import Evidence, Trust
+from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
+
+SPACING_M = 0.1
+"""Images nearer than this to the last one kept show no motion of their own."""
+WINDOW_M, WINDOW_IMAGES = 1.5 * AGREEING_DISTANCE_M, 8
+"""The newest images over both are compared; images of slow cameras are farther apart."""
+AGREEING_HALF = 0.5
+"""Fewer than half of the images on the odometry's path are no outliers: motions differ."""
+TURNED_RAD, TURNED_STDS = math.radians(12.0), 3.5
+"""Headings that differ from the direction of motion by more than both were not drawn by chance;
+12 degrees is twice what maps of noisy odometry show in places."""
+FORGIVEN_M, LONGEST_M = 30.0, 16.0
+"""Distance after which an estimate that stayed counts as never moved, and the longest distance
+that must confirm one."""
+_HEADING_DRIFT_RAD = 0.05  # of odometry over the window
+_FIT_STEPS = 5  # of reweighting, from where the fit hardly changes
+
+
+def watched(trust: Trust, newest: Evidence) -> Trust:
+    """The trust after another image, accepted or not."""
+    recent = trust.recent
+    if recent and abs(newest.traveled_m - recent[-1].traveled_m) < SPACING_M:
+        return trust
+    recent = (*recent, newest)
+    while len(recent) > WINDOW_IMAGES and newest.traveled_m - recent[1].traveled_m >= WINDOW_M:
+        recent = recent[1:]
+    problem = contradiction(recent)
+    settled = newest.traveled_m - trust.moved_m > _confirming_m(trust) + FORGIVEN_M
+    moves = 0 if settled and not problem else trust.moves
+    return trust._replace(recent=recent, problem=problem, moves=moves)
+
+
+def moved(trust: Trust, traveled_m: float) -> Trust:
+    """The trust after images moved an established estimate."""
+    return Trust(moves=trust.moves + 1, moved_m=traveled_m)
+
+
+def doubts(trust: Trust, traveled_m: float) -> list[str]:
+    """Why an estimate is not trusted, in words."""
+    found = [trust.problem] if trust.problem else []
+    since_m = traveled_m - trust.moved_m
+    if since_m < _confirming_m(trust):
+        times = f', {trust.moves} times in a row' if trust.moves > 1 else ''
+        found.append(f'placed anew {since_m:.1f} m ago{times}: driving on confirms it')
+    return found
+
+
+def _confirming_m(trust: Trust) -> float:
+    """Distance over which an estimate must hold after it was moved."""
+    return min(AGREEING_DISTANCE_M * 2.0 ** (trust.moves - 1), LONGEST_M) if trust.moves else 0.0
+
+
+def contradiction(recent: Sequence[Evidence]) -> str:
+    """How images contradict the odometry's motion; '' where they do not, or are too few."""
+    span_m = recent[-1].traveled_m - recent[0].traveled_m
+    if len(recent) < WINDOW_IMAGES or span_m < AGREEING_DISTANCE_M:
+        return ''
+    path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
+    places = np.array([complex(*item.position) for item in recent])
+    variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
+    weight = 1 / variance
+    turn = 0.0
+    square = np.zeros(len(recent))
+    for _ in range(_FIT_STEPS):
+        along = path - np.average(path, weights=weight)
+        across = places - np.average(places, weights=weight)
+        turn = float(np.angle(np.sum(weight * np.conj(along) * across)))
+        square = np.abs(across - np.exp(1j * turn) * along) ** 2 / variance
+        weight = 1 / (variance * (1 + square))
+    agree = square <= AGREEING_VARIANCES
+    if agree.mean() < AGREEING_HALF:
+        return 'images and odometry show different motions'
+    lever = float(np.sum(agree * np.abs(along) ** 2 / variance))
+    # Neighboring images err alike, over about a meter.
+    dependence = max(1.0, len(recent) / (1 + span_m))
+    return _turned(recent, agree, turn, dependence / max(lever, 1e-9))
+
+
+def _turned(
+    recent: Sequence[Evidence], agree: NDArray[np.bool_], turn: float, variance: float
+) -> str:
+    """Whether headings of images differ from the direction in which their positions move."""
+    items = [item for item, fits in zip(recent, agree, strict=True) if fits]
+    off = [item.yaw - item.dead_reckoned[2] - turn for item in items if math.isfinite(item.yaw)]
+    if not off:
+        return ''
+    # Angles have no median; those about their mean direction do.
+    mean = float(np.angle(np.mean(np.exp(1j * np.array(off)))))
+    angle = float(wrap_angle(mean + np.median(wrap_angle(np.array(off) - mean))))
+    yaw_variance = float(np.mean([item.yaw_variance for item in items if math.isfinite(item.yaw)]))
+    std = math.sqrt(variance + yaw_variance + _HEADING_DRIFT_RAD**2)
+    if abs(angle) < max(TURNED_RAD, TURNED_STDS * std):
+        return ''
+    return f'images look {math.degrees(angle):.0f} degrees off the motion: was the camera turned?'

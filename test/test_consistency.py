@@ -1,0 +1,202 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Images that contradict the odometry's motion cost the trust; so do repeated moves."""
+
+import math
+
+import numpy as np
+import pytest
+from filter_drives import Drive
+
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.fusion import consistency
+from sfa_localization.fusion.belief import Evidence, Trust
+from sfa_localization.fusion.consistency import (
+    AGREEING_DISTANCE_M,
+    FORGIVEN_M,
+    LONGEST_M,
+    SPACING_M,
+    WINDOW_IMAGES,
+    WINDOW_M,
+    contradiction,
+    doubts,
+    moved,
+    watched,
+)
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import Level
+
+NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.12, 'yaw_std': 0.03}
+
+
+def seen(poses, places, yaws, std=0.1, yaw_std=0.03):
+    """Evidence of images at places (complex) along a driven path of poses (N, 3)."""
+    steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+    return tuple(
+        Evidence(tuple(pose), traveled, (place.real, place.imag), yaw, std**2, yaw_std**2, False)
+        for pose, traveled, place, yaw in zip(
+            poses.tolist(), np.cumsum(steps).tolist(), places, yaws, strict=True
+        )
+    )
+
+
+def bend(length_m=3.0, count=16, turn=1.0):
+    """A path of odometry that turns, with the place and heading of each image in a turned map."""
+    s = np.linspace(0, length_m, count)
+    yaw = turn * s / max(length_m, 1e-9)
+    radius = length_m / turn
+    poses = np.column_stack([radius * np.sin(yaw), radius * (1 - np.cos(yaw)), yaw])
+    places = (poses[:, 0] + 1j * poses[:, 1]) * np.exp(2j) + (3 - 4j)
+    return poses, places, wrap_angle(yaw + 2.0)
+
+
+def noise(count, std, seed=0):
+    return np.random.default_rng(seed).normal(0, std, (count, 2)) @ np.array([1, 1j])
+
+
+def test_images_on_the_path_of_odometry_contradict_nothing():
+    for seed in range(200):
+        poses, places, yaws = bend()
+        rng = np.random.default_rng([seed, 1])
+        drawn = yaws + rng.normal(0, 0.03, len(yaws))
+        assert contradiction(seen(poses, places + noise(16, 0.1, seed), drawn)) == ''
+
+
+def test_a_third_of_wrong_images_contradict_nothing():
+    poses, places, yaws = bend()
+    places[::3] += 5.0
+    assert contradiction(seen(poses, places, yaws)) == ''
+
+
+@pytest.mark.parametrize('kind', ['repeated', 'alternating', 'elsewhere', 'backward'])
+def test_images_that_move_otherwise_contradict(kind):
+    poses, places, _ = bend(turn=2.0)
+    number = np.arange(len(places))
+    wrong = {
+        'repeated': np.full(len(places), places[0]),
+        'alternating': places[0] + 2.0 * (number % 2),
+        'elsewhere': 5.0 * np.exp(2.4j * number),
+        'backward': places[::-1] * np.exp(0.7j * number),
+    }[kind]
+    shown = contradiction(seen(poses, wrong + noise(16, 0.05), np.full(16, np.nan)))
+    assert shown == 'images and odometry show different motions'
+
+
+@pytest.mark.parametrize(('angle', 'noticed'), [(8, False), (25, True), (-40, True), (175, True)])
+def test_a_camera_that_was_turned_is_noticed(angle, noticed):
+    poses, places, yaws = bend()
+    shown = contradiction(seen(poses, places, wrap_angle(yaws + math.radians(angle))))
+    assert ('degrees off the motion: was the camera turned?' in shown) is noticed
+    if noticed:
+        assert f'look {angle} degrees off' in shown or f'look {-angle} degrees off' in shown
+
+
+def test_without_headings_only_the_motion_counts():
+    poses, places, _ = bend()
+    assert contradiction(seen(poses, places, np.full(16, np.nan))) == ''
+
+
+def test_too_few_images_or_too_short_a_path_contradict_nothing():
+    poses, places, yaws = bend()
+    repeated = np.full(len(places), places[0])
+    few = slice(0, WINDOW_IMAGES - 1)
+    assert contradiction(seen(3 * poses[few], repeated[few], yaws[few])) == ''
+    assert contradiction(seen(0.5 * poses, repeated, yaws)) == ''
+    assert contradiction(seen(poses, repeated, yaws)) != ''
+
+
+def test_the_window_holds_the_newest_images_over_both_distance_and_number():
+    poses, places, yaws = bend(length_m=20.0, count=400)
+    trust = Trust()
+    for item in seen(poses, places, yaws):
+        trust = watched(trust, item)
+    recent = trust.recent
+    steps = np.diff([item.traveled_m for item in recent])
+    assert steps.min() >= SPACING_M
+    assert WINDOW_M <= recent[-1].traveled_m - recent[0].traveled_m < WINDOW_M + 2 * SPACING_M
+    poses, places, yaws = bend(length_m=40.0, count=41)
+    for item in seen(poses, places, yaws):
+        trust = watched(trust, item)
+    assert len(trust.recent) == WINDOW_IMAGES
+
+
+def test_every_move_doubles_the_distance_that_confirms():
+    trust = Trust()
+    assert doubts(trust, 0.0) == []
+    trust = moved(trust, 10.0)
+    assert doubts(trust, 10.5) == ['placed anew 0.5 m ago: driving on confirms it']
+    assert doubts(trust, 10.0 + AGREEING_DISTANCE_M) == []
+    trust = moved(trust, 20.0)
+    assert 'placed anew 3.0 m ago, 2 times in a row: driving on confirms it' in doubts(trust, 23.0)
+    assert doubts(trust, 20.0 + 2 * AGREEING_DISTANCE_M) == []
+    for _ in range(10):
+        trust = moved(trust, 30.0)
+    assert doubts(trust, 30.0 + LONGEST_M - 0.1) != [] and doubts(trust, 30.0 + LONGEST_M) == []
+
+
+@pytest.mark.parametrize(('meters', 'moves'), [(FORGIVEN_M, 1), (FORGIVEN_M + 3.0, 0)])
+def test_an_estimate_that_stays_is_as_if_never_moved(meters, moves):
+    poses, places, yaws = bend(length_m=meters, count=200)
+    trust = moved(Trust(), 0.0)
+    for item in seen(poses, places, yaws):
+        trust = watched(trust, item)
+    assert trust.moves == moves
+
+
+def fed(drive, fused=None):
+    """Status and error at every image."""
+    fused, found = fused or PoseFilter(FilterConfig()), []
+    for event in drive.events(True):
+        drive.give(fused, event, True)
+        if event[1] == 1 and fused.state is not None:
+            error = fused.state.pose[:2] - drive.poses[drive.pictures[event[2]], :2]
+            found.append((fused.status, math.hypot(*error), fused.state))
+    return found
+
+
+def wrong_and_sure(found, limit_m=1.0):
+    return sum(status.level is Level.LOCALISED and error > limit_m for status, error, _ in found)
+
+
+@pytest.mark.parametrize('kind', ['frozen', 'alternating'])
+def test_while_images_repeat_the_filter_is_never_sure_and_wrong(kind):
+    drive = Drive(seconds=40, **NOISY)
+    stuck = drive.seen.copy()
+    for k in range(100, 300):
+        stuck[k] = drive.seen[100 if kind == 'frozen' else 100 - 20 * (k % 2)]
+    drive.seen = stuck
+    found = fed(drive)
+    assert wrong_and_sure(found) == 0
+    assert found[95][0].level is Level.LOCALISED and found[-1][1] < 0.5
+
+
+def test_after_a_knock_of_the_camera_the_filter_is_not_sure():
+    drive = Drive(seconds=40, **NOISY)
+    drive.seen[100:, 2] = wrap_angle(drive.seen[100:, 2] + math.radians(35))
+    found = fed(drive)
+    assert found[95][0].level is Level.LOCALISED
+    assert sum(status.level is Level.LOCALISED for status, *_ in found[130:]) == 0
+    reasons = {reason for status, *_ in found[130:] for reason in status.reasons}
+    assert any('was the camera turned?' in reason for reason in reasons)
+
+
+def test_a_kidnapped_robot_is_trusted_again_after_two_meters():
+    drive = Drive(seconds=40, **NOISY)
+    drive.kidnap(150, (5.0, -4.0, 2.0))
+    found = fed(drive)
+    levels = [status.level for status, *_ in found]
+    assert levels[145] is Level.LOCALISED and levels[153] is Level.DEGRADED
+    assert levels[156] is Level.DEGRADED and levels[190] is Level.LOCALISED
+    assert wrong_and_sure(found) <= 2  # until a third image does not match
+
+
+def test_constants_are_used(monkeypatch):
+    """The share and the angle that separate outliers and drift from contradictions."""
+    poses, places, yaws = bend()
+    turned = seen(poses, places, wrap_angle(yaws + math.radians(25)))
+    monkeypatch.setattr(consistency, 'TURNED_RAD', math.radians(30))
+    assert contradiction(turned) == ''
+    places[::3] += 5.0
+    monkeypatch.setattr(consistency, 'AGREEING_HALF', 0.8)
+    assert contradiction(seen(poses, places, yaws)) != ''
