@@ -81,6 +81,7 @@ def test_each_training_is_tested_in_each_light(made):
     for cell in cells:
         assert 0 <= cell['localized'] <= 1 and cell['false_localised_s'] >= 0
         assert 0 < cell['sfa']['mean_m'] < 6 and 0 <= cell['sfa']['within_95'] <= 1
+        assert cell['slow']['mean_m'] > 0 and cell['slow']['mean_m'] != cell['sfa']['mean_m']
     day = cells[0]
     assert day['retrieval']['mean_m'] < 1.0 and day['retrieval']['heading_deg'] < 20
 
@@ -172,7 +173,8 @@ CELLS = [
         'trained': 'day', 'light': 'day', 'season': 'summer', 'localized': 0.97,
         'sfa': {'mean_m': 0.1234, 'heading_deg': 0.8, 'within_95': 0.9},
         'ekf': {'mean_m': 0.056, 'heading_deg': 0.512, 'within_95': 0.949},
-        'false_localised_s': 1.25, 'retrieval': {'mean_m': 0.2, 'heading_deg': 0.6},
+        'slow': {'mean_m': 2.5}, 'false_localised_s': 1.25,
+        'retrieval': {'mean_m': 0.2, 'heading_deg': 0.6},
     },
     {'trained': 'day', 'light': 'evening', 'season': 'winter', 'problem': 'no image can be used'},
 ]  # fmt: skip
@@ -182,7 +184,7 @@ def test_table_has_a_line_for_each_cell():
     lines = table(CELLS).splitlines()
     assert len({line.count('|') for line in lines}) == 1
     assert lines[2] == (
-        '| day | day, summer | 0.123 | 0.056 | 0.51 | 95 % | 97 % | 1.2 | 0.200 | 0.60 |'
+        '| day | day, summer | 2.500 | 0.123 | 0.056 | 0.51 | 95 % | 97 % | 1.2 | 0.200 | 0.60 |'
     )
     assert lines[3] == '| day | evening, winter |' + ' - |' * len(MEASURES)
 

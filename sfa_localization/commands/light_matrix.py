@@ -24,7 +24,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError
 from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.data.run import Run, Trajectory
-from sfa_localization.evaluation import evaluate, score, write_json
+from sfa_localization.evaluation import evaluate, moved, score, write_json
 from sfa_localization.features.retrieval import ImageRetrieval
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.evaluation import save_text
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from sfa_localization.commands.reproduce import ReproduceConfig
 
 RESULTS = 'matrix.json'
+BATCH = 64
+"""Images that are read together."""
 Cell = dict[str, Any]
 Condition = tuple[str, str]
 """Light and season."""
@@ -63,7 +65,7 @@ QUICK = Plan(
     (8.0, 8.0),
     (300, 30),
     (*((light, 'summer') for light in LIGHTS), ('overcast', 'autumn'), ('day', 'winter')),
-    5,
+    6,
 )
 
 
@@ -122,8 +124,9 @@ def reproduce_light(
 ) -> list[Cell]:
     """Fill the matrix; write it as JSON, table and figure below `out`. Returns its cells.
 
-    A cell has `trained`, `light` and `season`, and the scores that `_judged` names. Raises
-    LocalizationError, also for a folder with results of other settings.
+    A cell has `trained`, `light` and `season`, the scores that `_judged` names, and those of plain
+    image `retrieval` and of `slow` features alone. Raises LocalizationError, also for a folder with
+    results of other settings.
     """
     start = time.monotonic()
 
@@ -207,9 +210,11 @@ def _fill_row(
         for test, drive in zip(tests, drives, strict=True):
             work.announce(f'{trained}, tested in {" ".join(test)}')
             run = _read(drive, cache / drive.name, recipe)
-            baseline = {'retrieval': _retrieved(retrieval, run)}
             cell, transform = _judged(model, drive, bags[0], transform)
-            keep({'trained': trained, 'light': test[0], 'season': test[1], **cell, **baseline})
+            beside = {'retrieval': _retrieved(retrieval, run)}
+            if transform is not None:
+                beside['slow'] = _slow_alone(model, run, transform)
+            keep({'trained': trained, 'light': test[0], 'season': test[1], **cell, **beside})
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe) -> Run:
@@ -250,15 +255,23 @@ def _summary(scores: Mapping[str, Any]) -> Cell:
     }
 
 
+def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
+    """Scores of slow features without the keyframes, which verify and replace their estimates."""
+    views = [view for batch in run.panoramas.batches(BATCH) for view in model.views(batch)]
+    poses = np.array([[*view.position, view.yaw] for view in views])
+    truth = _truth(run)
+    return _summary(score(truth, moved(Trajectory(truth.stamps_ns, poses), transform)))
+
+
 def _retrieval(runs: Sequence[Run]) -> ImageRetrieval:
     """The images of the training drives at their true poses."""
-    images = (image for run in runs for batch in run.panoramas.batches(64) for image in batch)
+    images = (image for run in runs for batch in run.panoramas.batches(BATCH) for image in batch)
     return ImageRetrieval.of(images, np.concatenate([_truth(run).poses for run in runs]))
 
 
 def _retrieved(retrieval: ImageRetrieval, run: Run) -> Cell:
     truth = _truth(run)
-    poses = [retrieval.locate(i) for batch in run.panoramas.batches(64) for i in batch]
+    poses = [retrieval.locate(i) for batch in run.panoramas.batches(BATCH) for i in batch]
     return _summary(score(truth, Trajectory(truth.stamps_ns, np.array(poses))))
 
 

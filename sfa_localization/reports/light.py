@@ -39,8 +39,8 @@ def _percent(share: float) -> str:
 
 
 def _distance(meters: float) -> float:
-    """0 to 0.1 m, 1 from 10 m on, by the logarithm."""
-    return float(np.log10(max(meters, 0.1)) + 1) / 2
+    """0 to 0.1 m, 1 from 3 m on, by the logarithm."""
+    return float(np.log10(max(meters, 0.1)) + 1) / 1.5
 
 
 def _angle(degrees: float) -> float:
@@ -48,6 +48,7 @@ def _angle(degrees: float) -> float:
 
 
 MEASURES = (
+    Measure('slow features alone (m)', ('slow', 'mean_m'), '{:.3f}'.format, _distance),
     Measure('SFA mean (m)', ('sfa', 'mean_m'), '{:.3f}'.format, _distance),
     Measure('EKF mean (m)', ('ekf', 'mean_m'), '{:.3f}'.format, _distance),
     Measure('EKF heading (°)', ('ekf', 'heading_deg'), '{:.2f}'.format, _angle),
@@ -76,7 +77,7 @@ def matrix_figure(path: Path, cells: Cells) -> None:
     rows = list(dict.fromkeys(str(cell['trained']) for cell in cells))
     columns = list(dict.fromkeys(_condition(cell) for cell in cells))
     height = 0.9 + len(MEASURES) * (0.35 + 0.32 * len(rows))
-    figure = Figure(figsize=(2.2 + 0.85 * len(columns), height), layout='constrained')
+    figure = Figure(figsize=(2.2 + 0.8 * len(columns), height), layout='constrained')
     panels = figure.subplots(len(MEASURES), 1, sharex=True, squeeze=False)[:, 0]
     for axes, measure in zip(panels, MEASURES, strict=True):
         values = np.full((len(rows), len(columns)), np.nan)
@@ -88,8 +89,7 @@ def matrix_figure(path: Path, cells: Cells) -> None:
         axes.set_yticks(range(len(rows)), rows)
     names = [name.replace(', ', ',\n') for name in columns]
     panels[-1].set_xticks(range(len(columns)), names)
-    panels[-1].set_xlabel('tested in')
-    figure.supylabel('trained in', fontsize='medium')
+    panels[-1].set_xlabel('tested in; rows: trained in')
     save(figure, path)
 
 
