@@ -74,6 +74,7 @@ def made(tmp_path_factory, gardens, small_network):  # noqa: F811
     return out, reproduce_light(out, CONFIG, PLAN)
 
 
+@pytest.mark.slow
 def test_each_training_is_tested_in_each_light(made):
     _, cells = made
     names = [(cell['trained'], cell['light'], cell['season']) for cell in cells]
@@ -86,6 +87,7 @@ def test_each_training_is_tested_in_each_light(made):
     assert day['retrieval']['mean_m'] < 1.0 and day['retrieval']['heading_deg'] < 20
 
 
+@pytest.mark.slow
 def test_a_known_transform_is_used_instead_of_a_fit(made):
     out, cells = made
     model, drive = PlaceModel.load(out / 'day.npz'), out / 'test_evening_summer'
@@ -97,6 +99,7 @@ def test_a_known_transform_is_used_instead_of_a_fit(made):
     assert evaluate(model, drive, transform=away).scores['sfa']['mean'] > 90
 
 
+@pytest.mark.slow
 def test_the_test_drive_is_the_same_in_any_light(made):
     out, _ = made
     truths = []
@@ -106,6 +109,7 @@ def test_the_test_drive_is_the_same_in_any_light(made):
     assert np.array_equal(*truths)
 
 
+@pytest.mark.slow
 def test_results_are_written_as_json_table_and_figure(made):
     out, cells = made
     assert json.loads((out / 'matrix.json').read_text())['cells'] == cells
@@ -120,6 +124,7 @@ def never(*_args, **_named):
     raise AssertionError('done again')
 
 
+@pytest.mark.slow
 def test_what_is_finished_is_not_done_again(made, monkeypatch):
     out, cells = made
     for step in ('simulate', 'train', 'evaluate'):
@@ -127,6 +132,7 @@ def test_what_is_finished_is_not_done_again(made, monkeypatch):
     assert reproduce_light(out, CONFIG, PLAN) == cells
 
 
+@pytest.mark.slow
 def test_an_interrupted_matrix_goes_on_with_the_missing_cell(made, monkeypatch):
     out, cells = made
     file = out / 'matrix.json'
@@ -137,6 +143,7 @@ def test_an_interrupted_matrix_goes_on_with_the_missing_cell(made, monkeypatch):
     assert reproduce_light(out, CONFIG, PLAN) == cells
 
 
+@pytest.mark.slow
 def test_results_of_other_settings_are_left_alone(made):
     out, _ = made
     before = (out / 'matrix.json').read_bytes()
