@@ -98,7 +98,7 @@ class Memory(NamedTuple):
     `support` counts accepted images since the last start, `rejected` those outside the gate in a
     row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
     images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`
-    outlives restarts.
+    and `scatter`, the usual squared distance of images over that expected, outlive restarts.
     """
 
     support: int = 0
@@ -111,6 +111,7 @@ class Memory(NamedTuple):
     evidence: tuple[Evidence, ...] = ()
     update: Update | None = None
     trust: Trust = Trust()
+    scatter: float = 1.0
 
 
 class Belief(NamedTuple):

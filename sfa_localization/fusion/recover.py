@@ -137,6 +137,7 @@ class Recovery:
             accepted_m=belief.traveled_m,
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
             trust=moved(trust, belief.traveled_m) if established or trust.moves else Trust(),
+            scatter=belief.memory.scatter,
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
         return placed._replace(memory=memory)
