@@ -26,8 +26,9 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)
 
-robustness: $(READY)  ## run the tests of test/README.md: bad input, time, loss, overload
+robustness: $(READY)  ## run the tests of test/README.md; print what each fault of a drive did
 	$(PY) -m pytest -m robustness $(ARGS)
+	PYTHONPATH=.:test $(PY) -m robustness
 
 fuzz: $(READY)  ## 10,000 hostile messages, models, bags, YAML and image files each (ARGS='--kinds bags')
 	$(PY) test/benchmarks/fuzz.py $(ARGS)
