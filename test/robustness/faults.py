@@ -25,6 +25,8 @@ DOWN_S = 2.0
 """A node that was killed is back after so many seconds."""
 STANDING_HZ = 5
 """Rate of pictures where the robot stands."""
+ONE_IMAGE_S = 0.25
+"""By rounding, another machine may reject an image earlier or later."""
 SLIP_S, DARK_S = 8.0, 4.0
 """How long wheels slip, and how long a kidnapped robot sees nothing."""
 CARRIED_S = 9.0
@@ -76,6 +78,10 @@ class Fault:
     make: object
     ends_s: float = UNTIL_S
     allowed_s: float = 0.0
+
+    def allows(self, false_s):
+        """Whether so many seconds LOCALISED and wrong are not too long."""
+        return false_s <= (self.allowed_s + ONE_IMAGE_S if self.allowed_s else 0.0)
 
     def messages(self, world):
         """The messages in the order in which they arrive."""

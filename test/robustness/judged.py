@@ -93,16 +93,22 @@ def recovery_s(seconds, right, ends_s):
     return math.inf
 
 
-def table(verdicts):
-    """The rows as text, by name of the fault."""
-    width = max(map(len, verdicts))
-    head = f'{"fault":{width}s}  max error  mean error  false LOCALISED  LOCALISED  right again'
-    rows = [
-        f'{name:{width}s}  {one.max_m:7.2f} m  {one.mean_m:8.2f} m  {one.false_s:13.1f} s'
-        f'  {one.localised_s:7.1f} s  {shown(one.recovered_s):>11s}'
-        for name, one in verdicts.items()
-    ]
-    return '\n'.join([head, *rows])
+def head(width):
+    """The line above the rows, for names of a width."""
+    return f'{"fault":{width}s}  max error  mean error  false LOCALISED  LOCALISED  right again'
+
+
+def row(name, one, width):
+    """A verdict as text."""
+    return (
+        f'{name:{width}s}  {meters(one.max_m):>9s}  {meters(one.mean_m):>10s}'
+        f'  {one.false_s:13.1f} s  {one.localised_s:7.1f} s  {shown(one.recovered_s):>11s}'
+    )
+
+
+def meters(error):
+    """An error in words."""
+    return '-' if math.isnan(error) else f'{error:.2f} m'
 
 
 def shown(seconds):
