@@ -388,7 +388,7 @@ SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
 def small_network() -> Iterator[None]:
     """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network, 'STANDARD_LAYERS', {'160x16': (1, (SMALL_LAYER,))})
+        patch.setattr(network, 'STANDARD_NETWORKS', {(16, 160): (SMALL_LAYER,)})
         patch.setattr(selection, '_SEARCH_POINTS', 60)
         patch.setattr(selection, 'INDUCING_POINTS', 100)
         yield
