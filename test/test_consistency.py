@@ -192,6 +192,16 @@ def test_a_kidnapped_robot_is_trusted_again_after_two_meters():
     assert wrong_and_sure(found) <= 2  # until a third image does not match
 
 
+def test_a_start_that_was_wrong_is_trusted_again_after_two_meters():
+    drive = Drive(seconds=20, **NOISY)
+    drive.seen[0, :2] += 6.0
+    found = fed(drive)
+    placed = next(k for k, (_, error, _) in enumerate(found) if error < 1.0)
+    doubted = [status.level for status, *_ in found[placed : placed + 15]]
+    assert set(doubted) == {Level.DEGRADED}
+    assert found[placed + 30][0].level is Level.LOCALISED
+
+
 def test_driving_without_images_confirms_nothing():
     """Kidnapped, found again, and then blind: 2.4 m within the time that images may be silent."""
     drive = Drive(seconds=40, **NOISY)

@@ -52,7 +52,7 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
 
 
 def moved(trust: Trust, traveled_m: float) -> Trust:
-    """The trust after images moved an established estimate."""
+    """The trust after images moved the estimate, however young."""
     return Trust(moves=trust.moves + 1, moved_m=traveled_m)
 
 
