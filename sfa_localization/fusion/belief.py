@@ -82,7 +82,7 @@ class Evidence(NamedTuple):
 class Trust(NamedTuple):
     """Images over the last meters, and how they contradict the odometry's motion, '' if not.
 
-    `moves` counts how often images moved an established estimate lately, `moved_m` is the distance
+    `moves` counts how often images moved the estimate elsewhere lately, `moved_m` is the distance
     traveled when they did it last.
     """
 
