@@ -117,12 +117,14 @@ def evaluate(
     watch: WatchConfig | None = None,
     progress: bool = False,
     smooth: bool = False,
+    transform: RigidTransform | None = None,
 ) -> Evaluation:
     """Judge a model on a drive with ground truth, by what sfa_node and ekf_node would publish.
 
     The transform to the truth is fitted on `align_bag`, a training drive; without one, on the
-    drive itself. `smooth` adds the filter's estimates smoothed after the drive. Unusable images
-    count as skipped observations. Raises BagError or DataError, also without ground truth.
+    drive itself; a known `transform`, of an earlier evaluation, is used as it is. `smooth` adds the
+    filter's estimates smoothed after the drive. Unusable images count as skipped observations.
+    Raises BagError or DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
     trained = None
@@ -130,8 +132,9 @@ def evaluate(
         trained = _replay(align_bag, Localizer(model, config, watch), recipe, progress)
     kind = Smoother if smooth else PoseFilter
     drive = _replay(bag, Localizer(model, config, watch, kind), recipe, progress)
+    aligned_on = 'an earlier evaluation' if transform else str(align_bag or bag)
     reference = trained or drive
-    transform = fit_transform(reference.truth, reference.tracks['sfa'].poses)
+    transform = transform or fit_transform(reference.truth, reference.tracks['sfa'].poses)
     estimates = _in_truth(drive, transform)
     if trained is not None:
         estimates['supervised'] = _supervised(model, trained, drive)
@@ -141,7 +144,7 @@ def evaluate(
         _scores(drive, estimates, transform),
         {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])},
         drive.features,
-        str(align_bag or bag),
+        aligned_on,
         transform,
     )
 

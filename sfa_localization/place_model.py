@@ -23,9 +23,13 @@ from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Image
-from sfa_localization.data.threads import one_core
 from sfa_localization.features.agreement import Agreement, disagreement
-from sfa_localization.features.image_features import layer_harmonics, slow_features
+from sfa_localization.features.image_features import (
+    REFINING_LAYER,
+    layer_harmonics,
+    slow_features,
+    spectrum,
+)
 from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
 from sfa_localization.features.network import (
     Architecture,
@@ -36,37 +40,36 @@ from sfa_localization.features.network import (
 )
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
-from sfa_localization.metric.expansions import MetricMap
-from sfa_localization.metric.fast_expansions import Predictor, fast_map
+from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
+from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 4
+VERSION = 5
 _AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
-_METRIC = [
-    {
-        'weights': ArrayRule('M2'),
-        'spread': ArrayRule('MR'),
-        'sway': ArrayRule('MS2'),
-        'noise_m': ArrayRule('', all_positive=True),
-        'inflation': ArrayRule('', all_positive=True),
-    }
-]
-_BASIS = [
-    {
-        'kind': ArrayRule('', 'U'),
-        'scale': ArrayRule('K'),
-        'points': ArrayRule('MK'),
-        'whiten': ArrayRule('MM'),
-        'noise': ArrayRule('', all_positive=True),
-    },
-    {
-        'kind': ArrayRule('', 'U'),
-        'center': ArrayRule('M'),
-        'turn': ArrayRule('MR'),
-        'ridge': ArrayRule('P'),
-        'features': ArrayRule('', 'i', all_positive=True),
-    },
-]
+_PROCESS = {
+    'kind': ArrayRule('', 'U'),
+    'scale': ArrayRule('K'),
+    'points': ArrayRule('MK'),
+    'linear': ArrayRule('MC'),
+    'constant': ArrayRule('C'),
+    'factor': ArrayRule('T'),
+    'in_double': ArrayRule('', 'b'),
+    'scalars': ArrayRule('3', all_positive=True),
+}
+_MONOMIALS = {
+    'kind': ArrayRule('', 'U'),
+    'weights': ArrayRule('M2'),
+    'spread': ArrayRule('MR'),
+    'sway': ArrayRule('MS2'),
+    'noise_m': ArrayRule('', all_positive=True),
+    'inflation': ArrayRule('', all_positive=True),
+}
+_BASIS = {
+    'center': ArrayRule('M'),
+    'turn': ArrayRule('MR'),
+    'ridge': ArrayRule('P'),
+    'features': ArrayRule('', 'i', all_positive=True),
+}
 SCHEMA: Schema = {
     'network/#/': [
         {
@@ -77,8 +80,8 @@ SCHEMA: Schema = {
             'delta': ArrayRule('T'),
         }
     ],
-    'metric/': _METRIC,
-    'metric/basis_': _BASIS,
+    'metric/': [_PROCESS, _MONOMIALS],
+    'metric/basis_': [_BASIS],
     'keyframes/': [
         {
             'textures': ArrayRule('NRC', 'i'),
@@ -95,9 +98,18 @@ SCHEMA: Schema = {
             'feature_scale': ArrayRule('K', all_positive=True),
             'harmonic_scale': ArrayRule('J', all_positive=True),
             'weights': ArrayRule('M', 'c'),
-            'uncertainty': ArrayRule('MM', 'c'),
+            'factor': ArrayRule('T', 'c'),
             'scalars': ArrayRule('3', positive=(0, 1)),
             'calibration': ArrayRule('2', positive=(0,)),
+        }
+    ],
+    'refinement/': [
+        {
+            'mean': ArrayRule('D'),
+            'axes': ArrayRule('DK'),
+            'scalars': ArrayRule('2', positive=(1,)),
+            **{f'metric_{name}': rule for name, rule in _PROCESS.items()},
+            **{f'agreement_{name}': rule for name, rule in _AGREEMENT[0].items()},
         }
     ],
     'header': [{'': ArrayRule('', 'U')}],
@@ -155,7 +167,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass and keyframes, learned from one place.
+    """Network, metric map, compass, refinement and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
@@ -163,7 +175,7 @@ class PlaceModel:
     """
 
     network: Network
-    metric: MetricMap
+    metric: Predictor
     panorama: PanoramaConfig
     keyframes: Keyframes
     agreement: Agreement
@@ -172,7 +184,7 @@ class PlaceModel:
     heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
-    _fast: list[Predictor] = field(default_factory=list, init=False, repr=False, compare=False)
+    refinement: Refinement | None = None
 
     @property
     def camera_delay_s(self) -> float:
@@ -200,11 +212,15 @@ class PlaceModel:
         maps = self.network.maps(panoramas)
         slow = slow_features(maps)
         spread = disagreement(maps[-1])
-        positions, covariances = self._predictor().predict(slow)
+        positions, covariances = self.metric.predict(slow)
         covariances = covariances * self.agreement.factor(spread)[:, None, None]
         yaw, yaw_variance = self._headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
+        if self.refinement is not None:
+            positions, covariances = self.refinement.refine(
+                spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, covariances)
+            )
         joined = _joined(covariances, yaw_variance)
         matches = map(self._matched, panoramas, positions)
         return [
@@ -214,13 +230,6 @@ class PlaceModel:
 
     def _matched(self, panorama: Image, guess: Array) -> Match:
         return self.keyframes.match(panorama, guess if np.isfinite(guess).all() else None)
-
-    def _predictor(self) -> Predictor:
-        """The metric map's fastest form, compiled once."""
-        if not self._fast:
-            with one_core():
-                self._fast.append(fast_map(self.metric))
-        return self._fast[0]
 
     def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         if self.compass is None:
@@ -253,8 +262,9 @@ class PlaceModel:
         Raises ModelError where the results are not finite, or certain beyond reason.
         """
         check_weights(self.network)
-        if self.compass is not None and abs(self.compass.sign) != 1.0:
-            raise ModelError('its compass turns neither way')
+        turned = [part for part in (self.compass, self.refinement) if part is not None]
+        if any(abs(part.sign) != 1.0 for part in turned):
+            raise ModelError('it turns neither way')
         height, width = self.network.architecture.size
         if (height, width) != (self.panorama.height, self.panorama.width):
             raise ModelError('network and panorama are of different sizes')
@@ -296,14 +306,18 @@ class PlaceModel:
             arrays |= _prefixed('compass/', self.compass.to_arrays())
         if self.yaw_agreement is not None:
             arrays |= _prefixed('yaw_agreement/', self.yaw_agreement.to_arrays())
+        if self.refinement is not None:
+            arrays |= _prefixed('refinement/', self.refinement.to_arrays())
         return arrays
 
     @classmethod
     def _from_arrays(cls, arrays: Arrays, header: dict[str, Any]) -> PlaceModel:
-        compass, yaw_agreement = (_under(arrays, name) for name in ('compass/', 'yaw_agreement/'))
+        compass, yaw_agreement, refinement = (
+            _under(arrays, name) for name in ('compass/', 'yaw_agreement/', 'refinement/')
+        )
         return cls(
             network_from(arrays, header),
-            MetricMap.from_arrays(_under(arrays, 'metric/')),
+            map_from_arrays(_under(arrays, 'metric/')),
             PanoramaConfig(**header['panorama']),
             Keyframes.from_arrays(_under(arrays, 'keyframes/')),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
@@ -312,6 +326,7 @@ class PlaceModel:
             tuple(header['heading_layers']),
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
+            Refinement.from_arrays(refinement) if refinement else None,
         )
 
 
@@ -322,13 +337,13 @@ def _damaged(path: Path, reason: object) -> ModelError:
 def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
     """The network of a model file's arrays and header."""
     spec = dict(header['architecture'])
-    spec['size'] = tuple(spec['size'])
+    spec['size'], spec['grid'] = tuple(spec['size']), tuple(spec['grid'])
     spec['layers'] = tuple(
         Layer(**{**layer, 'field': tuple(layer['field']), 'stride': tuple(layer['stride'])})
         for layer in spec['layers']
     )
     architecture = Architecture(**spec)
-    if sum(name.endswith('/linear') for name in arrays) != len(architecture.layers):
+    if sum(name.endswith('/linear_offset') for name in arrays) != len(architecture.layers):
         raise ModelError('its layers are not those of its weights')
     nodes, deltas = [], []
     for depth in range(len(architecture.layers)):

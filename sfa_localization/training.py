@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a place model from recorded drives: the paper in seven steps; ground truth is never read.
+"""Learn a place model from recorded drives: the paper in eight steps; ground truth is never read.
 
 1  read the drives                            bags/drives.py
 2  train the SFA hierarchy (section 2)        features/network_training.py
@@ -8,7 +8,10 @@
 4  cut the odometry into segments             metric/segments.py
 5  learn the certified map (section 3)        metric/learning.py
 6  learn the compass                          metric/compass_training.py
-7  assemble the place model                   place_model.py
+7  refine the map with turned maps            metric/refinement.py
+8  assemble the place model                   place_model.py
+
+Steps 3 to 6 find the place and the heading by slow features. Step 7 goes beyond the paper.
 """
 
 from __future__ import annotations
@@ -25,11 +28,11 @@ from tqdm import tqdm
 from sfa_localization.bags.drives import ReadingRecipe, image_cache, read_drives
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings as visual_headings
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
-from sfa_localization.features.agreement import Agreement
 from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
 from sfa_localization.features.network import Architecture, Network, standard_architecture
@@ -44,13 +47,24 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
+from sfa_localization.metric.fast_expansions import fast_map
 from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
-from sfa_localization.metric.learning import MetricResult, correlation_along_drive, learn_metric
+from sfa_localization.metric.learning import (
+    MetricResult,
+    correlation_along_drive,
+    learn_metric,
+    left_out_agreement,
+)
+from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
+
+COARSE_POINTS = 700
+"""Inducing points of a first map that is refined: with more, the refined map and the heading are
+no better, and the model file is larger."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +84,7 @@ class Recipe(ReadingRecipe):
 class Trained:
     """The model and the intermediate results of its training, for reports.
 
-    `features` (N, K) of all images, drive after drive.
+    `features` (N, K) of all images, drive after drive; `metric` is that of the finest map.
     """
 
     model: PlaceModel
@@ -148,13 +162,19 @@ def _train_hierarchy(
 def learn_place(
     network: Network, runs: Sequence[Run], recipe: Recipe, progress: bool = False
 ) -> Trained:
-    """Steps 3 to 7: metric map, compass and keyframes for a trained network. Raises DataError."""
+    """Steps 3 to 8: maps, compass and keyframes for a trained network. Raises DataError."""
     images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
-    result = learn_metric(images.slow, segments, recipe.metric, recipe.network.seed)
-    heading = learn_heading(images, segments, result)
-    model = _assemble(network, runs, clocks, recipe, images, segments, result, heading)
+    points = COARSE_POINTS if _refines(recipe.metric, images) else None
+    seed = recipe.network.seed
+    first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
+    heading = learn_heading(images, segments, first)
+    finer = _refine(images, segments, first, heading, recipe)
+    if points is not None and finer is None:
+        first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
+    model = _assemble(network, runs, clocks, recipe, images, segments, first, heading, finer)
+    result = finer.metric if finer else first
     return Trained(model, tuple(runs), images.slow, segments, result, heading)
 
 
@@ -188,6 +208,33 @@ def _cut_odometry(
     return join(parts, [sum(counts[:k]) for k in range(len(runs))])
 
 
+def _refines(config: MetricConfig, images: ImageFeatures) -> bool:
+    """Whether step 7 refines the map, if there is a heading.
+
+    The paper's descent and its monomials stay as they are: they are there for comparison.
+    """
+    article = config.solver == 'paper' or config.metric_map == 'monomials'
+    return images.spectra is not None and not article
+
+
+def _refine(
+    images: ImageFeatures,
+    segments: Segments,
+    first: MetricResult,
+    heading: LearnedHeading | None,
+    recipe: Recipe,
+) -> LearnedRefinement | None:
+    """Step 7, where there are a heading and a layer to refine with."""
+    if heading is None or images.spectra is None or not _refines(recipe.metric, images):
+        return None
+    views, sign, seed = images.disagreement, heading.compass.sign, recipe.network.seed
+    try:
+        return learn_refinement(images.spectra, views, segments, first, sign, recipe.metric, seed)
+    except DataError as error:
+        logger.warning('positions are not refined: %s', error)
+        return None
+
+
 def _assemble(
     network: Network,
     runs: Sequence[Run],
@@ -195,26 +242,23 @@ def _assemble(
     recipe: Recipe,
     images: ImageFeatures,
     segments: Segments,
-    result: MetricResult,
+    first: MetricResult,
     heading: LearnedHeading | None,
+    finer: LearnedRefinement | None,
 ) -> PlaceModel:
-    """Step 7: the model, with its figures of merit."""
+    """Step 8: the model, with its figures of merit."""
     height, width, _ = runs[0].panoramas.shape
-    agreement = Agreement.fit(
-        images.disagreement[result.images],
-        (result.left_out**2).sum(1),
-        result.left_out_variance,
-        axes=2,
-        weight=result.left_out_weight,
-    )
-    clockwise = recipe.panorama.clockwise
-    known = learn_keyframes(runs, images, segments, result, agreement, clockwise)
+    agreement = left_out_agreement(images.disagreement, first)
+    result = finer.metric if finer else first
+    finest = finer.refinement.agreement if finer else agreement
+    known = learn_keyframes(runs, images, segments, result, finest, recipe.panorama.clockwise)
     # Of each run, s; None where the drive does not show it.
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
     quality = _quality(network, images, segments, result, known)
+    quality |= {'features_used': first.map.features, 'refined': finer is not None}
     return PlaceModel(
         network,
-        result.map,
+        fast_map(first.map),
         PanoramaConfig(**{**asdict(recipe.panorama), 'height': height, 'width': width}),
         known.keyframes,
         agreement,
@@ -223,6 +267,7 @@ def _assemble(
         compass_layers(len(network.nodes)) if heading else (),
         {**quality, **(heading.quality if heading else {}), 'camera_delay_s': delays},
         correlation_along_drive(result, segments, TURN_RADIUS_M),
+        finer.refinement if finer else None,
     )
 
 
@@ -243,7 +288,6 @@ def _quality(
         'segments': len(segments),
         'certified': bool(result.certificate.certified),
         'certificate': float(result.certificate.eigenvalue),
-        'features_used': result.map.features,
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
         'keyframes': len(known.keyframes.poses),
         'expected_error_m': result.forecast.expected_m * known.improvement,

@@ -7,7 +7,7 @@ import signal
 import tempfile
 
 import pytest
-from robustness import robustness_table
+from robustness.readme import robustness_table
 
 # Before rclpy is imported by any test; a user's own choice stands.
 _LOGS = tempfile.TemporaryDirectory(prefix='sfa_localization_ros_log_')

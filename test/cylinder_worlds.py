@@ -23,7 +23,7 @@ LAYERS = (
     Layer(field=(2, 3), stride=(1, 1), linear=6, outputs=5),
     Layer(field=(2, 6), stride=(1, 2), linear=6, outputs=4),
 )
-ARCHITECTURE = Architecture(SIZE, 1, 'none', LAYERS)
+ARCHITECTURE = Architecture(SIZE, SIZE, 'none', LAYERS)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ COLUMN_STEP = 4
 """Columns of a picture of PLACE_SIZE that are one rotation step."""
 PLACE_ARCHITECTURE = Architecture(
     PLACE_SIZE,
-    1,
+    PLACE_SIZE,
     'none',
     (
         Layer(field=(4, 8), stride=(4, COLUMN_STEP), linear=10, outputs=8),

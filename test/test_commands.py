@@ -211,6 +211,7 @@ BASE = {
     'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml --trials 10',
     'config': '',
     'demo': '--out {out}/demo',
+    'reproduce': 'light --out {out}/light',
 }
 DAMAGED = {
     'train': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
@@ -229,6 +230,8 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--trajectory': Case('--trajectory curves', another_drive),
         '--seed': Case('--seed 2', another_drive),
         '--world': Case('--world 2', differ(lambda o: o.bag()['pictures'][0])),
+        '--light': Case('--light evening', of_pictures),
+        '--season': Case('--season winter', of_pictures),
         '--area': Case('--area 9x7', lambda a, b: width(b) > width(a), beside='--length 20'),
         '--length': Case('--length 8', lambda a, b: metres(b) > metres(a) + 2),
         '--images': Case('--images raw', lambda a, b: '/image_raw' in b.bag()['topics']),
@@ -381,6 +384,12 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--seed': Case('--seed 4', noted(('seed', 4))),
         '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
     },
+    'reproduce': {
+        '--out': Case('--out {out}/elsewhere', written('elsewhere/matrix.png')),
+        '--quick': Case('--quick', noted(('area', (8.0, 8.0)))),
+        '--world': Case('--world 3', noted(('world', 3))),
+        '--seed': Case('--seed 40', noted(('seed', 40), ('seed', 41))),
+    },
 }
 SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
 
@@ -389,7 +398,7 @@ SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
 def small_network() -> Iterator[None]:
     """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network, 'STANDARD_LAYERS', {'160x16': (1, (SMALL_LAYER,))})
+        patch.setattr(network, 'STANDARD_NETWORKS', {(16, 160): (SMALL_LAYER,)})
         patch.setattr(selection, '_SEARCH_POINTS', 60)
         patch.setattr(selection, 'INDUCING_POINTS', 100)
         yield
@@ -397,12 +406,12 @@ def small_network() -> Iterator[None]:
 
 @pytest.fixture(scope='module', autouse=True)
 def gardens() -> Iterator[None]:
-    """Build a garden once for all drives in it: its seed and its area make it."""
+    """Build a garden once for all drives in it: seed, area, light and season make it."""
     made: dict[Any, simulation.Garden] = {}
     garden = simulation.Garden
 
     def again(seed: int, settings: SimulationConfig) -> simulation.Garden:
-        place = (seed, settings.area)
+        place = (seed, settings.area, settings.light, settings.season)
         if place not in made:
             made[place] = garden(seed, settings)
         return made[place]
@@ -414,12 +423,14 @@ def gardens() -> Iterator[None]:
 
 @contextlib.contextmanager
 def watched(name: str, notes: list[Any]) -> Iterator[None]:
-    """Note what no output shows; the demo's minutes of work are left out."""
+    """Note what no output shows; minutes of work of `demo` and `reproduce` are left out."""
     with pytest.MonkeyPatch.context() as patch:
         if name == 'play':
             watch_play(patch, notes)
         if name == 'demo':
             watch_demo(patch, notes)
+        if name == 'reproduce':
+            watch_reproduce(patch, notes)
         if name == 'train':
             watch_cluster(patch, notes)
         yield
@@ -467,6 +478,26 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     patch.setattr(demonstration, 'run_live', run_live)
     patch.setattr(demonstration, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
     patch.setattr(demonstration, '_write_results', lambda *_args: None)
+
+
+def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
+    """Drives are noted instead of simulated, and none is trained on or judged."""
+    from sfa_localization.commands import light_matrix
+
+    def simulated(settings, out, panorama, progress):
+        notes.extend((name, getattr(settings, name)) for name in ('world', 'seed', 'area'))
+
+    def judged(_model, _bag, _align_bag, transform):
+        return {'sfa': {'mean_m': 0.1}, 'localized': 1.0}, transform
+
+    patch.setattr(light_matrix, 'simulate', simulated)
+    patch.setattr(light_matrix, 'train', lambda *_args, **_named: None)
+    patch.setattr(light_matrix.PlaceModel, 'load', lambda _path: None)
+    patch.setattr(light_matrix, '_read', lambda *_args: None)
+    patch.setattr(light_matrix, '_retrieval', lambda _runs: None)
+    patch.setattr(light_matrix, '_slow_alone', lambda *_args: {'mean_m': 0.3})
+    patch.setattr(light_matrix, '_retrieved', lambda *_args: {'mean_m': 0.2})
+    patch.setattr(light_matrix, '_judged', judged)
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:

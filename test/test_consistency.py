@@ -125,10 +125,11 @@ def test_every_move_doubles_the_distance_that_confirms():
     trust = Trust()
     assert doubts(trust, 0.0) == []
     trust = moved(trust, 10.0)
-    assert doubts(trust, 10.5) == ['placed anew 0.5 m ago: driving on confirms it']
+    assert doubts(trust, 10.5) == ['placed anew, confirmed over 0.5 m: driving on confirms it']
     assert doubts(trust, 10.0 + AGREEING_DISTANCE_M) == []
     trust = moved(trust, 20.0)
-    assert 'placed anew 3.0 m ago, 2 times in a row: driving on confirms it' in doubts(trust, 23.0)
+    shown = 'placed anew 2 times in a row, confirmed over 3.0 m: driving on confirms it'
+    assert shown in doubts(trust, 23.0)
     assert doubts(trust, 20.0 + 2 * AGREEING_DISTANCE_M) == []
     for _ in range(10):
         trust = moved(trust, 30.0)
@@ -189,6 +190,31 @@ def test_a_kidnapped_robot_is_trusted_again_after_two_meters():
     assert levels[145] is Level.LOCALISED and levels[153] is Level.DEGRADED
     assert levels[156] is Level.DEGRADED and levels[190] is Level.LOCALISED
     assert wrong_and_sure(found) <= 2  # until a third image does not match
+
+
+def test_a_start_that_was_wrong_is_trusted_again_after_two_meters():
+    drive = Drive(seconds=20, **NOISY)
+    drive.seen[0, :2] += 6.0
+    found = fed(drive)
+    placed = next(k for k, (_, error, _) in enumerate(found) if error < 1.0)
+    doubted = [status.level for status, *_ in found[placed : placed + 15]]
+    assert set(doubted) == {Level.DEGRADED}
+    assert found[placed + 30][0].level is Level.LOCALISED
+
+
+def test_driving_without_images_confirms_nothing():
+    """Kidnapped, found again, and then blind: 2.4 m within the time that images may be silent."""
+    drive = Drive(seconds=40, **NOISY)
+    drive.kidnap(150, (5.0, -4.0, 2.0))
+    fused, levels, found_ns = PoseFilter(FilterConfig()), [], None
+    for stamp_ns, kind, index in drive.events(True):
+        if found_ns is None or kind == 0:
+            drive.give(fused, (stamp_ns, kind, index), True)
+        if found_ns is None and fused.counts['measurement: restarted elsewhere']:
+            found_ns = stamp_ns
+        if found_ns is not None and stamp_ns < found_ns + 2_900_000_000:
+            levels.append(fused.status.level)
+    assert len(levels) > 100 and set(levels) == {Level.DEGRADED}
 
 
 def test_constants_are_used(monkeypatch):

@@ -9,11 +9,11 @@ import pytest
 from cylinder_worlds import ARCHITECTURE, SIZE, drive
 from test_rotation import added, assert_equal, brute_force, views
 
-from sfa_localization.data.errors import ConfigError, DataError
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.features import network_training as hierarchy
 from sfa_localization.features.network import (
-    STANDARD_LAYERS,
+    STANDARD_NETWORKS,
     Network,
     Node,
     expand,
@@ -195,15 +195,16 @@ class TestPhotometric:
 class TestArchitecture:
     """The standard network for a size of panorama."""
 
-    @pytest.mark.parametrize('name', STANDARD_LAYERS)
-    def test_found_by_size(self, name):
-        width, height = map(int, name.split('x'))
-        found = standard_architecture((height, width), 'panorama')
-        assert (found.binning, found.layers) == STANDARD_LAYERS[name]
-
-    def test_no_fit_tells_sizes_for_each(self):
-        with pytest.raises(ConfigError, match=r'no standard network fits.*use.*use.*Architecture'):
-            standard_architecture((61, 601), 'panorama')
+    @pytest.mark.parametrize(
+        ('size', 'grid'),
+        [
+            ((60, 600), (30, 300)), ((30, 300), (30, 300)), ((40, 320), (40, 320)),
+            ((61, 601), (30, 300)), ((15, 90), (30, 300)), ((600, 3600), (30, 300)),
+        ],
+    )  # fmt: skip
+    def test_any_size_has_one(self, size, grid):
+        found = standard_architecture(size, 'panorama')
+        assert (found.size, found.grid, found.layers) == (size, grid, STANDARD_NETWORKS[grid])
 
 
 def test_a_single_picture_is_refused():

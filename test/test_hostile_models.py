@@ -67,16 +67,16 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         'not finite',
     ),
     'infinite points': (
-        lambda a: {**a, 'metric/basis_points': spoilt(a['metric/basis_points'], np.inf)},
+        lambda a: {**a, 'metric/points': spoilt(a['metric/points'], np.inf)},
         'not finite',
     ),
     'no variance of a point': (
-        lambda a: {**a, 'metric/noise_m': np.array(0.0)},
-        'metric/noise_m.*must be positive',
+        lambda a: {**a, 'metric/scalars': a['metric/scalars'] * [0, 1, 1]},
+        'metric/scalars.*must be positive',
     ),
     'no variance at all': (
-        lambda a: {**a, 'metric/inflation': np.array(0.0)},
-        'metric/inflation.*must be positive',
+        lambda a: {**a, 'metric/scalars': a['metric/scalars'] * [1, 0, 1]},
+        'metric/scalars.*must be positive',
     ),
     'negative agreement': (
         lambda a: {**a, 'agreement/numbers': np.array([1.0, -1.0, 1.0])},
@@ -103,7 +103,7 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         'compass/feature_scale.*must be positive',
     ),
     'enormous weights': (
-        lambda a: {**a, 'metric/weights': 1e30 * a['metric/weights'] + 1e30},
+        lambda a: {**a, 'metric/linear': 1e30 * a['metric/linear'] + 1e31},
         'beyond 1e',
     ),
     'a place that few images see, out of the world': (
@@ -119,14 +119,36 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
     'transposed': (lambda a: {**a, 'network/0/slow': a['network/0/slow'].T}, 'has the shape'),
     'a row less': (lambda a: {**a, 'compass/features': a['compass/features'][1:]}, 'the shape'),
     'other network': (lambda a: {**a, 'network/0/linear': a['network/0/linear'][:9]}, 'not fit'),
-    'fewer weights': (lambda a: {**a, 'metric/weights': a['metric/weights'][1:]}, 'the shape'),
+    'fewer weights': (lambda a: {**a, 'metric/linear': a['metric/linear'][1:]}, 'the shape'),
     'unknown array': (lambda a: {**a, 'extra/one': np.zeros(3)}, 'extra/one is unknown'),
     'unknown name': (lambda a: {**a, 'compass/one': np.zeros(3)}, 'compass/one is unknown'),
     'a thousandth layer': (
         lambda a: {**a, **{k.replace('/0/', '/999/'): v for k, v in a.items() if '/0/' in k}},
         'damaged',
     ),
-    'unknown map': (lambda a: {**a, 'metric/basis_kind': np.array('?')}, 'damaged'),
+    'unknown map': (lambda a: {**a, 'metric/kind': np.array('?')}, 'damaged'),
+    'no triangle': (lambda a: {**a, 'metric/factor': a['metric/factor'][1:]}, 'damaged'),
+    'a smaller triangle': (lambda a: {**a, 'compass/factor': a['compass/factor'][:3]}, 'damaged'),
+    'a larger triangle': (
+        lambda a: {**a, 'refinement/metric_factor': np.ones(10**6)},
+        'damaged',
+    ),
+    'a refinement that turns neither way': (
+        lambda a: {**a, 'refinement/scalars': a['refinement/scalars'] * [0, 1]},
+        'turns neither way',
+    ),
+    'components of other maps': (
+        lambda a: {
+            **a,
+            'refinement/mean': a['refinement/mean'][1:],
+            'refinement/axes': a['refinement/axes'][1:],
+        },
+        'damaged',
+    ),
+    'fewer components': (
+        lambda a: {**a, 'refinement/axes': a['refinement/axes'][:, 1:]},
+        'the shape',
+    ),
     'huge panorama': (
         lambda a: changed_header(a, panorama={'width': 10**9, 'height': 60}),
         'outside',
@@ -140,7 +162,8 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
     'huge layer': (lambda a: first_layer(a, outputs=10**12), 'sizes are from 1'),
     'text stride': (lambda a: first_layer(a, stride='ab'), 'sizes are from 1'),
     'no layers': (lambda a: architecture(a, layers=[]), 'sizes are from 1'),
-    'no binning': (lambda a: architecture(a, binning=0), 'sizes are from 1'),
+    'no grid': (lambda a: architecture(a, grid=[0, 40]), 'sizes are from 1'),
+    'text grid': (lambda a: architecture(a, grid='ab'), 'sizes are from 1'),
     'NaN limit': (lambda a: first_layer(a, clip=float('nan')), 'clip'),
     'other brightness': (lambda a: architecture(a, normalization='x'), 'normalization'),
     'layers beyond': (lambda a: changed_header(a, heading_layers=[99]), 'damaged'),
@@ -169,7 +192,7 @@ def test_wrong_content_with_a_right_checksum(name, arrays, tmp_path):
 
 def test_other_numbers_than_were_saved(arrays, tmp_path):
     """The zip is whole; only the checksum of the header shows the change."""
-    np.savez(tmp_path / 'bad.npz', **{**arrays, 'metric/noise_m': np.array(9.0)})
+    np.savez(tmp_path / 'bad.npz', **{**arrays, 'metric/scalars': 9 * arrays['metric/scalars']})
     rejected(tmp_path / 'bad.npz', 'checksum')
 
 

@@ -3,11 +3,12 @@
 """Unsupervised metric learning against worlds whose every place is known."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from metric_worlds import (
+    RATE,
     criss_cross,
     drive,
     exact_features,
@@ -24,10 +25,11 @@ from sfa_localization.data.geometry import RigidTransform, align, compose, inver
 from sfa_localization.features.agreement import share_within
 from sfa_localization.metric import alternation, learning, paper_solver, selection
 from sfa_localization.metric.alternation import MetricProblem
-from sfa_localization.metric.expansions import MetricMap, Monomials, monomials
+from sfa_localization.metric.expansions import Monomials, Process, monomials
+from sfa_localization.metric.fast_expansions import fast_map, map_from_arrays
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
-from sfa_localization.metric.phases import certify
+from sfa_localization.metric.phases import certify, refine
 from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate, schur
 from sfa_localization.metric.segments import assignment, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -179,6 +181,64 @@ def test_the_gyros_bias_is_found(monkeypatch):
     assert blind.yaw_bias == pytest.approx([0.0])
 
 
+BIASES = np.array([1.4e-3, -2e-3, 1e-3, 3e-3])
+"""rad/s, of one minute each."""
+
+
+def changing_drive(make):
+    """Of 200 s, with a bias that changes every minute."""
+    twists, start = meander(200.0, seed=4)
+    return make(twists, start=start, bias=np.repeat(BIASES, 60 * RATE)[: len(twists) + 1])
+
+
+def test_a_changing_bias_is_found():
+    run = changing_drive(partial(noisy_drive, seed=4))
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    one = cut(run.odometry, run.stamps_ns, ANY)
+    spreads = []
+    for segments in (one, join([one], [0])):
+        result = learn_metric(features, segments, GP)
+        images, yaw = headings(result, segments)
+        spreads.append(wrap_angle(yaw - in_odometry_frame(run)[images, 2]).std())
+    assert result.yaw_bias == pytest.approx(BIASES, abs=4e-4)
+    assert result.certificate.certified
+    assert spreads[1] < 0.7 * spreads[0]
+
+
+def test_a_changing_bias_does_not_turn_the_map():
+    run = changing_drive(drive)
+    segments = join([cut(run.odometry, run.stamps_ns, ANY)], [0])
+    result = learn_metric(exact_features(run.poses), segments, EXACT)
+    images, yaw = headings(result, segments)
+    truth = in_odometry_frame(run)[images]
+    assert np.abs(wrap_angle(yaw - truth[:, 2])).max() < np.deg2rad(0.2)
+    assert np.abs(positions(result, segments)[1] - truth[:, :2]).max() < 0.005
+
+
+def test_the_curvature_is_the_change_of_the_slope():
+    """Of the least cost by the biases, where origins and directions follow."""
+    run = changing_drive(partial(noisy_drive, seed=4))
+    segments = join([cut(run.odometry, run.stamps_ns, ANY)], [0])
+    problem = MetricProblem.of(garden_features(run.poses[:, :2], noise=0.05), segments, GP)
+    basis = Process.fit(problem.features, np.full(12, 0.3), 0.1, 100)
+    fit = problem.fit(basis, rounds=1)
+    form = dataclasses.replace(fit.form(fit.elimination), bias_std=0.003)
+
+    def follow(bias):
+        h, origins = schur(form.system(bias))
+        z = refine(h, fit.solution.z)
+        return np.concatenate([origins @ z, z])
+
+    changes = [
+        (form.slope(b + unit, follow(b + unit)) - form.slope(b - unit, follow(b - unit))) / 2e-5
+        for b in (fit.solution.bias,)
+        for unit in 1e-5 * np.eye(4)
+    ]
+    curvature = form.curvature(fit.solution.bias, follow(fit.solution.bias))
+    assert np.allclose(curvature, changes, rtol=1e-4, atol=1e-6 * np.max(changes))
+    assert np.linalg.eigvalsh(curvature)[0] > 0
+
+
 def noisy_inputs():
     _, segments, features, _ = noisy_result()
     return features, segments
@@ -258,14 +318,18 @@ def test_left_out_errors_exceed_those_of_the_fit():
 def test_the_same_seed_gives_the_same_bytes():
     _, _, _, result = noisy_result()
     again = learn_metric(*noisy_inputs(), GP)
-    for name, array in result.map.to_arrays().items():
-        assert array.tobytes() == again.map.to_arrays()[name].tobytes(), name
+    arrays = fast_map(again.map).to_arrays()
+    for name, array in fast_map(result.map).to_arrays().items():
+        assert array.tobytes() == arrays[name].tobytes(), name
 
 
 def test_arrays_bring_back_the_map():
     _, _, features, result = noisy_result()
-    again = MetricMap.from_arrays(result.map.to_arrays())
-    assert np.array_equal(again.predict(features)[0], result.map.predict(features)[0])
+    fast = fast_map(result.map)
+    again = map_from_arrays(fast.to_arrays())
+    for one, other in zip(again.predict(features), fast.predict(features), strict=True):
+        assert np.array_equal(one, other)
+    assert np.allclose(fast.predict(features)[0], result.map.predict(features)[0], atol=1e-6)
 
 
 def test_two_runs_share_one_map():
@@ -277,7 +341,8 @@ def test_two_runs_share_one_map():
     images, found = positions(result, segments)
     frame = align(found, places[images, :2])
     assert errors(frame.apply(found), places[images, :2]).mean() < 0.2
-    assert len(result.yaw_bias) == 2
+    minutes = [np.ptp(r.stamps_ns) / 60e9 for r in (one, two)]
+    assert len(result.yaw_bias) == np.ceil(minutes).sum()
     assert np.array_equal(np.flatnonzero(assignment(segments, len(places)) >= 0), np.sort(images))
 
 
@@ -295,7 +360,7 @@ def test_a_mirrored_map_is_told_by_the_turns_and_not_certified():
 
     def problem(turns):
         links = Links.of(without(segments, *(LINKS[1:] if turns else LINKS)))
-        form = QuadraticForm(elimination.gram, links, stack.run, 1e-4, 0.0)
+        form = QuadraticForm(elimination.gram, links, stack.period, 1e-4, 0.0)
         return schur(form.system(np.zeros(1)))[0]
 
     # Without turns the mirror image is as good, and as proven, as the truth.
@@ -382,8 +447,8 @@ def test_an_unproven_map_is_rejected(monkeypatch):
     """Odometry that contradicts the images so is hard to make; the proof is taken away."""
     choose = learning.choose
 
-    def unproven(problem):
-        fit = choose(problem)
+    def unproven(*choice):
+        fit = choose(*choice)
         certificate = dataclasses.replace(fit.solution.certificate, eigenvalue=-1.0)
         solution = dataclasses.replace(fit.solution, certificate=certificate)
         return dataclasses.replace(fit, solution=solution)

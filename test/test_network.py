@@ -19,8 +19,9 @@ from sfa_localization.features.network import (
     expand,
     input_map,
     linear_stage,
+    resampled,
 )
-from sfa_localization.features.network import STANDARD_LAYERS as STANDARD
+from sfa_localization.features.network import STANDARD_NETWORKS as STANDARD
 
 
 def random_network(architecture: Architecture, seed: int = 0) -> Network:
@@ -43,12 +44,18 @@ def pictures(size: tuple[int, int], count: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ('name', 'size', 'rotations', 'rows'),
-    [('600x60', (60, 600), 60, [30, 6, 4, 1]), ('320x40', (40, 320), 64, [40, 9, 2, 1])],
+    ('size', 'grid', 'rotations', 'rows'),
+    [
+        ((60, 600), (30, 300), 60, [30, 6, 4, 1]),
+        ((40, 320), (40, 320), 64, [40, 9, 2, 1]),
+        ((25, 120), (30, 300), 60, [30, 6, 4, 1]),
+        ((150, 720), (30, 300), 60, [30, 6, 4, 1]),
+        ((128, 1024), (30, 300), 60, [30, 6, 4, 1]),
+    ],
 )
-def test_standard_layers(name, size, rotations, rows):
-    binning, layers = STANDARD[name]
-    architecture = Architecture(size, binning, 'panorama', layers)
+def test_standard_layers(size, grid, rotations, rows):
+    layers = STANDARD[grid]
+    architecture = Architecture(size, grid, 'panorama', layers)
     assert (architecture.rotations, architecture.map_rows) == (rotations, rows)
     made = random_network(architecture).maps(pictures(size, 2))
     assert [m.shape for m in made] == [
@@ -56,14 +63,30 @@ def test_standard_layers(name, size, rotations, rows):
     ]
 
 
+def scene(rows: int, columns: int) -> np.ndarray:
+    """The same smooth panorama in any size."""
+    elevation = (np.arange(rows) + 0.5)[:, None] / rows
+    azimuth = 2 * np.pi * (np.arange(columns) + 0.5) / columns
+    waves = (np.sin(azimuth), np.cos(2 * azimuth) * elevation, np.sin(3 * azimuth) + elevation)
+    image = np.stack([120 + 40 * wave + 0 * elevation for wave in waves], axis=2)
+    return image.round().astype(np.uint8)
+
+
 @pytest.mark.parametrize('normalization', NORMALIZATIONS)
-@pytest.mark.parametrize('name', STANDARD)
-def test_maps_turn_with_the_robot(name, normalization):
-    binning, layers = STANDARD[name]
-    width, height = map(int, name.split('x'))
-    architecture = Architecture((height, width), binning, normalization, layers)
-    network, images = random_network(architecture), pictures((height, width), 2)
-    step = binning * layers[0].stride[1]
+@pytest.mark.parametrize(
+    ('size', 'grid'),
+    [
+        ((60, 600), (30, 300)),
+        ((40, 320), (40, 320)),
+        ((25, 120), (30, 300)),
+        ((150, 720), (30, 300)),
+    ],
+)
+def test_maps_turn_with_the_robot(size, grid, normalization):
+    layers = STANDARD[grid]
+    network = random_network(Architecture(size, grid, normalization, layers))
+    images = pictures(size, 2)
+    step = size[1] * layers[0].stride[1] // grid[1]
     turned = network.maps(np.roll(images, 7 * step, axis=2))
     for one, other in zip(network.maps(images), turned, strict=True):
         assert np.allclose(np.roll(one, 7, axis=2), other, atol=1e-5)
@@ -102,7 +125,7 @@ def test_results_stay_when_the_network_is_used_again():
 
 def test_outputs_are_clipped():
     layer = Layer((4, 8), (4, 4), 6, 5, clip=0.01)
-    network = random_network(Architecture(SIZE, 1, 'none', (layer,)))
+    network = random_network(Architecture(SIZE, SIZE, 'none', (layer,)))
     assert np.abs(network.maps(pictures(SIZE, 1))[0]).max() == pytest.approx(0.01)
 
 
@@ -126,17 +149,36 @@ def test_linear_stage_is_the_product_of_whole_fields(depth):
 
 
 class TestPreparing:
-    """Binning and normalization."""
+    """Resampling and normalization."""
 
-    def architecture(self, normalization: str, binning: int = 1) -> Architecture:
-        layer = Layer((12 // binning, 8), (1, 4), 6, 5)
-        return Architecture(SIZE, binning, normalization, (layer,))
+    def architecture(self, normalization: str, grid: tuple[int, int] = SIZE) -> Architecture:
+        layer = Layer((grid[0], 8), (1, 4), 6, 5)
+        return Architecture(SIZE, grid, normalization, (layer,))
 
-    def test_binning_averages_squares(self):
+    def test_too_many_pixels_are_averaged(self):
         images = pictures(SIZE, 1)
-        binned = input_map(images, self.architecture('none', 2)).reshape(6, 24, 3)
+        smaller = input_map(images, self.architecture('none', (6, 24))).reshape(6, 24, 3)
         mean = images[0].reshape(6, 2, 24, 2, 3).mean((1, 3))
-        assert np.abs((binned + 1) * 128 - mean).max() <= 0.51
+        assert np.abs((smaller + 1) * 128 - mean).max() <= 0.51
+
+    @pytest.mark.parametrize(
+        'size', [(15, 90), (25, 120), (29, 299), (150, 720), (40, 1000), (600, 120)]
+    )
+    def test_a_scene_looks_alike_in_all_sizes(self, size):
+        grid = (30, 300)
+        shown = resampled(scene(*size), grid)
+        assert shown.shape == (*grid, 3)
+        assert np.abs(shown.astype(float) - scene(*grid)).max() < 12
+
+    @pytest.mark.parametrize('columns', [90, 120, 299, 720])
+    def test_the_ends_belong_together(self, columns):
+        image = scene(30, columns)
+        turned = resampled(np.roll(image, columns // 2, axis=1), (30, 300))
+        shift = 300 * (columns // 2) / columns
+        there = resampled(image, (30, 300)).astype(float)
+        frequencies = np.fft.rfftfreq(300)[:, None] * shift
+        back = np.fft.rfft(there, axis=1) * np.exp(-2j * np.pi * frequencies)
+        assert np.abs(np.fft.irfft(back, 300, axis=1) - turned).max() < 6
 
     @pytest.mark.parametrize('gain', [0.8, 0.5])
     def test_gain_does_not_matter(self, gain):
@@ -171,28 +213,25 @@ class TestPreparing:
 
 
 @pytest.mark.parametrize(
-    ('size', 'binning', 'told'),
+    ('grid', 'reason'),
     [
-        ((60, 601), 2, 'use 600 x 60'),
-        ((61, 600), 2, r'use 600 x (60|62)'),
-        ((60, 604), 2, 'use a width of 600 or 610'),
-        ((62, 600), 2, r'layer 1: fields of 10 rows, stride 4, do not fill 31 rows: use 30 or 34'),
-        ((52, 600), 2, r'layer 3'),
-        ((10, 600), 2, r'do not fill 5 rows: use 10 or 14'),
-        ((60, 100), 2, 'wider than the 10 columns'),
+        ((30, 302), 'use a width of 300 or 305'),
+        ((31, 300), r'layer 1: fields of 10 rows, stride 4, do not fill 31 rows: use 30 or 34'),
+        ((26, 300), r'layer 3'),
+        ((5, 300), r'do not fill 5 rows: use 10 or 14'),
+        ((30, 50), 'wider than the 10 columns'),
     ],
 )
-def test_odd_sizes_are_refused_with_those_that_fit(size, binning, told):
-    with pytest.raises(ConfigError, match=told):
-        Architecture(size, binning, 'panorama', STANDARD['600x60'][1])
+def test_odd_grids_are_rejected_with_those_that_fit(grid, reason):
+    with pytest.raises(ConfigError, match=reason):
+        Architecture((60, 600), grid, 'panorama', STANDARD[30, 300])
 
 
-def test_the_sizes_told_fit():
-    layers = STANDARD['600x60'][1]
-    for size in ((60, 600), (60, 610)):
-        Architecture(size, 2, 'panorama', layers)
+def test_the_suggested_grids_fit():
+    for grid in ((30, 300), (30, 305)):
+        Architecture((60, 600), grid, 'panorama', STANDARD[30, 300])
 
 
 def test_fields_hold_whole_strides():
     with pytest.raises(ConfigError, match='no multiple of the stride 4: use 8 or 12'):
-        Architecture(SIZE, 1, 'none', (Layer((4, 10), (4, 4), 6, 5), *LAYERS[1:]))
+        Architecture(SIZE, SIZE, 'none', (Layer((4, 10), (4, 4), 6, 5), *LAYERS[1:]))

@@ -159,6 +159,41 @@ def test_a_long_pause_of_the_recording_is_survived_and_reported():
     assert fused.status.level is Level.LOST
 
 
+@pytest.mark.parametrize('apart_s', [-1e9, -100, -7, 7, 100])
+def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart_s):
+    drive = Drive(seconds=8)
+    fused = known()
+    for stamp_ns, kind, index in drive.events():
+        if kind == 0:
+            drive.give(fused, (stamp_ns, kind, index))
+        else:
+            stamp_ns = int(stamp_ns + apart_s * SECOND)
+            fused.add_measurement(stamp_ns, drive.seen[index, :2], np.eye(2))
+    assert fused.counts['reset'] == fused.counts['clock went back'] == 0
+    assert fused.counts['odometry: used'] == len(drive.stamps_ns)
+    assert drive.error(fused, -1)[0] < 0.1
+    assert fused.status.level is Level.DEGRADED
+    where = 'behind' if apart_s < 0 else 'ahead of'
+    said = f'images are stamped {abs(apart_s):.0f} s {where} the odometry'
+    assert any(said in reason for reason in fused.status.reasons)
+    # Once the clocks agree, all is forgotten.
+    drive.feed(fused, start=8 - 0.11)
+    fused.add_measurement(int(drive.stamps_ns[-1]) + 1, drive.poses[-1, :2], np.eye(2) * 1e-2)
+    assert not any('stamped' in reason for reason in fused.status.reasons)
+
+
+def test_after_a_pause_images_alone_go_on():
+    drive = Drive(seconds=2)
+    fused = known()
+    drive.feed(fused)
+    reasons = [
+        fused.add_measurement(START_NS + (20 + k) * SECOND, [0.0, 0.0], np.eye(2)).reason
+        for k in range(4)
+    ]
+    assert reasons[:2] == ['stamp ahead of the odometry'] * 2
+    assert 'stamp' not in reasons[2] and 'stamp' not in reasons[3]
+
+
 def test_prediction_to_a_stamp_recalls_and_extrapolates():
     drive = Drive(twists=np.tile([1.0, 0.0], (200, 1)))
     fused = known()

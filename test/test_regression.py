@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.metric import fast_expansions
 from sfa_localization.metric.expansions import (
     MetricMap,
     Monomials,
@@ -14,6 +15,7 @@ from sfa_localization.metric.expansions import (
     monomials,
     spread,
 )
+from sfa_localization.metric.fast_expansions import FastProcess, fast_map, map_from_arrays
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.standard_normal((80, 6))
@@ -101,9 +103,31 @@ def metric_map(request):
 
 
 def test_arrays_bring_back_the_same_map(metric_map):
-    again = MetricMap.from_arrays(metric_map.to_arrays())
-    for a, b in zip(metric_map.predict(FEATURES), again.predict(FEATURES), strict=True):
+    saved = fast_map(metric_map)
+    again = map_from_arrays(saved.to_arrays())
+    for a, b in zip(saved.predict(FEATURES), again.predict(FEATURES), strict=True):
         assert np.array_equal(a, b)
+
+
+def test_a_large_process_is_saved_in_single_precision(monkeypatch):
+    """Of a regression, so that the variance is a small difference of large numbers."""
+    basis = Process.fit(FEATURES, np.full(3, 0.2), 1e-4, 60)
+    expanded = basis.expand(FEATURES)
+    precision = expanded.T @ expanded + np.diag(basis.ridge)
+    root = 0.05 * np.linalg.inv(np.linalg.cholesky(precision)).T
+    rng = np.random.default_rng(1)
+    process = MetricMap(basis, rng.standard_normal((61, 2)), root, np.zeros((61, 1, 2)), 0.05, 1.0)
+    exact = FastProcess.of(process, basis)
+    exact_bytes = exact.to_arrays()['factor'].nbytes
+    monkeypatch.setattr(fast_expansions, '_EXACT_POINTS', 10)
+    rounded = FastProcess.of(process, basis)
+    again = map_from_arrays(rounded.to_arrays())
+    assert exact_bytes == 60 * 61 / 2 * 8
+    assert rounded.to_arrays()['factor'].nbytes == exact_bytes / 2
+    places, covariances = again.predict(FEATURES)
+    assert np.array_equal(places, exact.predict(FEATURES)[0])
+    assert np.array_equal(covariances, rounded.predict(FEATURES)[1])
+    assert np.allclose(covariances, exact.predict(FEATURES)[1], rtol=0.01, atol=1e-12)
 
 
 def test_one_row_predicts_as_many_do(metric_map):
@@ -122,12 +146,14 @@ def test_covariances_are_symmetric_and_positive(metric_map):
 def test_too_few_features_are_named(metric_map):
     with pytest.raises(DataError, match='reads 3 slow features, not 2'):
         metric_map.predict(FEATURES[:, :2])
+    with pytest.raises(DataError, match='reads 3 slow features, not 2'):
+        fast_map(metric_map).predict(FEATURES[:, :2])
 
 
 def test_a_missing_array_is_named(metric_map):
-    arrays = metric_map.to_arrays()
-    del arrays['spread']
-    with pytest.raises(ModelError, match='spread'):
-        MetricMap.from_arrays(arrays)
+    arrays = fast_map(metric_map).to_arrays()
+    name = 'spread' if 'spread' in arrays else 'linear'
+    with pytest.raises(ModelError, match=name):
+        map_from_arrays({key: value for key, value in arrays.items() if key != name})
     with pytest.raises(ModelError, match='train the model again'):
-        MetricMap.from_arrays({**metric_map.to_arrays(), 'basis_kind': np.array('spline')})
+        map_from_arrays({**arrays, 'kind': np.array('spline')})

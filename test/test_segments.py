@@ -217,6 +217,18 @@ def test_joined_runs_keep_their_pictures_apart():
     assert (owner == -1).sum() == 2 * len(run.stamps_ns) - both.images.used
 
 
+def test_joined_runs_have_periods_of_their_own(monkeypatch):
+    """Each with a yaw-rate bias; none of them without a segment."""
+    monkeypatch.setattr(segments_module, 'BIAS_PERIOD_S', 20.0)
+    run = drive(np.vstack([straight(12.0), stand(50.0), straight(12.0)]))
+    one = cut(run.odometry, run.stamps_ns, ANY)
+    both = join([one, one], [0, len(run.stamps_ns)])
+    starts = [run.stamps_ns[s.images[0]] * 1e-9 - 1.0 for s in one]
+    own = [0 if start < 20.0 else 1 for start in starts]
+    assert {0, 1} == set(own)
+    assert [s.period for s in both] == own + [2 + period for period in own]
+
+
 @pytest.mark.parametrize(
     ('parts', 'config', 'remedy'),
     [

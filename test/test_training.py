@@ -106,8 +106,47 @@ def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeyp
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
     assert 'too few to learn a compass' in caplog.text
     assert trained.model.compass is None
+    assert trained.model.refinement is None and not trained.model.quality['refined']
     assert 'expected_yaw_error_deg' not in trained.model.quality
     assert 'heading' not in summary(trained)
+
+
+def test_turned_maps_refine_the_map(bag, tmp_path):
+    trained = train([bag], tmp_path / 'model.npz', RECIPE)
+    assert trained.model.quality['refined']
+    assert '4 slow features refined by turned maps' in summary(trained)
+    # What is expected, and reported, is what the finer map was learned from.
+    finest = trained.metric.map, trained.model.refinement.metric
+    places = [each.predict(np.zeros((1, 32)))[0] for each in finest]
+    np.testing.assert_allclose(*places, atol=1e-6)
+
+
+def test_maps_that_cannot_refine_leave_the_first_map(bag, tmp_path, monkeypatch, caplog):
+    """With all its points, and where the heading was learned."""
+    monkeypatch.setattr(training, 'COARSE_POINTS', 30)
+    refined = train([bag], tmp_path / 'model.npz', RECIPE)
+    monkeypatch.setattr(training, 'learn_refinement', _fail)
+    trained = train([bag], tmp_path / 'model.npz', RECIPE)
+    assert 'positions are not refined: the drive cannot fix a map' in caplog.text
+    assert trained.model.compass is not None and trained.model.refinement is None
+    assert 'refined' not in summary(trained)
+    assert len(refined.model.metric.points) == 30
+    assert len(trained.model.metric.points) > 100
+    places = [model.metric.predict(trained.features)[0] for model in (refined.model, trained.model)]
+    assert np.hypot(*np.subtract(*places).T).mean() < 0.1
+
+
+def test_two_layers_have_none_to_refine_with(bag, tmp_path):
+    bottom, _, top = ARCHITECTURE.layers
+    two = replace(ARCHITECTURE, layers=(bottom, replace(top, field=(3, 6))))
+    trained = train([bag], tmp_path / 'model.npz', replace(RECIPE, architecture=two))
+    assert trained.model.compass is not None and trained.model.refinement is None
+
+
+def test_monomials_are_not_refined(bag, tmp_path):
+    metric = replace(RECIPE.metric, metric_map='monomials')
+    trained = train([bag], tmp_path / 'model.npz', replace(RECIPE, metric=metric))
+    assert trained.model.refinement is None
 
 
 def test_a_heading_from_some_of_the_images_only(bag, tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.lib import format as npy
@@ -26,6 +26,7 @@ from sfa_localization.data.files import atomic_write, is_regular
 from sfa_localization.data.rejections import short_line
 
 Arrays = dict[str, NDArray[Any]]
+Number = TypeVar('Number', bound=np.generic)
 
 LARGEST_FILE = 1 << 28
 """Bytes of a file: twenty times a model of a large garden. In use a model is ten times its file."""
@@ -82,6 +83,19 @@ def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
     if not intact:
         raise ModelError(f'{path}: damaged (its checksum is wrong or missing): {remedy} again')
     return arrays
+
+
+def packed(lower: NDArray[Number]) -> NDArray[Number]:
+    """The lower triangle (N (N + 1) / 2,) of a triangular matrix (N, N), row by row."""
+    return np.asarray(lower[np.tril_indices(len(lower))])
+
+
+def unpacked(triangle: NDArray[Number]) -> NDArray[Number]:
+    """The lower triangular matrix (N, N), in Fortran order, of its packed triangle."""
+    size = (round((8 * len(triangle) + 1) ** 0.5) - 1) // 2
+    lower = np.zeros((size, size), triangle.dtype, order='F')
+    lower[np.tril_indices(size)] = triangle
+    return lower
 
 
 def checksum(arrays: Mapping[str, NDArray[Any]], header: Mapping[str, Any]) -> str:

@@ -22,7 +22,12 @@ from sfa_localization.features.network import Network
 from sfa_localization.features.rotation import Map
 
 Complex = NDArray[np.complex128]
+Spectrum = NDArray[np.complex64]
 
+REFINING_LAYER = 1
+"""Layer (0-based), below the top, whose map refines positions: it still holds the heading."""
+HARMONICS = 13
+"""Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
 # Images whose maps and textures are kept for compass and keyframes, however long the drives.
 SAMPLES = 3000
 
@@ -45,6 +50,25 @@ def layer_harmonics(maps: list[Map], layers: tuple[int, ...]) -> Complex:
     return np.concatenate([harmonics(maps[layer]) for layer in layers], axis=1)
 
 
+def spectrum(maps: Map, count: int = HARMONICS) -> Spectrum:
+    """Harmonics 0, 1, ... of maps (T, rows, R, C) over the columns: (T, H, rows * C).
+
+    H is at most `count`, and only harmonics below R / 2, which a turn by a fraction of a column
+    leaves what they are. Scaled so that, with all of an odd R, squared norms are the maps'.
+    """
+    columns = maps.shape[2]
+    order = np.arange(min(count, (columns + 1) // 2))
+    phase = -2j * np.pi / columns * np.outer(order, np.arange(columns))
+    wave = np.exp(phase) * np.sqrt(np.where(order > 0, 2.0, 1.0) / columns)[:, None]
+    parts = wave.astype(np.complex64) @ maps
+    return np.asarray(parts.transpose(0, 2, 1, 3).reshape(len(maps), len(order), -1))
+
+
+def has_refining_layer(network: Network) -> bool:
+    """Whether there is such a layer below the top, whose own maps hardly show the heading."""
+    return len(network.nodes) > REFINING_LAYER + 1
+
+
 @dataclass(frozen=True, slots=True)
 class ImageFeatures:
     """Network outputs for all N images, run after run, and more for a sample of S of them."""
@@ -59,6 +83,8 @@ class ImageFeatures:
     """(S, J) of the layers that the compass reads."""
     textures: NDArray[np.int8]
     """(S, rows, columns) local contrast, for keyframes."""
+    spectra: Spectrum | None
+    """(N, H, J) of the layer that refines positions; None in a network without it."""
     variance_shares: dict[str, list[float]]
     """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
 
@@ -75,6 +101,7 @@ def features_of_runs(
     in_sample = np.zeros(total, bool)
     in_sample[sampled] = True
     slow, spread, harmonic, textures = [], [], [], []
+    spectra: list[Spectrum] = []
     shares = _VarianceShares(network.architecture.outputs)
     start = 0
     for images in (batch for run in runs for batch in run.panoramas.batches(BATCH)):
@@ -85,6 +112,8 @@ def features_of_runs(
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
         textures += [quantized(texture(image)[None]) for image in images[keep]]
+        if has_refining_layer(network):
+            spectra.append(spectrum(maps[REFINING_LAYER]))
         start += len(images)
         on_images(len(images))
     return ImageFeatures(
@@ -93,6 +122,7 @@ def features_of_runs(
         sampled,
         np.concatenate(harmonic),
         np.concatenate(textures),
+        np.concatenate(spectra) if spectra else None,
         shares.result(),
     )
 

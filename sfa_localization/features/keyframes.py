@@ -47,6 +47,9 @@ _COARSE, _CANDIDATES = 15, 64
 LOWEST, LOWEST_SHARE = 0.42, 0.5
 # Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
 _DOUBT = 4.0
+# Beside slow features that agree, a match counts with so many times its variance: the errors of
+# both have those of the map in common, so that the less certain one adds little.
+_CAUTION = 4.0
 # Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
 _APART = 6.0
 
@@ -115,9 +118,10 @@ class Match:
         if self.support < -_DOUBT or distance > _APART:
             return self.pose[:2], float(self.pose[2]), self.covariance
         joint = np.zeros((3, 3))
-        gain = mine @ np.linalg.inv(mine + its)
-        joint[:2, :2] = noise.joint_factor * max(1.0, distance) * gain @ its
-        joint[:2, :2] = (joint[:2, :2] + joint[:2, :2].T) / 2
+        gain = _CAUTION * mine @ np.linalg.inv(_CAUTION * mine + its)
+        rest = np.eye(2) - gain
+        both = gain @ its @ gain.T + rest @ mine @ rest.T
+        joint[:2, :2] = noise.joint_factor * max(1.0, distance) * both
         found, joint[2, 2] = self._combined_yaw(yaw, float(covariance[2, 2]))
         return self.pose[:2] + gain @ (position - self.pose[:2]), found, joint
 

@@ -50,18 +50,18 @@ class Layer:
 class Architecture:
     """Sizes of the network; the weights are in `Network`.
 
-    `size` is (rows, columns) of the panorama; pixels are averaged in squares of `binning`.
-    `normalization` 'panorama' removes the mean and scale of each channel of each image.
+    `size` is (rows, columns) of the panorama, `grid` that of the image it is resampled to for the
+    first layer. `normalization` 'panorama' removes the mean and scale of each channel of each
+    image.
     """
 
     size: tuple[int, int]
-    binning: int
+    grid: tuple[int, int]
     normalization: str
     layers: tuple[Layer, ...]
 
     def __post_init__(self) -> None:
         _check_numbers(self)
-        _check_binning(self.size, self.binning)
         _check_columns(self)
         for depth, rows in enumerate(self.map_rows[:-1]):
             _check_rows(depth, rows, self.layers[depth])
@@ -69,7 +69,7 @@ class Architecture:
     @property
     def rotations(self) -> int:
         """Columns of every map: steps of the simulated rotation."""
-        return self.size[1] // self.binning // self.layers[0].stride[1]
+        return self.grid[1] // self.layers[0].stride[1]
 
     @property
     def fields(self) -> tuple[Field, ...]:
@@ -84,8 +84,8 @@ class Architecture:
 
     @property
     def map_rows(self) -> list[int]:
-        """Rows of the binned image and of every layer's map."""
-        rows = [self.size[0] // self.binning]
+        """Rows of the resampled image and of every layer's map."""
+        rows = [self.grid[0]]
         for receptive in self.fields:
             rows.append(receptive.rows_out(rows[-1]))
         return rows
@@ -110,7 +110,7 @@ LARGEST_SIGNAL = 1 << 28
 
 def _check_numbers(architecture: Architecture) -> None:
     """All sizes must be whole and positive, and the limit of the signals too."""
-    numbers: list[object] = [*architecture.size, architecture.binning]
+    numbers: list[object] = [*architecture.size, *architecture.grid]
     for layer in architecture.layers:
         numbers += [*layer.field, *layer.stride, layer.linear, layer.outputs]
     whole = all(isinstance(n, int) and 1 <= n <= LARGEST_NUMBER for n in numbers)
@@ -122,17 +122,9 @@ def _check_numbers(architecture: Architecture) -> None:
         raise ConfigError(f'unknown normalization: use {", ".join(NORMALIZATIONS)}')
 
 
-def _check_binning(size: tuple[int, int], binning: int) -> None:
-    if size[0] % binning or size[1] % binning:
-        nearest = ' x '.join(str(round(n / binning) * binning) for n in reversed(size))
-        raise ConfigError(
-            f'a panorama of {size[1]} x {size[0]} cannot be binned by {binning}: use {nearest}'
-        )
-
-
 def _check_columns(architecture: Architecture) -> None:
-    """Fields must cover whole strides, and strides the panorama."""
-    first, columns = architecture.layers[0], architecture.size[1] // architecture.binning
+    """Fields must cover whole strides, and strides the resampled image."""
+    first, columns = architecture.layers[0], architecture.grid[1]
     stride = first.stride[1]
     if first.field[1] % stride:
         raise ConfigError(
@@ -141,9 +133,8 @@ def _check_columns(architecture: Architecture) -> None:
         )
     if columns % stride:
         raise ConfigError(
-            f'a panorama {architecture.size[1]} wide does not hold whole strides of {stride} '
-            f'pixels: use a width of '
-            f'{_multiples(architecture.size[1], stride * architecture.binning)}'
+            f'a grid {columns} wide does not hold whole strides of {stride} pixels: use a width of '
+            f'{_multiples(columns, stride)}'
         )
     for depth, receptive in enumerate(architecture.fields):
         if receptive.columns * receptive.spacing > architecture.rotations + receptive.spacing - 1:
@@ -175,35 +166,21 @@ PAPER_LAYERS = (
     Layer(field=(3, 5), stride=(1, 1), linear=32, outputs=32),
     Layer(field=(4, 20), stride=(1, 1), linear=48, outputs=32),
 )
-# 320 x 40 images, the sizes published for this family of networks.
+# 320 x 40 images, as published for this family of networks.
 SMALL_LAYERS = (
     Layer(field=(8, 10), stride=(4, 5), linear=32, outputs=32),
     Layer(field=(6, 14), stride=(3, 7), linear=32, outputs=32),
     Layer(field=(2, 9), stride=(1, 1), linear=32, outputs=32),
 )
 
-STANDARD_LAYERS = {
-    '600x60': (2, PAPER_LAYERS),
-    '300x30': (1, PAPER_LAYERS),
-    '320x40': (1, SMALL_LAYERS),
-}
-"""Size of the panorama -> (binning, layers)."""
+STANDARD_NETWORKS = {(30, 300): PAPER_LAYERS, (40, 320): SMALL_LAYERS}
+"""Grid -> layers; the first is for panoramas of all sizes but those of the others' grids."""
 
 
 def standard_architecture(size: tuple[int, int], normalization: str) -> Architecture:
-    """The first standard network that fits panoramas of (rows, columns).
-
-    Raises ConfigError when none does, naming the sizes that would.
-    """
-    reasons = []
-    for binning, layers in STANDARD_LAYERS.values():
-        try:
-            return Architecture(size, binning, normalization, layers)
-        except ConfigError as error:
-            reasons.append(str(error))
-    raise ConfigError(
-        f'no standard network fits: {"; ".join(reasons)}; or train with an Architecture of your own'
-    )
+    """The standard network for panoramas of (rows, columns), which are resampled to its grid."""
+    grid = size if size in STANDARD_NETWORKS else next(iter(STANDARD_NETWORKS))
+    return Architecture(size, grid, normalization, STANDARD_NETWORKS[grid])
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +225,7 @@ def expand_into(z: Map, out: Map) -> None:
 
 
 def input_map(images: Image, architecture: Architecture) -> Map:
-    """Panoramas (T, H, W, C) uint8 -> binned, normalized map (T, rows, R, stride * C) float32.
+    """Panoramas (T, H, W, C) uint8 -> resampled, normalized map (T, rows, R, stride * C) float32.
 
     Raises ModelError when the images have another size than the network expects.
     """
@@ -259,15 +236,28 @@ def input_map(images: Image, architecture: Architecture) -> Map:
             f'{images.shape[-3]}: set the panorama size of the omnicam node, or train again'
         )
     normalize = _NORMALIZATIONS[architecture.normalization]
-    maps = np.stack([normalize(_binned(image, architecture.binning)) for image in images])
+    maps = np.stack([normalize(resampled(image, architecture.grid)) for image in images])
     return maps.reshape(len(maps), maps.shape[1], architecture.rotations, -1)
 
 
-def _binned(image: Image, binning: int) -> Image:
-    if binning == 1:
+def resampled(image: Image, grid: tuple[int, int]) -> Image:
+    """A panorama (H, W, C) at the size (rows, columns) of a grid; its ends belong together.
+
+    Pixels are averaged where they are too many, and interpolated where they are too few.
+    """
+    rows, columns = grid
+    height, width = min(image.shape[0], rows), min(image.shape[1], columns)
+    if image.shape[:2] != (height, width):
+        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+    if (height, width) == grid:
         return image
-    size = (image.shape[1] // binning, image.shape[0] // binning)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    # As many columns on both sides as give whole columns of the grid.
+    margin = width // math.gcd(width, columns)
+    added = margin * columns // width
+    wrapped = np.pad(image, ((0, 0), (margin, margin), (0, 0)), 'wrap')
+    size = (columns + 2 * added, rows)
+    larger = cv2.resize(wrapped, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(larger[:, added : added + columns])
 
 
 def _unnormalized(image: Image) -> Map:

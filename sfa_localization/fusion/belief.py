@@ -83,7 +83,7 @@ class Evidence(NamedTuple):
 class Trust(NamedTuple):
     """Images over the last meters, and how they contradict the odometry's motion, '' if not.
 
-    `moves` counts how often images moved an established estimate lately, `moved_m` is the distance
+    `moves` counts how often images moved the estimate elsewhere lately, `moved_m` is the distance
     traveled when they did it last.
     """
 
@@ -99,7 +99,7 @@ class Memory(NamedTuple):
     `support` counts accepted images since the last start, `rejected` those outside the gate in a
     row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
     images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`
-    outlives restarts.
+    and `scatter`, the usual squared distance of images over that expected, outlive restarts.
     """
 
     support: int = 0
@@ -112,6 +112,7 @@ class Memory(NamedTuple):
     evidence: tuple[Evidence, ...] = ()
     update: Update | None = None
     trust: Trust = Trust()
+    scatter: float = 1.0
 
 
 class Belief(NamedTuple):

@@ -52,17 +52,19 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
 
 
 def moved(trust: Trust, traveled_m: float) -> Trust:
-    """The trust after images moved an established estimate."""
+    """The trust after images moved the estimate, however young."""
     return Trust(moves=trust.moves + 1, moved_m=traveled_m)
 
 
-def doubts(trust: Trust, traveled_m: float) -> list[str]:
-    """Why an estimate is not trusted, in words."""
+def doubts(trust: Trust, accepted_m: float) -> list[str]:
+    """Why an estimate is not trusted, in words; the last image that fits it came at `accepted_m`
+    of the distance traveled.
+    """
     found = [trust.problem] if trust.problem else []
-    since_m = traveled_m - trust.moved_m
+    since_m = accepted_m - trust.moved_m
     if since_m < _confirming_m(trust):
-        times = f', {trust.moves} times in a row' if trust.moves > 1 else ''
-        found.append(f'placed anew {since_m:.1f} m ago{times}: driving on confirms it')
+        times = f' {trust.moves} times in a row' if trust.moves > 1 else ''
+        found.append(f'placed anew{times}, confirmed over {since_m:.1f} m: driving on confirms it')
     return found
 
 

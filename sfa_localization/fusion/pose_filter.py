@@ -37,6 +37,8 @@ HISTORY_S = 5.0
 TIME_JUMP_S = 60.0
 """A stamp this far ahead needs AHEAD_COUNT like it: one alone is a damaged message."""
 AHEAD_COUNT = 3
+"""So many images in a row beyond the history are no accident: their clock is another one. They are
+used where no odometry comes between them, which then has ended."""
 BACKWARD_COUNT = 5
 """Odometry messages in a row that are too late until the clock is taken to have gone back."""
 DELAY_LIMIT_NS = 500_000_000
@@ -89,6 +91,8 @@ class PoseFilter:
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._backward = 0
         self._ahead = (0, 0)
+        self._apart = (0, 0)
+        self._alone = 0
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
             self._waiting = np.array(self.config.initial_pose), self._initial_covariance()
@@ -145,6 +149,7 @@ class PoseFilter:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
+        self._alone = 0
         event = OdometryEvent(stamp_ns, twist, _finite(pose))
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.twist.omega)
@@ -161,6 +166,7 @@ class PoseFilter:
             factor = self.config.measurement_factor
             fused, noise = read_measurement(value, covariance, factor)
             taken_ns = self._taken(stamp_ns)
+            self._note_apart(taken_ns)
             self._require_place(taken_ns, _MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
@@ -242,7 +248,15 @@ class PoseFilter:
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
-        return status_of(self._history.newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
+        status = status_of(self._history.newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
+        count, apart_ns = self._apart
+        if count < AHEAD_COUNT:
+            return status
+        where = 'ahead of' if apart_ns > 0 else 'behind'
+        seconds = f'{abs(apart_ns) * 1e-9:.0f} s'
+        reason = f'images are stamped {seconds} {where} the odometry: are the clocks synchronized?'
+        level = Level.DEGRADED if status.level is Level.LOCALISED else status.level
+        return Status(level, (*status.reasons, reason))
 
     # Whether a message can be placed in time.
 
@@ -257,6 +271,8 @@ class PoseFilter:
             return
         if stamp_ns > newest + TIME_JUMP_S * 1e9:
             self._require_others_ahead(stamp_ns)
+        if rank == _MEASUREMENT and self._history.newest.odometry_ns is not None:
+            self._require_same_clock(stamp_ns, newest)
         if stamp_ns <= newest and not self._history.reaches(stamp_ns):
             self._behind('too old', stamp_ns, rank)
         elif stamp_ns <= newest and self._history.holds((stamp_ns, rank)):
@@ -286,6 +302,20 @@ class PoseFilter:
             raise DataError('stamp far ahead')
         self._ahead = (0, 0)
         self.counts['gap in time'] += 1
+
+    def _require_same_clock(self, stamp_ns: int, newest_ns: int) -> None:
+        """An image far ahead, of another clock, would make all odometry that follows too old."""
+        if stamp_ns > newest_ns + HISTORY_S * 1e9:
+            self._alone += 1
+            if self._alone < AHEAD_COUNT:
+                raise DataError('stamp ahead of the odometry')
+
+    def _note_apart(self, stamp_ns: int) -> None:
+        """Count images in a row beyond the history, and note how far from the newest message."""
+        newest = self._history.newest_ns
+        apart_ns = 0 if newest is None or stamp_ns <= 0 else stamp_ns - newest
+        beyond = abs(apart_ns) > HISTORY_S * 1e9
+        self._apart = (self._apart[0] + 1, apart_ns) if beyond else (0, 0)
 
     def _behind(self, reason: str, stamp_ns: int, rank: int) -> None:
         """Odometry that comes late time and again means that the clock went back: start anew."""

@@ -131,13 +131,14 @@ class Recovery:
         reason: str,
     ) -> Belief:
         pose = found.pose if isinstance(found, Relocation) else found.value
-        trust, established = belief.memory.trust, belief.memory.support >= ENOUGH_IMAGES
+        trust = belief.memory.trust
         memory = Memory(
             support=1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
-            trust=moved(trust, belief.traveled_m) if established or trust.moves else Trust(),
+            trust=moved(trust, belief.traveled_m) if belief.located or trust.moves else Trust(),
+            scatter=belief.memory.scatter,
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
         return placed._replace(memory=memory)

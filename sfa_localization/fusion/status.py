@@ -52,7 +52,8 @@ def status_of(
         degraded.append(f'position known to {state.position_std:.1f} m only')
     if belief.memory.rejected >= FEW_IMAGES:
         degraded.append(f'{belief.memory.rejected} images in a row did not match')
-    degraded += doubts(belief.memory.trust, belief.traveled_m)
+    # Only images confirm: what was driven since the last one, or before it came late, does not.
+    degraded += doubts(belief.memory.trust, belief.memory.accepted_m)
     degraded += _silences(belief)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'

@@ -31,8 +31,17 @@ STARTS = ('started', 'restarted elsewhere')
 GATE_PROBABILITY = 0.999
 """Share of correct measurements that the gate accepts: one in a thousand is rejected."""
 _GATES = {size: float(chi2.ppf(GATE_PROBABILITY, size)) for size in (2, 3)}
+_MEDIANS = {size: float(chi2.ppf(0.5, size)) for size in (2, 3)}
+OUTLYING_SHARE = 0.8
+"""Images farther off than this share of the usual ones lose weight, with the fourth power of their
+distance: errors of images have heavy tails, and those of neighbors are alike. Of images that err as
+they claim, the fifth that loses weight loses little."""
+SCATTER_STEP = 0.05
+"""Relative change of the usual distance per image: it is learned over about twenty images."""
+LEAST_SCATTER = 0.05
 WIDE_GATE = 4.0
 """A prior of so many times a measurement's variance would follow it anywhere (gain above 0.8)."""
+_OUTLYING = {size: float(chi2.ppf(OUTLYING_SHARE, size)) for size in (2, 3)}
 _OBSERVED = np.eye(3, SIZE)
 _SEEN_BY_POSITION = (X, Y, ERROR, ERROR + 1, ERROR + 2)
 _NOT_SEEN_BY_POSITION = tuple(sorted({*range(SIZE)} - {*_SEEN_BY_POSITION}))
@@ -139,8 +148,22 @@ class Correction:
             evidence=remember(belief, event, accepted=True),
             update=update,
             trust=belief.memory.trust,
+            scatter=_scatter(belief.memory.scatter, d2 / _MEDIANS[event.value.size]),
         )
+        outlying = d2 / (belief.memory.scatter * _OUTLYING[event.value.size])
+        if outlying > 1:
+            lighter = event._replace(white=event.white * outlying**2)
+            mean, covariance, _ = kalman.corrected(belief, belief.covariance, lighter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
+
+
+def _scatter(usual: float, distance: float) -> float:
+    """The running median of the images' squared distances, each over the expected median.
+
+    It is at most 1: an image that claims too little is not believed more than it claims.
+    """
+    step = math.exp(SCATTER_STEP if distance > usual else -SCATTER_STEP)
+    return min(max(usual * step, LEAST_SCATTER), 1.0)
 
 
 def _pulls_far(belief: Belief, event: MeasurementEvent) -> bool:

@@ -38,7 +38,7 @@ LINK_WEIGHT = 2.0
 """Weight of odometry's links over that by their variances: noise of the features, which least
 squares takes for noise of the place, contracts the map, and the links counteract that."""
 YAW_BIAS_STD = 0.003
-"""rad/s: the yaw-rate bias to expect of odometry or a gyroscope, estimated per run."""
+"""rad/s: the yaw-rate bias to expect of odometry or a gyroscope, estimated per period."""
 # m^2 per axis: a start that the first round replaces.
 _FIRST_VARIANCE = 0.04
 # Odometry's own paths are no better than this, however well a map fits them.
@@ -82,7 +82,7 @@ class MetricProblem:
         for _ in range(max(rounds, 1)):
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
             solution = self._solve(elimination, variance * correlation, solution)
-            weights = elimination.weights(solution.coefficients(self.stack.run))
+            weights = elimination.weights(solution.coefficients(self.stack.period))
             predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
             residuals = solution.places(self.stack) - predicted
             before = variance
@@ -100,9 +100,11 @@ class MetricProblem:
     def _solve(
         self, elimination: Elimination, variance: float, before: Solution | None
     ) -> Solution:
-        form = QuadraticForm(elimination.gram, self.links, self.stack.run, variance, YAW_BIAS_STD)
+        form = QuadraticForm(
+            elimination.gram, self.links, self.stack.period, variance, YAW_BIAS_STD
+        )
         if before is None:
-            solution = form.solve(None, np.zeros(self.stack.run[-1] + 1))
+            solution = form.solve(None, np.zeros(self.stack.period[-1] + 1))
         else:
             solution = form.solve(before.z, before.bias)
         return self._unmirrored(solution)
@@ -162,8 +164,8 @@ class MapFit:
 
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
-        links, run = self.problem.links, self.stack.run
-        return QuadraticForm(elimination.gram, links, run, self.link_variance, 0.0)
+        links, period = self.problem.links, self.stack.period
+        return QuadraticForm(elimination.gram, links, period, self.link_variance, 0.0)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:

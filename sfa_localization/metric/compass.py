@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.linalg import blas
 
+from sfa_localization.data.array_files import packed, unpacked
 from sfa_localization.data.geometry import Array, wrap_angle
 
 Complex = NDArray[np.complex128]
@@ -31,9 +32,9 @@ class Compass:
     """A learned heading: inducing images and their weights.
 
     `features` (M, K) and `harmonic` (M, J) of the inducing images, divided by `feature_scale`
-    (K,) and `harmonic_scale` (J,); `weights` (M,) complex; `uncertainty` (M, M) Hermitian, such
-    that the predictive variance is prior - k^H uncertainty k; `calibration` (power, floor) of the
-    variance of yaw; `sign` is -1 where columns grow clockwise.
+    (K,) and `harmonic_scale` (J,); `weights` (M,) complex; `factor` (M, M) lower
+    triangular in Fortran order, such that the predictive variance is prior - |k factor|^2;
+    `calibration` (power, floor) of the variance of yaw; `sign` is -1 where columns grow clockwise.
     """
 
     features: Array
@@ -41,15 +42,17 @@ class Compass:
     feature_scale: Array
     harmonic_scale: Array
     weights: Complex
-    uncertainty: Complex
+    factor: NDArray[np.complex64]
     length: float
     noise: float
     sign: float
     calibration: Array
-    _factors: _PredictionFactors = field(init=False, repr=False, compare=False)
+    _adjoint: NDArray[np.complex64] = field(init=False, repr=False, compare=False)
+    """(J, M) of the harmonics."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, '_factors', _PredictionFactors.of(self))
+        adjoint = np.ascontiguousarray(self.harmonic.conj().T, np.complex64)
+        object.__setattr__(self, '_adjoint', adjoint)
 
     def predict(self, features: Array, harmonic: Complex) -> tuple[Array, Array]:
         """Yaw (T,) rad and its variance (T,) rad^2, at most pi^2 / 3 (a uniform yaw)."""
@@ -60,8 +63,8 @@ class Compass:
     def _field(self, features: Array, harmonic: Complex) -> tuple[Complex, Array]:
         s, f = self._scaled(features, harmonic)
         near = _near(s, self.features, self.length)
-        kernel = near.astype(np.float32) * (f.astype(np.complex64) @ self._factors.adjoint)
-        left = np.maximum(prior_variance(f) - self._factors.explained(kernel), 0.0)
+        kernel = near.astype(np.float32) * (f.astype(np.complex64) @ self._adjoint)
+        left = np.maximum(prior_variance(f) - _explained(kernel, self.factor), 0.0)
         return kernel @ self.weights, left + self.noise
 
     def _scaled(self, features: Array, harmonic: Complex) -> tuple[Array, Complex]:
@@ -75,7 +78,7 @@ class Compass:
             'feature_scale': self.feature_scale,
             'harmonic_scale': self.harmonic_scale,
             'weights': self.weights,
-            'uncertainty': self.uncertainty,
+            'factor': packed(self.factor),
             'scalars': np.array([self.length, self.noise, self.sign]),
             'calibration': self.calibration,
         }
@@ -89,7 +92,7 @@ class Compass:
             np.asarray(arrays['feature_scale'], float),
             np.asarray(arrays['harmonic_scale'], float),
             np.asarray(arrays['weights'], np.complex128),
-            np.asarray(arrays['uncertainty'], np.complex128),
+            unpacked(np.asarray(arrays['factor'], np.complex64)),
             length,
             noise,
             sign,
@@ -97,38 +100,25 @@ class Compass:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _PredictionFactors:
-    """What a prediction multiplies by: the harmonics' adjoint (J, M), complex64, and a factor.
-
-    `factor` (M, M) is lower triangular in Fortran order, factor factor^H = uncertainty.
-    """
-
-    adjoint: NDArray[np.complex64]
-    factor: NDArray[np.complex64]
-
-    @classmethod
-    def of(cls, compass: Compass) -> _PredictionFactors:
-        adjoint = np.ascontiguousarray(compass.harmonic.conj().T, np.complex64)
-        return cls(adjoint, np.asfortranarray(_root(compass.uncertainty), np.complex64))
-
-    def explained(self, kernel: NDArray[np.complex64]) -> Array:
-        """|k factor|^2 (T,), reading only the lower triangle for a single image."""
-        if len(kernel) > 1:
-            product = kernel @ self.factor
-        else:
-            product = blas.ctrmv(self.factor, kernel[0], lower=1, trans=1)[None]
-        return np.asarray((product.real**2 + product.imag**2).sum(1, dtype=np.float64))
-
-
-def _root(hermitian: Complex) -> Complex:
-    """Lower triangular L with L L^H = a matrix, its negative part (rounding) left out."""
+def triangular(hermitian: Complex) -> NDArray[np.complex64]:
+    """Lower triangular L in Fortran order with L L^H = a matrix, its negative part left out."""
     try:
-        return np.asarray(linalg.cholesky(hermitian, lower=True))
+        root = linalg.cholesky(hermitian, lower=True)
     except linalg.LinAlgError:
+        # Rounding.
         values, axes = linalg.eigh(hermitian)
         root = axes * np.sqrt(np.maximum(values, 0.0))
-        return np.asarray(linalg.qr(root.conj().T, mode='r')[0].conj().T)
+        root = linalg.qr(root.conj().T, mode='r')[0].conj().T
+    return np.asfortranarray(root, np.complex64)
+
+
+def _explained(kernel: NDArray[np.complex64], factor: NDArray[np.complex64]) -> Array:
+    """|k factor|^2 (T,), reading only the lower triangle for a single image."""
+    if len(kernel) > 1:
+        product = kernel @ factor
+    else:
+        product = blas.ctrmv(factor, kernel[0], lower=1, trans=1)[None]
+    return np.asarray((product.real**2 + product.imag**2).sum(1, dtype=np.float64))
 
 
 def scaled_inputs(

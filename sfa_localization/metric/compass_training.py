@@ -22,6 +22,7 @@ from sfa_localization.metric.compass import (
     phase_variance,
     prior_variance,
     scaled_inputs,
+    triangular,
 )
 from sfa_localization.metric.forecast import nearest_used
 from sfa_localization.metric.learning import MetricResult, headings, positions
@@ -198,7 +199,8 @@ class _CompassProblem:
             kernel.conj().T @ kernel, moment, kernel_between(s, f, s, f, length), noise
         )
         scales = self.feature_scale, self.harmonic_scale
-        return Compass(s, f, *scales, weights, uncertainty, length, noise, sign, calibration)
+        factor = triangular(uncertainty)
+        return Compass(s, f, *scales, weights, factor, length, noise, sign, calibration)
 
 
 def _evenly(count: int, most: int) -> Indices:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 
 Arrays = dict[str, NDArray[Any]]
@@ -38,9 +38,6 @@ class Basis(Protocol):
 
     def missing(self, expanded: Array) -> Array:
         """(M,) prior variance that the expansion leaves out, over a point's variance."""
-
-    def to_arrays(self) -> Arrays:
-        """Everything needed to restore it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +81,6 @@ class Monomials:
 
     def to_arrays(self) -> Arrays:
         return {
-            'kind': np.array('monomials'),
             'center': self.center,
             'turn': self.turn,
             'ridge': self.ridge_,
@@ -130,7 +126,8 @@ class Process:
 
     @classmethod
     def at(cls, points: Array, scale: Array, noise: float) -> Process:
-        """With given inducing points (m, K), already scaled."""
+        """With given inducing points (m, K), already scaled; rounded as model files hold them."""
+        points = points.astype(np.float32).astype(np.float64)
         kernel = matern(points, points)
         kernel[np.diag_indices_from(kernel)] += 1e-9
         factor = scipy.linalg.cholesky(kernel, lower=True)
@@ -154,20 +151,6 @@ class Process:
         held = np.einsum('ij,ij->i', expanded[:, :-1], expanded[:, :-1])
         return np.asarray(np.maximum(1.0 - held, 0.0) / self.noise)
 
-    def to_arrays(self) -> Arrays:
-        return {
-            'kind': np.array('gp'),
-            'scale': self.scale,
-            'points': self.points,
-            'whiten': self.whiten,
-            'noise': np.array(self.noise),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> Process:
-        noise = float(arrays['noise'])
-        return cls(arrays['scale'], arrays['points'], arrays['whiten'], noise)
-
 
 def matern(a: Array, b: Array) -> Array:
     """Matern 5/2 kernel (M, m) of unit length and variance between (M, K) and (m, K)."""
@@ -187,9 +170,6 @@ def spread(points: Array, size: int) -> NDArray[np.int64]:
         chosen[k] = np.argmax(distance)
         distance = np.minimum(distance, ((points - points[chosen[k]]) ** 2).sum(1))
     return chosen
-
-
-_BASES: dict[str, type[Monomials] | type[Process]] = {'monomials': Monomials, 'gp': Process}
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +198,7 @@ class MetricMap:
 
         Raises DataError when there are fewer features than it was learned from.
         """
-        features = np.atleast_2d(np.asarray(features, float))
-        if features.shape[1] < self.features:
-            raise DataError(f'the map reads {self.features} slow features, not {features.shape[1]}')
+        features = checked_features(features, self.features)
         expanded = self.basis.expand(features)
         return expanded @ self.weights, self._covariance(expanded)
 
@@ -232,8 +210,13 @@ class MetricMap:
         return np.asarray(self.inflation * (joint + own[:, None, None] * np.eye(2)))
 
     def to_arrays(self) -> Arrays:
-        """Plain arrays, from which `from_arrays` restores the map."""
+        """Plain arrays, from which `from_arrays` restores a map of monomials.
+
+        That of a process is saved in its fast form, see fast_expansions.py.
+        """
+        assert isinstance(self.basis, Monomials)
         own = {
+            'kind': np.array('monomials'),
             'weights': self.weights,
             'spread': self.spread,
             'sway': self.sway,
@@ -244,15 +227,20 @@ class MetricMap:
 
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> MetricMap:
-        """Raises ModelError when an array is missing or of an unknown kind."""
-        try:
-            parts = {k[6:]: v for k, v in arrays.items() if k.startswith('basis_')}
-            basis: Basis = _BASES[str(parts['kind'])].from_arrays(parts)
-            weights, spread, sway = (np.asarray(arrays[n], float) for n in _ARRAYS)
-            noise_m, inflation = float(arrays['noise_m']), float(arrays['inflation'])
-        except KeyError as error:
-            raise ModelError(f'the metric map lacks {error}: train the model again') from None
+        """Raises KeyError when an array is missing."""
+        parts = {k[6:]: v for k, v in arrays.items() if k.startswith('basis_')}
+        basis = Monomials.from_arrays(parts)
+        weights, spread, sway = (np.asarray(arrays[n], float) for n in _ARRAYS)
+        noise_m, inflation = float(arrays['noise_m']), float(arrays['inflation'])
         return cls(basis, weights, spread, sway, noise_m, inflation)
 
 
 _ARRAYS = ('weights', 'spread', 'sway')
+
+
+def checked_features(features: Array, count: int) -> Array:
+    """Features (M, >= count), of one row also (K,). Raises DataError when there are fewer."""
+    features = np.atleast_2d(np.asarray(features, float))
+    if features.shape[1] < count:
+        raise DataError(f'the map reads {count} slow features, not {features.shape[1]}')
+    return features

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.agreement import needed_factor
+from sfa_localization.data.geometry import Array, RigidTransform, wrap_angle
+from sfa_localization.features.agreement import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.alternation import MapFit, MetricProblem
 from sfa_localization.metric.expansions import MetricMap
@@ -38,7 +38,7 @@ _LARGEST_SHARE = 0.8
 
 @dataclass(frozen=True, slots=True)
 class MetricResult:
-    """What was learned of N segments, M images in them, R runs. All in the map frame."""
+    """What was learned of N segments, M images in them, R periods. All in the map frame."""
 
     map: MetricMap
     angles: Array
@@ -48,7 +48,7 @@ class MetricResult:
     angle_covariance: Array
     """(N, N) rad^2."""
     yaw_bias: Array
-    """(R,) rad/s: by how much the odometry of each run turned too fast."""
+    """(R,) rad/s: by how much the odometry turned too fast in each period."""
     certificate: Certificate
     """Of the directions; the paper's descent seldom ends close enough to have one."""
     images: Indices
@@ -80,9 +80,21 @@ class MetricResult:
 
 
 def learn_metric(
-    features: Array, segments: Segments, config: MetricConfig, seed: int = 0
+    features: Array,
+    segments: Segments,
+    config: MetricConfig,
+    seed: int = 0,
+    *,
+    points: int | None = None,
+    scale: Array | None = None,
+    onto: MetricResult | None = None,
 ) -> MetricResult:
     """Learn meters from slow features (N, K), one row per image of the runs, and segments.
+
+    At most `points` images span a Gaussian process. It weights the features by their slowness and
+    chooses how many it reads; with `scale` (K,), it weights them by that and reads all; a unit
+    length is then the typical distance of two images. The result lies in its own map frame, or in
+    that of `onto`, another result of the same segments.
 
     Raises DataError when the features are unusable, when the drive cannot determine a map (the
     message names what to drive instead), or when optimality is not proven.
@@ -93,11 +105,12 @@ def learn_metric(
     if config.solver == 'paper':
         fit, history = paper_solver.learn(problem)
     else:
-        fit = choose(problem)
+        fit = choose(problem, points, scale)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
-    return _result(fit, diagnostics, history)
+    frame = map_frame(fit) if onto is None else _frame_of(onto, fit)
+    return _result(fit, frame, diagnostics, history)
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -117,7 +130,19 @@ def _check_certificate(fit: MapFit) -> None:
     )
 
 
-def _result(fit: MapFit, diagnostics: Diagnostics, history: Array) -> MetricResult:
+def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
+    """From the fit's arbitrary frame to that of another result, by headings, then positions."""
+    segments, solution = fit.problem.segments, fit.solution
+    (_, yaw), (_, places) = headings(other, segments), positions(other, segments)
+    own_yaw = _headings(np.angle(solution.z), solution.bias, fit.stack)
+    turn = RigidTransform(0.0, 0.0, float(np.angle(np.exp(1j * (yaw - own_yaw)).mean())))
+    x_m, y_m = (places - turn.apply(plane(fit.places))).mean(0).tolist()
+    return RigidTransform(x_m, y_m, turn.yaw_rad)
+
+
+def _result(
+    fit: MapFit, frame: RigidTransform, diagnostics: Diagnostics, history: Array
+) -> MetricResult:
     left = leave_out(fit)
     weights_sway = sway(fit)
     sway_variance = (np.abs(fit.expanded @ weights_sway) ** 2).sum(1)
@@ -125,7 +150,6 @@ def _result(fit: MapFit, diagnostics: Diagnostics, history: Array) -> MetricResu
     part = part_of(fit.stack, fit.problem.seed)
     weight = expected.importance(nearest_used(plane(fit.places), part))
     inflation = max(needed_factor(left.ratio, 2, weight), 1.0)
-    frame = map_frame(fit)
     turn = np.exp(1j * frame.yaw_rad)
     return MetricResult(
         map=metric_map(fit, weights_sway, frame, inflation),
@@ -156,8 +180,13 @@ def positions(result: MetricResult, segments: Segments) -> tuple[Indices, Array]
 def headings(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
     """Images (M,) of the segments, and the robot's yaw (M,) rad in the map frame."""
     stack = Stack.of(segments)
-    own = stack.headings - result.yaw_bias[stack.run[stack.owner]] * stack.times_s
-    return stack.images, wrap_angle(result.angles[stack.owner] + own)
+    return stack.images, _headings(result.angles, result.yaw_bias, stack)
+
+
+def _headings(angles: Array, bias: Array, stack: Stack) -> Array:
+    """Yaw (M,) rad of the images, from the directions (N,) rad and the biases (R,) rad/s."""
+    own = stack.headings - bias[stack.period[stack.owner]] * stack.times_s
+    return wrap_angle(angles[stack.owner] + own)
 
 
 def correlation_along_drive(
@@ -178,3 +207,15 @@ def correlation_along_drive(
         result.left_out, result.left_out_variance, np.concatenate(driven), owner
     )
     return ErrorCorrelation(min(found.share, _LARGEST_SHARE), found.distance_m)
+
+
+def left_out_agreement(disagreement: Array, result: MetricResult) -> Agreement:
+    """Factor on the variance of positions, from the disagreement (N,) of the views of all images
+    and the left-out errors of a map."""
+    return Agreement.fit(
+        disagreement[result.images],
+        (result.left_out**2).sum(1),
+        result.left_out_variance,
+        axes=2,
+        weight=result.left_out_weight,
+    )

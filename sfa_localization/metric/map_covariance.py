@@ -50,7 +50,7 @@ def sway(fit: MapFit) -> Complex:
     moved = moved - moved.mean(0) - around_center[:, None] * turn
     values, vectors = np.linalg.eigh(np.real(moved.conj().T @ moved))
     keep = vectors[:, np.argsort(values)[::-1][:_SWAYS]]
-    bias = solution.bias[stack.run][:, None]
+    bias = solution.bias[stack.period][:, None]
     directions = directions @ keep
     changes = np.vstack([origins @ keep, directions, -bias * directions])
     weights = fit.elimination.weights(changes) - 1j * np.outer(fit.map_weights, turn @ keep)

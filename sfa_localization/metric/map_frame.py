@@ -42,12 +42,12 @@ def _odometry(fit: MapFit) -> tuple[Array, Array]:
     Corrected for the bias; the variances are those of the places; up to the first break.
     """
     segments = fit.problem.segments
-    bias = float(fit.solution.bias[0])
     poses, variances = [np.asarray(segments[0].start, float)], [0.0]
     yaw_variance = place_variance = 0.0
     for segment in segments.items[:-1]:
         if not segment.linked:
             break
+        bias = float(fit.solution.bias[segment.period])
         moved = segment.displacement - bias * segment.displacement_drift
         turned = segment.turn_rad - bias * segment.turn_time_s
         poses.append(compose(poses[-1], np.array([moved.real, moved.imag, turned])))

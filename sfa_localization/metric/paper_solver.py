@@ -172,8 +172,8 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     freedom = len(residuals) - terms - 1.5 * stack.segments
     variance, ones = residual_variance(residuals, freedom), np.ones(len(expanded))
     elimination = eliminate(expanded, basis.ridge, ones, stack)
-    bias = np.zeros(stack.run[-1] + 1)
-    form = QuadraticForm(elimination.gram, problem.links, stack.run, variance, 0.0)
+    bias = np.zeros(stack.period[-1] + 1)
+    form = QuadraticForm(elimination.gram, problem.links, stack.period, variance, 0.0)
     h = schur(form.system(bias))[0]
     solution = Solution(z, o, bias, certify(h, z), h, phase_cost(h, z))
     return MapFit(

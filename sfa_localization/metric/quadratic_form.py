@@ -9,7 +9,7 @@ With p = x + i y in meters and z_n = exp(i alpha_n), equation 1 of the paper rea
 where q_nm = d_nm on a straight line; on a curved segment it is the odometry's path. This is the
 only square that reads the features. `eliminate` minimizes it over the map's weights w, which
 leaves `Elimination.gram`, a quadratic form in [o, z, -b z]: the paths are corrected for the
-yaw-rate bias b of each run, q_nm - b drift_nm. `QuadraticForm` adds what odometry measured from
+yaw-rate bias b of each period, q_nm - b drift_nm. `QuadraticForm` adds what odometry measured from
 one segment to the next, each square weighted by `variance`, that of an image's position, over its
 own:
 
@@ -62,8 +62,8 @@ class Stack:
     """(M,) seconds since the reference heading of the segment: drift of `headings`."""
     first: Indices
     """(N,) row of each segment's first image."""
-    run: Indices
-    """(N,) run of each segment."""
+    period: Indices
+    """(N,) period of each segment, in which the yaw-rate bias is constant."""
     starts: Array
     """(N, 3) odometry poses of the segments' frames."""
 
@@ -78,7 +78,7 @@ class Stack:
             np.concatenate([s.headings for s in segments]),
             np.concatenate([s.times_s for s in segments]),
             np.concatenate([[0], np.cumsum(sizes)[:-1]]),
-            np.array([s.run for s in segments]),
+            np.array([s.period for s in segments]),
             np.array([s.start for s in segments]),
         )
 
@@ -87,8 +87,8 @@ class Stack:
         return len(self.first)
 
     def corrected(self, bias: Array) -> Complex:
-        """Paths (M,) without the yaw-rate bias of each run (R,)."""
-        return np.asarray(self.path - bias[self.run[self.owner]] * self.drift)
+        """Paths (M,) without the yaw-rate bias of each period (R,)."""
+        return np.asarray(self.path - bias[self.period[self.owner]] * self.drift)
 
     def sums(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Sum (N, ...) of the rows (M, ...) of each segment."""
@@ -103,7 +103,7 @@ class Links:
     """
 
     at: Indices
-    run: Indices
+    period: Indices
     turn: Array
     turn_variance: Array
     turn_time: Array
@@ -117,8 +117,8 @@ class Links:
         items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
         column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
         at = np.array([n for n, _ in items], np.int64)
-        run = np.array([s.run for _, s in items], np.int64)
-        return cls(at, run, *column)
+        period = np.array([s.period for _, s in items], np.int64)
+        return cls(at, period, *column)
 
     @property
     def used(self) -> bool:
@@ -222,7 +222,7 @@ def _solve(factor: Array, right: Complex) -> Complex:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Directions z (N,), origins o (N,), yaw-rate bias (R,) of each run, and their certificate."""
+    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods, certificate."""
 
     z: Complex
     o: Complex
@@ -236,9 +236,9 @@ class Solution:
         path = stack.corrected(self.bias)
         return np.asarray(self.o[stack.owner] + self.z[stack.owner] * path)
 
-    def coefficients(self, run: Indices) -> Complex:
+    def coefficients(self, period: Indices) -> Complex:
         """[o, z, -b z] (3N,)."""
-        return np.concatenate([self.o, self.z, -self.bias[run] * self.z])
+        return np.concatenate([self.o, self.z, -self.bias[period] * self.z])
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,12 +247,12 @@ class QuadraticForm:
 
     gram: Complex
     links: Links
-    run: Indices
+    period: Indices
     variance: float
     bias_std: float
 
     def system(self, bias: Array) -> Complex:
-        """The quadratic form (2N, 2N) in [o, z] at the runs' biases (R,)."""
+        """The quadratic form (2N, 2N) in [o, z] at the periods' biases (R,)."""
         form = self._biased_gram(bias)
         for rows, weight in self._link_rows(bias):
             form = form + rows.conj().T @ (weight[:, None] * rows)
@@ -260,8 +260,8 @@ class QuadraticForm:
 
     def _biased_gram(self, bias: Array) -> Complex:
         """S^T gram S (2N, 2N) with [o, z, -b z] = S [o, z], S = [[1, 0], [0, 1], [0, -b]]."""
-        n = len(self.run)
-        b = -bias[self.run]
+        n = len(self.period)
+        b = -bias[self.period]
         product = self.gram[:, : 2 * n].copy()
         product[:, n:] += self.gram[:, 2 * n :] * b
         form = product[: 2 * n]
@@ -270,9 +270,9 @@ class QuadraticForm:
 
     def _link_rows(self, bias: Array) -> list[tuple[Complex, Array]]:
         """Rows (L, 2N) whose weighted squares are the turns' and the displacements' costs."""
-        links, n, at = self.links, len(self.run), np.arange(len(self.links.at))
+        links, n, at = self.links, len(self.period), np.arange(len(self.links.at))
         turns, moves = np.zeros((2, len(at), 2 * n), complex)
-        own = bias[links.run]
+        own = bias[links.period]
         turns[at, n + links.at + 1] = 1.0
         turns[at, n + links.at] = -np.exp(1j * (links.turn - own * links.turn_time))
         moves[at, links.at + 1] = 1.0
@@ -284,10 +284,10 @@ class QuadraticForm:
 
     def slope(self, bias: Array, x: Complex) -> Array:
         """Derivative (R,) of the cost by each bias at [o, z] = x (2N,)."""
-        links, n = self.links, len(self.run)
+        links, n = self.links, len(self.period)
         z = x[n:]
-        right = self.gram[2 * n :] @ np.concatenate([x, -bias[self.run] * z])
-        own = np.bincount(self.run, np.real(-np.conj(z) * right), len(bias))
+        right = self.gram[2 * n :] @ np.concatenate([x, -bias[self.period] * z])
+        own = np.bincount(self.period, np.real(-np.conj(z) * right), len(bias))
         (turns, turn_weight), (moves, move_weight) = self._link_rows(bias)
         turned = -1j * links.turn_time * turns[np.arange(len(links.at)), n + links.at]
         for change, rows, weight in (
@@ -295,7 +295,7 @@ class QuadraticForm:
             (links.displacement_drift, moves, move_weight),
         ):
             pull = np.real(np.conj(change * z[links.at]) * (rows @ x)) * weight
-            own += np.bincount(links.run, pull, len(bias))
+            own += np.bincount(links.period, pull, len(bias))
         return np.asarray(own + self.variance * bias / self.bias_std**2)
 
     def solve(self, start: Complex | None, bias: Array) -> Solution:
@@ -309,32 +309,82 @@ class QuadraticForm:
         cost = float(np.real(np.vdot(z, h @ z))) / 2
         return Solution(z, origins @ z, bias, certificate, h, cost)
 
-    def _refined(self, bias: Array, z: Complex) -> tuple[Complex, Array]:
-        """Directions at given biases, and the slope of the cost by the biases."""
+    def _refined(self, bias: Array, z: Complex) -> Complex:
+        """[o, z] (2N,) at given biases, from directions nearby."""
         h, origins = schur(self.system(bias))
         z = refine(h, z)
-        return z, self.slope(bias, np.concatenate([origins @ z, z]))
+        return np.concatenate([origins @ z, z])
 
     def _estimate_bias(self, bias: Array, z: Complex) -> tuple[Array, Complex]:
         """Newton on the biases; the directions follow, so the slope is that of the envelope."""
-        runs = len(bias)
-        z, slope = self._refined(bias, z)
-        columns = [
-            self._refined(bias + _BIAS_DIFFERENCE * unit, z)[1] - slope for unit in np.eye(runs)
-        ]
-        curvature = np.column_stack(columns) / _BIAS_DIFFERENCE
-        floor = self.variance / self.bias_std**2 * np.eye(runs)
-        curvature = (curvature + curvature.T) / 2
-        if np.linalg.eigvalsh(curvature)[0] < floor[0, 0] / 2:
-            curvature = floor
+        n = len(z)
+        x = self._refined(bias, z)
+        curvature = self.curvature(bias, x)
         for _ in range(_BIAS_STEPS):
-            step = -np.linalg.solve(curvature, slope)
+            step = -np.linalg.solve(curvature, self.slope(bias, x))
             step = np.clip(step, -self.bias_std, self.bias_std)
             bias = bias + step
-            z, slope = self._refined(bias, z)
+            x = self._refined(bias, x[n:])
             if np.abs(step).max() < 1e-9 * self.bias_std:
                 break
-        return bias, z
+        return bias, x[n:]
+
+    def curvature(self, bias: Array, x: Complex) -> Array:
+        """Second derivative (R, R) of the least cost at given biases, where [o, z] = x (2N,).
+
+        Origins and angles y follow the biases b: f_bb - f_by f_yy^-1 f_yb. Where that is hardly
+        positive, the prior's alone.
+        """
+        n, units = len(self.period), np.eye(len(bias)) * _BIAS_DIFFERENCE
+        pull, slope = self._pull(bias, x), self.slope(bias, x)
+        bent = np.array([self.slope(bias + unit, x) - slope for unit in units])
+        mixed = np.array([_by_real(self._pull(bias + unit, x) - pull, x) for unit in units])
+        hessian = _real_hessian(self.system(bias), x, pull[n:])
+        floor = self.variance / self.bias_std**2
+        try:
+            follow = scipy.linalg.solve(hessian, mixed.T, assume_a='pos')
+        except np.linalg.LinAlgError:
+            return np.asarray(floor * np.eye(len(bias)))
+        curvature = bent / _BIAS_DIFFERENCE - mixed @ follow / _BIAS_DIFFERENCE**2
+        curvature = (curvature + curvature.T) / 2
+        if np.linalg.eigvalsh(curvature)[0] < floor / 2:
+            return np.asarray(floor * np.eye(len(bias)))
+        return np.asarray(curvature)
+
+    def _pull(self, bias: Array, x: Complex) -> Complex:
+        """system(bias) @ x (2N,), for far less work."""
+        n, b = len(self.period), -bias[self.period]
+        right = self.gram @ np.concatenate([x, b * x[n:]])
+        pull = right[: 2 * n]
+        pull[n:] += b * right[2 * n :]
+        for rows, weight in self._link_rows(bias):
+            pull += rows.conj().T @ (weight * (rows @ x))
+        return np.asarray(pull)
+
+
+def _by_real(gradient: Complex, x: Complex) -> Array:
+    """A gradient (2N,) by [o, z] = x as that (3N,) by [Re o, angles of z, Im o]."""
+    n = len(x) // 2
+    own = gradient[:n]
+    return np.concatenate([own.real, np.imag(np.conj(x[n:]) * gradient[n:]), own.imag])
+
+
+def _real_hessian(system: Complex, x: Complex, pull: Complex) -> Array:
+    """Hessian (3N, 3N) of the cost by [Re o, angles of z, Im o] at [o, z] = x (2N,).
+
+    `pull` (N,) is the gradient by z. What moves or turns all together is fixed.
+    """
+    n = len(pull)
+    along = np.concatenate([np.ones(n), 1j * x[n:]])
+    inner = np.conj(along)[:, None] * system * along
+    hessian = np.block([[inner.real, -inner.imag], [inner.imag, inner.real]])[: 3 * n, : 3 * n]
+    angles = np.arange(n, 2 * n)
+    hessian[angles, angles] -= np.real(np.conj(x[n:]) * pull)
+    none, ones = np.zeros(n), np.ones(n)
+    turn = np.concatenate([-x[:n].imag, ones, x[:n].real])
+    free = np.column_stack([np.r_[ones, none, none], np.r_[none, none, ones], turn])
+    free = np.linalg.qr(free)[0]
+    return np.asarray(hessian + np.trace(hessian) / len(hessian) * (free @ free.T))
 
 
 def schur(system: Complex) -> tuple[Complex, Complex]:

@@ -49,6 +49,8 @@ IMAGE_STEP_MAX_M = 1.5
 IMAGE_STEP_MIN_M = 0.02
 IMAGE_TURN_MIN_RAD = np.deg2rad(3.0)
 """Images closer to the one before, and turned less, repeat it: the robot stands still."""
+BIAS_PERIOD_S = 60.0
+"""The yaw-rate bias of odometry is constant for about this long: floors and tires change it."""
 SPEED_MIN_MPS = 0.05
 TURN_RATE_MIN_RADPS = 0.2
 """A robot that is slower, or turns faster, does not drive a straight line."""
@@ -94,6 +96,10 @@ class Segment:
     """Meters per rad/s: drift of `displacement`."""
     run: int = 0
     """Which of the joined runs it belongs to."""
+    since_start_s: float = 0.0
+    """Seconds from the start of the run's odometry to the first image."""
+    period: int = 0
+    """Which of the `BIAS_PERIOD_S` of the joined runs it belongs to: each has a yaw-rate bias."""
 
     @property
     def length_m(self) -> float:
@@ -156,10 +162,19 @@ def cut(
 
 
 def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
-    """Segments of several runs as one; the images of run k start at index offsets[k]."""
+    """Segments of several runs as one; the images of run k start at index offsets[k].
+
+    Each run is divided into periods of a constant yaw-rate bias.
+    """
     items: list[Segment] = []
     for number, (part, offset) in enumerate(zip(parts, offsets, strict=True)):
-        items += [replace(s, images=s.images + offset, run=number) for s in part]
+        minutes = [int(s.since_start_s // BIAS_PERIOD_S) for s in part]
+        first = items[-1].period + 1 if items else 0
+        periods = (first + np.unique(minutes, return_inverse=True)[1]).tolist()
+        items += [
+            replace(s, images=s.images + offset, run=number, period=period)
+            for s, period in zip(part, periods, strict=True)
+        ]
     return Segments(
         tuple(items), _sum(part.images for part in parts), _sum(part.odometry for part in parts)
     )
@@ -340,7 +355,10 @@ def _segment(poses: ImagePoses, group: Indices, straight: bool) -> Segment:
         path, drift = _driven_distance(path), np.zeros(len(group), complex)
     start = np.array([place[0].real, place[0].imag, heading])
     images = np.asarray(poses.images[group], np.int64)
-    return Segment(images, path, yaw - heading, time - time_s, drift, start)
+    since_start_s = float(time[0])
+    return Segment(
+        images, path, yaw - heading, time - time_s, drift, start, since_start_s=since_start_s
+    )
 
 
 def _driven_distance(path: Complex) -> Complex:

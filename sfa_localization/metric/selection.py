@@ -33,6 +33,8 @@ _COUNTS = {'gp': (8, 12, 16, 24, 32), 'monomials': (3, 4, 5, 6, 8, 10, 12)}
 # The search, and the comparison, use fewer inducing points than the final map: both rank alike.
 _SEARCH_POINTS = 300
 _SCORE_POINTS = 700
+# Of features at given weights: with 300 the search ends with too much noise.
+_SCALED_SEARCH_POINTS = 800
 # Length (in typical distances of two images) and noise (over the signal) that the search starts at.
 _FIRST_HYPER = (1.0, 1e-3)
 _LENGTH_BOUNDS = (0.05, 20.0)
@@ -109,7 +111,7 @@ def leave_out(fit: MapFit) -> LeftOut:
         weights[rows] = 0.0
         elimination = eliminate(fit.expanded, fit.basis.ridge, weights, stack)
         solution = fit.form(elimination).solve(fit.solution.z, fit.solution.bias)
-        coefficients = elimination.weights(solution.coefficients(stack.run))
+        coefficients = elimination.weights(solution.coefficients(stack.period))
         left = fit.expanded[rows]
         used = weights > 0
         turn, shift = align_complex(solution.places(stack)[used], places[used])
@@ -158,11 +160,18 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
     return np.asarray(weights / np.where(std > 0, std, 1.0))
 
 
-def choose(problem: MetricProblem) -> MapFit:
-    """The fit of the best basis of the kind that the settings name."""
+def choose(problem: MetricProblem, points: int | None = None, scale: Array | None = None) -> MapFit:
+    """The fit of the best basis of the kind that the settings name.
+
+    A process of at most `points` inducing points reads all features with weights `scale` (K,), or
+    the best count of them by their slowness.
+    """
+    size = INDUCING_POINTS if points is None else min(points, INDUCING_POINTS)
     if problem.config.metric_map == 'monomials':
         return _choose_monomials(problem)
-    return _choose_process(problem)
+    if scale is None:
+        return _choose_process(problem, size)
+    return _choose_scaled(problem, size, scale)
 
 
 def _counts(problem: MetricProblem) -> list[int]:
@@ -189,38 +198,57 @@ def _choose_monomials(problem: MetricProblem) -> MapFit:
     return problem.fit(best[1].basis, best[1])
 
 
-def _choose_process(problem: MetricProblem) -> MapFit:
+def _choose_process(problem: MetricProblem, size: int) -> MapFit:
     """Length and noise by the evidence, the count of features by what is left out."""
     best: tuple[float, MapFit, tuple[float, float]] | None = None
     hyper = _FIRST_HYPER
     for count in _counts(problem):
-        now, hyper = _search(count, hyper, problem, best and best[1])
+        now, hyper = _scored(count, hyper, problem, best and best[1])
         error = leave_out(now).typical_m
         if best is None or error < best[0]:
             best = error, now, hyper
     assert best is not None
     _, now, (length, noise) = best
     scale = feature_scale(problem.features, problem.stack, now.basis.features) / length
-    basis = Process.fit(problem.features, scale, noise, INDUCING_POINTS)
+    basis = Process.fit(problem.features, scale, noise, size)
     return problem.fit(basis, now)
 
 
-def _search(
+def _choose_scaled(problem: MetricProblem, size: int, scale: Array) -> MapFit:
+    """Length and noise by the evidence, all features at their given weights."""
+    points = min(_SCALED_SEARCH_POINTS, size)
+    now, (length, noise) = _search(problem, scale, points, _FIRST_HYPER, None)
+    basis = Process.fit(problem.features, scale / length, noise, size)
+    return problem.fit(basis, now)
+
+
+def _scored(
     count: int, hyper: tuple[float, float], problem: MetricProblem, start: MapFit | None
 ) -> tuple[MapFit, tuple[float, float]]:
     """The process over `count` features at its best length and noise, and these."""
-    features = problem.features
-    scale = feature_scale(features, problem.stack, count)
-    chosen = spread(features[:, :count] * scale, _SEARCH_POINTS)
-    points = features[chosen, :count] * scale
+    scale = feature_scale(problem.features, problem.stack, count)
+    now, (length, noise) = _search(problem, scale, _SEARCH_POINTS, hyper, start)
+    points = min(_SCORE_POINTS, INDUCING_POINTS)
+    basis = Process.fit(problem.features, scale / length, noise, points)
+    return problem.fit(basis, now, 2), (length, noise)
+
+
+def _search(
+    problem: MetricProblem,
+    scale: Array,
+    size: int,
+    hyper: tuple[float, float],
+    start: MapFit | None,
+) -> tuple[MapFit, tuple[float, float]]:
+    """The fit of `size` inducing points at the first length and noise, and the best of these."""
+    scaled = problem.features[:, : len(scale)] * scale
+    points = scaled[spread(scaled, size)]
 
     def make(length: float, noise: float) -> Process:
         return Process.at(points / length, scale / length, noise)
 
     now = problem.fit(make(*hyper), start, 3)
-    length, noise = _descend(make, hyper, now)
-    basis = Process.fit(features, scale / length, noise, min(_SCORE_POINTS, INDUCING_POINTS))
-    return problem.fit(basis, now, 2), (length, noise)
+    return now, _descend(make, hyper, now)
 
 
 def _descend(

@@ -8,7 +8,7 @@ surrounds it, then hedges, fences and walls, then the neighbors' trees and house
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import trimesh
@@ -19,6 +19,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
+from sfa_localization.simulation.daylight import LIGHTS
 from sfa_localization.simulation.rendering import (
     Light,
     Scene,
@@ -27,6 +28,7 @@ from sfa_localization.simulation.rendering import (
     panorama_view,
     raw_view,
 )
+from sfa_localization.simulation.seasons import in_season
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.simulation.textures import Floats
 
@@ -120,20 +122,17 @@ def bumpy(shape: Shape, rng: np.random.Generator, height: float, wavelength: flo
     vertices = shape.vertices + field_ * (shape.vertices[:, 2:] > 0.02)
     mesh = trimesh.Trimesh(vertices, shape.faces, process=False)
     shade = shape.shade * np.clip(1 + 0.5 * (field_ * shape.normals).sum(1) / height, 0.5, 1.4)
-    return Shape(
-        vertices, np.array(mesh.vertex_normals), shape.faces, shape.surface, shape.tint, shade
-    )
+    return replace(shape, vertices=vertices, normals=np.array(mesh.vertex_normals), shade=shade)
 
 
-def blob(
-    center: Array, radii: Array, tint: Tint, rng: np.random.Generator, detail: int = 3
-) -> Shape:
+def blob(center: Array, radii: Array, tint: Tint, rng: np.random.Generator, plant: str) -> Shape:
     """A leafy ellipsoid about `center` (3,) with half-axes `radii` (3,) in meters."""
-    mesh = trimesh.creation.icosphere(subdivisions=detail)
+    mesh = trimesh.creation.icosphere(subdivisions=3)
     mesh.apply_scale(np.asarray(radii, float))
     mesh.apply_translation(center)
     size = float(np.mean(radii))
-    return bumpy(solid(mesh, 'leaves', tint), rng, 0.13 * size, 1.1 * size)
+    shape = bumpy(solid(mesh, 'leaves', tint), rng, 0.13 * size, 1.1 * size)
+    return replace(shape, plant=plant)
 
 
 def pole(foot: Array, radius: float, height: float, surface: str, tint: Tint) -> Shape:
@@ -151,7 +150,8 @@ def tree(foot: Array, height: float, rng: np.random.Generator) -> list[Shape]:
     for _ in range(3):
         shift = rng.uniform(-0.5, 0.5, 3) * crown * [1, 1, 0.8]
         top = np.array([foot[0], foot[1], height - crown]) + shift
-        shapes.append(blob(top, crown * rng.uniform([0.7] * 3, [1, 1, 0.9]), tint, rng))
+        radii = crown * rng.uniform([0.7] * 3, [1, 1, 0.9])
+        shapes.append(blob(top, radii, tint, rng, 'crown'))
     return shapes
 
 
@@ -163,7 +163,8 @@ def conifer(foot: Array, height: float, rng: np.random.Generator) -> list[Shape]
         mesh = trimesh.creation.cone(0.30 * height * (1 - level), 0.42 * height, sections=20)
         mesh = mesh.subdivide().subdivide()
         mesh.apply_translation([foot[0], foot[1], level * height])
-        shapes.append(bumpy(solid(mesh, 'leaves', tint), rng, 0.03 * height, 0.15 * height))
+        needles = bumpy(solid(mesh, 'leaves', tint), rng, 0.03 * height, 0.15 * height)
+        shapes.append(replace(needles, plant='conifer'))
     return shapes
 
 
@@ -275,9 +276,9 @@ def lawn(plot: Plot) -> None:
         np.sin(x * a + y * b + c) for a, b, c in plot.rng.uniform(-1.8, 1.8, (7, 3)) * [1, 1, 3]
     )
     ground.shade[:] = 1 + 0.10 * np.tanh(3 * stripes) + 0.07 * np.asarray(patches)
-    plot.shapes.append(ground)
+    plot.shapes.append(replace(ground, plant='grass'))
     far = panel([-90, -90, -0.05], [180, 0, 0], [0, 180, 0], 6.0, 'grass', (0.08, 0.22, 0.16))
-    plot.shapes.append(far)
+    plot.shapes.append(replace(far, plant='grass'))
 
 
 def border(plot: Plot) -> None:
@@ -301,7 +302,8 @@ def _section(plot: Plot, kind: str, side: int, edges: Array) -> None:
     if kind == 'hedge':
         parts = box(center, np.array(size), 'leaves', choose(plot.rng, GREENS), step=0.22)
         seed = plot.rng.integers(2**32)
-        plot.shapes += [bumpy(part, np.random.default_rng(seed), 0.10, 0.9) for part in parts]
+        bumps = [bumpy(part, np.random.default_rng(seed), 0.10, 0.9) for part in parts]
+        plot.shapes += [replace(part, plant='hedge') for part in bumps]
         return
     tints = {'boards': WOODS, 'stones': STONES, 'bricks': BRICKS, 'plaster': PLASTERS}[kind]
     plot.shapes += box(center, np.array(size), kind, choose(plot.rng, tints))
@@ -315,8 +317,9 @@ def bed(plot: Plot) -> None:
         radius = plot.rng.uniform(0.18, 0.5)
         out = plot.rng.uniform(STRIP_M + 1.2 * radius, FENCE_M)
         center = np.array([*plot.beside(side, along, out), radius * 0.8])
-        tint = choose(plot.rng, BLOOMS if plot.rng.random() < 0.35 else GREENS)
-        plot.shapes.append(blob(center, radius * np.array([1, 1, 0.9]), tint, plot.rng))
+        tints, plant = (BLOOMS, 'bloom') if plot.rng.random() < 0.35 else (GREENS, 'bush')
+        tint = choose(plot.rng, tints)
+        plot.shapes.append(blob(center, radius * np.array([1, 1, 0.9]), tint, plot.rng, plant))
     for tint in ((0.55, 0.25, 0.08), (0.06, 0.25, 0.70), (0.10, 0.50, 0.62), (0.45, 0.45, 0.45)):
         side, along = int(plot.rng.integers(4)), plot.rng.uniform(-0.9, 0.9)
         foot = plot.beside(side, along, STRIP_M + 0.6)
@@ -364,12 +367,14 @@ class Garden:
     """A garden of one world seed, ready to be looked at from any pose of the frame `world`.
 
     `half` (2,) is half the driven area in meters, `obstacles` (N, 3) discs inside it as x, y,
-    radius, `dock` (3,) the pose that every drive starts from.
+    radius, `dock` (3,) the pose that every drive starts from; `shapes` are those of the season.
+    The same in any light and season: where things stand, and so every drive.
     """
 
     def __init__(self, seed: int, config: SimulationConfig | None = None) -> None:
         """Lay out and light the garden. Raises ConfigError when the area is too small."""
-        half = _checked_half((config or SimulationConfig()).area)
+        config = config or SimulationConfig()
+        half, daylight = _checked_half(config.area), LIGHTS[config.light]
         plot = Plot(half, np.random.default_rng([seed, 0]))
         self.dock = np.array([plot.rng.uniform(-0.5, 0.5) * half[0], 0.3 - half[1], np.pi / 2])
         for part in (lawn, border, bed, buildings):
@@ -377,7 +382,9 @@ class Garden:
         trees(plot, self.dock)
         self.half = half
         self.obstacles = np.array(plot.obstacles).reshape(-1, 3)
-        self.scene = Scene(plot.shapes, _sun(plot.rng), np.random.default_rng([seed, 1]))
+        self.shapes = in_season(plot.shapes, config.season, np.random.default_rng([seed, 2]))
+        sun = daylight.toward_sun(plot.rng)
+        self.scene = Scene(self.shapes, sun, np.random.default_rng([seed, 1]), daylight)
 
     def render_panorama(self, pose: Array, panorama: PanoramaConfig) -> Image:
         """The noiseless panorama (H, W, 3) BGR from `pose` (x m, y m, yaw rad)."""
@@ -403,9 +410,3 @@ def _checked_half(area: tuple[float, ...]) -> Array:
     if len(area) != 2 or min(area) < 6.0:
         raise ConfigError(f'SimulationConfig.area: {area} needs two sides of at least 6 m')
     return np.array(area) / 2
-
-
-def _sun(rng: np.random.Generator) -> Array:
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(32, 52))
-    level = np.cos(elevation)
-    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import Array
+from sfa_localization.simulation.daylight import LIGHTS, Daylight
 from sfa_localization.simulation.textures import (
     SKY_COLUMNS,
     SKY_HIGHEST_DEG,
@@ -31,16 +32,17 @@ from sfa_localization.simulation.textures import (
     sky,
 )
 
-SUN_BGR = np.array([1.04, 1.21, 1.30], np.float32)
-SKY_BGR = np.array([0.78, 0.65, 0.56], np.float32)
 BOUNCE = 0.22
+METER_ROUNDS = 4  # of metering: what is overexposed counts as white, which changes the mean
+METER_COLUMNS = 5  # every so many columns are metered
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
     """Triangles of one surface: `vertices` (V, 3) m, `normals` (V, 3), `faces` (F, 3).
 
-    `tint` is the BGR albedo, `shade` (V,) a factor of brightness.
+    `tint` is the BGR albedo, `shade` (V,) a factor of brightness; `plant` names the kind of plant,
+    '' for everything else.
     """
 
     vertices: Array
@@ -49,6 +51,7 @@ class Shape:
     surface: str
     tint: tuple[float, float, float]
     shade: Array
+    plant: str = ''
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +174,17 @@ def _hull(azimuth: Array, elevation: Array) -> Floats:
 class Scene:
     """Triangles with textures under a sun and a sky."""
 
-    def __init__(self, shapes: Sequence[Shape], sun: Array, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        sun: Array,
+        rng: np.random.Generator,
+        daylight: Daylight | None = None,
+    ) -> None:
         """Index the triangles of `shapes` and light them; `sun` (3,) points toward it."""
+        self.sun, self._daylight = sun, daylight or LIGHTS['day']
         self._atlas = Atlas.build(rng)
-        self._sky = sky(rng)
+        self._sky = sky(rng, self._daylight.sky, sun)
         offsets = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
         self._vertices = np.concatenate([shape.vertices for shape in shapes])
         self._faces = np.concatenate(
@@ -236,7 +246,9 @@ class Scene:
         hits = self._embree.run(start, rays.reshape(-1, 3), output=True)
         surfaces = self._surfaces(hits, rays, 2 * np.pi / dome.columns, light)
         missed = (hits['primID'] < 0).reshape(rays.shape[:2])
-        return np.asarray(np.where(missed[..., None], self._sky_at(dome, yaw_rad), surfaces))
+        seen = np.asarray(np.where(missed[..., None], self._sky_at(dome, yaw_rad), surfaces))
+        target = self._daylight.brightness
+        return seen if target is None else metered(seen * self._daylight.balance, dome, target)
 
     def _surfaces(
         self, hits: dict[str, NDArray[np.float32]], rays: Floats, pixel_rad: float, light: Light
@@ -252,7 +264,9 @@ class Scene:
         footprint = hits['tfar'] * pixel_rad / np.sqrt(slant + 0.01)
         u, v = values[:, 0].reshape(shape), values[:, 1].reshape(shape)
         texture = self._atlas.sample(u, v, rows[:, 15].reshape(shape), footprint.reshape(shape))
-        lit = values[:, 2:3] * (SUN_BGR * light.sun) + values[:, 3:4] * SKY_BGR
+        hour = self._daylight
+        sun, ambient = np.array(hour.sun, np.float32), np.array(hour.ambient, np.float32)
+        lit = values[:, 2:3] * (sun * light.sun) + values[:, 3:4] * ambient
         return np.asarray(texture * np.sqrt(np.maximum(lit * rows[:, 12:15], 0)).reshape(*shape, 3))
 
     def _sky_at(self, dome: Dome, yaw_rad: float) -> Floats:
@@ -263,6 +277,20 @@ class Scene:
         y = (SKY_HIGHEST_DEG - degrees) / (SKY_HIGHEST_DEG - SKY_LOWEST_DEG) * (SKY_ROWS - 1)
         grid = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
         return np.asarray(cv2.remap(self._sky, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+
+
+def metered(image: Floats, dome: Dome, target: float) -> Floats:
+    """The image of a dome exposed so that the default panorama's band has the mean gray `target`.
+
+    What is too bright for the camera counts as white.
+    """
+    config, degrees = PanoramaConfig(), np.degrees(dome.elevations_rad)
+    band = (degrees <= config.elevation_max) & (degrees >= config.elevation_min)
+    seen = image[band if band.any() else slice(None)][:, ::METER_COLUMNS]
+    gain = 1.0
+    for _ in range(METER_ROUNDS):
+        gain *= target / max(float(np.minimum(gain * seen, 255).mean()), 1e-3)
+    return np.asarray(image * np.float32(gain))
 
 
 def _about(direction: Array, spread: float, rng: np.random.Generator) -> Array:

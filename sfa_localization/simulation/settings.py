@@ -22,6 +22,15 @@ class SimulationConfig(Settings):
     )
     seed: int = setting(1, 'drive, sensor errors and light', low=0, high=2**63 - 1)
     world: int = setting(1, 'garden', low=0, high=2**63 - 1)
+    light: str = setting(
+        'day',
+        'sun, sky and what the camera makes of them: day (fixed exposure), morning, overcast, '
+        'evening (automatic exposure and white balance)',
+        choices=('day', 'morning', 'overcast', 'evening'),
+    )
+    season: str = setting(
+        'summer', 'color and leaves of the plants', choices=('summer', 'autumn', 'winter')
+    )
     area: tuple[float, ...] = setting(
         (16.0, 18.0), 'driven area along x and y', unit='m', low=6.0, high=100.0
     )

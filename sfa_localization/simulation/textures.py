@@ -163,22 +163,46 @@ def _strip(texture: Floats) -> Image:
     return np.concatenate(strip, 1)
 
 
-def sky(rng: np.random.Generator) -> Image:
+@dataclass(frozen=True, slots=True)
+class SkyLook:
+    """A sky in display brightness, BGR: `horizon`, `fall` from there up to the zenith, and clouds.
+
+    Clouds have the color `cloud`, the mean `cover` and the `contrast`; `wind` (pixels of their
+    noise) has moved them since the day. `glow` is added about the sun; `hills` are factors.
+    """
+
+    horizon: tuple[float, float, float] = (0.93, 0.74, 0.55)
+    fall: tuple[float, float, float] = (0.05, 0.18, 0.28)
+    cloud: tuple[float, float, float] = (0.95, 0.94, 0.93)
+    cover: float = 0.25
+    contrast: float = 0.45
+    wind: float = 0.0
+    glow: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hills: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+GLOW_RAD = 0.7
+"""Angle from the sun at which its glow has fallen to 1/e."""
+
+
+def sky(rng: np.random.Generator, look: SkyLook, sun: NDArray[np.float64]) -> Image:
     """Sky with clouds, haze and far hills: BGR (SKY_ROWS, SKY_COLUMNS, 3), highest row first.
 
-    Columns grow counterclockwise from the world's +x axis.
+    Columns grow counterclockwise from the world's +x axis; `sun` (3,) points toward it. The hills
+    stand where they stand in every light.
     """
     elevation = np.linspace(SKY_HIGHEST_DEG, SKY_LOWEST_DEG, SKY_ROWS, dtype=np.float32)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, SKY_COLUMNS, endpoint=False, dtype=np.float32)[None]
     height = np.clip(elevation / 60, 0, 1)
-    blue = np.array([0.93, 0.74, 0.55], np.float32) - height[..., None] * [0.05, 0.18, 0.28]
-    white = np.array([0.95, 0.94, 0.93], np.float32)
-    color = _mix(blue.astype(np.float32), white, _clouds(rng, elevation, azimuth))
+    blue = np.array(look.horizon, np.float32) - height[..., None] * look.fall
+    white = np.array(look.cloud, np.float32)
+    color = _mix(blue.astype(np.float32), white, _clouds(rng, elevation, azimuth, look))
+    color = color + _glow(elevation, azimuth, sun)[..., None] * np.array(look.glow, np.float32)
     for distance in (1.0, 0.5):
         hills = 0.6 + 2.2 * (1.2 - distance) + 1.1 * _outline(rng, azimuth)
         cover = np.clip((hills - elevation) / 0.3 + 0.5, 0, 1)
         green = np.array([0.42, 0.44, 0.38], np.float32) * (0.55 + 0.55 * distance)
-        color = _mix(color, green.astype(np.float32), cover)
+        color = _mix(color, (green * look.hills).astype(np.float32), cover)
     return np.clip(np.rint(color * 255), 0, 255).astype(np.uint8)
 
 
@@ -186,10 +210,18 @@ def _mix(below: Floats, above: Floats, cover: Floats) -> Floats:
     return np.asarray(below + (above - below) * cover[..., None], np.float32)
 
 
-def _clouds(rng: np.random.Generator, elevation: Floats, azimuth: Floats) -> Floats:
+def _glow(elevation: Floats, azimuth: Floats, sun: NDArray[np.float64]) -> Floats:
+    """1 toward the sun, less around it, for elevations (R, 1) in degrees, azimuths (1, C) rad."""
+    up = np.radians(elevation)
+    level = np.cos(azimuth) * sun[0] + np.sin(azimuth) * sun[1]
+    toward = np.clip(np.cos(up) * level + np.sin(up) * sun[2], -1, 1)
+    return np.asarray(np.exp(-((np.arccos(toward) / GLOW_RAD) ** 2)), np.float32)
+
+
+def _clouds(rng: np.random.Generator, elevation: Floats, azimuth: Floats, look: SkyLook) -> Floats:
     field = noise(rng, 2, 50, fall=2.0)
     radius = 75 / (np.radians(np.maximum(elevation, 0)) + 0.35)
-    x, y = (np.mod(256 + radius * f(azimuth), TILE) for f in (np.cos, np.sin))
+    x, y = (np.mod(256 + look.wind + radius * f(azimuth), TILE) for f in (np.cos, np.sin))
     clouds = cv2.remap(
         field,
         x.astype(np.float32),
@@ -197,7 +229,7 @@ def _clouds(rng: np.random.Generator, elevation: Floats, azimuth: Floats) -> Flo
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_WRAP,
     )
-    return np.asarray(np.clip(0.25 + 0.45 * clouds, 0, 0.9), np.float32)
+    return np.asarray(np.clip(look.cover + look.contrast * clouds, 0, 0.9), np.float32)
 
 
 def _outline(rng: np.random.Generator, azimuth: Floats) -> Floats:

@@ -139,8 +139,8 @@ def best_cost(trial: Problem, stack: Stack) -> float:
     links = Links.of(trial.segments)
     unused = np.full(len(links.at), np.inf)
     links = replace(links, turn_variance=unused, displacement_variance=unused)
-    form = QuadraticForm(elimination.gram, links, stack.run, 1.0, 0.0)
-    solution = form.solve(None, np.zeros(stack.run[-1] + 1))
+    form = QuadraticForm(elimination.gram, links, stack.period, 1.0, 0.0)
+    solution = form.solve(None, np.zeros(stack.period[-1] + 1))
     return phase_cost(solution.h, solution.z)
 
 

@@ -32,7 +32,13 @@ from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
 from sfa_localization.features import network_training as hierarchy
 from sfa_localization.features.agreement import Agreement
-from sfa_localization.features.image_features import harmonics, layer_harmonics, slow_features
+from sfa_localization.features.image_features import (
+    REFINING_LAYER,
+    harmonics,
+    layer_harmonics,
+    slow_features,
+    spectrum,
+)
 from sfa_localization.features.keyframe_training import MOST
 from sfa_localization.features.keyframes import Keyframes, MatchNoise, quantized, texture
 from sfa_localization.features.network import input_map, standard_architecture
@@ -44,7 +50,7 @@ from sfa_localization.features.network_training import (
     train_network,
 )
 from sfa_localization.features.sfa import Statistics, solve
-from sfa_localization.metric.compass import Compass, kernel_between
+from sfa_localization.metric.compass import Compass, kernel_between, triangular
 from sfa_localization.metric.compass_training import (
     INDUCING_IMAGES,
     PLACE_FEATURES,
@@ -53,8 +59,10 @@ from sfa_localization.metric.compass_training import (
 )
 from sfa_localization.metric.expansions import MetricMap, Process
 from sfa_localization.metric.fast_expansions import FastProcess
+from sfa_localization.metric.refinement import DIMENSIONS, Projection, Refinement, turned_back
 from sfa_localization.metric.selection import INDUCING_POINTS
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.training import COARSE_POINTS
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
@@ -180,30 +188,39 @@ def in_turns(functions: list[Callable[[], object]], rounds: int) -> np.ndarray:
 def made_up_model(network) -> PlaceModel:
     """A model of the default sizes whose map and compass mean nothing; their cost is real."""
     rng = np.random.default_rng(0)
-    count = INDUCING_POINTS
-    points = rng.normal(size=(count, 16))
-    basis = Process.at(points * 0.3, np.full(16, 0.3), 0.01)
-    expanded = basis.expand(points)
-    posterior = linalg.inv(expanded.T @ expanded + np.diag(basis.ridge) + 1e-9 * np.eye(count + 1))
-    spread = linalg.cholesky(0.05**2 * posterior, lower=True)
-    sway = 1e-3 * rng.normal(size=(count + 1, 12, 2))
-    map_ = MetricMap(basis, rng.normal(size=(count + 1, 2)), spread, sway, 0.05, 1.0)
     images = rng.integers(0, 256, (40, *SIZE, 3), np.uint8)
     maps = network.maps(images)
     layers = compass_layers(len(network.nodes))
     width = layer_harmonics([m[:1] for m in maps], layers).shape[1]
     with one_core():
         compass = _compass(rng, INDUCING_IMAGES, PLACE_FEATURES, width)
+    turned = turned_back(spectrum(maps[REFINING_LAYER]), np.zeros(len(images)), compass.sign)
+    axes = linalg.qr(rng.normal(size=(turned.shape[1], DIMENSIONS)), mode='economic')[0]
+    projection = Projection(turned.mean(0), axes.astype(np.float32))
+    finer = _map(rng, INDUCING_POINTS, DIMENSIONS)
     return PlaceModel(
         network,
-        map_,
+        _map(rng, COARSE_POINTS, 16),
         PanoramaConfig(),
         _keyframes(rng),
         agreement=Agreement(1.0, 1.0, 1.0),
         compass=compass,
         yaw_agreement=Agreement(1.0, 1.0, 1.0),
         heading_layers=layers,
+        refinement=Refinement(projection, finer, Agreement(1.0, 1.0, 1.0), compass.sign, 3.0),
     )
+
+
+def _map(rng: np.random.Generator, count: int, features: int) -> FastProcess:
+    """A map of random inducing points."""
+    points = rng.normal(size=(count, features))
+    basis = Process.at(points * 0.3, np.full(features, 0.3), 0.01)
+    expanded = basis.expand(points)
+    posterior = linalg.inv(expanded.T @ expanded + np.diag(basis.ridge) + 1e-9 * np.eye(count + 1))
+    spread = linalg.cholesky(0.05**2 * posterior, lower=True)
+    sway = 1e-3 * rng.normal(size=(count + 1, 12, 2))
+    metric = MetricMap(basis, rng.normal(size=(count + 1, 2)), spread, sway, 0.05, 1.0)
+    return FastProcess.of(metric, basis)
 
 
 def _keyframes(rng: np.random.Generator) -> Keyframes:
@@ -222,21 +239,26 @@ def _compass(rng: np.random.Generator, count: int, features: int, width: int) ->
     moment = kernel.conj().T @ np.exp(1j * rng.uniform(-3, 3, count))
     solution = _solve(kernel.conj().T @ kernel, moment, kernel, 0.1)
     scales = np.ones(features), np.ones(width)
-    return Compass(s, f, *scales, *solution, 2.0, 0.1, -1.0, np.array([1.0, 1e-3]))
+    weights, uncertainty = solution
+    return Compass(
+        s, f, *scales, weights, triangular(uncertainty), 2.0, 0.1, -1.0, np.array([1.0, 1e-3])
+    )
 
 
 def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
     """Locating one picture against the matrix products of its equations, on one core."""
     height, width = model.network.architecture.size
     image = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
-    blind = replace(model, compass=None, yaw_agreement=None, heading_layers=())
+    coarse = replace(model, refinement=None)
+    blind = replace(coarse, compass=None, yaw_agreement=None)
     products, network_only = bare_products(model, image), bare_network(model)
     nowhere = np.zeros(2)
     with one_core():
-        whole, bare, without, matched, maps, bare_maps = in_turns(
+        whole, bare, unrefined, without, matched, maps, bare_maps = in_turns(
             [
                 lambda: model.locate(image),
                 lambda: [product() for product in products],
+                lambda: coarse.locate(image),
                 lambda: blind.locate(image),
                 lambda: model.keyframes.match(image, nowhere),
                 lambda: model.network.maps(image[None]),
@@ -253,7 +275,8 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
         'locate_p99_ms': float(np.percentile(whole, 99)) * 1e3,
         'matmul_ms': median * 1e3,
         'network_over_matmul': float(np.median(maps) / np.median(bare_maps)),
-        'locate_heading_cost': float(np.median(whole) / np.median(without)) - 1,
+        'locate_heading_cost': float(np.median(unrefined) / np.median(without)) - 1,
+        'locate_refinement_cost': float(np.median(whole) / np.median(unrefined)) - 1,
         'locate_keyframes_cost': float(
             np.median(matched) / (np.median(whole) - np.median(matched))
         ),
@@ -291,22 +314,30 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
     close = keyframes.spectra[:CLOSE].transpose(2, 0, 1)
     made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
     maps = model.network.maps(image[None])
-    fast = model._predictor()
-    assert isinstance(fast, FastProcess)
-    features = slow_features(maps)[:, : len(fast.scale)] * fast.scale
-    kernel = np.ones((1, len(fast.points)))
-    made += [_product(features, fast.points.T.copy()), _product(kernel, fast.linear)]
-    made.append(_triangular(fast.factor))
+    assert isinstance(model.metric, FastProcess)
+    made += bare_process(model.metric, slow_features(maps))
+    if model.refinement is not None:
+        projection, finer = model.refinement.projection, model.refinement.metric
+        made.append(_product(np.ones((1, len(projection.axes)), np.float32), projection.axes))
+        made += bare_process(finer, np.ones((1, len(finer.scale))))
     if model.compass is not None:
         compass = model.compass
         for layer in model.heading_layers:
             wave = np.ones(maps[layer].shape[2], np.complex64)
             made.append(_product(wave, maps[layer].astype(np.complex64)))
         f = np.concatenate([harmonics(maps[layer]) for layer in model.heading_layers], axis=1)
-        made.append(_product(f.astype(np.complex64), compass._factors.adjoint))
-        made.append(_triangular(compass._factors.factor))
+        made.append(_product(f.astype(np.complex64), compass._adjoint))
+        made.append(_triangular(compass.factor))
         made.append(_product(np.ones((1, len(compass.weights)), complex), compass.weights))
     return made
+
+
+def bare_process(fast: FastProcess, features: np.ndarray) -> list[Callable[[], object]]:
+    """The products of a map of features (1, K)."""
+    scaled = features[:, : len(fast.scale)] * fast.scale
+    kernel = np.ones((1, len(fast.points)))
+    made = [_product(scaled, fast.points.T.copy()), _product(kernel, fast.linear)]
+    return [*made, _triangular(fast.factor)]
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> Callable[[], object]:

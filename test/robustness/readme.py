@@ -1,11 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which tests show which kind of robustness: read off the table in README.md."""
+"""Which tests show which kind of robustness: read off the table in test/README.md."""
 
 import re
 from pathlib import Path
 
-TABLE = Path(__file__).with_name('README.md')
+TABLE = Path(__file__).parents[1] / 'README.md'
 _ROW = re.compile(r'^\| (\d+) \|(.*)$', re.MULTILINE)
 _TEST = re.compile(r'`(test_\w+\.py)::(\w+)`')
 

@@ -1,0 +1,8 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of images, odometry, clocks and nodes: what a recorded drive with each of them gives.
+
+`recorded` holds the drive and the model for it, `faults` what goes wrong, `replay` and `live` run
+it through the Localizer and through the three nodes, `judged` compares with the truth. `readme`
+reads the table of test/README.md.
+"""
