@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from filter_drives import Drive
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion import update
 from sfa_localization.fusion.pose_filter import PoseFilter
@@ -15,9 +16,9 @@ from sfa_localization.fusion.update import LEAST_SCATTER
 NOISY = {'v_std': 0.02, 'omega_std': 0.02, 'position_std': 0.3, 'yaw_std': 0.03}
 
 
-def fed(drive, claimed=0.3):
+def fed(drive, claimed=0.3, correlation=None):
     """The filter's errors in m at the images, and its claimed standard deviations."""
-    fused, errors, stds = PoseFilter(FilterConfig()), [], []
+    fused, errors, stds = PoseFilter(FilterConfig(), correlation), [], []
     for stamp_ns, kind, index in drive.events(True):
         if kind == 0:
             fused.add_odometry(stamp_ns, *drive.read[index], drive.variances())
@@ -72,3 +73,10 @@ def test_images_that_err_as_they_claim_hardly_lose_weight(monkeypatch):
     robust = np.mean([fed(drive)[0].mean() for drive in drives])
     monkeypatch.setattr(update, '_OUTLYING', {2: 1e9, 3: 1e9})
     assert robust < 1.15 * np.mean([fed(drive)[0].mean() for drive in drives])
+
+
+def test_positions_with_white_errors_keep_their_weight(monkeypatch):
+    drive, white = Drive(seconds=60, **NOISY), ErrorCorrelation(0.02, 1.0)
+    found = fed(drive, correlation=white)[0]
+    monkeypatch.setattr(update, '_OUTLYING', {2: 1e9, 3: 1e9})
+    assert np.array_equal(found, fed(drive, correlation=white)[0])

@@ -67,7 +67,7 @@ class Recovery:
     def __init__(self, config: FilterConfig, correlation: ErrorCorrelation) -> None:
         self._config = config
         self._correlation = correlation
-        self.decorrelation_m = correlation.distance_m
+        self.share, self.decorrelation_m = correlation.share, correlation.distance_m
 
     def blank(self, stamp_ns: int) -> Belief:
         """The belief before the first message, without a pose."""

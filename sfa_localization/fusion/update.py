@@ -36,6 +36,9 @@ OUTLYING_SHARE = 0.8
 """Images farther off than this share of the usual ones lose weight, with the fourth power of their
 distance: errors of images have heavy tails, and those of neighbors are alike. Of images that err as
 they claim, the fifth that loses weight loses little."""
+ALIKE_SHARE = 0.2
+"""Where neighbors share less of their errors, positions are those of a sensor with white errors:
+they keep their weight inside the gate."""
 SCATTER_STEP = 0.05
 """Relative change of the usual distance per image: it is learned over about twenty images."""
 LEAST_SCATTER = 0.05
@@ -151,7 +154,7 @@ class Correction:
             scatter=_scatter(belief.memory.scatter, d2 / _MEDIANS[event.value.size]),
         )
         outlying = d2 / (belief.memory.scatter * _OUTLYING[event.value.size])
-        if outlying > 1:
+        if outlying > 1 and self._recovery.share >= ALIKE_SHARE:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, belief.covariance, lighter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
