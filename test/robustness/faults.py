@@ -20,7 +20,7 @@ CONSISTENT_LIE_S = 2.0
 """Seconds for which a lie that was there from the start, and contradicts nothing at first, may be
 believed."""
 NOTICED_S = 1.0
-"""A robot that is moved suddenly is noticed by the next few images; one alone may be an error."""
+"""A robot that is moved, or held, suddenly is noticed by the next few images: one alone may err."""
 DOWN_S = 2.0
 """A node that was killed is back after so many seconds."""
 STANDING_HZ = 5
@@ -367,8 +367,9 @@ def kidnapped_in_the_dark(world, _):
     return messages(before.followed_by(after))
 
 
-enter_all({'wheels slip': slip}, ends_s=FROM_S + SLIP_S)
-enter_all({'robot pushed': pushed}, ends_s=FROM_S + SLIP_S, allowed_s=NOTICED_S)
+enter_all(
+    {'wheels slip': slip, 'robot pushed': pushed}, ends_s=FROM_S + SLIP_S, allowed_s=NOTICED_S
+)
 enter_all({'kidnapped': kidnapped}, ends_s=FROM_S, allowed_s=NOTICED_S)
 # Nothing shows it until images are missed.
 enter_all(
