@@ -20,7 +20,7 @@ pytest.importorskip('rclpy')
 from sfa_localization.commands import live_nodes
 
 pytestmark = pytest.mark.ros
-TIMEOUTS = live_nodes.Timeouts(start_s=20.0, silence_s=1.0, settle_s=0.3, stop_s=3.0)
+TIMEOUTS = live_nodes.Timeouts(start_s=20.0, silence_s=4.0, settle_s=0.3, stop_s=3.0)
 
 STAND_IN = """
 import math, sys, time
