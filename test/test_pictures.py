@@ -108,7 +108,7 @@ def test_every_kind_of_buffer_and_padded_rows(picture):
         ({'data': b'1' * 145}, 'data size'),
         ({'step': 23}, 'data size'),
         ({'width': 9}, 'step is shorter'),
-        ({'step': 0}, 'data size'),
+        ({'step': 0}, 'empty'),
         ({'encoding': 'yuv422', 'width': 7, 'step': 24}, 'unusable'),
         ({'height': 2**32 - 1}, 'data size'),
     ],
