@@ -18,7 +18,7 @@ from tqdm import tqdm
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD, read_twist
@@ -29,6 +29,8 @@ from sfa_localization.fusion.smoother import Smoother
 
 _NS = Decimal(1_000_000_000)
 _SECOND_NS = 1_000_000_000
+LARGEST_LOG = 1 << 30
+"""Bytes of a log: more than a year of odometry at 1 Hz, or three days at 100 Hz."""
 _STRETCH = 20
 """Positions that are aligned with odometry together: so few that odometry hardly drifts."""
 ENOUGH_POSITIONS = 5 * _STRETCH
@@ -478,10 +480,10 @@ def _require_overlap(odometry: Table, positions: Table) -> None:
 
 def _read_table(path: Path, known: dict[str, tuple[str, ...]], needed: tuple[str, ...]) -> Table:
     try:
-        text = path.read_text(encoding='utf-8-sig')
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_regular(path, LARGEST_LOG).decode('utf-8-sig')
+        rows = [_split(line) for line in text.splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f'{path}: cannot be read: {error}') from None
-    rows = [_split(line) for line in text.splitlines() if line.strip()]
     names, start = _header(rows, known)
     if not names:
         raise DataError(f'{path}: holds no rows; the first line must be stamp_s,{",".join(needed)}')

@@ -3,6 +3,7 @@
 """The filter command on logs as people have them: headers, gaps, disorder, missing variances."""
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -290,3 +291,22 @@ def test_truth_without_heading_is_named(tmp_path, capsys):
     (tmp_path / 't.csv').write_text('stamp_s,x_m,y_m\n1,2,3\n')
     code, _ = run(tmp_path, Drive(seconds=5, **NOISY), '--truth', str(tmp_path / 't.csv'))
     assert code == 1 and 'no column yaw_rad' in capsys.readouterr().err
+
+
+def test_a_log_that_is_no_file_or_never_ends_is_one_error_line(tmp_path, capsys):
+    """A pipe would wait for its writer, and a device fill the memory."""
+    os.mkfifo(tmp_path / 'pipe.csv')
+    (tmp_path / 'positions.csv').write_text('stamp_s,x_m,y_m\n1,2,3\n')
+    (tmp_path / 'wide.csv').write_text('stamp_s,v_mps,omega_radps\n1,"' + 'x' * 200_000 + '\n')
+    for name in ('pipe.csv', 'wide.csv', '/dev/zero'):
+        odometry = tmp_path / name
+        words = [
+            str(odometry),
+            str(tmp_path / 'positions.csv'),
+            '--output',
+            str(tmp_path / 'o.tum'),
+        ]
+        assert main(['filter', *words]) == 1
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 and f'{odometry}: cannot be read' in lines[0]
+    assert not (tmp_path / 'o.tum').exists()
