@@ -13,6 +13,7 @@ import math
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
-from sfa_localization.localizer import Localizer, Observation
+from sfa_localization.localizer import Localizer, Observation, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -91,17 +92,45 @@ class _Track:
 
 
 @dataclass(frozen=True, slots=True)
-class _Replay:
-    """What model and filter make of a drive.
+class _Located:
+    """What the model makes of a drive: its usable images, of which `features` (N, K) are.
 
-    `tracks` holds 'sfa', the usable images, of which `features` (N, K) are; 'ekf', the filter at
-    each odometry message, and whether it was LOCALISED there, `sure` (T,); and 'smoothed', if
-    wanted. `counts` are those of messages, observations and states.
+    `counts` are those of messages and observations.
     """
 
     run: Run
     truth: Trajectory
+    images: _Track
     features: Array
+    counts: dict[str, Any]
+
+    @classmethod
+    def of(cls, run: Run, observations: list[Observation]) -> _Located:
+        """From the observations of all images. Raises DataError where none can be used."""
+        usable = [one for one in observations if not one.problem]
+        if not usable:
+            raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
+        skipped = Counter(one.problem for one in observations if one.problem)
+        counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
+        counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
+        clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+        if clock.delay_ns:
+            counts['camera_delay_s'] = round(clock.delay_s, 3)
+        assert run.ground_truth is not None
+        features = np.array([one.estimate.slow_features for one in usable])
+        return cls(run, run.ground_truth, _images(usable, clock), features, counts)
+
+
+@dataclass(frozen=True, slots=True)
+class _Replay:
+    """What model and filter make of a drive.
+
+    `tracks` holds 'sfa', the usable images; 'ekf', the filter at each odometry message, and
+    whether it was LOCALISED there, `sure` (T,); and 'smoothed', if wanted. `counts` are those of
+    what was fused, and of states.
+    """
+
+    located: _Located
     sure: NDArray[np.bool_]
     tracks: dict[str, _Track]
     counts: dict[str, Any]
@@ -129,72 +158,84 @@ def evaluate(
     recipe = as_live(recipe or Recipe(), model.panorama)
     trained = None
     if align_bag is not None:
-        trained = _replay(align_bag, Localizer(model, config, watch), recipe, progress)
+        trained = _locate(align_bag, Observer(model, watch), recipe, progress)
     kind = Smoother if smooth else PoseFilter
-    drive = _replay(bag, Localizer(model, config, watch, kind), recipe, progress)
+    replay = _replay(bag, Localizer(model, config, watch, kind), recipe, progress)
+    drive = replay.located
     aligned_on = 'an earlier evaluation' if transform else str(align_bag or bag)
     reference = trained or drive
-    transform = transform or fit_transform(reference.truth, reference.tracks['sfa'].poses)
-    estimates = _in_truth(drive, transform)
-    if trained is not None:
-        estimates['supervised'] = _supervised(model, trained, drive)
+    transform = transform or fit_transform(reference.truth, reference.images.poses)
+    estimates = _in_truth(model, replay, trained, transform)
+    false_s = _false_localised_s(replay, estimates['ekf'])
     return Evaluation(
         drive.truth,
         estimates,
-        _scores(drive, estimates, transform),
-        {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])},
+        _scores(replay, estimates, transform),
+        {**drive.counts, **replay.counts, 'false_localised_s': false_s},
         drive.features,
         aligned_on,
         transform,
     )
 
 
-def _in_truth(drive: _Replay, transform: RigidTransform) -> dict[str, Trajectory]:
-    tracks = {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
-    return {'odometry': odometry_from_start(drive.truth, drive.run), **tracks}
+def _in_truth(
+    model: PlaceModel, replay: _Replay, trained: _Located | None, transform: RigidTransform
+) -> dict[str, Trajectory]:
+    """All estimates in the frame of the truth."""
+    drive = replay.located
+    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
+    estimates |= {name: moved(track.poses, transform) for name, track in replay.tracks.items()}
+    if trained is not None:
+        estimates['supervised'] = _supervised(model, trained, drive)
+    return estimates
 
 
 def _scores(
-    drive: _Replay, estimates: Mapping[str, Trajectory], transform: RigidTransform
+    replay: _Replay, estimates: Mapping[str, Trajectory], transform: RigidTransform
 ) -> Scores:
     """The errors of every estimate; of the model's also calibration and similarity."""
-    scores = {name: score(drive.truth, estimate) for name, estimate in estimates.items()}
-    for name, track in drive.tracks.items():
-        turn = rotation(transform.yaw_rad)
-        scores[name] |= calibration(drive.truth, estimates[name], turn, track.covariances)
-        scores[name]['similarity'] = similarity(drive.truth, estimates[name])
+    truth, turn = replay.located.truth, rotation(transform.yaw_rad)
+    scores = {name: score(truth, estimate) for name, estimate in estimates.items()}
+    for name, track in replay.tracks.items():
+        scores[name] |= calibration(truth, estimates[name], turn, track.covariances)
+        scores[name]['similarity'] = similarity(truth, estimates[name])
     return scores
+
+
+def _locate(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
+    """Run the model over a bag. Raises BagError or DataError."""
+    with _cache() as cache:
+        run = _read(bag, cache, recipe, progress)
+        with _bar(run, progress) as bar:
+            observations = []
+            for observation in observer.observe_run(run):
+                observations.append(observation)
+                bar.update()
+        return _Located.of(run, observations)
 
 
 def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Replay:
     """Run model and filter over a bag. Raises BagError or DataError."""
-    with image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate') as cache:
+    with _cache() as cache:
         run = _read(bag, cache, recipe, progress)
         observations, fused, states = _replayed(localizer, run, progress)
-        clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
-    usable = [one for one in observations if not one.problem]
-    if not usable:
-        raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-    skipped = Counter(one.problem for one in observations if one.problem)
-    counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
-    counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
-    counts['fusion'] = dict(localizer.filter.counts)
-    if clock.delay_ns:
-        counts['camera_delay_s'] = round(clock.delay_s, 3)
-    counts['states_s'] = states
-    counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
-    tracks = {'sfa': _located(usable, clock), 'ekf': _Track.of([state for state, _ in fused])}
+        located = _Located.of(run, observations)
+    tracks = {'sfa': located.images, 'ekf': _Track.of([state for state, _ in fused])}
     if isinstance(localizer.filter, Smoother):
         tracks['smoothed'] = _Track.of(localizer.filter.smoothed())
-    assert run.ground_truth is not None
-    return _Replay(
-        run,
-        run.ground_truth,
-        np.array([one.estimate.slow_features for one in usable]),
-        np.array([level is Level.LOCALISED for _, level in fused], bool),
-        tracks,
-        counts,
-    )
+    counts: dict[str, Any] = {'fusion': dict(localizer.filter.counts), 'states_s': states}
+    counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
+    sure = np.array([level is Level.LOCALISED for _, level in fused], bool)
+    return _Replay(located, sure, tracks, counts)
+
+
+def _cache() -> AbstractContextManager[Path]:
+    return image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate')
+
+
+def _bar(run: Run, progress: bool) -> tqdm:
+    total, title = len(run.panoramas), f'locating {run.name}'
+    return tqdm(desc=title, total=total, unit='img', disable=not progress)
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
@@ -211,8 +252,7 @@ def _replayed(
     observations: list[Observation] = []
     fused, states = [], dict[str, float]()
     before_ns = int(run.odometry.stamps_ns[0])
-    title = f'locating {run.name}'
-    with tqdm(desc=title, total=len(run.panoramas), unit='img', disable=not progress) as bar:
+    with _bar(run, progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
             if observation is not None:
                 observations.append(observation)
@@ -226,7 +266,7 @@ def _replayed(
     return observations, fused, states
 
 
-def _located(usable: list[Observation], clock: CameraClock) -> _Track:
+def _images(usable: list[Observation], clock: CameraClock) -> _Track:
     """The usable images in the map.
 
     The map is judged where images were taken, by `clock`; the filter has to find out by itself.
@@ -291,11 +331,11 @@ def calibration(
     }
 
 
-def _false_localised_s(drive: _Replay, ekf: Trajectory) -> float:
+def _false_localised_s(replay: _Replay, ekf: Trajectory) -> float:
     """Seconds in which the filter was LOCALISED and more than `WRONG_M` off."""
-    stamps = ekf.stamps_ns
-    apart = np.hypot(*(ekf.poses - drive.truth.at(stamps))[:, :2].T)
-    wrong = drive.sure & known(drive.truth, stamps) & (apart > WRONG_M)
+    stamps, truth = ekf.stamps_ns, replay.located.truth
+    apart = np.hypot(*(ekf.poses - truth.at(stamps))[:, :2].T)
+    wrong = replay.sure & known(truth, stamps) & (apart > WRONG_M)
     return float(np.diff(stamps, prepend=stamps[:1])[wrong].sum() * 1e-9)
 
 
@@ -347,10 +387,10 @@ def _summary(values: Array) -> dict[str, float]:
     }
 
 
-def _supervised(model: PlaceModel, trained: _Replay, drive: _Replay) -> Trajectory:
+def _supervised(model: PlaceModel, trained: _Located, drive: _Located) -> Trajectory:
     """The drive by the model's own regression, fitted on the ground truth of a training drive."""
     basis = model.metric.basis
-    stamps = trained.tracks['sfa'].poses.stamps_ns
+    stamps = trained.images.poses.stamps_ns
     mask = known(trained.truth, stamps)
     expanded = basis.expand(trained.features[mask])
     places = trained.truth.at(stamps[mask])[:, :2]
@@ -358,7 +398,7 @@ def _supervised(model: PlaceModel, trained: _Replay, drive: _Replay) -> Trajecto
     weights = np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
     positions = basis.expand(drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
-    stamps = drive.tracks['sfa'].poses.stamps_ns
+    stamps = drive.images.poses.stamps_ns
     return Trajectory(stamps, np.column_stack([positions, unknown]))
 
 

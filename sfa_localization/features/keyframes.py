@@ -143,17 +143,24 @@ def texture(panorama: Image) -> Texture:
     The logarithm of the brightness minus its surroundings, over their standard deviation: what is
     left of an image after its light.
     """
-    height, width = min(panorama.shape[0], _ROWS), min(panorama.shape[1], _COLUMNS)
-    grey = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
-    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    small = small_gray(panorama, _ROWS, _COLUMNS)
+    width = small.shape[1]
     margin = max(width // 6, 1)
     light = np.log(np.pad(small, ((0, 0), (margin, margin)), 'wrap') + np.float32(_DARKEST))
     detail = light - cv2.GaussianBlur(light, (0, 0), width * _BLUR)
     contrast = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), width * _BLUR))
-    return _normalized((detail / (contrast + np.float32(_FLATTEST)))[:, margin:-margin])
+    return normalized((detail / (contrast + np.float32(_FLATTEST)))[:, margin:-margin])
 
 
-def _normalized(image: Texture) -> Texture:
+def small_gray(panorama: Image, rows: int, columns: int) -> Texture:
+    """A panorama (H, W, 3) uint8 in gray, of at most so many rows and columns."""
+    size = min(panorama.shape[1], columns), min(panorama.shape[0], rows)
+    gray = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def normalized(image: Texture) -> Texture:
+    """An image of zero mean and unit norm."""
     centered = image - image.mean()
     return np.asarray(centered / max(float(np.linalg.norm(centered)), 1e-6), np.float32)
 
@@ -196,7 +203,7 @@ class Keyframes:
         """Keyframes ready to be matched. Raises DataError for too few."""
         if len(textures) < _FEWEST:
             raise DataError(f'{len(textures)} images are too few for keyframes')
-        spectra = spectrum(np.stack([_normalized(t.astype(np.float32)) for t in textures]))
+        spectra = spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
         coarse = np.ascontiguousarray(_coarse(spectra).transpose(2, 0, 1))
         return cls(textures, poses, noise, clockwise, spectra, coarse, cKDTree(poses[:, :2]))
 

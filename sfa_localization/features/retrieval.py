@@ -11,14 +11,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.keyframes import Spectra, spectrum
+from sfa_localization.features.keyframes import (
+    Spectra,
+    Texture,
+    normalized,
+    small_gray,
+    spectrum,
+)
 
 COLUMNS, ROWS = 150, 30
 
@@ -38,7 +42,7 @@ class ImageRetrieval:
 
         Raises DataError for none.
         """
-        small = [small_gray(panorama) for panorama in panoramas]
+        small = [_likeness(panorama) for panorama in panoramas]
         if not small:
             raise DataError('no training image to retrieve')
         return cls(spectrum(np.stack(small)), poses, small[0].shape[1], clockwise)
@@ -48,7 +52,7 @@ class ImageRetrieval:
         turned by the rotation at which it does.
         """
         curves = np.fft.irfft(
-            np.einsum('krf,rf->kf', self.spectra, np.conj(spectrum(small_gray(panorama)))),
+            np.einsum('krf,rf->kf', self.spectra, np.conj(spectrum(_likeness(panorama)))),
             self.columns,
             axis=1,
         )
@@ -58,10 +62,6 @@ class ImageRetrieval:
         return np.array([x, y, wrap_angle(yaw + turn)])
 
 
-def small_gray(panorama: Image) -> NDArray[np.float32]:
+def _likeness(panorama: Image) -> Texture:
     """A panorama (H, W, 3) as a gray image of at most (ROWS, COLUMNS), zero mean, unit norm."""
-    size = min(panorama.shape[1], COLUMNS), min(panorama.shape[0], ROWS)
-    gray = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
-    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    small -= small.mean()
-    return np.asarray(small / max(float(np.linalg.norm(small)), 1e-6), np.float32)
+    return normalized(small_gray(panorama, ROWS, COLUMNS))

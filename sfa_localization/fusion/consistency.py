@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.geometry import align_complex, wrap_angle
 from sfa_localization.fusion.belief import Evidence, Trust
 from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
 
@@ -82,13 +82,10 @@ def contradiction(recent: Sequence[Evidence]) -> str:
     places = np.array([complex(*item.position) for item in recent])
     variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
     weight = 1 / variance
-    turn = 0.0
-    square = np.zeros(len(recent))
     for _ in range(_FIT_STEPS):
         along = path - np.average(path, weights=weight)
-        across = places - np.average(places, weights=weight)
-        turn = float(np.angle(np.sum(weight * np.conj(along) * across)))
-        square = np.abs(across - np.exp(1j * turn) * along) ** 2 / variance
+        turn, shift = align_complex(path, places, weight)
+        square = np.abs(turn * path + shift - places) ** 2 / variance
         weight = 1 / (variance * (1 + square))
     agree = square <= AGREEING_VARIANCES
     if agree.mean() < AGREEING_HALF:
@@ -96,7 +93,7 @@ def contradiction(recent: Sequence[Evidence]) -> str:
     lever = float(np.sum(agree * np.abs(along) ** 2 / variance))
     # Neighboring images err alike, over about a meter.
     dependence = max(1.0, len(recent) / (1 + span_m))
-    return _turned(recent, agree, turn, dependence / max(lever, 1e-9))
+    return _turned(recent, agree, float(np.angle(turn)), dependence / max(lever, 1e-9))
 
 
 def _turned(
