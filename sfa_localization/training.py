@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
 from sfa_localization.features.checkpoint import Checkpoint
+from sfa_localization.features.closures import find_closures
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
 from sfa_localization.features.network import Architecture, Network, standard_architecture
 from sfa_localization.features.network_training import (
@@ -48,7 +49,7 @@ from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.fast_expansions import fast_map
-from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
+from sfa_localization.metric.keyframe_map import KeyframeMap, images_seen, learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
@@ -166,6 +167,8 @@ def learn_place(
     images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
+    closures = find_closures(images_seen(runs, images), recipe.panorama.clockwise)
+    segments = replace(segments, closures=closures)
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
     first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)

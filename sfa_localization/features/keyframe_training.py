@@ -18,6 +18,7 @@ from sfa_localization.features.keyframes import (
     NEIGHBORS,
     Keyframes,
     MatchNoise,
+    correlate,
 )
 
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
@@ -61,7 +62,8 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     sample = np.unique(np.linspace(0, count - 1, min(_TRIALS, count)).round().astype(np.int64))
     for start in range(0, len(sample), _AT_ONCE):
         rows = sample[start : start + _AT_ONCE]
-        found = keyframes.correlate(keyframes.spectra[rows], keyframes.spectra)
+        columns = keyframes.textures.shape[2]
+        found = correlate(keyframes.spectra[rows], keyframes.spectra, columns)
         for row, scores, shifts in zip(rows.tolist(), *found, strict=True):
             scores[np.abs(path_m - path_m[row]) < _STRETCH_M] = -np.inf
             if np.isfinite(scores).sum() >= NEIGHBORS and scores.max() >= LOWEST:

@@ -176,7 +176,35 @@ def quantized(textures: Texture) -> NDArray[np.int8]:
     return np.asarray(np.clip(np.rint(textures * (_STEPS / deviation)), -127, 127), np.int8)
 
 
-def _coarse(spectra: Spectra) -> Spectra:
+def correlate(
+    spectra: Spectra, keyframes: Spectra, columns: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Largest correlation of T spectra (T, rows, F) with each of K (K, rows, F), (T, K), and the
+    shift of columns, to a part of one of so many, at which it is reached.
+    """
+    products = keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0)
+    curves = fft.irfft(products.transpose(2, 1, 0), columns, axis=2)
+    top = curves.argmax(2)
+    t, k = np.ogrid[: len(spectra), : len(keyframes)]
+    left, middle, right = (curves[t, k, (top + step) % columns] for step in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
+    return middle, np.asarray(top + part, np.float32)
+
+
+def coarse(spectra: Spectra) -> Spectra:
+    """Low frequencies of spectra (K, rows, F), in pairs of rows, of unit norm: (F', K, rows')."""
+    return np.ascontiguousarray(_low(spectra).transpose(2, 0, 1))
+
+
+def coarse_scores(spectra: Spectra, keyframes: Spectra) -> NDArray[np.float32]:
+    """About the largest correlation (T, K) of spectra (T, rows, F) with keyframes' `coarse`."""
+    products = keyframes @ np.conj(_low(spectra)).transpose(2, 1, 0)
+    curves = fft.irfft(products.transpose(2, 1, 0), 2 * len(keyframes), axis=2)
+    return np.asarray(curves.max(2))
+
+
+def _low(spectra: Spectra) -> Spectra:
     """Low frequencies of spectra (T, rows, F), in pairs of rows, of unit norm."""
     low = spectra[:, : spectra.shape[1] // 2 * 2, 1 : _COARSE + 1]
     low = low[:, ::2] + low[:, 1::2] if low.shape[1] else spectra[:, :, 1 : _COARSE + 1]
@@ -204,8 +232,8 @@ class Keyframes:
         if len(textures) < _FEWEST:
             raise DataError(f'{len(textures)} images are too few for keyframes')
         spectra = spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
-        coarse = np.ascontiguousarray(_coarse(spectra).transpose(2, 0, 1))
-        return cls(textures, poses, noise, clockwise, spectra, coarse, cKDTree(poses[:, :2]))
+        tree = cKDTree(poses[:, :2])
+        return cls(textures, poses, noise, clockwise, spectra, coarse(spectra), tree)
 
     def match(self, panorama: Image, guess: Array | None = None) -> Match:
         """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
@@ -234,35 +262,18 @@ class Keyframes:
         """Fill in what is still missing of the wanted keyframes' correlations."""
         wanted = wanted[np.isneginf(scores[wanted])]
         if len(wanted):
-            found, shift = self.correlate(image, self.spectra[wanted])
+            found, shift = correlate(image, self.spectra[wanted], self.textures.shape[2])
             scores[wanted], shifts[wanted] = found[0], shift[0]
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
         """The keyframes that are likeliest by the coarse structure of the image."""
-        products = self.coarse @ np.conj(_coarse(spectrum)).transpose(2, 1, 0)
-        scores = fft.irfft(products[:, :, 0].T, 2 * len(self.coarse), axis=1).max(1)
+        scores = coarse_scores(spectrum, self.coarse)[0]
         number = min(_CANDIDATES, len(scores))
         return np.sort(np.argpartition(-scores, number - 1)[:number])
 
     def nearest(self, place: Array) -> NDArray[np.int64]:
         """The keyframes nearest to a place (2,) m."""
         return np.asarray(self.tree.query(place, min(NEIGHBORS, len(self.poses)))[1], np.int64)
-
-    def correlate(
-        self, spectra: Spectra, keyframes: Spectra
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Largest correlation of T spectra (T, rows, F) with each of K, (T, K), and the shift of
-        columns, to a part of a column, at which it is reached.
-        """
-        columns = self.textures.shape[2]
-        products = keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0)
-        curves = fft.irfft(products.transpose(2, 1, 0), columns, axis=2)
-        top = curves.argmax(2)
-        t, k = np.ogrid[: len(spectra), : len(keyframes)]
-        left, middle, right = (curves[t, k, (top + step) % columns] for step in (-1, 0, 1))
-        bend = left - 2 * middle + right
-        part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
-        return middle, np.asarray(top + part, np.float32)
 
     def located(
         self,

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.expansions import Basis
+from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import (
     Elimination,
     Links,
@@ -59,6 +60,7 @@ class MetricProblem:
     segments: Segments
     stack: Stack
     links: Links
+    loops: Loops
     config: MetricConfig
     seed: int = 0
     """Of the parts that are left out, and of the points that the forecast draws."""
@@ -70,7 +72,8 @@ class MetricProblem:
         """From features (N, K) of all images. Raises DataError when they are unusable."""
         stack = Stack.of(segments)
         rows = _checked_rows(np.asarray(features, float), stack, config)
-        return cls(rows, segments, stack, Links.of(segments), config, seed)
+        loops = Loops.of(segments.closures, stack)
+        return cls(rows, segments, stack, Links.of(segments), loops, config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
         """Alternate solution and noise until the noise settles; a near `start` saves rounds."""
@@ -81,7 +84,8 @@ class MetricProblem:
         correlation = start.correlation if start else LINK_WEIGHT
         for _ in range(max(rounds, 1)):
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
-            solution = self._solve(elimination, variance * correlation, solution)
+            loops = self.loops.form(self.stack, solution)
+            solution = self._solve(elimination, loops, variance * correlation, solution)
             weights = elimination.weights(solution.coefficients(self.stack.period))
             predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
             residuals = solution.places(self.stack) - predicted
@@ -93,16 +97,19 @@ class MetricProblem:
                 break
         assert solution is not None
         return MapFit(
-            self, basis, expanded, noise_ratio, variance, correlation,
+            self, basis, expanded, noise_ratio, variance, correlation, loops,
             elimination, solution, np.asarray(residuals), weights,
         )  # fmt: skip
 
     def _solve(
-        self, elimination: Elimination, variance: float, before: Solution | None
+        self,
+        elimination: Elimination,
+        loops: Complex,
+        variance: float,
+        before: Solution | None,
     ) -> Solution:
-        form = QuadraticForm(
-            elimination.gram, self.links, self.stack.period, variance, YAW_BIAS_STD
-        )
+        gram = elimination.gram + variance * loops
+        form = QuadraticForm(gram, self.links, self.stack.period, variance, YAW_BIAS_STD)
         if before is None:
             solution = form.solve(None, np.zeros(self.stack.period[-1] + 1))
         else:
@@ -136,6 +143,8 @@ class MapFit:
     correlation: float
     """How many images count as one beside odometry's links, because residuals of neighbors are
     correlated; times LINK_WEIGHT."""
+    loops: Complex
+    """(3N, 3N) form of the loop closures in [o, z, -b z], see loops.py."""
     elimination: Elimination
     solution: Solution
     residuals: Complex
@@ -165,7 +174,8 @@ class MapFit:
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
         links, period = self.problem.links, self.stack.period
-        return QuadraticForm(elimination.gram, links, period, self.link_variance, 0.0)
+        gram = elimination.gram + self.link_variance * self.loops
+        return QuadraticForm(gram, links, period, self.link_variance, 0.0)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.features.agreement import Agreement, needed_factor, share_within
+from sfa_localization.features.closures import Views
 from sfa_localization.features.image_features import ImageFeatures
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
@@ -53,6 +54,13 @@ def learn_keyframes(
     kept = spread(poses)
     variance = result.left_out_variance * agreement.factor(images.disagreement[labeled])
     return _judged(keyframes, path[kept], row[kept], result, variance)
+
+
+def images_seen(runs: Sequence[Run], images: ImageFeatures) -> Views:
+    """The sampled images of all runs, to find loop closures among."""
+    run = np.repeat(np.arange(len(runs)), [len(r.panoramas) for r in runs])
+    rows = images.sampled
+    return Views(images.textures, rows, run[rows], _path(runs)[rows])
 
 
 def _path(runs: Sequence[Run]) -> Array:

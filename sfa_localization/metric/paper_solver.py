@@ -176,6 +176,8 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     form = QuadraticForm(elimination.gram, problem.links, stack.period, variance, 0.0)
     h = schur(form.system(bias))[0]
     solution = Solution(z, o, bias, certify(h, z), h, phase_cost(h, z))
+    no_loops = np.zeros_like(elimination.gram)
     return MapFit(
-        problem, basis, expanded, ones, variance, 1.0, elimination, solution, residuals, weights
-    )
+        problem, basis, expanded, ones, variance, 1.0, no_loops,
+        elimination, solution, residuals, weights,
+    )  # fmt: skip

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
+from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     MOMENT,
@@ -114,11 +115,13 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """Segments in driving order, and how many images and odometry messages were used."""
+    """Segments in driving order, how many images and odometry messages were used, and the loop
+    closures between their images."""
 
     items: tuple[Segment, ...]
     images: Count = field(default_factory=Count)
     odometry: Count = field(default_factory=Count)
+    closures: Closures = field(default_factory=Closures.none)
 
     def __len__(self) -> int:
         return len(self.items)

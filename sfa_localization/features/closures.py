@@ -1,0 +1,125 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closures: images of one place that were taken at different times, and the turn between them.
+
+Correlation of local contrast finds them in any light (see keyframes.py), before anything has been
+learned. They tie the stretches of a drive to each other, and drives in different lights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.features.keyframes import (
+    coarse,
+    coarse_scores,
+    correlate,
+    normalized,
+    spectrum,
+)
+
+Indices = NDArray[np.int64]
+
+LIKE = 0.55
+"""Least correlation of a closure: images of other places reach 0.4, some a little more."""
+STRETCH_M = 6.0
+"""Images that are nearer along the same drive are alike because they are neighbors."""
+# Each is the likest of the other, to so many images: neighbors are nearly equally like.
+_NEXT = 1
+# Of the coarse correlation, for the full one.
+_CANDIDATES = 24
+_AT_ONCE = 64  # bounds the memory
+
+
+@dataclass(frozen=True, slots=True)
+class Closures:
+    """L pairs of images: `images` (L, 2) indices among those of all drives; `turn` (L,) rad is the
+    robot's heading at the second minus that at the first.
+    """
+
+    images: Indices
+    turn: Array
+
+    def __len__(self) -> int:
+        return len(self.turn)
+
+    @classmethod
+    def none(cls) -> Closures:
+        """No closures."""
+        return cls(np.zeros((0, 2), np.int64), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """Images in driving order: `textures` (S, rows, columns), their indices `images` (S,) among
+    those of all drives, the drive `run` (S,) and the distance driven in it until each, (S,) m.
+    """
+
+    textures: NDArray[np.int8]
+    images: Indices
+    run: Indices
+    path_m: Array
+
+    def of(self, run: int) -> Views:
+        """Those of one drive."""
+        own = self.run == run
+        return Views(self.textures[own], self.images[own], self.run[own], self.path_m[own])
+
+
+def find_closures(views: Views, clockwise: bool) -> Closures:
+    """Images of two drives, or of a drive with itself, each of which is the likest of the other,
+    if they are like enough. `clockwise`: whether columns grow clockwise seen from above.
+    """
+    drives = [views.of(run) for run in np.unique(views.run).tolist()]
+    images, turns = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+    step = (2 if clockwise else -2) * np.pi / views.textures.shape[2]
+    for number, one in enumerate(drives):
+        for other in drives[number:]:
+            rows, shifts = _mutual(one, other)
+            images.append(np.column_stack([one.images[rows[:, 0]], other.images[rows[:, 1]]]))
+            turns.append(step * shifts)
+    return Closures(np.concatenate(images), np.concatenate(turns))
+
+
+def _mutual(one: Views, other: Views) -> tuple[Indices, Array]:
+    """Rows (L, 2) of closures between two drives, and the shifts (L,) of their columns."""
+    there, score, shift = _likest(one, other)
+    same = one is other
+    back = there if same else _likest(other, one)[0]
+    at = np.arange(len(there))
+    kept = (score >= LIKE) & (np.abs(back[there] - at) <= _NEXT) & (not same or at < there)
+    return np.column_stack([at, there])[kept], shift[kept]
+
+
+def _likest(one: Views, other: Views) -> tuple[Indices, Array, Array]:
+    """For each image (S,) of one drive the row of the likest of another, the correlation, -inf
+    without any, and the shift of the columns.
+    """
+    spectra, keyframes = (
+        spectrum(np.stack([normalized(t.astype(np.float32)) for t in v.textures]))
+        for v in (one, other)
+    )
+    rough, columns = coarse(keyframes), one.textures.shape[2]
+    best, score, shift = np.zeros(len(spectra), np.int64), *np.full((2, len(spectra)), -np.inf)
+    for start in range(0, len(spectra), _AT_ONCE):
+        scores = coarse_scores(spectra[start : start + _AT_ONCE], rough)
+        if one is other:
+            path = one.path_m[start : start + _AT_ONCE]
+            scores[np.abs(path[:, None] - other.path_m) < STRETCH_M] = -np.inf
+        number = min(_CANDIDATES, len(keyframes))
+        likely = np.sort(np.argpartition(-scores, number - 1, axis=1)[:, :number])
+        for row in range(len(scores)):
+            rows = likely[row][np.isfinite(scores[row, likely[row]])]
+            if not len(rows):
+                continue
+            found, shifts = correlate(
+                spectra[start + row : start + row + 1], keyframes[rows], columns
+            )
+            top = int(found[0].argmax())
+            best[start + row] = rows[top]
+            score[start + row], shift[start + row] = found[0, top], shifts[0, top]
+    return best, score, shift
