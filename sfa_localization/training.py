@@ -1,17 +1,18 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a place model from recorded drives: the paper in eight steps; ground truth is never read.
+"""Learn a place model from recorded drives: the paper in nine steps; ground truth is never read.
 
 1  read the drives                            bags/drives.py
-2  train the SFA hierarchy (section 2)        features/network_training.py
-3  slow features of all images                features/image_features.py
-4  cut the odometry into segments             metric/segments.py
-5  learn the certified map (section 3)        metric/learning.py
-6  learn the compass                          metric/compass_training.py
-7  refine the map with turned maps            metric/refinement.py
-8  assemble the place model                   place_model.py
+2  find loop closures                         features/closures.py
+3  train the SFA hierarchy (section 2)        features/network_training.py
+4  slow features of all images                features/image_features.py
+5  cut the odometry into segments             metric/segments.py
+6  learn the certified map (section 3)        metric/learning.py
+7  learn the compass                          metric/compass_training.py
+8  refine the map with turned maps            metric/refinement.py
+9  assemble the place model                   place_model.py
 
-Steps 3 to 6 find the place and the heading by slow features. Step 7 goes beyond the paper.
+Steps 4 to 7 find the place and the heading by slow features. Steps 2 and 8 go beyond the paper.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
 from sfa_localization.features.checkpoint import Checkpoint
-from sfa_localization.features.closures import find_closures
+from sfa_localization.features.closures import Closures, Views, find_closures, views_of
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
+from sfa_localization.features.joined_drives import edges_between
 from sfa_localization.features.network import Architecture, Network, standard_architecture
 from sfa_localization.features.network_training import (
     Executor,
@@ -49,7 +51,7 @@ from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.fast_expansions import fast_map
-from sfa_localization.metric.keyframe_map import KeyframeMap, images_seen, learn_keyframes
+from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
@@ -119,27 +121,49 @@ def train(
         checkpoint = Checkpoint.beside(output, settings, runs)
         if not resume:
             checkpoint.remove()
-        network = _train_hierarchy(runs, recipe, checkpoint, executor, progress)
         with one_core():
-            trained = learn_place(network, runs, recipe, progress)
+            known = match_images(runs, recipe, progress)
+        network = _train_hierarchy(runs, known.closures, recipe, checkpoint, executor, progress)
+        with one_core():
+            trained = learn_place(network, runs, recipe, progress, known)
         trained.model.save(output)
         checkpoint.remove()
     return trained
 
 
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """What images show before anything is learned: their local contrast, and loop closures."""
+
+    views: Views
+    closures: Closures
+
+
+def match_images(runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> Matched:
+    """Step 2: loop closures of the drives, also between drives in different lights."""
+    total, hidden = sum(len(run.panoramas) for run in runs), not progress
+    with tqdm(desc='local contrast of images', total=total, unit='img', disable=hidden) as bar:
+        views = views_of(runs, bar.update)
+    return Matched(views, find_closures(views, recipe.panorama.clockwise))
+
+
 def _train_hierarchy(
     runs: Sequence[Run],
+    closures: Closures,
     recipe: Recipe,
     checkpoint: Checkpoint,
     executor: Executor,
     progress: bool,
 ) -> Network:
-    """Step 2, from the checkpoint where there is one."""
+    """Step 3, from the checkpoint where there is one."""
     size = runs[0].panoramas.shape[:2]
     architecture = recipe.architecture or standard_architecture(size, recipe.network.normalization)
     start = checkpoint.read(architecture)
-    sequences, seed = [ImageSequence.of(run) for run in runs], recipe.network.seed
-    images, passes = sum(len(run.panoramas) for run in runs), 2 * len(architecture.layers)
+    drives, seed = [run.panoramas for run in runs], recipe.network.seed
+    sequences = [ImageSequence.of(run) for run in runs]
+    rotations, clockwise = architecture.rotations, recipe.panorama.clockwise
+    sequences += edges_between(drives, closures, rotations, clockwise)
+    images, passes = sum(len(s.panoramas) for s in sequences), 2 * len(architecture.layers)
     with tqdm(
         desc=f'slow features, {passes} passes',
         total=images * passes,
@@ -161,14 +185,18 @@ def _train_hierarchy(
 
 
 def learn_place(
-    network: Network, runs: Sequence[Run], recipe: Recipe, progress: bool = False
+    network: Network,
+    runs: Sequence[Run],
+    recipe: Recipe,
+    progress: bool = False,
+    known: Matched | None = None,
 ) -> Trained:
-    """Steps 3 to 8: maps, compass and keyframes for a trained network. Raises DataError."""
+    """Steps 4 to 9: maps, compass and keyframes for a trained network. Raises DataError."""
+    known = known or match_images(runs, recipe, progress)
     images = _slow_features(network, runs, progress)
     clocks = [_clock_of(run) for run in runs]
     segments = _cut_odometry(runs, clocks, recipe.segments)
-    closures = find_closures(images_seen(runs, images), recipe.panorama.clockwise)
-    segments = replace(segments, closures=closures)
+    segments = replace(segments, closures=known.closures)
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
     first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
@@ -176,13 +204,15 @@ def learn_place(
     finer = _refine(images, segments, first, heading, recipe)
     if points is not None and finer is None:
         first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
-    model = _assemble(network, runs, clocks, recipe, images, segments, first, heading, finer)
+    model = _assemble(
+        network, runs, clocks, recipe, images, known.views, segments, first, heading, finer
+    )
     result = finer.metric if finer else first
     return Trained(model, tuple(runs), images.slow, segments, result, heading)
 
 
 def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> ImageFeatures:
-    """Step 3: what the network outputs for all images."""
+    """Step 4: what the network outputs for all images."""
     total, hidden = sum(len(run.panoramas) for run in runs), not progress
     with tqdm(desc='features of all images', total=total, unit='img', disable=hidden) as bar:
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
@@ -202,7 +232,7 @@ def _clock_of(run: Run) -> CameraClock:
 def _cut_odometry(
     runs: Sequence[Run], clocks: Sequence[CameraClock], config: SegmentConfig
 ) -> Segments:
-    """Step 4: segments of all runs, at the stamps of the images by the clock of the odometry."""
+    """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""
     parts = [
         cut(run.odometry, run.panoramas.stamps_ns - clock.delay_ns, config, run.yaw_rate)
         for run, clock in zip(runs, clocks, strict=True)
@@ -212,7 +242,7 @@ def _cut_odometry(
 
 
 def _refines(config: MetricConfig, images: ImageFeatures) -> bool:
-    """Whether step 7 refines the map, if there is a heading.
+    """Whether step 8 refines the map, if there is a heading.
 
     The paper's descent and its monomials stay as they are: they are there for comparison.
     """
@@ -227,7 +257,7 @@ def _refine(
     heading: LearnedHeading | None,
     recipe: Recipe,
 ) -> LearnedRefinement | None:
-    """Step 7, where there are a heading and a layer to refine with."""
+    """Step 8, where there are a heading and a layer to refine with."""
     if heading is None or images.spectra is None or not _refines(recipe.metric, images):
         return None
     views, sign, seed = images.disagreement, heading.compass.sign, recipe.network.seed
@@ -244,17 +274,20 @@ def _assemble(
     clocks: Sequence[CameraClock],
     recipe: Recipe,
     images: ImageFeatures,
+    views: Views,
     segments: Segments,
     first: MetricResult,
     heading: LearnedHeading | None,
     finer: LearnedRefinement | None,
 ) -> PlaceModel:
-    """Step 8: the model, with its figures of merit."""
+    """Step 9: the model, with its figures of merit."""
     height, width, _ = runs[0].panoramas.shape
     agreement = left_out_agreement(images.disagreement, first)
     result = finer.metric if finer else first
     finest = finer.refinement.agreement if finer else agreement
-    known = learn_keyframes(runs, images, segments, result, finest, recipe.panorama.clockwise)
+    known = learn_keyframes(
+        views, images.disagreement, segments, result, finest, recipe.panorama.clockwise
+    )
     # Of each run, s; None where the drive does not show it.
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
     quality = _quality(network, images, segments, result, known)

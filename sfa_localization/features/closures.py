@@ -8,18 +8,23 @@ learned. They tie the stretches of a drive to each other, and drives in differen
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import BATCH, Run
+from sfa_localization.features.image_features import sample
 from sfa_localization.features.keyframes import (
     coarse,
     coarse_scores,
     correlate,
     normalized,
+    quantized,
     spectrum,
+    texture,
 )
 
 Indices = NDArray[np.int64]
@@ -68,6 +73,27 @@ class Views:
         """Those of one drive."""
         own = self.run == run
         return Views(self.textures[own], self.images[own], self.run[own], self.path_m[own])
+
+
+def views_of(runs: Sequence[Run], on_images: Callable[[int], object] = lambda count: None) -> Views:
+    """Of a sample of the images of all runs; `on_images` receives the size of each batch."""
+    counts = [len(run.panoramas) for run in runs]
+    chosen = sample(sum(counts))
+    run = np.repeat(np.arange(len(runs)), counts)[chosen]
+    textures, start = [], 0
+    for images in (batch for r in runs for batch in r.panoramas.batches(BATCH)):
+        seen = images[np.isin(np.arange(start, start + len(images)), chosen)]
+        textures += [quantized(texture(image)[None]) for image in seen]
+        start += len(images)
+        on_images(len(images))
+    path = np.concatenate([_path(r) for r in runs])[chosen]
+    return Views(np.concatenate(textures), chosen, run, path)
+
+
+def _path(run: Run) -> Array:
+    """Distance (N,) m that odometry had driven at each image."""
+    places = run.odometry.trajectory.at(run.panoramas.stamps_ns)[:, :2]
+    return np.cumsum(np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T))
 
 
 def find_closures(views: Views, clockwise: bool) -> Closures:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
 from sfa_localization.features.agreement import disagreement
-from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.network import Network
 from sfa_localization.features.rotation import Map
 
@@ -81,12 +80,15 @@ class ImageFeatures:
     """(S,) indices of the sample."""
     harmonic: Complex
     """(S, J) of the layers that the compass reads."""
-    textures: NDArray[np.int8]
-    """(S, rows, columns) local contrast, for keyframes."""
     spectra: Spectrum | None
     """(N, H, J) of the layer that refines positions; None in a network without it."""
     variance_shares: dict[str, list[float]]
     """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
+
+
+def sample(total: int) -> NDArray[np.int64]:
+    """Indices (S,) of at most `SAMPLES` of so many images, evenly."""
+    return np.unique(np.linspace(0, total - 1, min(total, SAMPLES)).round().astype(np.int64))
 
 
 def features_of_runs(
@@ -97,10 +99,10 @@ def features_of_runs(
 ) -> ImageFeatures:
     """Run all images through the network once; `on_images` receives the size of each batch."""
     total = sum(len(run.panoramas) for run in runs)
-    sampled = np.unique(np.linspace(0, total - 1, min(total, SAMPLES)).round().astype(np.int64))
+    sampled = sample(total)
     in_sample = np.zeros(total, bool)
     in_sample[sampled] = True
-    slow, spread, harmonic, textures = [], [], [], []
+    slow, spread, harmonic = [], [], []
     spectra: list[Spectrum] = []
     shares = _VarianceShares(network.architecture.outputs)
     start = 0
@@ -111,7 +113,6 @@ def features_of_runs(
         spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
-        textures += [quantized(texture(image)[None]) for image in images[keep]]
         if has_refining_layer(network):
             spectra.append(spectrum(maps[REFINING_LAYER]))
         start += len(images)
@@ -121,7 +122,6 @@ def features_of_runs(
         np.concatenate(spread),
         sampled,
         np.concatenate(harmonic),
-        np.concatenate(textures),
         np.concatenate(spectra) if spectra else None,
         shares.result(),
     )

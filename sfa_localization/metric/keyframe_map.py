@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Run
 from sfa_localization.features.agreement import Agreement, needed_factor, share_within
 from sfa_localization.features.closures import Views
-from sfa_localization.features.image_features import ImageFeatures
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.metric.learning import MetricResult, headings, positions
@@ -38,39 +35,24 @@ class KeyframeMap:
 
 
 def learn_keyframes(
-    runs: Sequence[Run],
-    images: ImageFeatures,
+    views: Views,
+    disagreement: Array,
     segments: Segments,
     result: MetricResult,
     agreement: Agreement,
     clockwise: bool,
 ) -> KeyframeMap:
-    """Keyframes where the certified solution puts their images. Raises DataError for too few."""
+    """Keyframes where the certified solution puts the images of `views`; `disagreement` (N,) is
+    that of all images' rotated views. Raises DataError for too few.
+    """
     labeled, places = positions(result, segments)
-    known, in_sample, row = np.intersect1d(images.sampled, labeled, return_indices=True)
+    _, seen, row = np.intersect1d(views.images, labeled, return_indices=True)
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
-    path = _path(runs)[known]
-    keyframes = fit_keyframes(images.textures[in_sample], poses, path, clockwise)
+    path = views.path_m[seen] + _ANOTHER_DRIVE_M * views.run[seen]
+    keyframes = fit_keyframes(views.textures[seen], poses, path, clockwise)
     kept = spread(poses)
-    variance = result.left_out_variance * agreement.factor(images.disagreement[labeled])
+    variance = result.left_out_variance * agreement.factor(disagreement[labeled])
     return _judged(keyframes, path[kept], row[kept], result, variance)
-
-
-def images_seen(runs: Sequence[Run], images: ImageFeatures) -> Views:
-    """The sampled images of all runs, to find loop closures among."""
-    run = np.repeat(np.arange(len(runs)), [len(r.panoramas) for r in runs])
-    rows = images.sampled
-    return Views(images.textures, rows, run[rows], _path(runs)[rows])
-
-
-def _path(runs: Sequence[Run]) -> Array:
-    """Distance (N,) m that odometry had driven at each image, far apart between drives."""
-    parts = []
-    for number, run in enumerate(runs):
-        places = run.odometry.trajectory.at(run.panoramas.stamps_ns)[:, :2]
-        steps = np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T)
-        parts.append(number * _ANOTHER_DRIVE_M + np.cumsum(steps))
-    return np.concatenate(parts)
 
 
 def _judged(

@@ -5,7 +5,7 @@
 Image a of segment i and image b of segment j are of one place, with a known turn between them:
 
     |z_j exp(i h_b) - exp(i turn) z_i exp(i h_a)|^2       the turn, h the headings in the segments
-    |o_j + z_j q_b - o_i - z_i q_a|^2                     the place, up to the distance of the images
+    |o_j + z_j q_b - o_i - z_i q_a|^2                     the place, to their distance
 
 How well they hold is estimated with the map. A few may be wrong: places can look alike. What does
 not fit loses its weight (Cauchy's), so that the form stays quadratic and its solution certified.

@@ -1,0 +1,88 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Edges of no time between drives: one place in another light is one moment to slowness.
+
+What differs between two images of a loop closure is light, or season, but not the place. As
+neighbors in the training sequence they make slow only what both lights show alike: what tells
+the drives apart would otherwise be the slowest feature of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.run import Image, Panoramas, Stamps
+from sfa_localization.features.closures import Closures, Indices
+from sfa_localization.features.network_training import ImageSequence
+
+_MOST = 400
+"""Edges of a training: enough for statistics, a small part of its time."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairedPanoramas:
+    """The images of loop closures, a, b, a, b: each b turned to the heading of its a, and by one
+    rotation step more, as the simulated rotation expects of neighbors.
+
+    `drives` in order, `pairs` (E, 2) indices among all of their images, `columns` (E,) to turn by.
+    """
+
+    drives: tuple[Panoramas, ...]
+    pairs: Indices
+    columns: Indices
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        return np.arange(len(self), dtype=np.int64)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.drives[0].shape
+
+    def __len__(self) -> int:
+        return 2 * len(self.pairs)
+
+    def read(self, start: int, stop: int) -> Image:
+        """Images start .. stop - 1 of the sequence (stop - start, H, W, C)."""
+        return np.stack([self._image(*divmod(n, 2)) for n in range(start, min(stop, len(self)))])
+
+    def batches(self, size: int) -> Iterator[Image]:
+        for start in range(0, len(self), size):
+            yield self.read(start, start + size)
+
+    def _image(self, pair: int, second: int) -> Image:
+        starts = np.cumsum([0, *(len(drive) for drive in self.drives)])
+        index = int(self.pairs[pair, second])
+        drive = int(np.searchsorted(starts, index, 'right')) - 1
+        row = index - int(starts[drive])
+        image = self.drives[drive].read(row, row + 1)[0]
+        return np.roll(image, int(self.columns[pair]), axis=1) if second else image
+
+
+def edges_between(
+    drives: Sequence[Panoramas], closures: Closures, rotations: int, clockwise: bool
+) -> list[ImageSequence]:
+    """The closures between different drives as a sequence for a network of so many rotations;
+    none without any.
+    """
+    starts = np.cumsum([0, *(len(drive) for drive in drives)])
+    drive = np.searchsorted(starts, closures.images, 'right')
+    between = np.flatnonzero(drive[:, 0] != drive[:, 1])
+    if not len(between):
+        return []
+    chosen = between[_evenly(len(between))]
+    width = drives[0].shape[1]
+    turned = closures.turn[chosen] * (width / (2 * np.pi if clockwise else -2 * np.pi))
+    columns = np.round(width / rotations - turned).astype(np.int64)
+    paired = PairedPanoramas(tuple(drives), closures.images[chosen], columns)
+    joined: NDArray[np.bool_] = np.arange(len(paired) - 1) % 2 == 0
+    return [ImageSequence(paired, joined)]
+
+
+def _evenly(count: int) -> Indices:
+    kept = np.linspace(0, count - 1, min(count, _MOST)).round().astype(np.int64)
+    return np.unique(kept)
