@@ -1,0 +1,200 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closures: found in any light, right about the turn, a help even if some are wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres
+from metric_worlds import criss_cross, drive, garden_features, meander
+
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.run import PanoramaArray
+from sfa_localization.features.closures import STRETCH_M, Closures, Views, find_closures
+from sfa_localization.features.joined_drives import edges_between
+from sfa_localization.features.keyframes import quantized, texture
+from sfa_localization.metric import selection
+from sfa_localization.metric.learning import headings, learn_metric, positions
+from sfa_localization.metric.loops import Loops
+from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.segments import cut, join
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+
+CONFIG = PanoramaConfig(width=120, height=24)
+COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)
+GP = MetricConfig(slow_features=12)
+
+
+def wander(count: int, seed: int) -> np.ndarray:
+    """Poses (N, 3) of a winding drive, 0.1 m apart, turned anyhow."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(np.full(count, 0.06)) + seed
+    places = np.column_stack([1.6 * np.sin(1.1 * t + seed), 1.6 * np.sin(0.83 * t)])
+    return np.column_stack([places, np.cumsum(rng.normal(0, 0.3, count))])
+
+
+def views(world: Spheres, drives: list[np.ndarray], config: PanoramaConfig, gamma=1.0) -> Views:
+    textures, parts = [], []
+    for number, poses in enumerate(drives):
+        images = world.panoramas(poses, config)
+        lit = 255 * (images / 255) ** (gamma if number else 1.0)
+        textures += [quantized(texture(image)[None]) for image in lit.astype(np.uint8)]
+        steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
+        parts.append(np.cumsum(steps))
+    count = sum(len(poses) for poses in drives)
+    run = np.repeat(np.arange(len(drives)), [len(poses) for poses in drives])
+    return Views(np.concatenate(textures), np.arange(count), run, np.concatenate(parts))
+
+
+@pytest.mark.parametrize('config', [CONFIG, COUNTER])
+def test_closures_are_of_one_place_and_know_the_turn(config):
+    poses = [wander(250, 0), wander(200, 1)]
+    seen = views(Spheres.about(0), poses, config, gamma=1.8)
+    closures = find_closures(seen, config.clockwise)
+    true = np.concatenate(poses)
+    first, second = closures.images.T
+    between = first < 250
+    between &= second >= 250
+    assert between.sum() > 20
+    assert (np.hypot(*(true[first] - true[second])[:, :2].T) < 0.5).mean() > 0.93
+    error = np.abs(wrap_angle(true[second, 2] - true[first, 2] - closures.turn))
+    assert np.median(error) < np.radians(1.5)
+    own = ~between
+    assert (np.abs(seen.path_m[first] - seen.path_m[second])[own] >= STRETCH_M).all()
+    assert len({tuple(pair) for pair in closures.images.tolist()}) == len(closures)
+
+
+def test_strange_places_close_no_loop():
+    here, there = (views(Spheres.about(n), [wander(150, n)], CONFIG) for n in (0, 5))
+    both = Views(
+        np.concatenate([here.textures, there.textures]),
+        np.arange(300),
+        np.repeat([0, 1], 150),
+        np.concatenate([here.path_m, there.path_m]),
+    )
+    images = find_closures(both, True).images
+    assert not ((images[:, 0] < 150) & (images[:, 1] >= 150)).any()
+
+
+# --- in the map -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(selection, 'INDUCING_POINTS', 300)
+
+
+def in_two_lights():
+    """Two drives whose features have nothing in common, as in lights that no feature survives."""
+    drives = [
+        drive(twists, start=start, bias=1e-3, yaw_noise=0.01, speed_noise=0.03, seed=seed)
+        for seed, (twists, start) in enumerate([criss_cross(12, seed=1), meander(120.0)])
+    ]
+    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in drives]
+    first = len(drives[0].poses)
+    poses = np.vstack([run.poses for run in drives])
+    features = np.zeros((len(poses), 12))
+    features[:, :6] = garden_features(poses[:, :2], noise=0.05, count=6)
+    features[first:] = 5.0 + garden_features(poses[first:, :2], noise=0.05, world=3)
+    return poses, features, join(parts, [0, first]), first
+
+
+def true_closures(poses, first, wrong=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    near = [
+        (a, b)
+        for a in range(0, first, 2)
+        for b in (first + int(np.argmin(np.hypot(*(poses[first:] - poses[a])[:, :2].T))),)
+        if np.hypot(*(poses[a] - poses[b])[:2]) < 0.3
+    ]
+    pairs = np.array(near)
+    turn = wrap_angle(poses[pairs[:, 1], 2] - poses[pairs[:, 0], 2])
+    turn = turn + rng.normal(0, 0.005, len(turn))
+    lies = rng.random(len(pairs)) < wrong
+    pairs[lies, 1] = rng.integers(first, len(poses), int(lies.sum()))
+    turn[lies] = rng.uniform(-np.pi, np.pi, int(lies.sum()))
+    return Closures(pairs, turn)
+
+
+def errors_of(result, segments, poses):
+    images, places = positions(result, segments)
+    frame = align(places, poses[images, :2])
+    yaw = headings(result, segments)[1] + frame.yaw_rad
+    far = np.hypot(*(frame.apply(places) - poses[images, :2]).T)
+    return far.mean(), np.abs(wrap_angle(yaw - poses[images, 2])).mean()
+
+
+@pytest.mark.parametrize('wrong', [0.0, 0.15])
+def test_closures_tie_drives_that_share_no_feature(wrong, quick):
+    poses, features, segments, first = in_two_lights()
+    with pytest.raises(DataError, match='directions are uncertain'):
+        learn_metric(features, segments, GP)
+    closures = true_closures(poses, first, wrong)
+    tied = dataclasses.replace(segments, closures=closures)
+    result = learn_metric(features, tied, GP)
+    far, turned = errors_of(result, tied, poses)
+    assert result.certificate.certified
+    assert far < 0.25 and turned < 0.03
+
+
+def test_the_form_is_the_sum_of_the_weighted_squares():
+    poses, _, segments, first = in_two_lights()
+    stack = Stack.of(segments)
+    closures = true_closures(poses, first)
+    loops = Loops.of(closures, stack)
+    rng = np.random.default_rng(0)
+    n = stack.segments
+    z, o = np.exp(1j * rng.uniform(-3, 3, n)), rng.normal(size=n) + 1j * rng.normal(size=n)
+    bias = rng.normal(0, 1e-6, stack.period[-1] + 1)
+    x = np.concatenate([o, z, -bias[stack.period] * z])
+    form = loops.form(stack, None)
+    total = 0.0
+    yaw = np.angle(z)[stack.owner] + stack.headings
+    yaw = yaw - bias[stack.period[stack.owner]] * stack.times_s
+    places = o[stack.owner] + z[stack.owner] * stack.corrected(bias)
+    for (a, b), turn, share in zip(loops.rows, loops.turn, loops.share, strict=True):
+        total += share / 0.01**2 * abs(np.exp(1j * yaw[b]) - np.exp(1j * (yaw[a] + turn))) ** 2
+        total += share / 0.3**2 * abs(places[b] - places[a]) ** 2
+    assert np.vdot(x, form @ x).real == pytest.approx(total, rel=1e-4)
+    assert np.abs(form - form.conj().T).max() < 1e-9 * np.abs(form).max()
+
+
+def test_closures_of_images_without_a_segment_are_left_out():
+    _, _, segments, _ = in_two_lights()
+    stack = Stack.of(segments)
+    images = np.array([[10**6, stack.images[0]], [stack.images[0], stack.images[-1]]])
+    assert len(Loops.of(Closures(images, np.zeros(2)), stack).turn) == 1
+    assert len(Loops.of(Closures.none(), stack).turn) == 0
+
+
+# --- in the network ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('config', [CONFIG, COUNTER])
+def test_an_edge_turns_the_second_image_to_the_heading_of_the_first(config):
+    world, rotations = Spheres.about(0), 12
+    turns = 2 * np.pi / config.width * np.array([0, 7, -30])
+    first = np.array([[0.1, 0.2, 0.3], [0.5, -0.4, 2.0], [-1.0, 0.3, -2.0]])
+    second = first + np.column_stack([np.zeros((3, 2)), turns])
+    drives = [
+        PanoramaArray(np.arange(3), world.panoramas(poses, config)) for poses in (first, second)
+    ]
+    pairs = np.column_stack([np.arange(3), np.arange(3, 6)])
+    (edges,) = edges_between(drives, Closures(pairs, turns), rotations, config.clockwise)
+    images = edges.panoramas.read(0, 6)
+    step = config.width // rotations
+    for a, b in zip(images[::2], images[1::2], strict=True):
+        ahead = np.roll(a, step, axis=1).astype(int)
+        assert np.abs(b - ahead).mean() < 4.0
+        assert np.abs(b - a.astype(int)).mean() > 10.0
+    assert edges.joined.tolist() == [True, False, True, False, True]
+
+
+def test_closures_within_a_drive_are_no_edges():
+    images = PanoramaArray(np.arange(4), np.zeros((4, 24, 120, 3), np.uint8))
+    inside = Closures(np.array([[0, 3], [4, 7]]), np.zeros(2))
+    assert edges_between([images, images], inside, 12, True) == []
+    assert edges_between([images, images], Closures.none(), 12, True) == []
