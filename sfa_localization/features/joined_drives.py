@@ -3,7 +3,7 @@
 """Edges of no time between drives: one place in another light is one moment to slowness.
 
 What differs between two images of a loop closure is light, or season, but not the place. As
-neighbors in the training sequence they make slow only what both lights show alike: what tells
+neighbors in the training sequence they make slow only what both lights show alike: what sets
 the drives apart would otherwise be the slowest feature of all.
 """
 
