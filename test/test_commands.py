@@ -227,6 +227,16 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--compressed': Case(
             '--compressed', lambda a, b: '/panorama/compressed' in {*b.bag()['topics']}
         ),
+        '--poses': Case(
+            '--poses {data}/positions.csv --area 20x20',
+            lambda a, b: a.code == 1 and 'give both' in a.text and len(b.bag()['truth']) > 10,
+            beside='--odometry {data}/odom.csv',
+        ),
+        '--odometry': Case(
+            '--odometry {data}/odom.csv',
+            lambda a, b: a.code == 1 and len(b.bag()['odometry'].poses) > 100,
+            beside='--poses {data}/positions.csv --area 20x20',
+        ),
         '--trajectory': Case('--trajectory curves', another_drive),
         '--seed': Case('--seed 2', another_drive),
         '--world': Case('--world 2', differ(lambda o: o.bag()['pictures'][0])),
