@@ -269,7 +269,7 @@ def simulate(
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
-    garden = Garden(config.world, config, open_lawn=given is not None)
+    garden = Garden(config.world, config, given is not None)
     recorded = given or drive(garden, config)
     if config.images == 'panorama':
         view = panorama_view(panorama or PanoramaConfig())
