@@ -23,6 +23,8 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.metric.segments import PIECE_LENGTH_M
+from sfa_localization.metric.sufficiency import ROUTE, is_one_route
 
 PANORAMA, OMNIDIRECTIONAL, FISHEYE = 'panorama', 'omnidirectional', 'fisheye'
 DUAL_FISHEYE, ORDINARY = 'dual fisheye', 'ordinary camera'
@@ -216,6 +218,8 @@ def inspect(
         report.problems, report.notes = bag.problems, bag.recording.notes
         report.images = survey.images()
         report.drive = survey.drive(report.images)
+    if report.drive is not None and _one_route(report.drive.places):
+        report.notes.append(ROUTE)
     report.lacks += lacks(report, config)
     return report
 
@@ -414,6 +418,12 @@ def _lacks_of_images(images: ImageTopic, used: int, config: InspectionConfig) ->
         yield 'the images are dark: open the lens or wait for daylight'
 
 
+def _one_route(places: Array) -> bool:
+    """Whether training will learn one route, and no area, from images at places (M, 3)."""
+    moved = len(places) > 1 and path_length(places) >= 1.0
+    return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
+
+
 def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
     gap, share = spacing(places), covered_share(places, config.reach)
     if path_length(places) < 1.0:
@@ -421,6 +431,8 @@ def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
         return
     if gap > config.max_spacing:
         yield f'images are {gap:.2f} m apart: drive slower or record more of them'
+    if _one_route(places):
+        return
     if share < MIN_COVERED:
         yield (
             f'{share:.0%} of the area lie within {config.reach:g} m of an image: '

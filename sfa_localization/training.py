@@ -61,6 +61,8 @@ from sfa_localization.metric.learning import (
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.sufficiency import ROUTE
+from sfa_localization.metric.turn_noise import against_compass, against_images, expected_noise
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
@@ -68,6 +70,10 @@ logger = logging.getLogger(__name__)
 COARSE_POINTS = 700
 """Inducing points of a first map that is refined: with more, the refined map and the heading are
 no better, and the model file is larger."""
+_NOISE_FACTOR = 2.0
+"""Noise of turns that differs by less bends no map: links weigh a little more or less."""
+_NOISE_ROUNDS = 3
+"""With the noise that is stated, with the one found, and once more where that was a bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +131,7 @@ def train(
             known = match_images(runs, recipe, progress)
         network = _train_hierarchy(runs, known.closures, recipe, checkpoint, executor, progress)
         with one_core():
-            trained = learn_place(network, runs, recipe, progress, known)
+            trained = learn_place(network, runs, recipe, progress, strict, known)
         trained.model.save(output)
         checkpoint.remove()
     return trained
@@ -189,18 +195,26 @@ def learn_place(
     runs: Sequence[Run],
     recipe: Recipe,
     progress: bool = False,
+    strict: bool = False,
     known: Matched | None = None,
 ) -> Trained:
-    """Steps 4 to 9: maps, compass and keyframes for a trained network. Raises DataError."""
+    """Steps 4 to 9: maps, compass and keyframes for a trained network.
+
+    Raises DataError; `strict` also for a single route, of which else a warning says so.
+    """
     known = known or match_images(runs, recipe, progress)
     images = _slow_features(network, runs, progress)
-    clocks = [_clock_of(run) for run in runs]
-    segments = _cut_odometry(runs, clocks, recipe.segments)
-    segments = replace(segments, closures=known.closures)
+    seen = [list(visual_headings(run.panoramas)) for run in runs]
+    clocks = [_clock_of(run, own) for run, own in zip(runs, seen, strict=True)]
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
-    first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
-    heading = learn_heading(images, segments, first)
+    segments, first, heading = _learn_map(
+        images, known.closures, runs, clocks, seen, recipe, points
+    )
+    if first.diagnostics.one_route:
+        if strict:
+            raise DataError(f'{ROUTE}, or train without --strict')
+        logger.warning(ROUTE)
     finer = _refine(images, segments, first, heading, recipe)
     if points is not None and finer is None:
         first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
@@ -218,9 +232,12 @@ def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> Ima
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 
-def _clock_of(run: Run) -> CameraClock:
-    """The delay of the camera's clock; warns of one that the filter cannot compensate."""
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, visual_headings(run.panoramas))
+def _clock_of(run: Run, seen: Sequence[float]) -> CameraClock:
+    """The delay of the camera's clock, by the headings rad that its images show.
+
+    Warns of one that the filter cannot compensate.
+    """
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, seen)
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
             '%s: the stamps of images and odometry are %.2f s apart: the filter compensates half '
@@ -229,12 +246,81 @@ def _clock_of(run: Run) -> CameraClock:
     return clock
 
 
+def _learn_map(
+    images: ImageFeatures,
+    closures: Closures,
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    seen: Sequence[Sequence[float]],
+    recipe: Recipe,
+    points: int | None,
+) -> tuple[Segments, MetricResult, LearnedHeading | None]:
+    """Steps 5 to 7, and once more where turns are much noisier than stated or assumed.
+
+    Wheels that slip would bend the map. Where a map cannot even be learned with the noise that is
+    stated, the shifts of the images, `seen` in each run (N,) rad, bound it.
+    """
+    learned: tuple[Segments, MetricResult, LearnedHeading | None] | None = None
+    noise: float | None = None
+    for _ in range(_NOISE_ROUNDS):
+        segments = _cut_odometry(runs, clocks, recipe.segments, noise)
+        segments = replace(segments, closures=closures)
+        try:
+            first = learn_metric(
+                images.slow, segments, recipe.metric, recipe.network.seed, points=points
+            )
+            heading = learn_heading(images, segments, first)
+            learned = segments, first, heading
+            found = against_compass(heading, segments, first) if heading else None
+        except DataError:
+            if learned is not None:
+                break
+            found = _bound(runs, clocks, seen, recipe.segments) if noise is None else None
+            if found is None or _agree(found, segments, recipe.segments):
+                raise
+        if found is None or _agree(found, segments, recipe.segments):
+            break
+        noise = found
+    assert learned is not None
+    return learned
+
+
+def _agree(found: float, segments: Segments, config: SegmentConfig) -> bool:
+    """Whether a noise of turns confirms the one in use, or that is the user's."""
+    if config.yaw_noise != SegmentConfig().yaw_noise:
+        return True
+    used = expected_noise(segments)
+    return found <= _NOISE_FACTOR * max(used, config.yaw_noise) and (
+        used <= _NOISE_FACTOR * max(found, config.yaw_noise)
+    )
+
+
+def _bound(
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    seen: Sequence[Sequence[float]],
+    config: SegmentConfig,
+) -> float | None:
+    """The noise of turns by the images alone, of all runs together."""
+    found = [
+        against_images(
+            run.odometry, run.yaw_rate, run.panoramas.stamps_ns - clock.delay_ns, own, config
+        )
+        for run, clock, own in zip(runs, clocks, seen, strict=True)
+    ]
+    squares = [noise**2 for noise in found if noise is not None]
+    return float(np.sqrt(np.mean(squares))) if squares else None
+
+
 def _cut_odometry(
-    runs: Sequence[Run], clocks: Sequence[CameraClock], config: SegmentConfig
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    config: SegmentConfig,
+    noise: float | None,
 ) -> Segments:
     """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""
     parts = [
-        cut(run.odometry, run.panoramas.stamps_ns - clock.delay_ns, config, run.yaw_rate)
+        cut(run.odometry, run.panoramas.stamps_ns - clock.delay_ns, config, run.yaw_rate, noise)
         for run, clock in zip(runs, clocks, strict=True)
     ]
     counts = [len(run.panoramas) for run in runs]

@@ -88,7 +88,7 @@ class Outcome:
                 'topics': {topic.name: topic.kind for topic in bag.topics.values()},
                 'truth': bag.trajectory(),
                 'odometry': bag.odometry(),
-                'turns': bag.yaw_rate().omega,
+                'turns': bag.yaw_rate().omega if '/imu' in bag.topics else np.zeros(0),
                 'pictures': np.array([picture for _, picture in bag.images()]),
             }
 
@@ -226,6 +226,16 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--size': Case('--size 40x12', lambda a, b: b.bag()['pictures'].shape[1:3] == (12, 40)),
         '--compressed': Case(
             '--compressed', lambda a, b: '/panorama/compressed' in {*b.bag()['topics']}
+        ),
+        '--poses': Case(
+            '--poses {data}/positions.csv --area 20x20',
+            lambda a, b: a.code == 1 and 'give both' in a.text and len(b.bag()['truth']) > 10,
+            beside='--odometry {data}/odom.csv',
+        ),
+        '--odometry': Case(
+            '--odometry {data}/odom.csv',
+            lambda a, b: a.code == 1 and len(b.bag()['odometry'].poses) > 100,
+            beside='--poses {data}/positions.csv --area 20x20',
         ),
         '--trajectory': Case('--trajectory curves', another_drive),
         '--seed': Case('--seed 2', another_drive),
@@ -406,14 +416,14 @@ def small_network() -> Iterator[None]:
 
 @pytest.fixture(scope='module', autouse=True)
 def gardens() -> Iterator[None]:
-    """Build a garden once for all drives in it: seed, area, light and season make it."""
+    """Build a garden once for all drives in it: seed, area, light, season and lawn make it."""
     made: dict[Any, simulation.Garden] = {}
     garden = simulation.Garden
 
-    def again(seed: int, settings: SimulationConfig) -> simulation.Garden:
-        place = (seed, settings.area, settings.light, settings.season)
+    def again(seed: int, settings: SimulationConfig, open_lawn: bool) -> simulation.Garden:
+        place = (seed, settings.area, settings.light, settings.season, open_lawn)
         if place not in made:
-            made[place] = garden(seed, settings)
+            made[place] = garden(seed, settings, open_lawn)
         return made[place]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -28,6 +28,7 @@ from sfa_localization.inspection import (
     path_length,
     spacing,
 )
+from sfa_localization.metric.sufficiency import ROUTE
 
 START = 1_700_000_000_000_000_000
 STEP = 200_000_000
@@ -47,6 +48,18 @@ def star(share: float) -> tuple[float, float]:
 
 def circle(share: float) -> tuple[float, float]:
     return float(8 * np.cos(6.28 * share)), float(8 * np.sin(6.28 * share))
+
+
+def eight(share: float) -> tuple[float, float]:
+    return float(8 * np.sin(6.28 * share)), float(8 * np.sin(12.56 * share))
+
+
+def cross(share: float) -> tuple[float, float]:
+    """Along x and back to the middle, then along y to both sides."""
+    stops = np.array([[-15, 0], [15, 0], [0.3, 0], [0.3, 15], [0.3, -15]], float)
+    driven = np.cumsum([0, *np.abs(np.diff(stops, axis=0)).sum(1)])
+    x, y = (np.interp(share * driven[-1], driven, axis) for axis in stops.T)
+    return float(x), float(y)
 
 
 def line(share: float) -> tuple[float, float]:
@@ -103,8 +116,8 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
     ('options', 'reason'),
     [
         ({'pictures': 149}, '149 images with odometry are few'),
-        ({'route': line}, 'driven along 1 of 6 directions'),
-        ({'route': circle}, 'of the area lie within 1 m of an image'),
+        ({'route': cross}, 'driven along 2 of 6 directions'),
+        ({'route': eight}, 'of the area lie within 1 m of an image'),
         ({'route': lambda share: (0.0, 0.0), 'speed': 0.0}, 'the robot did not move'),
         ({'shape': (48, 64)}, 'the images do not show all directions'),
         ({'brightness': 4}, 'the images are dark'),
@@ -118,6 +131,15 @@ def test_it_gives_the_reason_why_a_drive_is_not_enough(
     report = inspect(write(tmp_path / 'bag', **options), config=ENOUGH)
     assert any(reason in lack for lack in report.lacks), report.lacks
     assert f'not enough to train on: {report.lacks[0]}' in report.as_text()
+
+
+@pytest.mark.parametrize('route', [line, circle])
+def test_one_route_is_enough_for_a_model_of_the_route_and_says_so(
+    route: Route, tmp_path: Path
+) -> None:
+    report = inspect(write(tmp_path / 'bag', route=route), config=ENOUGH)
+    assert report.lacks == [] and ROUTE in report.notes
+    assert ROUTE not in inspect(write(tmp_path / 'star'), config=ENOUGH).notes
 
 
 @pytest.mark.parametrize('missing', ['/panorama', '/odom'])

@@ -23,11 +23,12 @@ from metric_worlds import (
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
 from sfa_localization.features.agreement import share_within
-from sfa_localization.metric import alternation, learning, paper_solver, selection
+from sfa_localization.metric import alternation, learning, paper_solver, selection, sufficiency
 from sfa_localization.metric.alternation import MetricProblem
 from sfa_localization.metric.expansions import Monomials, Process, monomials
 from sfa_localization.metric.fast_expansions import fast_map, map_from_arrays
 from sfa_localization.metric.learning import headings, learn_metric, positions
+from sfa_localization.metric.map_covariance import angle_covariance
 from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
 from sfa_localization.metric.phases import certify, refine
 from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate, schur
@@ -392,21 +393,36 @@ def test_a_sheared_grid_is_refused_without_turns_and_right_with_them():
     assert errors(predicted, in_odometry_frame(run)[:, :2]).max() < 1e-6
 
 
-def test_a_collapsed_drive_is_refused():
+def test_a_collapsed_drive_is_refused_without_turns_and_one_route_with_them():
     back_and_forth = np.vstack([straight(8.0), turn(np.pi), straight(8.0), turn(np.pi)] * 3)
     run = drive(back_and_forth)
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     features = exact_features(run.poses)
-    for unused in ((), LINKS):
-        with pytest.raises(DataError, match='directions'):
-            learn_metric(features, without(segments, *unused), EXACT)
+    with pytest.raises(DataError, match='directions'):
+        learn_metric(features, without(segments, *LINKS), EXACT)
+    assert learn_metric(features, segments, EXACT).diagnostics.one_route
 
 
-def test_lanes_that_nothing_crosses_are_refused():
+def test_lanes_that_nothing_crosses_are_one_route():
     run = drive(lanes(10.0, 1.2, 9))
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
-    with pytest.raises(DataError, match='drive across earlier tracks'):
-        learn_metric(exact_features(run.poses - [3.0, 3.0, 0.0]), segments, EXACT)
+    features = exact_features(run.poses - [3.0, 3.0, 0.0])
+    found = learn_metric(features, segments, EXACT)
+    assert found.diagnostics.one_route and found.diagnostics.crossings == 0
+    assert errors(found.map.predict(features)[0], in_odometry_frame(run)[:, :2]).max() < 1e-6
+
+
+def test_a_short_piece_of_unknown_direction_does_not_refuse_a_drive():
+    run = curved_drive()
+    segments = cut(run.odometry, run.stamps_ns, ANY)
+    fit = MetricProblem.of(exact_features(run.poses), segments, EXACT).fit(
+        Monomials.fit(exact_features(run.poses), 5, 0.0)
+    )
+    lengths = np.array([segment.length_m for segment in segments])
+    sure = sufficiency.diagnose(fit).angle_std_rad
+    deviations = np.sqrt(np.diag(angle_covariance(fit)))
+    assert lengths[deviations <= sure].sum() >= 0.9 * lengths.sum()
+    assert lengths[deviations < sure].sum() < 0.9 * lengths.sum()
 
 
 def test_too_few_segments_are_refused():

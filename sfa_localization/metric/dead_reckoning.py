@@ -27,6 +27,9 @@ YAW_JUMP_MAX_RAD = 0.5
 """A pose this far from where the twist leads is an odometry reset."""
 # Periods of the odometry that are no pause, however slow it is.
 _PERIODS = 2.5
+# A pause up to this long is bridged where the twists before and after differ by no more.
+_BRIDGE_MAX_S = 1.5
+_UNSURE_M, _UNSURE_RAD = 0.05, 0.1
 # A gyroscope is compared with wheels that have turned this much, rad^2 in steps of a second, and
 # must then agree within this factor: skidding wheels are off by two, degrees by 57.
 _TURNS_TO_JUDGE = 1.0
@@ -56,9 +59,16 @@ class OdometryTrack:
 
     @classmethod
     def of(
-        cls, odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None
+        cls,
+        odometry: Odometry,
+        config: SegmentConfig,
+        yaw_rate: YawRate | None,
+        turn_noise: float | None = None,
     ) -> OdometryTrack:
-        """From wheel odometry, with the turns of the gyroscope where there is one."""
+        """From wheel odometry, with the turns of the gyroscope where there is one.
+
+        A known `turn_noise` (rad per square root of s) replaces what is stated or assumed.
+        """
         kept, skipped = _usable(odometry)
         stamps, poses = odometry.stamps_ns[kept], np.array(odometry.poses[kept], float)
         twists = odometry.twists[kept]
@@ -75,7 +85,9 @@ class OdometryTrack:
             twists = np.column_stack([twists[:, 0], np.gradient(yaw, seconds_since_start(stamps))])
         elif config.yaw_source == 'gyro':
             raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
-        sums = _running_sums(stamps, poses, yaw, variances, config.yaw_noise)
+        assumed = config.yaw_noise if turn_noise is None else turn_noise
+        stated = variances if turn_noise is None else np.zeros(len(variances))
+        sums = _running_sums(stamps, poses, yaw, stated, assumed)
         rate = _smoothed(seconds_since_start(stamps), twists[:, 1])
         part = np.concatenate([[0], np.cumsum(breaks)])
         count = Count(int(kept.sum()), skipped)
@@ -106,12 +118,23 @@ def _breaks(stamps: Stamps, poses: Array, twists: Array, skipped: dict[str, int]
     rate = np.maximum(np.abs(twists[:-1, 1]), np.abs(twists[1:, 1]))
     # Odometry that is always slow does not pause at each message.
     gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
+    gap &= ~_steady(dt, twists)
     reset = np.hypot(step[:, 0], step[:, 1]) > speed * dt + JUMP_MAX_M
     reset |= np.abs(step[:, 2]) > rate * dt + YAW_JUMP_MAX_RAD
     for reason, mask in (('pauses', gap), ('resets', reset & ~gap)):
         if mask.any():
             skipped[reason] = int(mask.sum())
     return np.asarray(gap | reset)
+
+
+def _steady(dt: Array, twists: Array) -> Mask:
+    """Mask (N - 1,) of short pauses that odometry bridges: it says the same before and after.
+
+    Drivers that repeat a command, or speak only when it changes, pause like that.
+    """
+    unsure = np.abs(np.diff(twists, axis=0)) * dt[:, None]
+    alike = (unsure[:, 0] < _UNSURE_M) & (unsure[:, 1] < _UNSURE_RAD)
+    return np.asarray(alike & (dt < _BRIDGE_MAX_S))
 
 
 def _usable_gyro(yaw_rate: YawRate | None) -> YawRate | None:

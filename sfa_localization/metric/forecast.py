@@ -32,6 +32,7 @@ Indices = NDArray[np.int64]
 
 REACH_M = 1.0
 """Ground further than this from every image is not covered by the drive."""
+_NARROW_M = 0.1
 # Enough for the mean and the map of the expected error; each is a small linear system.
 _POINTS = 1000
 # Of distances, in which left-out images are weighted.
@@ -125,6 +126,15 @@ def nearest_used(places: Array, part: Indices) -> Array:
 
 def _covered(places: Array, rng: np.random.Generator) -> Array:
     """Points (K, 2) drawn evenly inside the hull of the places (M, 2), and near one of them."""
+    center = places.mean(0)
+    axes = np.linalg.svd(places - center, full_matrices=False)[2]
+    along, across = (places - center) @ axes.T[:, 0], (places - center) @ axes.T[:, 1]
+    if np.ptp(across) < _NARROW_M:
+        # One straight route has hardly a hull: the ground that it covers is its line.
+        spots = rng.uniform(along.min(), along.max(), (4 * _POINTS, 1))
+        line = center + spots * axes[0]
+        near = cKDTree(places).query(line)[0] <= REACH_M
+        return np.asarray(line[near][:_POINTS])
     hull = ConvexHull(places)
     normals, offsets = hull.equations[:, :2], hull.equations[:, 2]
     tree = cKDTree(places)

@@ -47,12 +47,15 @@ IMAGES_MIN = 3
 """Fewest images of a segment: two determine its origin and direction, the third tests them."""
 IMAGE_STEP_MAX_M = 1.5
 """Longest distance without an image inside a segment."""
-IMAGE_STEP_MIN_M = 0.02
+IMAGE_STEP_MIN_M = 0.01
 IMAGE_TURN_MIN_RAD = np.deg2rad(3.0)
-"""Images closer to the one before, and turned less, repeat it: the robot stands still."""
+"""Images closer to the one before, and turned less, repeat it: the robot stands still, or is slow
+for its camera."""
+STANDING_S = 1.0
+"""A robot that has not come one such step farther after this time stands still."""
 BIAS_PERIOD_S = 60.0
 """The yaw-rate bias of odometry is constant for about this long: floors and tires change it."""
-SPEED_MIN_MPS = 0.05
+SPEED_MIN_MPS = 0.01
 TURN_RATE_MIN_RADPS = 0.2
 """A robot that is slower, or turns faster, does not drive a straight line."""
 DISTANCE_NOISE = 0.01
@@ -138,17 +141,19 @@ def cut(
     image_stamps_ns: Stamps,
     config: SegmentConfig,
     yaw_rate: YawRate | None = None,
+    turn_noise: float | None = None,
 ) -> Segments:
     """Cut a drive into segments at the stamps of its images (N,).
 
     `config.segments` names the cutter: 'straight' keeps lines between turns on the spot, by
     translational and angular velocity, as the paper does; 'any' cuts the whole drive into pieces
     bounded by length and by accumulated odometry error. Images without odometry, of a standing
-    robot, or in too short a piece are left out and counted in `Segments.images`.
+    robot, or in too short a piece are left out and counted in `Segments.images`. A known
+    `turn_noise` (rad per square root of s) replaces what the messages state.
 
     Raises DataError when no segment is left.
     """
-    track = OdometryTrack.of(odometry, config, yaw_rate)
+    track = OdometryTrack.of(odometry, config, yaw_rate, turn_noise)
     skipped: dict[str, int] = {}
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
@@ -263,7 +268,7 @@ class ImagePoses:
 
 
 def _without_standstill(poses: ImagePoses, skipped: dict[str, int]) -> ImagePoses:
-    """Leave out images of a robot that stands still."""
+    """Leave out images that repeat the one before, as of a robot that stands still."""
     keep = np.ones(len(poses.images), bool)
     last = 0
     for i in range(1, len(keep)):
@@ -271,7 +276,12 @@ def _without_standstill(poses: ImagePoses, skipped: dict[str, int]) -> ImagePose
         turned = abs(poses.yaw[i] - poses.yaw[last]) >= IMAGE_TURN_MIN_RAD
         keep[i] = moved or turned or poses.part[i] != poses.part[last]
         last = i if keep[i] else last
-    tally(skipped, 'standing still', ~keep)
+    driven = poses.sums[:, LENGTH]
+    later = np.interp(poses.time_s + STANDING_S, poses.time_s, driven) - driven
+    before = driven - np.interp(poses.time_s - STANDING_S, poses.time_s, driven)
+    stands = np.minimum(later, before) < IMAGE_STEP_MIN_M
+    tally(skipped, 'standing still', ~keep & stands)
+    tally(skipped, 'nearly where the one before was', ~keep & ~stands)
     return poses.take(keep)
 
 
@@ -325,12 +335,13 @@ def _even(poses: ImagePoses, group: Indices) -> list[Indices]:
 def _wear(poses: ImagePoses, group: Indices) -> Array:
     """Driven since the first image (M,), in pieces: each is used up by its length or its error."""
     driven = np.diff(poses.sums[group], axis=0)
-    yaw = np.sqrt(driven[:, YAW_VARIANCE]) * PIECE_LENGTH_M
+    length, limit = driven[:, LENGTH], PIECE_STD_M**2
+    # The heading's variance v moves the end of a length l by v l^2 / 3, which grows with l^3.
+    yaw = np.cbrt(length**2 * driven[:, YAW_VARIANCE] / (3 * limit))
     # Variances add up: the error of k equal steps is sqrt(k) times that of one.
-    random = DISTANCE_NOISE**2 * driven[:, LENGTH] + yaw**2 / 3
+    random = DISTANCE_NOISE**2 * length / limit + yaw
     turned = (TURN_SLIDE + YAW_SLIP * PIECE_LENGTH_M / 2) * driven[:, TURNED]
-    share = driven[:, LENGTH] / PIECE_LENGTH_M
-    wear = np.maximum(share, random / PIECE_STD_M**2) + turned / PIECE_STD_M
+    wear = np.maximum(length / PIECE_LENGTH_M, random) + turned / PIECE_STD_M
     return np.concatenate([[0.0], np.cumsum(wear)])
 
 

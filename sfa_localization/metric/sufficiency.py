@@ -18,9 +18,17 @@ from sfa_localization.metric.phases import metric_upgrade
 from sfa_localization.metric.quadratic_form import Stack
 
 Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
 
 ANGLE_STD_MAX_DEG = 10.0
 """Standard deviation of a segment's direction beyond which the map bends visibly."""
+SURE_SHARE = 0.9
+"""Of the driven length, whose directions must be surer: a short piece between two breaks of the
+odometry bends nothing, because the map alone places it."""
+ROUTE = (
+    'no track crosses another: the model holds the route in the shape of its odometry, and little '
+    'beside it; cross earlier tracks to learn an area'
+)
 # Fewer directions leave any shear possible.
 _SEGMENTS_MIN = 3
 # Narrower drives do not cover an area.
@@ -47,7 +55,14 @@ class Diagnostics:
     mirror_ambiguous: bool
     """The mirror image of the map explains the data as well."""
     angle_std_rad: float
-    """Largest uncertainty of a segment's direction relative to the whole map."""
+    """Uncertainty of a segment's direction relative to the whole map, of all but the least sure
+    segments: see SURE_SHARE."""
+
+    @property
+    def one_route(self) -> bool:
+        """Whether nothing but odometry, by its turns, connects the parts of the drive."""
+        signed = bool(np.isnan(self.upgrade_condition))
+        return signed and _connects_nothing(self.extent_m, self.crossings)
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -77,29 +92,30 @@ def diagnose(fit: MapFit) -> Diagnostics:
         length_m=float(np.abs(heading).sum()),
         extent_m=_extent(places),
         directions=_directions(heading),
-        crossings=_crossings(places, stack),
+        crossings=_crossings(places, stack.first),
         upgrade_condition=float(condition),
         mirror_ambiguous=not signed and len(links.at) == 0,
-        angle_std_rad=float(np.sqrt(np.diag(angle_covariance(fit))).max()),
+        angle_std_rad=_sure(np.sqrt(np.diag(angle_covariance(fit))), stack),
     )
 
 
 def check(diagnostics: Diagnostics) -> None:
-    """Raises DataError, naming what to drive, when the data cannot determine the map."""
+    """Raises DataError, naming what to drive, when the data cannot determine the map.
+
+    One route determines its own map: see `Diagnostics.one_route`.
+    """
     if diagnostics.upgrade_condition < _UPGRADE_MIN:
         raise DataError(
             'without turns the lines leave the map sheared or collapsed: drive at least three '
             'well-spread directions'
         )
-    if min(diagnostics.extent_m) < _WIDTH_MIN_M:
+    if diagnostics.one_route:
+        return
+    if _connects_nothing(diagnostics.extent_m, diagnostics.crossings):
         raise DataError(
-            f'the drive covers {diagnostics.extent_m[0]:.1f} m by {diagnostics.extent_m[1]:.1f} m: '
-            'drive in other directions too, so that the area is covered'
-        )
-    if diagnostics.crossings == 0:
-        raise DataError(
-            'no segment crosses another, so only odometry connects them: drive across '
-            'earlier tracks, from well-spread directions'
+            f'the drive covers {diagnostics.extent_m[0]:.1f} m by {diagnostics.extent_m[1]:.1f} m '
+            f'with {diagnostics.crossings} crossings, and odometry does not connect it: drive in '
+            'other directions too, across earlier tracks'
         )
     if np.rad2deg(diagnostics.angle_std_rad) > ANGLE_STD_MAX_DEG:
         raise DataError(
@@ -107,6 +123,31 @@ def check(diagnostics: Diagnostics) -> None:
             'drive longer, in more directions, and cross earlier tracks '
             f'({diagnostics.crossings} crossings now)'
         )
+
+
+def is_one_route(places: Complex, length_m: float) -> bool:
+    """Whether a drive through places (M,), x + i y in meters by the odometry, is one route.
+
+    The same check as that of a map, `Diagnostics.one_route`, of pieces of a length.
+    """
+    steps = np.abs(np.diff(places, prepend=places[:1]))
+    piece = np.floor(np.cumsum(steps) / length_m).astype(int)
+    first = np.flatnonzero(np.diff(piece, prepend=-1))
+    return _connects_nothing(_extent(places), _crossings(places, first))
+
+
+def _connects_nothing(extent_m: tuple[float, float], crossings: int) -> bool:
+    """Whether images on different tracks of a drive show no place in common."""
+    return min(extent_m) < _WIDTH_MIN_M or crossings == 0
+
+
+def _sure(angle_std: Array, stack: Stack) -> float:
+    """What SURE_SHARE of the driven length, by segments, stays below."""
+    steps = np.abs(np.diff(stack.path, prepend=0)) * (np.diff(stack.owner, prepend=-1) == 0)
+    lengths = np.bincount(stack.owner, steps)
+    order = np.argsort(angle_std)
+    driven = np.cumsum(lengths[order])
+    return float(angle_std[order][np.searchsorted(driven, SURE_SHARE * driven[-1])])
 
 
 def _extent(places: Complex) -> tuple[float, float]:
@@ -121,10 +162,10 @@ def _directions(steps: Complex) -> float:
     return 1.0 - float(abs((steps**2 / np.maximum(np.abs(steps), 1e-12)).sum()) / max(total, 1e-12))
 
 
-def _crossings(places: Complex, stack: Stack) -> int:
-    """Chords of segments that cross, leaving out neighbors on the drive."""
-    ends = np.append(stack.first[1:], len(places)) - 1
-    a, b = places[stack.first], places[ends]
+def _crossings(places: Complex, first: Indices) -> int:
+    """Chords of segments, from the rows `first` (N,) on, that cross, leaving out neighbors."""
+    ends = np.append(first[1:], len(places)) - 1
+    a, b = places[first], places[ends]
     i, j = np.triu_indices(len(a), 2)
 
     def side(p: Complex, q: Complex, r: Complex) -> Array:

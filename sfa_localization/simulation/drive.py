@@ -54,11 +54,14 @@ _FRAME_REACH_M = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A recorded drive: the truth in frame `world`, the measurements, the stamps of the images."""
+    """A recorded drive: the truth in frame `world`, the measurements, the stamps of the images.
+
+    A robot without a gyroscope has no `yaw_rate`.
+    """
 
     truth: Trajectory
     odometry: Odometry
-    yaw_rate: YawRate
+    yaw_rate: YawRate | None
     image_stamps_ns: Stamps
 
     @property
@@ -258,14 +261,16 @@ def simulate(
     panorama: PanoramaConfig | None = None,
     camera: CameraModel | None = None,
     progress: bool = False,
+    given: Drive | None = None,
 ) -> Drive:
     """Record a drive to the bag `out`; `progress` shows a bar. Returns what was recorded.
 
+    A `given` drive is recorded instead of one of `config`; no tree on the lawn is in its way.
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
-    garden = Garden(config.world, config)
-    recorded = drive(garden, config)
+    garden = Garden(config.world, config, given is not None)
+    recorded = given or drive(garden, config)
     if config.images == 'panorama':
         view = panorama_view(panorama or PanoramaConfig())
     else:
@@ -301,9 +306,28 @@ def _image_entries(
 
 
 def _sensor_entries(bag: BagWriter, drive: Drive) -> Iterator[Entry]:
-    odometry, gyro = drive.odometry, drive.yaw_rate
+    """What is not an image, in the order of the stamps."""
+    yield from heapq.merge(
+        _odometry_entries(bag, drive.odometry),
+        _gyro_entries(bag, drive.yaw_rate),
+        _truth_entries(bag, drive.truth),
+        key=lambda entry: entry[0],
+    )
+
+
+def _odometry_entries(bag: BagWriter, odometry: Odometry) -> Iterator[Entry]:
     for i, stamp in enumerate(map(int, odometry.stamps_ns)):
         twist, variance = odometry.twists[i], odometry.variances[i]
         yield stamp, partial(bag.odometry, '/odom', stamp, odometry.poses[i], twist, variance)
+
+
+def _gyro_entries(bag: BagWriter, gyro: YawRate | None) -> Iterator[Entry]:
+    if gyro is None:
+        return
+    for i, stamp in enumerate(map(int, gyro.stamps_ns)):
         yield stamp, partial(bag.imu, '/imu', stamp, gyro.omega[i], gyro.variance[i])
-        yield stamp, partial(bag.pose, '/ground_truth', stamp, drive.truth.poses[i])
+
+
+def _truth_entries(bag: BagWriter, truth: Trajectory) -> Iterator[Entry]:
+    for stamp, pose in zip(map(int, truth.stamps_ns), truth.poses, strict=True):
+        yield stamp, partial(bag.pose, '/ground_truth', stamp, pose)

@@ -341,14 +341,14 @@ def buildings(plot: Plot) -> None:
         plot.shapes += house(center, np.array([*plot.extent(side, deep, wide), height]), plot.rng)
 
 
-def trees(plot: Plot, dock: Array) -> None:
-    """Trees behind the fence all around, and a few on the lawn."""
+def trees(plot: Plot, dock: Array, on_lawn: int) -> None:
+    """Trees behind the fence all around, and some on the lawn."""
     for number in range(14):
         side, along = number % 4, plot.rng.uniform(-1.1, 1.1)
         foot = plot.beside(side, along, plot.rng.uniform(FENCE_M + 1.5, 9.0))
         kind = conifer if plot.rng.random() < 0.3 else tree
         plot.shapes += kind(foot, plot.rng.uniform(3.5, 7.5), plot.rng)
-    for _ in range(round(plot.half.prod() * 4 / 100)):
+    for _ in range(on_lawn):
         foot = _free_spot(plot, dock)
         plot.shapes += tree(foot, plot.rng.uniform(3.2, 4.8), plot.rng)
         plot.obstacles.append((float(foot[0]), float(foot[1]), 0.17))
@@ -371,15 +371,20 @@ class Garden:
     The same in any light and season: where things stand, and so every drive.
     """
 
-    def __init__(self, seed: int, config: SimulationConfig | None = None) -> None:
-        """Lay out and light the garden. Raises ConfigError when the area is too small."""
+    def __init__(
+        self, seed: int, config: SimulationConfig | None = None, open_lawn: bool = False
+    ) -> None:
+        """Lay out and light the garden; on an `open_lawn` stands no tree.
+
+        Raises ConfigError when the area is too small.
+        """
         config = config or SimulationConfig()
         half, daylight = _checked_half(config.area), LIGHTS[config.light]
         plot = Plot(half, np.random.default_rng([seed, 0]))
         self.dock = np.array([plot.rng.uniform(-0.5, 0.5) * half[0], 0.3 - half[1], np.pi / 2])
         for part in (lawn, border, bed, buildings):
             part(plot)
-        trees(plot, self.dock)
+        trees(plot, self.dock, 0 if open_lawn else round(half.prod() * 4 / 100))
         self.half = half
         self.obstacles = np.array(plot.obstacles).reshape(-1, 3)
         self.shapes = in_season(plot.shapes, config.season, np.random.default_rng([seed, 2]))
