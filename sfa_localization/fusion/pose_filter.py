@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,11 +24,12 @@ from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEve
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import read_measurement, read_pose, read_twist
-from sfa_localization.fusion.motion import State
+from sfa_localization.fusion.motion import BIAS, State
 from sfa_localization.fusion.predict import COAST_S, ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.rules import Rules
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
+from sfa_localization.fusion.turn_watch import TurnWatch
 from sfa_localization.fusion.update import measurement_event
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
@@ -65,6 +67,7 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
+        self._watch = TurnWatch()
         self._rules = Rules(self.config, self.correlation)
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._forget()
@@ -88,6 +91,7 @@ class PoseFilter:
     def _forget(self) -> None:
         # Stamps may start anew; the camera's delay stays what it was.
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
+        self._watch.forget_time()
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._backward = 0
         self._ahead = (0, 0)
@@ -153,6 +157,7 @@ class PoseFilter:
         event = OdometryEvent(stamp_ns, twist, _finite(pose))
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.twist.omega)
+        self._watch.add_odometry(stamp_ns, driven.twist.omega - float(driven.mean[BIAS]))
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -175,6 +180,8 @@ class PoseFilter:
         event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
         assert update is not None
+        if update.reason == 'restarted elsewhere':
+            self._watch.doubt()
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
@@ -188,6 +195,7 @@ class PoseFilter:
         """
         if stamp_ns > 0 and math.isfinite(yaw_rad):
             self._camera.add_heading(int(stamp_ns), yaw_rad)
+            self._watch.add_heading(int(stamp_ns), yaw_rad)
 
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
@@ -233,7 +241,7 @@ class PoseFilter:
     @property
     def state(self) -> State | None:
         """The estimate at the newest message; None before there is any."""
-        return self._history.newest.state
+        return self._spread(self._history.newest.state)
 
     def at(self, stamp_ns: int) -> State | None:
         """The estimate at a stamp: predicted beyond the newest message, recalled within history.
@@ -243,20 +251,46 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         if self._history.newest_ns is None or not self._history.reaches(stamp_ns):
             return self.state if stamp_ns == self._history.newest.stamp_ns else None
-        return self._rules.prediction.coast(self._history.before(stamp_ns), stamp_ns).state
+        before = self._history.before(stamp_ns)
+        return self._spread(self._rules.prediction.coast(before, stamp_ns).state)
+
+    def _spread(self, state: State | None) -> State | None:
+        """The estimate, less certain by how far the robot moves while images may be off in time."""
+        compensated_s = self._compensated_s
+        if state is None or not self._watch.off(compensated_s):
+            return state
+        v, omega = state.twist.tolist()
+        off_s = self._watch.error_s(compensated_s)
+        covariance = state.covariance.copy()
+        covariance[:3, :3] += np.diag(np.square([v * off_s, v * off_s, omega * off_s]))
+        return replace(state, covariance=covariance)
+
+    @property
+    def _compensated_s(self) -> float:
+        """The delay by which stamps of images are corrected."""
+        delay_ns = self._camera.clock.delay_ns
+        return delay_ns * 1e-9 if abs(delay_ns) <= DELAY_LIMIT_NS else 0.0
 
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
         status = status_of(self._history.newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
-        count, apart_ns = self._apart
-        if count < AHEAD_COUNT:
+        reasons = self._apart_in_time()
+        if not reasons:
             return status
-        where = 'ahead of' if apart_ns > 0 else 'behind'
-        seconds = f'{abs(apart_ns) * 1e-9:.0f} s'
-        reason = f'images are stamped {seconds} {where} the odometry: are the clocks synchronized?'
         level = Level.DEGRADED if status.level is Level.LOCALISED else status.level
-        return Status(level, (*status.reasons, reason))
+        return Status(level, (*status.reasons, *reasons))
+
+    def _apart_in_time(self) -> list[str]:
+        """How images and odometry are apart in time, beyond what `CameraClock` measures."""
+        count, apart_ns = self._apart
+        if count >= AHEAD_COUNT:
+            where = 'ahead of' if apart_ns > 0 else 'behind'
+            far = f'{abs(apart_ns) * 1e-9:.0f} s {where} the odometry'
+            return [f'images are stamped {far}: are the clocks synchronized?']
+        measured = abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS
+        problem = '' if measured else self._watch.problem(self._compensated_s)
+        return [problem] if problem else []
 
     # Whether a message can be placed in time.
 
