@@ -268,7 +268,8 @@ def test_paths_that_are_no_file(kind, tmp_path):
         path.mkdir()
     else:
         path = Path({'long name': 300 * 'x', 'zero byte': 'a\0b', 'device': '/dev/zero'}[kind])
-    rejected(path, 'no such file: train it')
+    what = {'pipe': 'is no regular file', 'device': 'is no regular file', 'folder': 'is a folder'}
+    rejected(path, f'{what.get(kind, "no such file")}: train it')
 
 
 def test_damaged_models_give_one_kind_of_error(whole, tmp_path):
