@@ -45,6 +45,9 @@ BACKWARD_COUNT = 5
 """Odometry messages in a row that are too late until the clock is taken to have gone back."""
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
+SUSPECTED, CLEARED = 0.5, 0.3
+"""Probability of images of another time from which the estimate is not trusted, and below which it
+is again."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
@@ -67,7 +70,7 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
-        self._watch = TurnWatch()
+        self._watch, self._off = TurnWatch(), False
         self._rules = Rules(self.config, self.correlation)
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._forget()
@@ -158,6 +161,7 @@ class PoseFilter:
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.twist.omega)
         self._watch.add_odometry(stamp_ns, driven.twist.omega - float(driven.mean[BIAS]))
+        self._judge_time()
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -182,6 +186,7 @@ class PoseFilter:
         assert update is not None
         if update.reason == 'restarted elsewhere':
             self._watch.doubt()
+            self._judge_time()
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
@@ -201,6 +206,11 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+
+    def _judge_time(self) -> None:
+        """Whether images are likely of another time; once they were, until that is unlikely."""
+        limit = CLEARED if self._off else SUSPECTED
+        self._off = self._watch.apart(self._compensated_s) > limit
 
     def _taken(self, stamp_ns: int) -> int:
         """When an image was taken, on the clock of the odometry."""
@@ -257,7 +267,7 @@ class PoseFilter:
     def _spread(self, state: State | None) -> State | None:
         """The estimate, less certain by how far the robot moves while images may be off in time."""
         compensated_s = self._compensated_s
-        if state is None or not self._watch.off(compensated_s):
+        if state is None or not self._off:
             return state
         v, omega = state.twist.tolist()
         off_s = self._watch.error_s(compensated_s)
@@ -289,8 +299,7 @@ class PoseFilter:
             far = f'{abs(apart_ns) * 1e-9:.0f} s {where} the odometry'
             return [f'images are stamped {far}: are the clocks synchronized?']
         measured = abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS
-        problem = '' if measured else self._watch.problem(self._compensated_s)
-        return [problem] if problem else []
+        return [self._watch.problem(self._compensated_s)] if self._off and not measured else []
 
     # Whether a message can be placed in time.
 

@@ -33,18 +33,17 @@ _EXPECTED_S = 0.3
 """Where the delay is expected at the start: synchronized clocks, and a camera's latency."""
 _SURPRISE = 1e-2
 """Probability of anything else at the start."""
-_BREAK, _HEAL = 5e-5, 5e-4
+_BREAK, _HEAL = 1e-4, 1e-3
 """Probabilities, per pair of images, that images in time come to any other delay at once, and the
 reverse: where nothing shows a delay for long, it is rather none."""
-_DRIFT, _LEAVE = 0.1, 0.01
+_DRIFT, _LEAVE = 0.1, 0.2
 """Probability, per pair, that a delay moves by a step, as of clocks that drift and videos that run
 slowly; and the share of it with which images that are in time begin to be late."""
 DOUBT = 0.3
 """Probability of any other delay where images have just moved the estimate."""
-_EVIDENCE = 0.8
-"""Exponent of likelihoods: errors of neighboring pairs are alike, so that they count for less."""
-_LEAST_RAD, _MOST_RAD, _START_RAD = 0.004, 0.1, 0.006
-"""Standard deviation of a turn between two images against the odometry's: limits and start."""
+_LEAST_RAD, _MOST_RAD, _START_RAD = 0.008, 0.1, 0.010
+"""Standard deviation of a turn between two images against the odometry's: limits and start. Below a
+half degree the noise of the odometry itself would decide between delays."""
 _LEARNING = 0.03  # relative change of that standard deviation per pair
 _MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 _GAIN = 0.05
@@ -53,6 +52,8 @@ _MISMATCH, _MISMATCH_RAD = 0.05, 0.3
 """Share of pairs whose turn is wrong, and by how much: something covers a part of the image."""
 _UNRELATED_RAD = 0.05
 """Turns of images that have nothing to do with the odometry differ by so much per pair."""
+_SMOOTH_S = 0.2
+"""Turns of robots that drive last longer."""
 _ACCELERATION = 0.3
 """rad/s^2: how fast a turn rate changes, for times of which no odometry has come yet."""
 # Shares of the drift by one step between neighbors, either way.
@@ -136,14 +137,8 @@ class TurnWatch:
         far = np.where(np.abs(_DELAYS - compensated_s) > TOLERATED_S, square, 0.0)
         return math.sqrt(float(self._odds[:-1] @ far + self._odds[-1] * square.mean()))
 
-    def off(self, compensated_s: float) -> bool:
-        """Whether images are rather off."""
-        return self.apart(compensated_s) > 0.5
-
     def problem(self, compensated_s: float) -> str:
-        """How images and odometry are apart in time; '' where they are rather not."""
-        if not self.off(compensated_s):
-            return ''
+        """How images and odometry are most likely apart in time."""
         best = int(np.argmax(self._odds))
         off_s = 0.0 if best == len(_DELAYS) else float(_DELAYS[best]) - compensated_s
         if abs(off_s) <= TOLERATED_S:
@@ -212,7 +207,7 @@ def _weighed(odds: Array, residual: Array, std: Array) -> Array:
         return odds
     # Of times without odometry nothing is known.
     fits = np.append(np.where(np.isfinite(fits), fits, unrelated), unrelated)
-    odds = odds * fits**_EVIDENCE
+    odds = odds * fits
     odds /= odds.sum()
     return _moved(odds)
 
@@ -230,8 +225,13 @@ def _moved(odds: Array) -> Array:
 
 
 def _at(times: Array, known: Array, yaws: Array, rate: float) -> Array:
-    """Heading at times (N,), going on at a rate beyond the last one that is known."""
-    return np.asarray(np.interp(times, known, yaws) + rate * np.maximum(times - known[-1], 0.0))
+    """Heading at times (N,), going on at a rate beyond the last one that is known.
+
+    The mean of three: noise of the odometry differs between delays, and would decide.
+    """
+    near = np.concatenate([times - _SMOOTH_S, times, times + _SMOOTH_S])
+    yaw = np.interp(near, known, yaws) + rate * np.maximum(near - known[-1], 0.0)
+    return np.asarray(yaw.reshape(3, -1).mean(axis=0))
 
 
 def _density(residual: Array | float, std: Array | float) -> Array:
