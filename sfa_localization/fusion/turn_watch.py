@@ -21,7 +21,7 @@ import numpy as np
 from sfa_localization.data.geometry import Array, wrap_angle
 
 EARLIEST_S, LATEST_S = -1.5, 6.0
-"""Delays that are told apart; those beyond look like images without relation to the odometry."""
+"""Delays that are distinguished; those beyond look like images without relation to the odometry."""
 TOLERATED_S = 0.45
 """Delays within this around the one that is compensated are small: 0.45 m at walking speed."""
 _STEP_S = 0.1
