@@ -6,8 +6,8 @@ Images that are stamped late, a queue that lags behind, a video that loops or ru
 smooth curve all of them lie on the odometry's path, meters away from the robot. What shows them is
 that the robot turned at another time. A Bayes filter holds the probability of each delay, and of
 images that have nothing to do with the odometry. It forgets by evidence, not by time: on a straight
-line, which shows no delay, it keeps what it found. `CameraClockFinder` measures a small delay that
-lasts; this one watches for any that is not compensated.
+line, which shows no delay, it keeps what it found for minutes. `CameraClockFinder` measures a delay
+that lasts; this one watches for any that is not compensated.
 """
 
 from __future__ import annotations
