@@ -41,6 +41,7 @@ from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.predict import COAST_S
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -248,7 +249,10 @@ def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
 def _replayed(
     localizer: Localizer, run: Run, progress: bool
 ) -> tuple[list[Observation], list[tuple[State, Level]], dict[str, float]]:
-    """Observations of all images, the filter at each odometry message, seconds by state."""
+    """Observations of all images, the filter at each odometry message, seconds by state.
+
+    A state lasts for COAST_S at most: in a pause of the recording nobody says anything.
+    """
     observations: list[Observation] = []
     fused, states = [], dict[str, float]()
     before_ns = int(run.odometry.stamps_ns[0])
@@ -259,7 +263,8 @@ def _replayed(
                 bar.update()
                 continue
             level = localizer.status.level
-            states[level.name] = states.get(level.name, 0.0) + (stamp_ns - before_ns) * 1e-9
+            lasted_s = min((stamp_ns - before_ns) * 1e-9, COAST_S)
+            states[level.name] = states.get(level.name, 0.0) + lasted_s
             before_ns = stamp_ns
             if state is not None:
                 fused.append((state, level))
@@ -336,7 +341,8 @@ def _false_localised_s(replay: _Replay, ekf: Trajectory) -> float:
     stamps, truth = ekf.stamps_ns, replay.located.truth
     apart = np.hypot(*(ekf.poses - truth.at(stamps))[:, :2].T)
     wrong = replay.sure & known(truth, stamps) & (apart > WRONG_M)
-    return float(np.diff(stamps, prepend=stamps[:1])[wrong].sum() * 1e-9)
+    lasted_s = np.minimum(np.diff(stamps, prepend=stamps[:1]) * 1e-9, COAST_S)
+    return float(lasted_s[wrong].sum())
 
 
 def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:

@@ -20,6 +20,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD, read_twist
 from sfa_localization.fusion.log_noise import EXPECTED, NEARLY_WHITE, Learned, Log, Noise, learn
@@ -528,7 +529,9 @@ def _column_indices(
     if 'stamp_s' not in at and 'stamp_ns' not in at:
         missing.insert(0, 'stamp_s')
     if missing:
-        raise DataError(f'{path}: no column {" or ".join(missing)} among {", ".join(names)}')
+        raise DataError(
+            f'{path}: no column {" or ".join(missing)} among {short_line(", ".join(names))}'
+        )
     return at
 
 

@@ -45,13 +45,18 @@ from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
 VERSION = 5
+FARTHEST_M = 1e6
+"""No place is farther from the origin of its map: there a pose's last digits are still micrometers.
+"""
+_STEEPEST = 1e9
+"""Weights of a map, m: a million times those of any training."""
 _AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
 _PROCESS = {
     'kind': ArrayRule('', 'U'),
     'scale': ArrayRule('K'),
     'points': ArrayRule('MK'),
-    'linear': ArrayRule('MC'),
-    'constant': ArrayRule('C'),
+    'linear': ArrayRule('MC', largest=_STEEPEST),
+    'constant': ArrayRule('C', largest=FARTHEST_M),
     'factor': ArrayRule('T'),
     'in_double': ArrayRule('', 'b'),
     'scalars': ArrayRule('3', all_positive=True),
@@ -85,7 +90,7 @@ SCHEMA: Schema = {
     'keyframes/': [
         {
             'textures': ArrayRule('NRC', 'i'),
-            'poses': ArrayRule('N3'),
+            'poses': ArrayRule('N3', largest=FARTHEST_M),
             'noise': ArrayRule('8', positive=(0, 1, 2, 3, 4, 5, 6)),
         }
     ],
@@ -123,7 +128,7 @@ class Estimate:
 
     `slow_features` (K,); `position` (2,) m and `yaw` rad (NaN without a compass) in the map frame;
     `covariance` (3, 3) of [x, y, yaw], with pi^2 / 3 where yaw is unknown; `novelty` at most 1 for
-    a familiar image.
+    a familiar image. Where the model gives no finite estimate, position and covariance are NaN.
     """
 
     slow_features: Array
@@ -151,15 +156,22 @@ class View:
         """How far both are apart, see `Match.distance`; NaN where one of them is unknown."""
         if self.match.score < self.noise.lowest:
             return np.nan
-        return self.match.distance(self.position, self.covariance[:2, :2])
+        try:
+            return self.match.distance(self.position, self.covariance[:2, :2])
+        except np.linalg.LinAlgError:
+            return np.nan
 
     def estimate(self, factor: float = 1.0) -> Estimate:
         """Both together, with a `factor` on the variances of slow features."""
         novelty = self.noise.novelty(self.match.score)
         claimed = self.covariance * factor
-        position, yaw, covariance = self.match.combined(
-            self.position, float(self.yaw), claimed, self.noise
-        )
+        try:
+            position, yaw, covariance = self.match.combined(
+                self.position, float(self.yaw), claimed, self.noise
+            )
+        except np.linalg.LinAlgError:
+            nothing = np.full(2, np.nan), np.full((3, 3), np.nan)
+            return Estimate(self.slow_features, nothing[0], np.nan, nothing[1], novelty)
         covariance = covariance * max(novelty, 1.0) ** 2
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
         return Estimate(self.slow_features, position, yaw, covariance, novelty)

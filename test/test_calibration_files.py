@@ -15,7 +15,7 @@ from sfa_localization.camera.calibration_files import (
 )
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import CameraConfig, LensCalibration
-from sfa_localization.data.errors import CameraError
+from sfa_localization.data.errors import CameraError, ConfigError
 
 OCAM = """#polynomial coefficients of the direct mapping
 
@@ -142,6 +142,20 @@ def test_ocam_camera_by_hand(tmp_path):
     pixel = np.array([[318.5 - 0.2, 241.5 + 99.9]])
     expected = np.array([[-100.0, 0.0, 187.0]]) / np.hypot(100, 187)
     np.testing.assert_allclose(camera.unproject(pixel), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize('affine', ['0.0 0.0 0.0', '0.5 0.5 1.0'])
+def test_an_ocam_lens_that_maps_all_pixels_to_a_line_is_rejected(tmp_path, affine):
+    text = OCAM.replace('0.999 0.001 -0.002', affine)
+    assert text != OCAM
+    with pytest.raises(CameraError, match='singular'):
+        make_camera(read(tmp_path, text, 'calib_results.txt'), (480, 640))
+
+
+@pytest.mark.parametrize('name', ['distortion', 'polynomial', 'affine'])
+def test_coefficients_beyond_all_lenses_are_rejected(name):
+    with pytest.raises(ConfigError, match=f'{name}: 1e.300 is outside'):
+        LensCalibration(**{name: (1e300, 1.0, 1.0)})
 
 
 def test_camera_info_of_a_pinhole(tmp_path):

@@ -18,11 +18,15 @@ from sfa_localization.fusion.settings import FilterConfig
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
 
+from builtin_interfaces.msg import Time as Stamp  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from nav_msgs.msg import Odometry, Path  # noqa: E402
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
+from rcl_interfaces.msg import ParameterValue  # noqa: E402
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.time import Time  # noqa: E402
 from ros_bench import Bench, until  # noqa: E402
@@ -432,6 +436,39 @@ def test_simulated_time_that_steps_back_starts_anew(bench):
     play(bench, node, drive)
     bench.publish('/clock', Clock(clock=Time(nanoseconds=START_NS - 10**10).to_msg()))
     assert until(lambda: node._filter.counts['reset'] == 1)
+
+
+@pytest.mark.parametrize('kind', [77, 200, 10])
+def test_a_parameter_of_an_unknown_type_is_refused_and_ends_nothing(bench, kind):
+    node = bench.run(EkfNode)
+    odd = ParameterMessage(name='speed_std', value=ParameterValue(type=kind))
+    fine = ParameterMessage(name='rate_std', value=ParameterValue(type=3, double_value=0.03))
+    answer = bench.call(
+        SetParameters, '/ekf_node/set_parameters', SetParameters.Request(parameters=[fine, odd])
+    )
+    assert [result.successful for result in answer.results] == [True, False]
+    assert str(kind) in answer.results[1].reason
+    request = SetParametersAtomically.Request(parameters=[fine, odd])
+    answer = bench.call(SetParametersAtomically, '/ekf_node/set_parameters_atomically', request)
+    assert not answer.result.successful
+    assert node.get_parameter('rate_std').value == 0.03
+
+
+def test_a_negative_clock_ends_nothing(bench):
+    node = bench.run(EkfNode, use_sim_time=True)
+    bench.publish('/clock', Clock(clock=Stamp(sec=-1)))
+    assert until(lambda: sum(node.monitor('/clock').refused.values()) == 1)
+    bench.publish('/clock', Clock(clock=Stamp(sec=100)))
+    assert until(lambda: node.get_clock().now().nanoseconds == 100 * 10**9)
+
+
+@pytest.mark.parametrize(('number', 'label'), [(3, ''), (2, ''), (200, ''), (0, 'nonsense')])
+def test_a_transition_that_does_not_fit_is_answered(bench, number, label):
+    bench.run(EkfNode)
+    request = ChangeState.Request(transition=Transition(id=number, label=label))
+    assert not bench.call(ChangeState, '/ekf_node/change_state', request).success
+    state = bench.call(GetState, '/ekf_node/get_state', GetState.Request()).current_state
+    assert state.label == 'active'
 
 
 def test_live_parameters_reach_the_filter_and_keep_the_pose(bench):

@@ -4,6 +4,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from picture_readers import PictureReader, Recording
 
 from sfa_localization import evaluation, tuning
 from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
 from sfa_localization.data.geometry import rotation
 from sfa_localization.data.run import PanoramaArray, Trajectory
+from sfa_localization.fusion.predict import COAST_S
+from sfa_localization.fusion.status import Level
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -86,7 +90,11 @@ def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path,
     assert not (tmp_path / 'new.yaml').exists()
 
 
-def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(bag, tmp_path, capsys):
+def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(
+    bag, tmp_path, monkeypatch, capsys
+):
+    # The pictures of the reader hold its answers, and show no turns.
+    monkeypatch.setattr(VisualGyro, 'add', lambda gyro, picture: np.nan)
     figures = evaluated(bag, tmp_path, ekf_node={'measurement_factor': 0.02})
     out = capsys.readouterr().out
     rejected = figures['counts']['fusion']['measurement: outside the gate']
@@ -94,6 +102,17 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(bag, tmp_p
     seconds = figures['counts']['states_s']
     assert seconds['LOCALISED'] > 1.0
     assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
+
+
+def test_a_pause_of_the_recording_is_no_time_in_any_state():
+    stamps = np.array([0, 1, 2, 10**9, 10**9 + 1], np.int64) * 10**9
+    odometry = SimpleNamespace(stamps_ns=stamps)
+    run = SimpleNamespace(odometry=odometry, panoramas=[], name='paused')
+    localizer = SimpleNamespace(
+        status=SimpleNamespace(level=Level.LOCALISED),
+        replay=lambda _: ((int(stamp_ns), None, None) for stamp_ns in stamps),
+    )
+    assert evaluation._replayed(localizer, run, False)[2] == {'LOCALISED': 2 + COAST_S + 1}
 
 
 class Torn(PictureReader):

@@ -82,6 +82,35 @@ def test_the_command_tells_what_the_live_filter_would_have(tmp_path):
     assert max(np.abs(told[s][:2] - p[:2]).max() for s, p in zip(stamps, poses, strict=True)) < 1e-5
 
 
+@pytest.mark.parametrize('name', ['odom.csv', 'positions.csv', 'truth.tum', 'link.csv'])
+def test_nothing_that_is_read_is_replaced(tmp_path, capsys, name):
+    drive = Drive(seconds=5)
+    logs = write_logs(tmp_path, drive)
+    (tmp_path / 'link.csv').symlink_to(logs[0])
+    (tmp_path / 'truth.tum').write_text('0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n')
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    truth = ['--truth', str(tmp_path / 'truth.tum')]
+    assert main(['filter', *map(str, logs), *truth, '--output', str(tmp_path / name)]) == 1
+    assert 'would be replaced' in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_covariances_beside_the_output_replace_nothing_that_is_read(tmp_path, capsys):
+    odometry, positions = write_logs(tmp_path, Drive(seconds=5))
+    moved = positions.rename(tmp_path / 'poses.covariance.csv')
+    before = moved.read_bytes()
+    output = ['--output', str(tmp_path / 'poses.tum')]
+    assert main(['filter', str(odometry), str(moved), *output]) == 1
+    assert 'would be replaced' in capsys.readouterr().err and moved.read_bytes() == before
+
+
+def test_control_characters_of_a_header_are_not_shown(tmp_path):
+    (tmp_path / 'odom.csv').write_text('stamp_s,\x1b]0;title\x07\x1b[31mv,omega\n0,1,0\n')
+    with pytest.raises(DataError, match='no column v_mps') as raised:
+        filtering.read_odometry_table(tmp_path / 'odom.csv')
+    assert str(raised.value).isprintable()
+
+
 def test_without_a_pose_it_starts_from_the_way_and_beats_the_positions(tmp_path):
     drive = Drive(seconds=60, start=(500.0, -200.0, 2.5), **NOISY)
     _, found = run(tmp_path, drive)

@@ -110,6 +110,14 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: {**a, 'keyframes/poses': spoilt(a['keyframes/poses'], 1e308)},
         'beyond 1e',
     ),
+    'keyframes beyond the horizon': (
+        lambda a: {**a, 'keyframes/poses': 1e12 + a['keyframes/poses']},
+        'keyframes/poses holds a number beyond 1e',
+    ),
+    'a map that rises without bound': (
+        lambda a: {**a, 'metric/linear': 1e20 * a['metric/linear']},
+        'metric/linear holds a number beyond 1e',
+    ),
     'text for numbers': (lambda a: {**a, 'compass/weights': np.array('x')}, 'is of type'),
     'integers for numbers': (
         lambda a: {**a, 'keyframes/poses': a['keyframes/poses'].astype(int)},
@@ -260,7 +268,8 @@ def test_paths_that_are_no_file(kind, tmp_path):
         path.mkdir()
     else:
         path = Path({'long name': 300 * 'x', 'zero byte': 'a\0b', 'device': '/dev/zero'}[kind])
-    rejected(path, 'no such file: train it')
+    what = {'pipe': 'is no regular file', 'device': 'is no regular file', 'folder': 'is a folder'}
+    rejected(path, f'{what.get(kind, "no such file")}: train it')
 
 
 def test_damaged_models_give_one_kind_of_error(whole, tmp_path):

@@ -13,8 +13,10 @@ from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
+from sfa_localization.features.keyframes import Match, MatchNoise
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Observer, unusable_covariance
+from sfa_localization.place_model import View
 
 
 def test_a_good_picture_is_believed():
@@ -119,3 +121,12 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
         (15, IMAGE, 2), (20, ODOMETRY, 2), (30, IMAGE, 3),
     ]  # fmt: skip
     assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3
+
+
+def test_a_view_without_a_finite_estimate_is_no_error():
+    """Two estimates that are certain beyond all numbers have no mean."""
+    match = Match(np.zeros(3), np.zeros((3, 3)), score=0.9, support=0.0)
+    view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise())
+    assert math.isnan(view.distance)
+    estimate = view.estimate()
+    assert np.isnan(estimate.position).all() and np.isnan(estimate.covariance).all()

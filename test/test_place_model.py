@@ -3,6 +3,7 @@
 """The place model: where a picture was taken, and how it is saved and loaded."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -229,6 +230,12 @@ class TestFile:
     def test_missing(self, tmp_path):
         with pytest.raises(ModelError, match=r'none\.npz: no such file: train it'):
             PlaceModel.load(tmp_path / 'none.npz')
+
+    def test_what_is_no_file_is_named(self, tmp_path):
+        os.mkfifo(tmp_path / 'pipe.npz')
+        for name, what in (('pipe.npz', 'is no regular file'), ('.', 'is a folder')):
+            with pytest.raises(ModelError, match=what):
+                PlaceModel.load(tmp_path / name)
 
     @pytest.mark.parametrize('content', [b'', b'no zip', b'PK\x03\x04 broken'])
     def test_no_model(self, tmp_path, content):

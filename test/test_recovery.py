@@ -259,8 +259,12 @@ def test_the_memory_is_bounded_and_its_newer_half_complete():
     ({'rejected': 5, 'gate_excess': 1.1}, 0.4, Level.DEGRADED),  # LOST_DISTANCE_M
     ({'rejected': 4, 'gate_excess': 9.0}, 9.0, Level.DEGRADED),  # ENOUGH_IMAGES
     ({'rejected': 2, 'gate_excess': 9.0}, 9.0, Level.LOCALISED),  # FEW_IMAGES
+    ({'rejected': 9, 'gate_excess': 9.0, 'doubt': (0.2, 0.2, 0.0)}, 9.0, Level.DEGRADED),  # LOST_M
+    ({'rejected': 9, 'gate_excess': 9.0, 'doubt': (0.0, 0.0, 0.1)}, 9.0, Level.LOST),  # LOST_RAD
 ])  # fmt: skip
 def test_contradictions_make_the_estimate_degraded_then_lost(memory, moved_m, level):
+    if memory['rejected'] >= 5:
+        memory = {'doubt': (1.0, 1.0, 0.0), **memory}
     belief = belief_at(accepted_ns=SECOND, **memory)
     belief = belief._replace(traveled_m=moved_m, odometry_ns=SECOND)
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level

@@ -22,6 +22,8 @@ from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, Pano
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
 
+LEAST_AFFINE = 1e-3
+"""Determinant of the affine part of a lens: 1 for square pixels; at 0 all pixels lie on a line."""
 _SAMPLES = 2048  # of a curve that is inverted, before Newton's method
 _NEWTON_STEPS = 3
 
@@ -426,6 +428,8 @@ def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int
     calibrated = (calibration.image_height, calibration.image_width)
     limit = calibration.radius_max or float(np.hypot(*np.maximum(size, calibrated)))
     c, d, e = calibration.affine
+    if abs(c - d * e) < LEAST_AFFINE:
+        raise CameraError('affine (c d e) of the ocam model is singular: c - d e must not be 0')
     return OcamLens(Polynomial(calibration.polynomial), center, (c, d, e), limit)
 
 

@@ -77,7 +77,7 @@ class CaptureConfig(Settings):
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
         if len(self.source_size) not in (0, 2):
-            raise ConfigError('CaptureConfig.source_size: give columns and rows, or nothing')
+            raise ConfigError('source_size: give columns and rows, or nothing')
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ class CameraConfig(Settings):
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
         if len(self.mount_rpy) != 3:
-            raise ConfigError('CameraConfig.mount_rpy: give three angles: roll, pitch and yaw')
+            raise ConfigError('mount_rpy: give three angles: roll, pitch and yaw')
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,13 +168,16 @@ class LensCalibration(Settings):
     cy: float = setting(319.5, 'row of the center', unit='px', low=-1e5, high=1e5)
     xi: float = setting(0.9, 'mirror parameter of the mirror model', low=0.0, high=10.0)
     distortion: tuple[float, ...] = setting(
-        (), 'lens distortion: k1 k2 p1 p2 (mirror), k1 k2 k3 k4 (fisheye), or none'
+        (),
+        'lens distortion: k1 k2 p1 p2 (mirror), k1 k2 k3 k4 (fisheye), or none',
+        low=-1e3,
+        high=1e3,
     )
     polynomial: tuple[float, ...] = setting(
-        (), 'coefficients a0 a1 ... of the ocam model, as in calib_results.txt'
+        (), 'coefficients a0 a1 ... of the ocam model, as in calib_results.txt', low=-1e6, high=1e6
     )
     affine: tuple[float, ...] = setting(
-        (1.0, 0.0, 0.0), 'affine parameters c d e of the ocam model'
+        (1.0, 0.0, 0.0), 'affine parameters c d e of the ocam model', low=-100.0, high=100.0
     )
     radius_min: float = setting(
         40.0, 'radius about the center below which nothing is visible', unit='px', low=0, high=1e5

@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Filter; print what was skipped, rejected and written."""
     from sfa_localization import filtering
 
+    beside = arguments.output.with_suffix('.covariance.csv')
+    _require_other_files(arguments, (arguments.output, beside))
     truth = filtering.read_truth(arguments.truth) if arguments.truth else None
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
@@ -84,13 +88,20 @@ def run(arguments: argparse.Namespace) -> int:
             'or give --initial-pose X Y YAW'
         )
     filtering.write_tum(arguments.output, result.stamps_ns, result.poses)
-    beside = arguments.output.with_suffix('.covariance.csv')
     filtering.write_covariances(beside, result.stamps_ns, result.covariances)
     if truth is not None:
         print(_judgement(truth, result))
     waited = f', {result.before_start} rows before the start' if result.before_start else ''
     print(f'{arguments.output}: {len(result.poses)} poses{waited}')
     return 0
+
+
+def _require_other_files(arguments: argparse.Namespace, outputs: Sequence[Path]) -> None:
+    """Require that nothing replaces what is read."""
+    inputs = (arguments.odometry, arguments.positions, arguments.config, arguments.truth)
+    for path in filter(None, inputs):
+        if os.path.realpath(path) in [os.path.realpath(output) for output in outputs]:
+            raise DataError(f'{path}: would be replaced by the output: give another --output')
 
 
 def _print_counts(odometry: Table, positions: Table, result: Filtered) -> None:

@@ -22,7 +22,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.files import atomic_write, is_regular
+from sfa_localization.data.files import absence, atomic_write, is_regular
 from sfa_localization.data.rejections import short_line
 
 Arrays = dict[str, NDArray[Any]]
@@ -64,7 +64,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
     """Arrays of an .npz file whose header names its kind and version. Raises ModelError."""
     if not is_regular(path):
-        raise ModelError(f'{path}: no such file: {remedy}')
+        raise ModelError(f'{path}: {absence(path)}: {remedy}')
     try:
         with path.open('rb') as file:
             arrays = _arrays(file, path.stat().st_size)

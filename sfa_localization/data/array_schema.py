@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -21,13 +22,14 @@ class ArrayRule(NamedTuple):
     `shape` has a character for each axis: a digit is its length, a letter any length, the same
     everywhere in the group. `kind` is that of its dtype: f real, c complex, i integer, u unsigned,
     b boolean, U text. The numbers at the places `positive`, in order, must be > 0;
-    `all_positive`: all.
+    `all_positive`: all. None is larger than `largest`, either way.
     """
 
     shape: str
     kind: str = 'f'
     positive: tuple[int, ...] = ()
     all_positive: bool = False
+    largest: float = math.inf
 
 
 Group = Mapping[str, ArrayRule]
@@ -89,3 +91,5 @@ def _check(name: str, array: NDArray[Any], rule: ArrayRule, lengths: dict[str, i
     numbers = array.ravel() if rule.all_positive else array.ravel()[list(rule.positive)]
     if rule.kind in 'fiu' and not np.all(numbers > 0):
         raise ModelError(f'the array {name} holds a number that must be positive: train it again')
+    if rule.kind in 'fiuc' and array.size and np.abs(array).max() > rule.largest:
+        raise ModelError(f'the array {name} holds a number beyond {rule.largest:g}: train it again')

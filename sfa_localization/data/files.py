@@ -23,6 +23,13 @@ def is_regular(path: Path | str) -> bool:
     return os.path.isfile(path)
 
 
+def absence(path: Path | str) -> str:
+    """Why there is no regular file: nothing is there, or a folder, or what may never end."""
+    if os.path.isdir(path):
+        return 'is a folder'
+    return 'is no regular file' if os.path.exists(path) else 'no such file'
+
+
 def read_regular(path: Path | str, largest: int) -> bytes:
     """The bytes of a regular file of at most `largest` bytes. Raises OSError.
 

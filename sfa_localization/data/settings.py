@@ -49,7 +49,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
-            value = _checked(type(self).__name__, item, getattr(self, item.name))
+            value = _checked(item, getattr(self, item.name))
             object.__setattr__(self, item.name, value)
 
     @classmethod
@@ -77,9 +77,9 @@ def nearest(name: str, known: Collection[str]) -> str:
     return f'; did you mean {close[0]!r}?' if close else ''
 
 
-def _checked(group: str, item: dataclasses.Field[Any], value: Any) -> Any:
+def _checked(item: dataclasses.Field[Any], value: Any) -> Any:
     """Return the value in the type of the default, or raise ConfigError."""
-    where = f'{group}.{item.name}'
+    where = item.name
     value = _converted(where, item.default, value)
     numbers = value if isinstance(value, tuple) else (value,)
     for number in numbers:

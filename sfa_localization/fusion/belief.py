@@ -83,14 +83,29 @@ class Evidence(NamedTuple):
 class Trust(NamedTuple):
     """Images over the last meters, and how they contradict the odometry's motion, '' if not.
 
-    `moves` counts how often images moved the estimate elsewhere lately, `moved_m` is the distance
-    traveled when they did it last.
+    With a problem, `misfit` are the standard deviations (m, rad) by which they do. `moves` counts
+    how often images moved the estimate elsewhere lately, `moved_m` is the distance traveled when
+    they did it last; until an image fits `confirming_m` later, `jump_m` is the standard deviation
+    of being wrong.
     """
 
     recent: tuple[Evidence, ...] = ()
     problem: str = ''
+    misfit: tuple[float, float] = (0.0, 0.0)
     moves: int = 0
     moved_m: float = 0.0
+    confirming_m: float = 0.0
+    jump_m: float = 0.0
+
+    def unconfirmed(self, accepted_m: float) -> bool:
+        """Whether no image has fitted yet that far from where images moved the estimate."""
+        return accepted_m - self.moved_m < self.confirming_m
+
+    def variances(self, accepted_m: float) -> tuple[float, float, float]:
+        """Of x, y and yaw, on top, while the estimate is not trusted."""
+        off_m, off_rad = self.misfit if self.problem else (0.0, 0.0)
+        position = off_m**2 + (self.jump_m**2 if self.unconfirmed(accepted_m) else 0.0)
+        return position, position, off_rad**2
 
 
 class Memory(NamedTuple):
@@ -98,8 +113,9 @@ class Memory(NamedTuple):
 
     `support` counts accepted images since the last start, `rejected` those outside the gate in a
     row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
-    images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`
-    and `scatter`, the usual squared distance of images over that expected, outlive restarts.
+    images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`,
+    `scatter`, the usual squared distance of images over that expected, and `period_s`, the usual
+    time between images, outlive restarts.
     """
 
     support: int = 0
@@ -113,6 +129,7 @@ class Memory(NamedTuple):
     update: Update | None = None
     trust: Trust = Trust()
     scatter: float = 1.0
+    period_s: float = 1.0
 
 
 class Belief(NamedTuple):
@@ -140,13 +157,16 @@ class Belief(NamedTuple):
     def state(self) -> State | None:
         """The estimate, if there is any.
 
-        Doubt widens the published covariance, not the gate: wrong images must not open it.
+        Doubt and distrust widen what is published, not the gate: wrong images must not open it.
         """
         if not self.located:
             return None
         covariance = symmetric(self.covariance)
         if self.memory.doubt is not _NO_DOUBT:
             covariance[:3, :3] += np.diag(self.memory.doubt)
+        trust = self.memory.trust
+        if trust.problem or trust.confirming_m:
+            covariance[:3, :3] += np.diag(trust.variances(self.memory.accepted_m))
         return State(self.stamp_ns, self.mean, covariance)
 
 

@@ -33,6 +33,10 @@ TURNED_RAD, TURNED_STDS = math.radians(12.0), 3.5
 FORGIVEN_M, LONGEST_M = 30.0, 16.0
 """Distance after which an estimate that stayed counts as never moved, and the longest distance
 that must confirm one."""
+WRONG_MOVE, LARGEST_JUMP_M = 0.22, 1.4
+"""Standard deviation of an estimate that images have just moved, of the way by which they did: one
+in twenty such moves is wrong, by all of it; and its limit (m), because a robot that was carried far
+is not lost."""
 _HEADING_DRIFT_RAD = 0.05  # of odometry over the window
 _FIT_STEPS = 5  # of reweighting, from where the fit hardly changes
 
@@ -45,15 +49,20 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
     recent = (*recent, newest)
     while len(recent) > WINDOW_IMAGES and newest.traveled_m - recent[1].traveled_m >= WINDOW_M:
         recent = recent[1:]
-    problem = contradiction(recent)
-    settled = newest.traveled_m - trust.moved_m > _confirming_m(trust) + FORGIVEN_M
+    problem, misfit = compared(recent)
+    settled = newest.traveled_m - trust.moved_m > trust.confirming_m + FORGIVEN_M
     moves = 0 if settled and not problem else trust.moves
-    return trust._replace(recent=recent, problem=problem, moves=moves)
+    return trust._replace(recent=recent, problem=problem, misfit=misfit, moves=moves)
 
 
-def moved(trust: Trust, traveled_m: float) -> Trust:
-    """The trust after images moved the estimate, however young."""
-    return Trust(moves=trust.moves + 1, moved_m=traveled_m)
+def moved(trust: Trust, traveled_m: float, jump_m: float = 0.0) -> Trust:
+    """The trust after images moved the estimate, however young, by a distance."""
+    return Trust(
+        moves=trust.moves + 1,
+        moved_m=traveled_m,
+        confirming_m=min(AGREEING_DISTANCE_M * 2.0**trust.moves, LONGEST_M),
+        jump_m=min(WRONG_MOVE * jump_m, LARGEST_JUMP_M),
+    )
 
 
 def doubts(trust: Trust, accepted_m: float) -> list[str]:
@@ -61,23 +70,23 @@ def doubts(trust: Trust, accepted_m: float) -> list[str]:
     of the distance traveled.
     """
     found = [trust.problem] if trust.problem else []
-    since_m = accepted_m - trust.moved_m
-    if since_m < _confirming_m(trust):
+    if trust.moves and trust.unconfirmed(accepted_m):
+        since_m = accepted_m - trust.moved_m
         times = f' {trust.moves} times in a row' if trust.moves > 1 else ''
         found.append(f'placed anew{times}, confirmed over {since_m:.1f} m: driving on confirms it')
     return found
 
 
-def _confirming_m(trust: Trust) -> float:
-    """Distance over which an estimate must hold after it was moved."""
-    return min(AGREEING_DISTANCE_M * 2.0 ** (trust.moves - 1), LONGEST_M) if trust.moves else 0.0
-
-
 def contradiction(recent: Sequence[Evidence]) -> str:
     """How images contradict the odometry's motion; '' where they do not, or are too few."""
+    return compared(recent)[0]
+
+
+def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
+    """The contradiction, and by how much (m, rad) the images differ; see `contradiction`."""
     span_m = recent[-1].traveled_m - recent[0].traveled_m
     if len(recent) < WINDOW_IMAGES or span_m < AGREEING_DISTANCE_M:
-        return ''
+        return '', (0.0, 0.0)
     path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
     places = np.array([complex(*item.position) for item in recent])
     variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
@@ -85,11 +94,12 @@ def contradiction(recent: Sequence[Evidence]) -> str:
     for _ in range(_FIT_STEPS):
         along = path - np.average(path, weights=weight)
         turn, shift = align_complex(path, places, weight)
-        square = np.abs(turn * path + shift - places) ** 2 / variance
+        apart = np.abs(turn * path + shift - places)
+        square = apart**2 / variance
         weight = 1 / (variance * (1 + square))
     agree = square <= AGREEING_VARIANCES
     if agree.mean() < AGREEING_HALF:
-        return 'images and odometry show different motions'
+        return 'images and odometry show different motions', (math.sqrt(np.mean(apart**2)), 0.0)
     lever = float(np.sum(agree * np.abs(along) ** 2 / variance))
     # Neighboring images err alike, over about a meter.
     dependence = max(1.0, len(recent) / (1 + span_m))
@@ -98,17 +108,18 @@ def contradiction(recent: Sequence[Evidence]) -> str:
 
 def _turned(
     recent: Sequence[Evidence], agree: NDArray[np.bool_], turn: float, variance: float
-) -> str:
+) -> tuple[str, tuple[float, float]]:
     """Whether headings of images differ from the direction in which their positions move."""
     items = [item for item, fits in zip(recent, agree, strict=True) if fits]
     off = [item.yaw - item.dead_reckoned[2] - turn for item in items if math.isfinite(item.yaw)]
     if not off:
-        return ''
+        return '', (0.0, 0.0)
     # Angles have no median; those about their mean direction do.
     mean = float(np.angle(np.mean(np.exp(1j * np.array(off)))))
     angle = float(wrap_angle(mean + np.median(wrap_angle(np.array(off) - mean))))
     yaw_variance = float(np.mean([item.yaw_variance for item in items if math.isfinite(item.yaw)]))
     std = math.sqrt(variance + yaw_variance + _HEADING_DRIFT_RAD**2)
     if abs(angle) < max(TURNED_RAD, TURNED_STDS * std):
-        return ''
-    return f'images look {math.degrees(angle):.0f} degrees off the motion: was the camera turned?'
+        return '', (0.0, 0.0)
+    degrees = f'{math.degrees(angle):.0f} degrees'
+    return f'images look {degrees} off the motion: was the camera turned?', (0.0, abs(angle))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,11 +24,12 @@ from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEve
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import read_measurement, read_pose, read_twist
-from sfa_localization.fusion.motion import State
+from sfa_localization.fusion.motion import BIAS, State
 from sfa_localization.fusion.predict import COAST_S, ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.rules import Rules
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
+from sfa_localization.fusion.turn_watch import TurnWatch
 from sfa_localization.fusion.update import measurement_event
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
@@ -43,6 +45,9 @@ BACKWARD_COUNT = 5
 """Odometry messages in a row that are too late until the clock is taken to have gone back."""
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
+SUSPECTED, CLEARED = 0.5, 0.3
+"""Probability of images of another time from which the estimate is not trusted, and below which it
+is again."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
@@ -65,6 +70,7 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
+        self._watch, self._off = TurnWatch(), False
         self._rules = Rules(self.config, self.correlation)
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._forget()
@@ -88,6 +94,7 @@ class PoseFilter:
     def _forget(self) -> None:
         # Stamps may start anew; the camera's delay stays what it was.
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
+        self._watch.forget_time()
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._backward = 0
         self._ahead = (0, 0)
@@ -153,6 +160,8 @@ class PoseFilter:
         event = OdometryEvent(stamp_ns, twist, _finite(pose))
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.twist.omega)
+        self._watch.add_odometry(stamp_ns, driven.twist.omega - float(driven.mean[BIAS]))
+        self._judge_time()
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -175,6 +184,9 @@ class PoseFilter:
         event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
         assert update is not None
+        if update.reason == 'restarted elsewhere':
+            self._watch.doubt()
+            self._judge_time()
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
@@ -188,11 +200,17 @@ class PoseFilter:
         """
         if stamp_ns > 0 and math.isfinite(yaw_rad):
             self._camera.add_heading(int(stamp_ns), yaw_rad)
+            self._watch.add_heading(int(stamp_ns), yaw_rad)
 
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+
+    def _judge_time(self) -> None:
+        """Whether images are likely of another time; once they were, until that is unlikely."""
+        limit = CLEARED if self._off else SUSPECTED
+        self._off = self._watch.apart(self._compensated_s) > limit
 
     def _taken(self, stamp_ns: int) -> int:
         """When an image was taken, on the clock of the odometry."""
@@ -233,7 +251,7 @@ class PoseFilter:
     @property
     def state(self) -> State | None:
         """The estimate at the newest message; None before there is any."""
-        return self._history.newest.state
+        return self._spread(self._history.newest.state)
 
     def at(self, stamp_ns: int) -> State | None:
         """The estimate at a stamp: predicted beyond the newest message, recalled within history.
@@ -243,20 +261,45 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         if self._history.newest_ns is None or not self._history.reaches(stamp_ns):
             return self.state if stamp_ns == self._history.newest.stamp_ns else None
-        return self._rules.prediction.coast(self._history.before(stamp_ns), stamp_ns).state
+        before = self._history.before(stamp_ns)
+        return self._spread(self._rules.prediction.coast(before, stamp_ns).state)
+
+    def _spread(self, state: State | None) -> State | None:
+        """The estimate, less certain by how far the robot moves while images may be off in time."""
+        compensated_s = self._compensated_s
+        if state is None or not self._off:
+            return state
+        v, omega = state.twist.tolist()
+        off_s = self._watch.error_s(compensated_s)
+        covariance = state.covariance.copy()
+        covariance[:3, :3] += np.diag(np.square([v * off_s, v * off_s, omega * off_s]))
+        return replace(state, covariance=covariance)
+
+    @property
+    def _compensated_s(self) -> float:
+        """The delay by which stamps of images are corrected."""
+        delay_ns = self._camera.clock.delay_ns
+        return delay_ns * 1e-9 if abs(delay_ns) <= DELAY_LIMIT_NS else 0.0
 
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
         status = status_of(self._history.newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
-        count, apart_ns = self._apart
-        if count < AHEAD_COUNT:
+        reasons = self._apart_in_time()
+        if not reasons:
             return status
-        where = 'ahead of' if apart_ns > 0 else 'behind'
-        seconds = f'{abs(apart_ns) * 1e-9:.0f} s'
-        reason = f'images are stamped {seconds} {where} the odometry: are the clocks synchronized?'
         level = Level.DEGRADED if status.level is Level.LOCALISED else status.level
-        return Status(level, (*status.reasons, reason))
+        return Status(level, (*status.reasons, *reasons))
+
+    def _apart_in_time(self) -> list[str]:
+        """How images and odometry are apart in time, beyond what `CameraClock` measures."""
+        count, apart_ns = self._apart
+        if count >= AHEAD_COUNT:
+            where = 'ahead of' if apart_ns > 0 else 'behind'
+            far = f'{abs(apart_ns) * 1e-9:.0f} s {where} the odometry'
+            return [f'images are stamped {far}: are the clocks synchronized?']
+        measured = abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS
+        return [self._watch.problem(self._compensated_s)] if self._off and not measured else []
 
     # Whether a message can be placed in time.
 

@@ -132,13 +132,16 @@ class Recovery:
     ) -> Belief:
         pose = found.pose if isinstance(found, Relocation) else found.value
         trust = belief.memory.trust
+        jump_m = math.hypot(*(pose[:2] - belief.mean[:2])) if belief.located else 0.0
+        again = belief.located or trust.moves > 0
         memory = Memory(
             support=1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
-            trust=moved(trust, belief.traveled_m) if belief.located or trust.moves else Trust(),
+            trust=moved(trust, belief.traveled_m, jump_m) if again else Trust(),
             scatter=belief.memory.scatter,
+            period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
         return placed._replace(memory=memory)

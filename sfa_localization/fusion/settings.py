@@ -88,8 +88,8 @@ class FilterConfig(Settings):
         Settings.__post_init__(self)
         if len(self.initial_pose) not in (0, 3):
             raise ConfigError(
-                f'FilterConfig.initial_pose: {len(self.initial_pose)} numbers given; '
+                f'initial_pose: {len(self.initial_pose)} numbers given; '
                 'give x (m), y (m) and yaw (rad), or none'
             )
         if self.degraded_std > self.lost_std:
-            raise ConfigError('FilterConfig: degraded_std must not exceed lost_std')
+            raise ConfigError('degraded_std must not exceed lost_std')

@@ -8,15 +8,23 @@ import enum
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from sfa_localization.fusion.belief import Belief
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.consistency import doubts
 from sfa_localization.fusion.evidence import ENOUGH_IMAGES, FEW_IMAGES
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
-from sfa_localization.fusion.recover import IMAGE_TIMEOUT_S
+from sfa_localization.fusion.recover import DOUBT_STDS, IMAGE_TIMEOUT_S
 from sfa_localization.fusion.settings import FilterConfig
 
+SILENT_IMAGES, LEAST_SILENCE_S = 6.0, 1.5
+"""Images that stay away for so many of their usual periods are missed, but not before 1.5 s, in
+which a robot goes about as many meters, and after IMAGE_TIMEOUT_S at the latest: meanwhile the
+robot may be towed, held or carried away, and nothing shows it."""
+LOST_M, LOST_RAD = 1.0, 0.3
+"""Images that contradict by less leave the estimate near enough to find a way by."""
 LOST_EXCESS, LOST_DISTANCE_M = 4.0, 0.5
 """ENOUGH_IMAGES in a row that contradict mean LOST where they lie outside the gate by this factor
 on d2, or the robot has moved so far: standing, it may see one place where the map is wrong."""
@@ -84,9 +92,16 @@ def _contradictions(belief: Belief) -> list[str]:
     memory = belief.memory
     moved_m = belief.traveled_m - memory.accepted_m
     serious = memory.gate_excess > LOST_EXCESS or moved_m > LOST_DISTANCE_M
-    if memory.rejected < ENOUGH_IMAGES or not serious:
+    off_m, _, off_rad = np.sqrt(memory.doubt) * DOUBT_STDS
+    near = off_m <= LOST_M and off_rad <= LOST_RAD
+    if memory.rejected < ENOUGH_IMAGES or near or not serious:
         return []
     return [f'{memory.rejected} images in a row contradict the estimate']
+
+
+def silence_limit_s(period_s: float) -> float:
+    """Time without an accepted image after which it is missed, by the usual time between them."""
+    return min(max(SILENT_IMAGES * period_s, LEAST_SILENCE_S), IMAGE_TIMEOUT_S)
 
 
 def _silences(belief: Belief) -> list[str]:
@@ -95,7 +110,7 @@ def _silences(belief: Belief) -> list[str]:
         reasons.append('no image has confirmed the start yet')
     else:
         silence_s = (belief.stamp_ns - belief.memory.accepted_ns) * 1e-9
-        if silence_s > IMAGE_TIMEOUT_S:
+        if silence_s > silence_limit_s(belief.memory.period_s):
             reasons.append(f'no usable image for {silence_s:.0f} s')
     if belief.odometry_ns is None:
         reasons.append('no odometry')

@@ -42,6 +42,8 @@ they keep their weight inside the gate."""
 SCATTER_STEP = 0.05
 """Relative change of the usual distance per image: it is learned over about twenty images."""
 LEAST_SCATTER = 0.05
+PERIOD_STEP = 0.1
+"""Relative change of the usual time between images per image: learned over about twenty."""
 WIDE_GATE = 4.0
 """A prior of so many times a measurement's variance would follow it anywhere (gain above 0.8)."""
 _OUTLYING = {size: float(chi2.ppf(OUTLYING_SHARE, size)) for size in (2, 3)}
@@ -98,7 +100,9 @@ class Correction:
 
     def _fused(self, belief: Belief, event: MeasurementEvent) -> Belief:
         trust = watched(belief.memory.trust, evidence_of(belief, event, accepted=False))
-        belief = belief._replace(memory=belief.memory._replace(trust=trust))
+        period_s = _period_s(belief.memory, event.stamp_ns)
+        memory = belief.memory._replace(trust=trust, period_s=period_s)
+        belief = belief._replace(memory=memory)
         heading_lost = belief.covariance[YAW, YAW] > self._lost_yaw_variance
         if belief.located and (event.value.size == 3 or not heading_lost):
             return self._gated(belief, event)
@@ -152,6 +156,7 @@ class Correction:
             update=update,
             trust=belief.memory.trust,
             scatter=_scatter(belief.memory.scatter, d2 / _MEDIANS[event.value.size]),
+            period_s=belief.memory.period_s,
         )
         outlying = d2 / (belief.memory.scatter * _OUTLYING[event.value.size])
         if outlying > 1 and self._recovery.share >= ALIKE_SHARE:
@@ -167,6 +172,14 @@ def _scatter(usual: float, distance: float) -> float:
     """
     step = math.exp(SCATTER_STEP if distance > usual else -SCATTER_STEP)
     return min(max(usual * step, LEAST_SCATTER), 1.0)
+
+
+def _period_s(memory: Memory, stamp_ns: int) -> float:
+    """The running median of the time between images, accepted or not."""
+    if memory.update is None:
+        return memory.period_s
+    longer = (stamp_ns - memory.update.stamp_ns) * 1e-9 > memory.period_s
+    return memory.period_s * math.exp(PERIOD_STEP if longer else -PERIOD_STEP)
 
 
 def _pulls_far(belief: Belief, event: MeasurementEvent) -> bool:

@@ -57,4 +57,4 @@ class MetricConfig(Settings):
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
         if len(self.anchor) not in (0, 3):
-            raise ConfigError(f'MetricConfig.anchor: {self.anchor} is not empty, and not x, y, yaw')
+            raise ConfigError(f'anchor: {self.anchor} is not empty, and not x, y, yaw')

@@ -15,6 +15,9 @@ from typing import Any, TypeVar, cast
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -63,10 +66,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, kinds: Sequence[type[Settings]], **options: Any) -> None:
+        self.monitors: dict[str, Monitor] = {}
         super().__init__(name, **options)
+        # rclpy makes this one without `create_service`.
+        change = self._service_change_state
+        change.callback = self._answering('change_state', change.callback)
         self.active = False
         self.failure = ''
-        self.monitors: dict[str, Monitor] = {}
         self._resolved: dict[str, str] = {}
         self._settings: dict[type[Settings], Settings] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
@@ -251,6 +257,50 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             return True
         return False
 
+    # What rclpy itself makes: the services of parameters and of the life cycle, and /clock.
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], **options: Any
+    ) -> Any:
+        """A service, by rclpy too, whose requests end nothing: what raises is refused."""
+        answer = self._answering(srv_name.rpartition('/')[2], callback)
+        return super().create_service(srv_type, srv_name, answer, **options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[[Any], None], *more: Any, **options: Any
+    ) -> Any:
+        """A subscription, by rclpy too, whose messages end nothing: /clock may be negative."""
+
+        def receive(message: Any) -> None:
+            try:
+                callback(message)
+            except InvalidHandle:
+                raise
+            except Exception as error:
+                if self.context.ok():
+                    self.refuse(topic, f'{type(error).__name__}: {error}')
+
+        return super().create_subscription(msg_type, topic, receive, *more, **options)
+
+    def _answering(
+        self, name: str, callback: Callable[[Any, Any], Any]
+    ) -> Callable[[Any, Any], Any]:
+        """A service's callback that refuses what it cannot do."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except InvalidHandle:
+                raise
+            except Exception as error:
+                if not self.context.ok():  # after a signal nothing can be answered
+                    raise
+                reason = f'request refused: {type(error).__name__}: {short_line(str(error))}'
+                self.refuse(name, reason)
+                return refusal(request, response, reason)
+
+        return answer
+
     # Life cycle.
 
     def start(self) -> bool:
@@ -324,6 +374,19 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._diagnostics.publish(message)
 
 
+def refusal(request: Any, response: Any, reason: str) -> Any:
+    """The answer to a request that raised: nothing of it has been done from there on."""
+    refused = SetParametersResult(successful=False, reason=reason)
+    if isinstance(response, SetParameters.Response):
+        missing = len(request.parameters) - len(response.results)
+        response.results = [*response.results, *([refused] * missing)]
+    elif isinstance(response, SetParametersAtomically.Response):
+        response.result = refused
+    elif isinstance(response, ChangeState.Response):
+        response.success = False
+    return response
+
+
 def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
     """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start.
 
@@ -379,7 +442,6 @@ def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
         try:
             executor.spin()
         except rclpy_implementation.RCLError as error:
-            # Asking a lifecycle node for a transition that its state does not have ends here, and
-            # so does a signal at some moments.
+            # A signal ends here at some moments.
             if rclpy.ok():
                 node.get_logger().error(f'request refused: {error}')

@@ -413,5 +413,5 @@ def rounded(image: Floats) -> Image:
 
 def _checked_half(area: tuple[float, ...]) -> Array:
     if len(area) != 2 or min(area) < 6.0:
-        raise ConfigError(f'SimulationConfig.area: {area} needs two sides of at least 6 m')
+        raise ConfigError(f'area: {area} needs two sides of at least 6 m')
     return np.array(area) / 2
