@@ -467,7 +467,7 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
     from sfa_localization.commands import demonstration
 
-    def run_live(programs, logs):
+    def run_live(programs, logs, on_end):
         notes.extend(pair for words in programs.values() for pair in pairwise(words))
 
     def simulated(settings, out, progress):
