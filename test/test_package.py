@@ -64,7 +64,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'training': (CORE | {'place_model'}, {'numpy', 'tqdm'}),
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC | {'tqdm'}),
     'tuning': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC | {'tqdm'}),
-    'inspection': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2'}),
+    'inspection': ({'data', 'camera', 'fusion', 'bags'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy', 'tqdm'}),
     'reports': ({'data', 'metric', 'training'}, {'numpy', 'matplotlib'}),
     'nodes': (
