@@ -134,7 +134,7 @@ class DrivenPath:
     odometry: Odometry
     places: Array
     """Poses (M, 3) of the images that have odometry."""
-    clock: CameraClock = CameraClock()
+    clock: CameraClock = field(default_factory=CameraClock)
     """By how much the images are stamped late, as far as turns show it."""
 
     def as_text(self) -> str:
