@@ -23,13 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from sfa_localization.bags.drives import ReadingRecipe, image_cache, read_drives
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings as visual_headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
@@ -62,6 +62,8 @@ from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
 
+STEPS = 8
+"""Of the paper as it is here: see above."""
 COARSE_POINTS = 700
 """Inducing points of a first map that is refined: with more, the refined map and the heading are
 no better, and the model file is larger."""
@@ -139,12 +141,11 @@ def _train_hierarchy(
     start = checkpoint.read(architecture)
     sequences, seed = [ImageSequence.of(run) for run in runs], recipe.network.seed
     images, passes = sum(len(run.panoramas) for run in runs), 2 * len(architecture.layers)
-    with tqdm(
-        desc=f'slow features, {passes} passes',
-        total=images * passes,
+    with progress_bar(
+        f'learn slow features in {passes} passes (step 2 of {STEPS})',
+        images * passes,
         initial=images * start.stages if start else 0,
-        unit='img',
-        disable=not progress,
+        shown=progress,
     ) as bar:
         if recipe.network.engine == 'mdp':
             return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
@@ -168,11 +169,15 @@ def learn_place(
     segments = _cut_odometry(runs, clocks, recipe.segments)
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
+    announce(f'learn the map from {len(segments)} segments (step 5 of {STEPS})', shown=progress)
     first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
+    announce(f'learn the heading (step 6 of {STEPS})', shown=progress)
     heading = learn_heading(images, segments, first)
+    announce(f'refine the map (step 7 of {STEPS})', shown=progress)
     finer = _refine(images, segments, first, heading, recipe)
     if points is not None and finer is None:
         first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
+    announce(f'choose keyframes, and check the map (step 8 of {STEPS})', shown=progress)
     model = _assemble(network, runs, clocks, recipe, images, segments, first, heading, finer)
     result = finer.metric if finer else first
     return Trained(model, tuple(runs), images.slow, segments, result, heading)
@@ -180,8 +185,9 @@ def learn_place(
 
 def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> ImageFeatures:
     """Step 3: what the network outputs for all images."""
-    total, hidden = sum(len(run.panoramas) for run in runs), not progress
-    with tqdm(desc='features of all images', total=total, unit='img', disable=hidden) as bar:
+    total = sum(len(run.panoramas) for run in runs)
+    title = f'compute the slow features of all images (step 3 of {STEPS})'
+    with progress_bar(title, total, shown=progress) as bar:
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 

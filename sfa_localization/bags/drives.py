@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S, load_run
@@ -25,6 +24,7 @@ from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.files import replaced_mode
+from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Image, Run
 
 SAME_IMAGE_NS = 1_000_000
@@ -133,7 +133,7 @@ def read_drive(
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
 ) -> Run:
     """Read one bag as a run of panoramas; raw camera images are unwrapped. Raises BagError."""
-    with tqdm(desc=f'reading {Path(bag).name}', unit='img', disable=not progress) as bar:
+    with progress_bar(f'read {Path(bag).name}', shown=progress) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total

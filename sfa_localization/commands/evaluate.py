@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,9 @@ from sfa_localization.fusion.settings import FilterConfig
 if TYPE_CHECKING:
     from sfa_localization.evaluation import Evaluation
 
+WRITES = """\
+tables on standard output; with --report index.html (one page for a browser), its figures,
+  report.md; with --json the errors"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
   evaluate garden.npz bags/test --align bags/coverage --report report --json results.json"""
@@ -61,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         recipe=recipe(arguments),
         config=settings(FilterConfig, arguments, arguments.config),
         watch=settings(WatchConfig, arguments, arguments.config),
-        progress=sys.stderr.isatty(),
+        progress=True,
         smooth=arguments.smooth,
     )
     print(table(result.scores), heading_table(result.scores), sep='\n\n')

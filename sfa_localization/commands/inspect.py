@@ -16,6 +16,9 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 
+WRITES = """\
+findings on standard output; with --report index.html (one page for a browser) and its
+  figures; with --json the findings"""
 EXAMPLES = """\
   inspect bags/coverage bags/test
   inspect recording_0.mcap --json bag.json --report report

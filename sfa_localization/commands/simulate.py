@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from sfa_localization.camera.settings import PanoramaConfig
@@ -13,6 +12,7 @@ from sfa_localization.commands.options import add_settings, destination, numbers
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.simulation.settings import SimulationConfig
 
+WRITES = 'a bag with images, odometry, turn rates and the ground truth'
 EXAMPLES = """\
   simulate bags/coverage --trajectory coverage --seed 1
   simulate bags/test --trajectory test --seed 2 --compressed
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.simulation.drive import simulate
 
     config = settings(SimulationConfig, arguments)
-    panorama, progress = _panorama(arguments.size), sys.stderr.isatty()
+    panorama, progress = _panorama(arguments.size), True
     drive = simulate(config, arguments.out, panorama, progress=progress)
     seconds = (drive.truth.stamps_ns[-1] - drive.truth.stamps_ns[0]) * 1e-9
     print(f'{arguments.out}: {len(drive.image_stamps_ns)} images in {seconds:.0f} s')

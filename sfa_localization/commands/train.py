@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 if TYPE_CHECKING:
     from sfa_localization.training import Recipe, Trained
 
+WRITES = 'MODEL.npz; with --report index.html (one page for a browser), its figures, training.md'
 EXAMPLES = """\
   train bags/coverage --output garden.npz
   train bags/a bags/b --output garden.npz --config localization.yaml --report report
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.bags,
             arguments.output,
             used,
-            progress=sys.stderr.isatty(),
+            progress=True,
             resume=arguments.resume,
             strict=arguments.strict,
             executor=executor,
