@@ -72,9 +72,10 @@ def executable() -> int:
 def command_parser(name: str) -> argparse.ArgumentParser:
     """Return the parser of one command; only its module is imported."""
     command = importlib.import_module(f'sfa_localization.commands.{name}')
+    texts = COMMANDS[name], f'writes: {command.WRITES}', f'examples:\n{command.EXAMPLES}'
     parser = argparse.ArgumentParser(
         prog=f'sfa_localization {name}',
-        description=f'{COMMANDS[name]}\n\nwrites: {command.WRITES}\n\nexamples:\n{command.EXAMPLES}',
+        description='\n\n'.join(texts),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_arguments(parser)
