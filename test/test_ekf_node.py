@@ -3,6 +3,7 @@
 """ekf_node on real messages: what it publishes, what it survives, how it tells its state."""
 
 import math
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -586,3 +587,24 @@ def test_a_given_start_and_a_damaged_file_come_before_a_saved_pose(bench, tmp_pa
     node = bench.run(EkfNode, pose_file=str(pose_file), **given)
     assert node._filter.state is None
     assert node._status().level is Level.UNINITIALISED
+
+
+def test_the_state_is_on_diagnostics_for_programs(bench):
+    """With the level, and the keys that config/problems.md names."""
+    drive = Drive(seconds=3, **NOISY)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, silence_timeout=60.0)
+    play(bench, node, drive)
+    level, text, values = node.health()
+    assert (level, text, values['state']) == (DiagnosticStatus.OK, 'localized', 'LOCALISED')
+    page = (FilePath(__file__).parents[1] / 'config/problems.md').read_text('utf-8')
+    for key in values:
+        kind, _, reason = key.partition(': ')
+        assert f'`{kind}: REASON`' in page if reason else f'`{key}`' in page, key
+    for expected, settings in (
+        ((DiagnosticStatus.WARN, 'DEGRADED'), FilterConfig(degraded_std=1e-3)),
+        ((DiagnosticStatus.ERROR, 'LOST'), FilterConfig(degraded_std=1e-3, lost_std=1e-3)),
+    ):
+        node._filter.reconfigure(settings)
+        level, text, values = node.health()
+        assert (level, values['state']) == expected
+        assert 'position known to' in text

@@ -90,11 +90,11 @@ def _write_page(arguments: argparse.Namespace, result: Evaluation) -> None:
     worst = worst_images(result.truth, result.estimates['sfa'])
     stamps = {one: one.stamp_ns + late_ns for one in worst}
     read = images_at(arguments.bag, stamps.values(), recipe(arguments))
-    pictures = {one: read[stamp] for one, stamp in stamps.items() if stamp in read}
+    samples = {one: read[stamp] for one, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
     write_evaluation_page(
         arguments.report, title, result.truth, result.estimates, result.scores, result.counts,
-        pictures,
+        samples,
     )  # fmt: skip
     print(f'{arguments.report / PAGE}: written')
 

@@ -76,6 +76,6 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
         for run, bag in enumerate(bags)
         if any(one.run == run for one in worst)
     }
-    pictures = {one: read[one.run][one.stamp_ns] for one in worst if one.stamp_ns in read[one.run]}
-    write_training_report(folder, trained, pictures)
+    samples = {one: read[one.run][one.stamp_ns] for one in worst if one.stamp_ns in read[one.run]}
+    write_training_report(folder, trained, samples)
     print(f'{folder / PAGE}: written')

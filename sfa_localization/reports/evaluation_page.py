@@ -63,17 +63,17 @@ def write_evaluation_page(
     estimates: Mapping[str, Trajectory],
     scores: report.Scores,
     counts: Mapping[str, Any],
-    pictures: Mapping[WorstImage, Image],
+    samples: Mapping[WorstImage, Image],
 ) -> None:
     """Write `folder`/index.html beside the figures of `evaluation.write_report`.
 
-    `counts` are those of Evaluation, `pictures` the worst images. Raises LocalizationError.
+    `counts` are those of Evaluation, `samples` the worst images. Raises LocalizationError.
     """
     error_map_figure(folder / 'error_map.png', truth, estimates['ekf'])
-    captions = [f'x {k.x_m:.1f} m, y {k.y_m:.1f} m: error {k.error_m:.2f} m' for k in pictures]
-    if pictures:
+    captions = [f'x {k.x_m:.1f} m, y {k.y_m:.1f} m: error {k.error_m:.2f} m' for k in samples]
+    if samples:
         sheet = folder / 'worst_images.png'
-        write_contact_sheet([*pictures.values()], 'Worst images', sheet, captions)
+        write_contact_sheet([*samples.values()], 'Worst images', sheet, captions)
     page.write_page(
         folder,
         title,
@@ -88,7 +88,7 @@ def write_evaluation_page(
         page.section('Slow features',
                      page.figure(folder / 'firing_maps.png', 'Slow features at the estimates')),
         page.section('Worst images', page.figure(folder / 'worst_images.png', 'Single images with '
-                     'the largest errors, and where they were taken')) if pictures else '',
+                     'the largest errors, and where they were taken')) if samples else '',
     )  # fmt: skip
 
 

@@ -67,12 +67,12 @@ def worst_images(trained: Trained) -> list[WorstImage]:
 
 
 def write_training_report(
-    folder: Path, trained: Trained, pictures: Mapping[WorstImage, Image] | None = None
+    folder: Path, trained: Trained, samples: Mapping[WorstImage, Image] | None = None
 ) -> None:
     """Write figures of the training, training.md, and the page index.html that contains them all.
 
     Coverage, line fits, odometry, firing maps and, where there are any, headings, descent and the
-    `pictures` of the worst images. Makes the folder. Raises LocalizationError when a file cannot
+    `samples` of the worst images. Makes the folder. Raises LocalizationError when a file cannot
     be written.
     """
     images, places = positions(trained.metric, trained.segments)
@@ -87,9 +87,9 @@ def write_training_report(
     if len(trained.metric.history):
         names.append('convergence')
         convergence_figure(folder / 'convergence.png', trained.metric.history)
-    if pictures:
+    if samples:
         names.append('worst_images')
-        _worst_figure(folder / 'worst_images.png', pictures)
+        _worst_figure(folder / 'worst_images.png', samples)
     shown = [f'![{name}]({name}.png)' for name in names]
     text = '\n\n'.join(['# Training', f'```\n{summary(trained)}\n```', *shown]) + '\n'
     report.save_text(folder / 'training.md', text)
@@ -98,9 +98,9 @@ def write_training_report(
     write_training_page(folder, title, trained, figures)
 
 
-def _worst_figure(path: Path, pictures: Mapping[WorstImage, Image]) -> None:
-    captions = [f'x {k.x_m:.1f} m, y {k.y_m:.1f} m: error {k.error_m:.2f} m' for k in pictures]
-    write_contact_sheet([*pictures.values()], 'Worst images', path, captions)
+def _worst_figure(path: Path, samples: Mapping[WorstImage, Image]) -> None:
+    captions = [f'x {k.x_m:.1f} m, y {k.y_m:.1f} m: error {k.error_m:.2f} m' for k in samples]
+    write_contact_sheet([*samples.values()], 'Worst images', path, captions)
 
 
 def odometry_figure(path: Path, trained: Trained) -> None:
