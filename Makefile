@@ -10,7 +10,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test robustness fuzz soak bench lint format colcon matrix clean
+.PHONY: help env demo test robustness animation fuzz soak bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,6 +29,9 @@ test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 robustness: $(READY)  ## run the tests of test/README.md; print what each fault of a drive did (15 minutes)
 	$(PY) -m pytest -m robustness $(ARGS)
 	PYTHONPATH=.:test $(PY) -m robustness --live
+
+animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp
+	PYTHONPATH=.:test $(PY) -m robustness.animation resource/kidnapped.webp
 
 fuzz: $(READY)  ## 10,000 hostile messages, models, bags, YAML and image files each (ARGS='--kinds bags')
 	$(PY) test/benchmarks/fuzz.py $(ARGS)

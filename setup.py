@@ -39,7 +39,6 @@ setup(
     long_description='See README.md.',
     author='The sfa_localization authors',
     maintainer='The sfa_localization authors',
-    maintainer_email='sfa-localization@example.org',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed']},

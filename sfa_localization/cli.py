@@ -15,6 +15,7 @@ from pathlib import Path
 from sfa_localization import __version__
 from sfa_localization.commands.processes import terminable
 from sfa_localization.data.errors import LocalizationError
+from sfa_localization.nodes.help import NODES, asks_for_help, node_help
 
 COMMANDS = {
     'simulate': 'Record a bag with a simulated robot in a simulated garden.',
@@ -33,11 +34,6 @@ LONGEST_ERROR = 4000
 """Characters of an error: the last lines of a program that failed, or a list of topics."""
 ROS_COMMANDS = ('play',)
 """Commands that ROS ends at a signal; the others end at SIGTERM as at Ctrl-C, and clean up."""
-NODES = {
-    'omnicam_node': 'ROS 2 node: camera images to panoramas (--ros-args -p NAME:=VALUE).',
-    'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
-    'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
-}
 OPTIONAL = {
     'trimesh': 'trimesh embreex',
     'embreex': 'trimesh embreex',
@@ -54,6 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command or node named by the first argument; return the exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
+    if name in NODES and asks_for_help(words[1:]):
+        print(node_help(name, NODES[name]), end='')
+        return 0
     if name in NODES:  # a node reads its ROS arguments itself
         node = importlib.import_module(f'sfa_localization.nodes.{name}')
         return guarded(lambda: int(node.main(words)))
@@ -73,9 +72,10 @@ def executable() -> int:
 def command_parser(name: str) -> argparse.ArgumentParser:
     """Return the parser of one command; only its module is imported."""
     command = importlib.import_module(f'sfa_localization.commands.{name}')
+    texts = COMMANDS[name], f'writes: {command.WRITES}', f'examples:\n{command.EXAMPLES}'
     parser = argparse.ArgumentParser(
         prog=f'sfa_localization {name}',
-        description=f'{COMMANDS[name]}\n\nexamples:\n{command.EXAMPLES}',
+        description='\n\n'.join(texts),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.add_arguments(parser)

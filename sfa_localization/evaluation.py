@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
-from tqdm import tqdm
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import WatchConfig
@@ -37,6 +36,7 @@ from sfa_localization.data.geometry import (
     rotation,
     wrap_angle,
 )
+from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import State
@@ -234,9 +234,8 @@ def _cache() -> AbstractContextManager[Path]:
     return image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate')
 
 
-def _bar(run: Run, progress: bool) -> tqdm:
-    total, title = len(run.panoramas), f'locating {run.name}'
-    return tqdm(desc=title, total=total, unit='img', disable=not progress)
+def _bar(run: Run, progress: bool) -> Any:
+    return progress_bar(f'locate the images of {run.name}', len(run.panoramas), shown=progress)
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:

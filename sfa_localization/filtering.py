@@ -13,13 +13,13 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD, read_twist
@@ -145,8 +145,8 @@ def run_filter(
         fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
     odometry = replace(odometry, stamps_ns=odometry.stamps_ns + lag_ns)
     answers, updates = list[State | None](), list[Update]()
-    for stamp_ns in tqdm(_feed(fused, odometry, positions, shift, updates), disable=not progress,
-                         total=len(odometry), unit=' rows', desc='filter'):  # fmt: skip
+    feed = _feed(fused, odometry, positions, shift, updates)
+    for stamp_ns in progress_over(feed, 'filter', len(odometry), 'rows', shown=progress):
         state = fused.at(stamp_ns - lag_ns)
         answers.append(state and replace(state, stamp_ns=stamp_ns - lag_ns))
     states = [state for state in answers if state]

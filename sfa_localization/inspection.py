@@ -19,10 +19,13 @@ from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.segments import PIECE_LENGTH_M
 from sfa_localization.metric.sufficiency import ROUTE, is_one_route
 
@@ -50,6 +53,10 @@ GRID = 100
 """Points per axis at which coverage is evaluated: steps of 1 % of the area's extent."""
 DARK = 12.0
 """Mean gray level of 255 below which an image is dark."""
+DELAY_SHOWN_S = 0.02
+"""A smaller delay of the camera is within the period of usual odometry."""
+# Of an unrolled circle; the inner third shows the robot or the camera itself.
+_RADII, _ANGLES, _INNER = 30, 400, 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +136,28 @@ class DrivenPath:
     odometry: Odometry
     places: Array
     """Poses (M, 3) of the images that have odometry."""
+    clock: CameraClock = field(default_factory=CameraClock)
+    """By how much the images are stamped late, as far as turns show it."""
 
     def as_text(self) -> str:
-        """A line for a terminal."""
+        """Lines for a terminal."""
+        clock = self.clock_text()
+        return '\n'.join([self.path_text(), *([f'  clocks: {clock}'] if clock else [])])
+
+    def clock_text(self) -> str:
+        """What turns show about the clocks; '' where they show nothing."""
+        if not self.clock.known:
+            return ''
+        delay_s = self.clock.delay_ns * 1e-9
+        if abs(delay_s) < DELAY_SHOWN_S:
+            return 'images and odometry agree'
+        late = 'late' if delay_s > 0 else 'early'
+        corrected = abs(self.clock.delay_ns) <= DELAY_LIMIT_NS
+        remedy = 'train and the filter correct it' if corrected else 'synchronize the clocks'
+        return f'images are stamped {abs(delay_s):.2f} s {late}: {remedy}'
+
+    def path_text(self) -> str:
+        """A line about the path."""
         found = self.as_dict()
         return (
             f'  drive: {found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images '
@@ -147,6 +173,7 @@ class DrivenPath:
             'area_m2': round(hull_area(self.places), 2),
             'spacing_m': round(spacing(self.places), 3),
             'directions': directions(self.places),
+            'camera_delay_s': round(self.clock.delay_s, 3) if self.clock.known else None,
         }
 
 
@@ -240,6 +267,8 @@ class _Survey:
         self._bag, self._image, self._odometry = bag, image, odometry
         self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
         self._motion: list[tuple[int, Any]] = []
+        self._turned: list[tuple[int, float]] = []
+        self._gyro = VisualGyro()
         self._sizes: dict[tuple[int, ...], int] = {}
         self._samples: list[Image] = []
         self._streams: list[Stream] = []
@@ -252,6 +281,8 @@ class _Survey:
             self._stamps[stream.topic].append(stamp_ns)
             if stream.topic == self._odometry.partition(':')[0]:
                 self._motion.append((stamp_ns, value))
+            elif stream.topic == self._image:
+                self._turned.append((stamp_ns, value))
 
     def _stream(self, name: str) -> Stream:
         if name == self._odometry.partition(':')[0]:
@@ -264,13 +295,17 @@ class _Survey:
             return self._bag.any_stream(name, decoding.image_of)
         return self._bag.any_stream(name, lambda message: None)
 
-    def _sample(self, message: Any) -> None:
-        """Decode an image; keep its size, and every so often the image itself."""
+    def _sample(self, message: Any) -> float:
+        """Decode an image; keep its size, and every so often the image itself.
+
+        Returns how far images have turned so far, rad.
+        """
         image = decoding.image_of(message)
         number = sum(self._sizes.values())
         self._sizes[image.shape[:2]] = self._sizes.get(image.shape[:2], 0) + 1
         if number % self._every == 0 and len(self._samples) < SAMPLES:
             self._samples.append(_small(image))
+        return self._gyro.add(_unrolled(image))
 
     def topics(self) -> list[TopicReport]:
         reports = []
@@ -309,12 +344,30 @@ class _Survey:
         stamps = images.stamps_ns if images else np.zeros(0, np.int64)
         tolerance = int(ODOMETRY_TOLERANCE_S * 1e9)
         near = stamps[odometry.trajectory.covers(stamps, tolerance)]
-        return DrivenPath(self._odometry, odometry, odometry.trajectory.at(near))
+        return DrivenPath(
+            self._odometry, odometry, odometry.trajectory.at(near), self._clock(odometry)
+        )
+
+    def _clock(self, odometry: Odometry) -> CameraClock:
+        """The delay of the camera's clock, at images in the order of their stamps."""
+        turned = sorted(self._turned)
+        stamps = np.array([stamp for stamp, _ in turned], np.int64)
+        return camera_clock(odometry, stamps, [yaw for _, yaw in turned])
 
 
 def _small(image: Image) -> Image:
     scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+
+def _unrolled(image: Image) -> Image:
+    """An image in which a turn of the robot is a shift: a circle, unrolled about its center."""
+    height, width = image.shape[:2]
+    if looks_like_panorama(height, width) or abs(width / height - 2) < 0.02:
+        return image
+    center, reach = ((width - 1) / 2, (height - 1) / 2), min(height, width) / 2
+    polar = cv2.warpPolar(image, (_RADII, _ANGLES), center, reach, cv2.INTER_LINEAR)
+    return np.ascontiguousarray(polar[:, _INNER:].transpose(1, 0, 2))
 
 
 def guess_geometry(samples: Sequence[Image]) -> str:
@@ -397,7 +450,9 @@ def lacks(report: BagReport, config: InspectionConfig) -> list[str]:
     if report.images is None or report.drive is None:
         return [] if report.lacks else ['neither images nor odometry could be read']
     places = report.drive.places
+    apart = abs(report.drive.clock.delay_ns) > DELAY_LIMIT_NS
     return [
+        *([report.drive.clock_text()] if apart else []),
         *_lacks_of_images(report.images, len(places), config),
         *(_lacks_of_drive(places, config) if len(places) > 1 else ()),
     ]

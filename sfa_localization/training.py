@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from sfa_localization.bags.drives import ReadingRecipe, image_cache, read_drives
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings as visual_headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
@@ -67,6 +67,8 @@ from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
 
+STEPS = 9
+"""Of the paper as it is here: see above."""
 COARSE_POINTS = 700
 """Inducing points of a first map that is refined: with more, the refined map and the heading are
 no better, and the model file is larger."""
@@ -147,8 +149,8 @@ class Matched:
 
 def match_images(runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> Matched:
     """Step 2: loop closures of the drives, also between drives in different lights."""
-    total, hidden = sum(len(run.panoramas) for run in runs), not progress
-    with tqdm(desc='local contrast of images', total=total, unit='img', disable=hidden) as bar:
+    total = sum(len(run.panoramas) for run in runs)
+    with progress_bar(f'find loop closures (step 2 of {STEPS})', total, shown=progress) as bar:
         views = views_of(runs, bar.update)
     return Matched(views, find_closures(views, recipe.panorama.clockwise))
 
@@ -170,12 +172,11 @@ def _train_hierarchy(
     rotations, clockwise = architecture.rotations, recipe.panorama.clockwise
     sequences += edges_between(drives, closures, rotations, clockwise)
     images, passes = sum(len(s.panoramas) for s in sequences), 2 * len(architecture.layers)
-    with tqdm(
-        desc=f'slow features, {passes} passes',
-        total=images * passes,
+    with progress_bar(
+        f'learn slow features in {passes} passes (step 3 of {STEPS})',
+        images * passes,
         initial=images * start.stages if start else 0,
-        unit='img',
-        disable=not progress,
+        shown=progress,
     ) as bar:
         if recipe.network.engine == 'mdp':
             return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
@@ -209,15 +210,17 @@ def learn_place(
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
     segments, first, heading = _learn_map(
-        images, known.closures, runs, clocks, seen, recipe, points
+        images, known.closures, runs, clocks, seen, recipe, points, progress
     )
     if first.diagnostics.one_route:
         if strict:
             raise DataError(f'{ROUTE}, or train without --strict')
         logger.warning(ROUTE)
+    announce(f'refine the map (step 8 of {STEPS})', shown=progress)
     finer = _refine(images, segments, first, heading, recipe)
     if points is not None and finer is None:
         first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
+    announce(f'choose keyframes, and check the map (step 9 of {STEPS})', shown=progress)
     model = _assemble(
         network, runs, clocks, recipe, images, known.views, segments, first, heading, finer
     )
@@ -227,8 +230,9 @@ def learn_place(
 
 def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> ImageFeatures:
     """Step 4: what the network outputs for all images."""
-    total, hidden = sum(len(run.panoramas) for run in runs), not progress
-    with tqdm(desc='features of all images', total=total, unit='img', disable=hidden) as bar:
+    total = sum(len(run.panoramas) for run in runs)
+    title = f'compute the slow features of all images (step 4 of {STEPS})'
+    with progress_bar(title, total, shown=progress) as bar:
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 
@@ -254,6 +258,7 @@ def _learn_map(
     seen: Sequence[Sequence[float]],
     recipe: Recipe,
     points: int | None,
+    progress: bool,
 ) -> tuple[Segments, MetricResult, LearnedHeading | None]:
     """Steps 5 to 7, and once more where turns are much noisier than stated or assumed.
 
@@ -265,10 +270,12 @@ def _learn_map(
     for _ in range(_NOISE_ROUNDS):
         segments = _cut_odometry(runs, clocks, recipe.segments, noise)
         segments = replace(segments, closures=closures)
+        announce(f'learn the map from {len(segments)} segments (step 6 of {STEPS})', shown=progress)
         try:
             first = learn_metric(
                 images.slow, segments, recipe.metric, recipe.network.seed, points=points
             )
+            announce(f'learn the heading (step 7 of {STEPS})', shown=progress)
             heading = learn_heading(images, segments, first)
             learned = segments, first, heading
             found = against_compass(heading, segments, first) if heading else None

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from tqdm import tqdm
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import WatchConfig
@@ -29,6 +28,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.progress import progress_bar, progress_over
 from sfa_localization.data.run import Odometry, Run, Stamps, Trajectory
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.fusion.pose_filter import PoseFilter, Update
@@ -184,8 +184,8 @@ def read_drives(
 
 def _locate(run: Run, observer: Observer, progress: bool) -> ImagePoses:
     count = len(run.panoramas)
-    observations = tqdm(observer.observe_run(run), 'locating', count, unit='img',
-                        disable=not progress)  # fmt: skip
+    title = f'locate the images of {run.name}'
+    observations = progress_over(observer.observe_run(run), title, count, shown=progress)
     usable = [one for one in observations if not one.problem]
     return ImagePoses(
         np.array([one.stamp_ns for one in usable], np.int64),
@@ -199,7 +199,7 @@ def tune(
 ) -> Outcome:
     """The best setting by the method of `how`. Raises DataError without enough data."""
     total = len(FACTORS) ** 2 if how.method == 'grid' else how.trials
-    with tqdm(total=total, desc=how.method, unit='trial', disable=not progress) as bar:
+    with progress_bar(f'tune by {how.method}', total, 'trials', shown=progress) as bar:
         if how.method == 'grid':
             return tune_by_grid(drives, config, bar.update)[0]
         return tune_by_likelihood(drives, config, how.trials, bar.update)

@@ -282,7 +282,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
             '--config {data}/fewer.yaml',
             lambda a, b: b.model().quality['features_used'] < a.model().quality['features_used'],
         ),
-        '--report': Case('--report {out}/report', written('report/training.md')),
+        '--report': Case('--report {out}/report', written('report/index.html')),
         '--resume': Case(
             '--resume',
             refuses('train without --resume'),
@@ -306,7 +306,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--align': Case('--align {data}/bag', differ(lambda o: o.text.splitlines()[-1])),
         '--config': Case('--config {data}/start.yaml', PRINTED),
         '--smooth': Case('--smooth', PRINTED),
-        '--report': Case('--report {out}/report', written('report/report.md')),
+        '--report': Case('--report {out}/report', written('report/index.html')),
         '--json': Case('--json {out}/figures.json', written('figures.json')),
         '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
         '--odom-topic': Case('--odom-topic /ground_truth', PRINTED),
@@ -327,7 +327,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
     },
     'inspect': {
         '--json': Case('--json {out}/found.json', written('found.json')),
-        '--report': Case('--report {out}/report', written('report/bag_pictures.png')),
+        '--report': Case('--report {out}/report', written('report/index.html')),
         '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['inspect']),
         '--image-topic': Case('--image-topic /nothing', lambda a, b: '/nothing' in b.text),
         '--odom-topic': Case('--odom-topic /ground_truth', says('by /ground_truth')),
@@ -477,7 +477,7 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
     from sfa_localization.commands import demonstration
 
-    def run_live(programs, logs):
+    def run_live(programs, logs, on_end):
         notes.extend(pair for words in programs.values() for pair in pairwise(words))
 
     def simulated(settings, out, progress):

@@ -29,6 +29,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import Image
+from std_msgs.msg import String
 
 role, behaviour = sys.argv[1:3]
 if behaviour == 'fail':
@@ -44,10 +45,13 @@ wanted = {'omnicam_node': [], 'sfa_node': [(Image, 'panorama')],
           'ekf_node': [(Odometry, '/odom'), pose]}
 subscriptions = [node.create_subscription(k, t, lambda m: None, 10) for k, t in wanted[role]]
 listeners = {'omnicam_node': 2, 'sfa_node': 2, 'ekf_node': 1}  # the next node, and the recorder
+states = node.create_publisher(String, 'ekf/state', 10)
 sent = 0
 
 def publish():
     global sent
+    if role == 'ekf_node':
+        states.publish(String(data='LOCALISED'))
     if publisher.get_subscription_count() < listeners[role]:
         return
     sent += 1
@@ -103,7 +107,9 @@ def test_chain_records_what_the_nodes_publish(tmp_path):
     script = Path(chain['sfa_node'][1])
     script.write_text(STAND_IN.replace('sent += 1', 'sent += 1\n    if sent > 40: return'))
     patient = dataclasses.replace(TIMEOUTS, silence_s=20.0)
-    live = live_nodes.run_live(chain, tmp_path / 'logs', patient)
+    ended: list[str] = []
+    live = live_nodes.run_live(chain, tmp_path / 'logs', patient, ended.append)
+    assert ended == ['LOCALISED']
     assert set(live) == {'sfa', 'ekf'}
     for trajectory in live.values():
         assert len(trajectory) > 5

@@ -29,8 +29,18 @@ from sfa_localization.data.settings import Settings
 from sfa_localization.nodes.settings import EkfNodeConfig
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md')])
+DOCUMENTS = sorted(
+    [
+        *ROOT.glob('*.md'),
+        *ROOT.glob('config/*.md'),
+        *ROOT.glob('bags/*.md'),
+        ROOT / 'test/README.md',
+    ]
+)
+README_LINES = 130
+"""At most so many: a stranger decides in half a minute."""
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
+NAMED = ('CITATION.cff', 'package.xml', 'setup.py')
 COMMANDS = set(cli.COMMANDS)
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`([a-z_]+ [^`]+)`')
@@ -38,7 +48,12 @@ LINK = re.compile(r'\]\(([^)#\s]+)\)')
 TOPIC = re.compile(r'\b((?:sfa|ekf)/[a-z_]+)\b')
 # Programs of other packages, whose arguments are not checked.
 FOREIGN = {'source', 'colcon', 'rviz2', 'rosdep', 'git', 'cd', 'mkdir', 'pip', 'sudo'}
-OTHER_ROS = {('run', 'robot_localization'), ('launch', 'nav2_bringup'), ('bag', 'record')}
+OTHER_ROS = {
+    ('run', 'robot_localization'),
+    ('launch', 'nav2_bringup'),
+    ('bag', 'record'),
+    ('topic', 'echo'),
+}
 
 
 def commands() -> list:
@@ -142,6 +157,29 @@ def topics() -> set[str]:
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     )
     return {text.lstrip('/') for text in strings if re.fullmatch(r'/?[a-z_]+(/[a-z_]+)*', text)}
+
+
+def test_the_readme_is_short_and_says_what_its_figures_are():
+    lines = (ROOT / 'README.md').read_text('utf-8').splitlines()
+    assert len(lines) <= README_LINES
+    figures = [k for k, line in enumerate(lines) if line.startswith('![')]
+    assert figures
+    for k in figures:
+        assert re.match(r'\*(Rendered|Half-real|Real)\b', lines[k + 2]), lines[k]
+
+
+@pytest.mark.parametrize('path', [*DOCUMENTS, *(ROOT / n for n in NAMED)], ids=lambda p: p.name)
+def test_no_placeholder_is_left(path):
+    assert not re.search(r'REPOSITORY|example\.(org|com|net)|TODO|FIXME', path.read_text('utf-8'))
+
+
+def test_the_cited_article_has_year_and_venue():
+    (article,) = yaml.safe_load((ROOT / 'CITATION.cff').read_text('utf-8'))['references']
+    assert isinstance(article['year'], int)
+    assert str(article['year']) in article['conference']['name']
+    assert f'Workshops, {article["year"]}' in (ROOT / 'README.md').read_text('utf-8').replace(
+        '\n', ' '
+    )
 
 
 @pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -3,6 +3,7 @@
 """ekf_node on real messages: what it publishes, what it survives, how it tells its state."""
 
 import math
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from transform_buffer import TransformBuffer
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose
 from sfa_localization.fusion import motion
-from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 
 pytest.importorskip('rclpy')
@@ -590,3 +591,57 @@ def test_frames_are_parameters(bench):
     assert (header.frame_id, child) == ('garden', 'wheels')
     bench.publish(IMAGE_POSE, picture(drive, 0, frame='garden'))
     assert until(lambda: node.monitor(IMAGE_POSE).used == 1)
+
+
+def test_after_a_restart_it_looks_where_it_was_first(bench, tmp_path):
+    pose_file = tmp_path / 'pose.json'
+    drive = Drive(seconds=8, **NOISY)
+    patient = {'pose_file': str(pose_file), 'silence_timeout': 60.0}
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, **patient)
+    play(bench, node, drive)
+    last = node._filter.state
+    assert until(lambda: node._sure is not None and node._sure.stamp_ns == last.stamp_ns)
+    assert not pose_file.exists(), 'the period has not passed'
+    bench.executor.remove_node(node)
+    node.destroy_node()
+    assert pose_file.exists()
+    again = bench.run(EkfNode, **patient)
+    heard = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
+    assert np.allclose(again._filter.state.pose, last.pose)
+    assert 0.5 < again._filter.state.position_std < 1.0
+    assert again._status().level is Level.DEGRADED, 'no image has confirmed it yet'
+    # Switched on elsewhere: the second image that says so is believed.
+    elsewhere = Drive(seconds=4, start=(30.0, 0.0, 1.0), **NOISY)
+    play(bench, again, elsewhere)
+    assert until(lambda: len(heard) == len(elsewhere.pictures))
+    assert np.hypot(*(pose_of(heard[-1]) - elsewhere.poses[elsewhere.pictures[-1]])[:2]) < 0.5
+
+
+@pytest.mark.parametrize('given', [{'initial_pose': AT_ORIGIN}, {}])
+def test_a_given_start_and_a_damaged_file_come_before_a_saved_pose(bench, tmp_path, given):
+    pose_file = tmp_path / 'pose.json'
+    pose_file.write_text('{}')
+    node = bench.run(EkfNode, pose_file=str(pose_file), **given)
+    assert node._filter.state is None
+    assert node._status().level is Level.UNINITIALISED
+
+
+def test_the_state_is_on_diagnostics_for_programs(bench):
+    """With the level, and the keys that config/problems.md names."""
+    drive = Drive(seconds=3, **NOISY)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, silence_timeout=60.0)
+    play(bench, node, drive)
+    level, text, values = node.health()
+    assert (level, text, values['state']) == (DiagnosticStatus.OK, 'localized', 'LOCALISED')
+    page = (FilePath(__file__).parents[1] / 'config/problems.md').read_text('utf-8')
+    for key in values:
+        kind, _, reason = key.partition(': ')
+        assert f'`{kind}: REASON`' in page if reason else f'`{key}`' in page, key
+    for expected, settings in (
+        ((DiagnosticStatus.WARN, 'DEGRADED'), FilterConfig(degraded_std=1e-3)),
+        ((DiagnosticStatus.ERROR, 'LOST'), FilterConfig(degraded_std=1e-3, lost_std=1e-3)),
+    ):
+        node._filter.reconfigure(settings)
+        level, text, values = node.health()
+        assert (level, values['state']) == expected
+        assert 'position known to' in text

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
@@ -282,3 +283,57 @@ def test_json_that_cannot_be_written_leaves_nothing_behind(
     assert main(['inspect', str(tmp_path / 'missing'), '--json', str(folder / 'taken')]) == 1
     assert f'{folder / "taken"}: cannot be written' in capsys.readouterr().err
     assert [path.name for path in folder.iterdir()] == ['taken']
+
+
+def rolled_up(panorama: np.ndarray) -> np.ndarray:
+    """The image (200, 200, 3) of a mirror that shows a panorama around its center."""
+    rows, columns = np.mgrid[:200, :200] - 99.5
+    radius = np.hypot(rows, columns)
+    across = (np.arctan2(rows, columns) / (2 * np.pi) % 1 * panorama.shape[1]).astype(int)
+    along = ((95 - radius) / 60 * panorama.shape[0]).astype(int)
+    seen = (along >= 0) & (along < panorama.shape[0])
+    circle = panorama[np.clip(along, 0, panorama.shape[0] - 1), across % panorama.shape[1]]
+    return np.where(seen[..., None], circle, 0).astype(np.uint8)
+
+
+@pytest.fixture(scope='module')
+def sample() -> tuple[list, object]:
+    """The images and the odometry of the sample's test drive."""
+    with Bag(Path(__file__).parents[1] / 'bags/sample_test') as bag:
+        return list(bag.images()), bag.odometry()
+
+
+@pytest.mark.parametrize(
+    ('late_s', 'circle', 'text'),
+    [
+        (0.0, False, 'images and odometry agree'),
+        (0.3, False, ' s late: train and the filter correct it'),
+        (-0.3, True, ' s early: train and the filter correct it'),
+        (0.9, False, ' s late: synchronize the clocks'),
+    ],
+)
+def test_clocks_that_differ_are_found(
+    sample: tuple, tmp_path: Path, late_s: float, circle: bool, text: str
+) -> None:
+    images, odometry = sample
+    with BagWriter(tmp_path / 'bag') as bag:
+        for stamp_ns, image in images:
+            shown = rolled_up(image) if circle else image
+            bag.image('/images', stamp_ns + round(late_s * 1e9), shown, 'camera', 'jpeg')
+        for stamp_ns, pose, twist in zip(
+            odometry.stamps_ns, odometry.poses, odometry.twists, strict=True
+        ):
+            bag.odometry('/odom', int(stamp_ns), pose, twist, (0.0, 0.0))
+    report = inspect(tmp_path / 'bag')
+    assert report.drive is not None
+    assert report.drive.as_dict()['camera_delay_s'] == pytest.approx(late_s, abs=0.03)
+    assert text in report.drive.clock_text()
+    assert f'  clocks: {report.drive.clock_text()}' in report.as_text().splitlines()
+    assert any('synchronize' in lack for lack in report.lacks) == (abs(late_s) > 0.5)
+
+
+def test_a_drive_without_turns_shows_nothing_about_clocks(tmp_path: Path) -> None:
+    report = inspect(write(tmp_path / 'bag', route=line))
+    assert report.drive is not None
+    assert report.drive.as_dict()['camera_delay_s'] is None
+    assert 'clocks' not in report.as_text()

@@ -51,21 +51,20 @@ CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__init__': (set(), set()),
     '__main__': ({'cli'}, set()),
-    'data': (set(), {'numpy', 'threadpoolctl', 'yaml'}),
+    'data': (set(), {'numpy', 'threadpoolctl', 'tqdm', 'yaml'}),
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
     'features': ({'data'}, NUMERIC | {'cv2', 'mdp', 'dask', 'distributed'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
-    # With tqdm, as bags.drives shows the progress of reading.
-    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'lz4', 'tqdm'}),
+    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'lz4'}),
     'metric': ({'data', 'features'}, NUMERIC),
     'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'fusion', 'metric', 'place_model'}, {'numpy'}),
-    'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex', 'tqdm'}),
-    'training': (CORE | {'place_model'}, {'numpy', 'tqdm'}),
-    'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC | {'tqdm'}),
-    'tuning': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC | {'tqdm'}),
-    'inspection': ({'data', 'camera', 'bags', 'metric'}, NUMERIC | {'cv2'}),
-    'filtering': ({'data', 'fusion'}, {'numpy', 'tqdm'}),
+    'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
+    'training': (CORE | {'place_model'}, {'numpy'}),
+    'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
+    'tuning': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
+    'inspection': ({'data', 'camera', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
+    'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'metric', 'training'}, {'numpy', 'matplotlib'}),
     'nodes': (
         {'data', 'camera', 'fusion', 'place_model', 'localizer', 'config'},
@@ -76,7 +75,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
         CORE
         | {'config', 'place_model', 'localizer', 'training', 'evaluation', 'tuning', 'inspection'}
         | {'filtering', 'simulation', 'reports', 'nodes', '__init__'},
-        {'numpy', 'tqdm', 'rosbags'} | ROS,
+        {'numpy', 'rosbags'} | ROS,
     ),
     'cli': ({'data', 'commands', 'nodes', '__init__'}, set()),
 }

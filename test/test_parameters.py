@@ -315,6 +315,7 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         'publish_tf': 'test_ekf_node.py::test_frames_are_parameters',
         'transform_tolerance': 'test_ekf_node.py::'
         'test_a_lookup_in_tf_is_the_pose_of_ekf_odometry_and_there_is_one_ahead',
+        'pose_file': 'test_ekf_node.py::test_after_a_restart_it_looks_where_it_was_first',
         'silence_timeout': 'test_ekf_node.py::test_silence_is_reported_without_any_clock_moving',
     },
 }

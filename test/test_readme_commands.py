@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of the README, run in its order: from a recording to the three live nodes.
+"""The commands of README.md and config/README.md, in order: from a recording to live nodes.
 
 They are read from the text and run unchanged; only the replay is faster than real time.
 """
@@ -22,13 +22,14 @@ from sfa_localization.data.geometry import align
 from sfa_localization.place_model import PlaceModel
 
 ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / 'README.md', ROOT / 'config/README.md')
 BLOCK = re.compile(r'<!-- run: (\w+) -->\s*```(\w+)\n(.*?)```', re.DOTALL)
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 pytestmark = pytest.mark.slow
 
 
 def blocks(kind: str, language: str) -> list[str]:
-    text = (ROOT / 'README.md').read_text('utf-8')
+    text = '\n'.join(page.read_text('utf-8') for page in PAGES)
     return [code for k, lang, code in BLOCK.findall(text) if (k, lang) == (kind, language)]
 
 

@@ -9,23 +9,26 @@ import glob
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
+from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S, load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.files import replaced_mode
-from sfa_localization.data.run import Run
+from sfa_localization.data.progress import progress_bar
+from sfa_localization.data.run import Image, Run
 
+SAME_IMAGE_NS = 1_000_000
+"""Stamps this near to each other are those of one image: no camera takes a thousand a second."""
 _LOCK = 'lock'
 R = TypeVar('R', bound='ReadingRecipe')
 
@@ -130,7 +133,7 @@ def read_drive(
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
 ) -> Run:
     """Read one bag as a run of panoramas; raw camera images are unwrapped. Raises BagError."""
-    with tqdm(desc=f'reading {Path(bag).name}', unit='img', disable=not progress) as bar:
+    with progress_bar(f'read {Path(bag).name}', shown=progress) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total
@@ -147,6 +150,23 @@ def read_drive(
             config=recipe.bag,
             odometry_tolerance_s=odometry_tolerance_s,
         )
+
+
+def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
+    """The camera's images (H, W, 3) of a bag at some stamps, by these stamps.
+
+    Those that are not within SAME_IMAGE_NS of an image are left out. Raises BagError.
+    """
+    wanted = sorted(stamps_ns)
+    found: dict[int, Image] = {}
+    if not wanted:
+        return {}
+    with Bag(bag, config=recipe.bag) as opened:
+        for stamp_ns, image in opened.images(recipe.topics.image):
+            found |= {at: image for at in wanted if abs(at - stamp_ns) <= SAME_IMAGE_NS}
+            if len(found) == len(wanted):
+                break
+    return found
 
 
 def as_live(recipe: R, panorama: PanoramaConfig) -> R:

@@ -16,6 +16,7 @@ from sfa_localization.camera.settings import (
 from sfa_localization.commands.options import add_settings, given, numbers, settings
 from sfa_localization.data.errors import LocalizationError
 
+WRITES = 'with --output a calibration file, with --check an image; else nothing'
 EXAMPLES = """\
   calibrate drive/*.png --check check.png --output camera.yaml
   calibrate image.png --model fisheye --field-of-view 190 --check check.png

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sfa_localization.config import render, write_config
 
+WRITES = 'the parameter file, or standard output'
 EXAMPLES = '  config\n  config --output localization.yaml'
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.data.settings import Settings, setting
 
+WRITES = 'in its folder two bags, model.npz, report/ with figures, results.json, logs/'
 EXAMPLES = '  demo\n  demo --world 2 --out demo_of_world_2'
 
 

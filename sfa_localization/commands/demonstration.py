@@ -65,7 +65,9 @@ def demonstrate(out: Path, config: DemoConfig, *, progress: bool = False) -> Eva
     trained = train([bags['coverage']], out / 'model.npz', progress=progress, resume=True)
     announce('run the three nodes live on the second')
     programs = commands(out / 'model.npz', bags['test'], config.rate)
-    live = run_live(programs, out / 'logs')
+    live = run_live(
+        programs, out / 'logs', on_end=lambda state: announce(f'the robot is {state or "silent"}')
+    )
     announce('compare with the truth')
     result, offline_m = _compare(trained, live, bags, progress)
     _write_results(out, result, trained, bags['coverage'])

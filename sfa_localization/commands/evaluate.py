@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands.options import (
@@ -20,6 +19,12 @@ from sfa_localization.commands.options import (
 )
 from sfa_localization.fusion.settings import FilterConfig
 
+if TYPE_CHECKING:
+    from sfa_localization.evaluation import Evaluation
+
+WRITES = """\
+tables on standard output; with --report index.html (one page for a browser), its figures,
+  report.md; with --json the errors"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
   evaluate garden.npz bags/test --align bags/coverage --report report --json results.json"""
@@ -58,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         recipe=recipe(arguments),
         config=settings(FilterConfig, arguments, arguments.config),
         watch=settings(WatchConfig, arguments, arguments.config),
-        progress=sys.stderr.isatty(),
+        progress=True,
         smooth=arguments.smooth,
     )
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
@@ -69,9 +74,29 @@ def run(arguments: argparse.Namespace) -> int:
         places = result.estimates['sfa'].poses[:, :2]
         results = result.truth, result.estimates, result.scores, places, result.features
         write_report(arguments.report, *results)
+        _write_page(arguments, result)
     if arguments.json:
         evaluation.write_json(arguments.json, result.as_dict())
     return 0
+
+
+def _write_page(arguments: argparse.Namespace, result: Evaluation) -> None:
+    """Write the page, with the worst images read from the bag once more."""
+    from sfa_localization.bags.drives import images_at
+    from sfa_localization.reports.evaluation_page import worst_images, write_evaluation_page
+    from sfa_localization.reports.page import PAGE
+
+    late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
+    worst = worst_images(result.truth, result.estimates['sfa'])
+    stamps = {one: one.stamp_ns + late_ns for one in worst}
+    read = images_at(arguments.bag, stamps.values(), recipe(arguments))
+    samples = {one: read[stamp] for one, stamp in stamps.items() if stamp in read}
+    title = f'{arguments.model.name} on {arguments.bag.name}'
+    write_evaluation_page(
+        arguments.report, title, result.truth, result.estimates, result.scores, result.counts,
+        samples,
+    )  # fmt: skip
+    print(f'{arguments.report / PAGE}: written')
 
 
 def _input_lines(counts: Mapping[str, Any]) -> list[str]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +20,7 @@ from sfa_localization.fusion.settings import FilterConfig
 if TYPE_CHECKING:
     from sfa_localization.filtering import Filtered, Table
 
+WRITES = 'poses in the format of TUM, and beside them a file of their covariances'
 EXAMPLES = """\
   filter odom.csv positions.csv --output poses.tum
   filter odom.csv gps.csv --config localization.yaml --initial-pose 0 0 1.57 \\
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         positions,
         fit.config,
         arguments.initial_pose,
-        progress=sys.stderr.isatty(),
+        progress=True,
         smooth=arguments.smooth,
         correlation=fit.correlation,
         lag_ns=fit.lag_ns,

@@ -16,6 +16,9 @@ from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 
+WRITES = """\
+findings on standard output; with --report index.html (one page for a browser) and its
+  figures; with --json the findings"""
 EXAMPLES = """\
   inspect bags/coverage bags/test
   inspect recording_0.mcap --json bag.json --report report
@@ -51,6 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         for number, report in enumerate(reports):
             prefix = f'{number}_' if len(reports) > 1 else ''
             _write_figures(report, arguments.report, prefix)
+        _write_page(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
     return 1 if any(report.error for report in reports) else 0
@@ -63,6 +67,33 @@ def write_json(path: Path, reports: Sequence[BagReport]) -> None:
         file.write(f'{text}\n'.encode())
 
 
+def _write_page(folder: Path, reports: Sequence[BagReport]) -> None:
+    """Write the page of all bags, with the figures that `_write_figures` made."""
+    from sfa_localization.reports.bag import bag_sections
+    from sfa_localization.reports.page import PAGE, write_page
+
+    sections = []
+    for number, report in enumerate(reports):
+        prefix = f'{number}_' if len(reports) > 1 else ''
+        name = f'{prefix}{Path(report.path).stem}'
+        shown = {}
+        if report.drive is not None:
+            shown[folder / f'{name}_path.png'] = 'The path by odometry, with the images'
+        if report.images is not None:
+            shown[folder / f'{name}_pictures.png'] = 'Images from all over the drive'
+        sections += bag_sections(report.as_dict(), _facts(report), shown)
+    write_page(folder, 'What is in the recording', *sections)
+    print(f'{folder / PAGE}: written')
+
+
+def _facts(report: BagReport) -> list[str]:
+    """Camera, drive and clocks, in words."""
+    images, drive = report.images, report.drive
+    camera = [f'{images.width}x{images.height}, {images.geometry}'] if images else []
+    clock = [f'clocks: {drive.clock_text()}'] if drive and drive.clock_text() else []
+    return [*camera, *([drive.path_text().strip()] if drive else []), *clock]
+
+
 def _write_figures(report: BagReport, folder: Path, prefix: str) -> None:
     from sfa_localization.reports.bag import write_contact_sheet, write_path
 
@@ -72,6 +103,6 @@ def _write_figures(report: BagReport, folder: Path, prefix: str) -> None:
         title = f'{name}: {images.topic}, {images.width}x{images.height}, {images.geometry}'
         write_contact_sheet(images.samples, title, folder / f'{prefix}{name}_pictures.png')
     if drive is not None:
-        title = f'{name}:{drive.as_text().partition(":")[2]}'
+        title = f'{name}:{drive.path_text().partition(":")[2]}'
         target = folder / f'{prefix}{name}_path.png'
         write_path(drive.odometry.poses, drive.places, title.replace(', along', ',\nalong'), target)

@@ -138,7 +138,7 @@ def reproduce_light(
     cells = opened(out, settings)
     done = f'; {len(cells)} cells are finished' if cells else ''
     announce(f'this takes about {plan.minutes} minutes on two cores{done}')
-    work = _Work(out, config, plan, announce, progress and sys.stderr.isatty())
+    work = _Work(out, config, plan, announce, progress)
     for trained, lights in TRAININGS.items():
         missing = [test for test in plan.tests if not _found(cells, trained, test)]
         if missing:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
+from std_msgs.msg import String
 
 from sfa_localization.commands.processes import Processes
 from sfa_localization.data.errors import LocalizationError, NodeError
@@ -75,6 +76,8 @@ class Recorder:
         self._executor.add_node(self._node)
         self._poses: dict[str, list[tuple[int, Array]]] = {name: [] for name in NODES}
         self._received_s = dict.fromkeys(NODES, -np.inf)
+        self.state = ''
+        self._node.create_subscription(String, 'ekf/state', self._keep_state, QoSProfile(depth=10))
         self._subscribe('omnicam_node', Image, self._keep_panorama)
         self._subscribe('sfa_node', PoseWithCovarianceStamped, self._keep_pose)
         self._subscribe('ekf_node', Odometry, self._keep_odometry)
@@ -94,6 +97,9 @@ class Recorder:
             self._received_s[name] = time.monotonic()
 
         self._node.create_subscription(kind, OUTPUTS[name], receive, QoSProfile(depth=QUEUE))
+
+    def _keep_state(self, message: String) -> None:
+        self.state = message.data
 
     @staticmethod
     def _keep_panorama(message: Image) -> tuple[int, Array]:
@@ -148,9 +154,14 @@ def commands(model: Path, bag: Path, rate: float) -> dict[str, list[str]]:
 
 
 def run_live(
-    programs: Mapping[str, Sequence[str]], folder: Path, timeouts: Timeouts | None = None
+    programs: Mapping[str, Sequence[str]],
+    folder: Path,
+    timeouts: Timeouts | None = None,
+    on_end: Callable[[str], None] | None = None,
 ) -> dict[str, Trajectory]:
     """Run the nodes, then the player; return the published poses, as 'sfa' and 'ekf'.
+
+    `on_end` is called with the last state on ekf/state when the replay ends.
 
     `programs` are command lines, see `commands`; logs go to `folder`. Raises NodeError when one
     ends too early, does not start, or stays silent. All processes have ended on return.
@@ -166,7 +177,10 @@ def run_live(
             processes.start(name, programs[name])
         _await_nodes(recorder, processes, timeouts.start_s)
         processes.start(PLAYER, programs[PLAYER])
-        _record(recorder, processes, timeouts)
+        _replay(recorder, processes, timeouts)
+        if on_end is not None:
+            on_end(recorder.state)
+        _settle(recorder, processes, timeouts)
         return {name: recorder.trajectory(f'{name}_node') for name in ('sfa', 'ekf')}
 
 
@@ -199,14 +213,18 @@ def _await_nodes(recorder: Recorder, processes: Processes, timeout_s: float) -> 
         recorder.spin(0.1)
 
 
-def _record(recorder: Recorder, processes: Processes, timeouts: Timeouts) -> None:
-    """Receive until replay and outputs have ended. Raises NodeError for a silent node."""
+def _replay(recorder: Recorder, processes: Processes, timeouts: Timeouts) -> None:
+    """Receive until the replay has ended. Raises NodeError for a silent node."""
     start = time.monotonic()
     while not processes.ended(PLAYER):
         recorder.spin(0.2)
         processes.require_alive(NODES)
         if time.monotonic() - start > timeouts.silence_s:
             _require_output(recorder, processes, timeouts.silence_s)
+
+
+def _settle(recorder: Recorder, processes: Processes, timeouts: Timeouts) -> None:
+    """Receive until the outputs have ended. Raises NodeError where there was none."""
     while min(recorder.silence_s(name) for name in NODES) < timeouts.settle_s:
         recorder.spin(0.1)
         processes.require_alive(NODES)

@@ -10,6 +10,7 @@ from pathlib import Path
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.commands.pace import PlayConfig
 
+WRITES = 'no file: it publishes'
 EXAMPLES = """\
   play bags/sample
   play bags/sample --rate 2 --loop --clock

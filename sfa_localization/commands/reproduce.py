@@ -11,6 +11,7 @@ from pathlib import Path
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.data.settings import Settings, setting
 
+WRITES = 'in its folder bags, models, report.md and results'
 EXAMPLES = """\
   reproduce light --quick
   reproduce light --world 12 --out light_of_world_12"""

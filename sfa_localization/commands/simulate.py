@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ from sfa_localization.simulation.settings import SimulationConfig
 if TYPE_CHECKING:
     from sfa_localization.simulation.drive import Drive
 
+WRITES = 'a bag with images, odometry, turn rates and the ground truth'
 EXAMPLES = """\
   simulate bags/coverage --trajectory coverage --seed 1
   simulate bags/test --trajectory test --seed 2 --compressed
@@ -57,9 +57,9 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.simulation.drive import simulate
 
     config = settings(SimulationConfig, arguments)
-    panorama, progress = _panorama(arguments.size), sys.stderr.isatty()
+    panorama = _panorama(arguments.size)
     given = _given_drive(arguments.poses, arguments.odometry, config)
-    drive = simulate(config, arguments.out, panorama, progress=progress, given=given)
+    drive = simulate(config, arguments.out, panorama, progress=True, given=given)
     seconds = (drive.truth.stamps_ns[-1] - drive.truth.stamps_ns[0]) * 1e-9
     print(f'{arguments.out}: {len(drive.image_stamps_ns)} images in {seconds:.0f} s')
     return 0

@@ -5,13 +5,18 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sfa_localization.commands.options import add_settings, add_topics, recipe
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
+if TYPE_CHECKING:
+    from sfa_localization.training import Recipe, Trained
+
+WRITES = 'MODEL.npz; with --report index.html (one page for a browser), its figures, training.md'
 EXAMPLES = """\
   train bags/coverage --output garden.npz
   train bags/a bags/b --output garden.npz --config localization.yaml --report report
@@ -41,20 +46,36 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.features.cluster import executor_at
     from sfa_localization.reports.summary import summary
 
+    used = recipe(arguments)
     with executor_at(arguments.dask) as executor:
         trained = training.train(
             arguments.bags,
             arguments.output,
-            recipe(arguments),
-            progress=sys.stderr.isatty(),
+            used,
+            progress=True,
             resume=arguments.resume,
             strict=arguments.strict,
             executor=executor,
         )
     print(summary(trained))
     if arguments.report:
-        from sfa_localization.reports.training import write_training_report
-
-        write_training_report(arguments.report, trained)
+        _write_report(arguments.report, arguments.bags, trained, used)
     print(f'{arguments.output}: written')
     return 0
+
+
+def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
+    """Write figures and the page, with the worst images read from the bags once more."""
+    from sfa_localization.bags.drives import images_at
+    from sfa_localization.reports.page import PAGE
+    from sfa_localization.reports.training import worst_images, write_training_report
+
+    worst = worst_images(trained)
+    read = {
+        run: images_at(bag, [one.stamp_ns for one in worst if one.run == run], used)
+        for run, bag in enumerate(bags)
+        if any(one.run == run for one in worst)
+    }
+    samples = {one: read[one.run][one.stamp_ns] for one in worst if one.stamp_ns in read[one.run]}
+    write_training_report(folder, trained, samples)
+    print(f'{folder / PAGE}: written')

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from sfa_localization.filtering import Table
     from sfa_localization.tuning import Outcome, TuningDrive, Validation
 
+WRITES = 'a parameter file with the noise parameters that were found'
 EXAMPLES = """\
   tune bags/test --model model.npz --output tuned.yaml
   tune bags/a bags/b --model model.npz --method grid --output tuned.yaml
@@ -105,7 +105,7 @@ def _from_bags(
     require_same_panorama(arguments.config, model.panorama)
     reading = dataclasses.replace(recipe(arguments), panorama=model.panorama)
     watch = settings(WatchConfig, arguments, arguments.config)
-    grid, progress = method.method == 'grid', sys.stderr.isatty()
+    grid, progress = method.method == 'grid', True
     drives = tuning.read_drives(arguments.drives, model, reading, grid, progress, watch)
     best = tuning.tune(drives, config, method, progress)
     parts = tuning.parts_of(drives)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from sfa_localization.data.errors import MessageError
+from sfa_localization.data.errors import DataError, MessageError
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
@@ -44,6 +45,7 @@ from sfa_localization.nodes.conversions import (
     to_stamp,
     to_transform,
 )
+from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
     latched_qos,
@@ -52,6 +54,7 @@ from sfa_localization.nodes.lifecycle import (
     sensor_qos,
 )
 from sfa_localization.nodes.monitor import steady_s
+from sfa_localization.nodes.saved_pose import SAVE_PERIOD_S, SavedPose, load_pose, save_pose
 from sfa_localization.nodes.settings import EkfNodeConfig
 
 try:
@@ -95,11 +98,14 @@ class EkfNode(LocalizationNode):
         self._state_level: Level | None = None
         self._ticks_since_state = 0
         self._last_moved = (0, 0.0)
+        self._sure: State | None = None
 
     def setup(self) -> None:
         self._begin()
+        self._restore_pose()
         self._make_publishers()
-        self.subscribe(Odometry, _ODOM, self._receive_odometry, sensor_qos(100))
+        self._discovery = Discovery(self, _ODOM, Odometry)
+        self._subscribe_odometry()
         self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
         for kind, topic, receive in (
@@ -112,6 +118,8 @@ class EkfNode(LocalizationNode):
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
+        self.every(SAVE_PERIOD_S, self._save_pose)
+        self.every(1.0, self._find_odometry)
         # Looped playback steps simulated time back; stamps alone would show it only later.
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -140,7 +148,13 @@ class EkfNode(LocalizationNode):
     def started(self) -> None:
         self._publish_state()
 
+    def destroy_node(self) -> None:
+        """End the node; the last sure pose is kept."""
+        self._attempt('pose_file', self._save_pose)
+        super().destroy_node()
+
     def teardown(self) -> None:
+        self._attempt('pose_file', self._save_pose)
         if self._jumps is not None:
             self._jumps.unregister()
             self._jumps = None
@@ -152,6 +166,17 @@ class EkfNode(LocalizationNode):
             self._filter.reconfigure(settings)
 
     # Inputs.
+
+    def _subscribe_odometry(self, instead: str = '') -> None:
+        receive = self._receive_odometry
+        self.subscribe(Odometry, _ODOM, receive, sensor_qos(100), instead=instead)
+
+    def _find_odometry(self) -> None:
+        """Take the only topic with odometry where nobody publishes on the expected one."""
+        found = self._discovery.found(self.monitor(_ODOM))
+        if found:
+            self.unsubscribe(_ODOM)
+            self._subscribe_odometry(found)
 
     def _receive_odometry(self, message: Odometry) -> None:
         motion = read_odometry(message)
@@ -229,6 +254,29 @@ class EkfNode(LocalizationNode):
             f'the clock went back by {-jump.delta.nanoseconds * 1e-9:.1f} s: starting anew'
         )
         self._attempt('clock', self._forget)
+
+    def _restore_pose(self) -> None:
+        """Begin at the pose of before the restart: a hypothesis, which images confirm or not."""
+        path = self._config.pose_file
+        if not path or self.settings(FilterConfig).initial_pose:
+            return
+        try:
+            saved = load_pose(FilePath(path), self._config.map_frame)
+        except DataError as error:
+            self.get_logger().warning(f'{error}: waiting for images that show where')
+            return
+        if saved is not None:
+            self._filter.set_pose(saved.stamp_ns, saved.pose, saved.moved())
+            x, y, yaw = saved.pose
+            self.get_logger().info(f'{path}: looking first at {x:.2f}, {y:.2f}, {yaw:.2f} rad')
+
+    def _save_pose(self) -> None:
+        """Write the last sure pose, if it is new."""
+        state, self._sure = self._sure, None
+        if state is not None and self._config.pose_file:
+            frame = self._config.map_frame
+            saved = SavedPose(state.stamp_ns, frame, state.pose, state.pose_covariance)
+            save_pose(FilePath(self._config.pose_file), saved)
 
     def _forget(self) -> None:
         self._filter.reset()
@@ -320,6 +368,8 @@ class EkfNode(LocalizationNode):
         if not self.active:
             return
         status = self._status()
+        if status.level is Level.LOCALISED:
+            self._sure = self._filter.state
         text = ': '.join([status.level.name, '; '.join(status.reasons)]).rstrip(': ')
         self._ticks_since_state += 1
         changed = status.level is not self._state_level

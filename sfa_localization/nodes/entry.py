@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import importlib
+import sys
 
 from sfa_localization.nodes import signals
+from sfa_localization.nodes.help import NODES, asks_for_help, node_help
 
 
 def omnicam_node() -> int:
@@ -25,5 +27,8 @@ def ekf_node() -> int:
 
 
 def _run(name: str) -> int:
+    if asks_for_help(sys.argv[1:]):
+        sys.stdout.write(node_help(name, NODES[name]))
+        return 0
     signals.end_at_once()
     return int(importlib.import_module(f'sfa_localization.nodes.{name}').main())

@@ -26,6 +26,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.rejections import short_line
@@ -146,24 +147,34 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         qos: QoSProfile | None = None,
         *,
         while_inactive: bool = False,
+        instead: str = '',
     ) -> None:
         """A subscription whose rejected messages are counted under `topic` and end nothing.
 
         An inactive node drops messages; not `while_inactive` those that come but once, latched.
+        Messages of the topic `instead`, where it is given, are taken as those of `topic`.
         """
-        self.require_input(topic)
+        self.require_input(topic, instead)
         made = self.create_subscription(
             kind,
-            topic,
+            instead or topic,
             self._guarded(topic, callback, while_inactive),
             qos or sensor_qos(),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self._entities.append((self.destroy_subscription, made))
 
-    def require_input(self, topic: str) -> None:
+    def unsubscribe(self, topic: str) -> None:
+        """Drop the subscriptions of an input."""
+        resolved = self._resolved[topic]
+        for entry in [*self._entities]:
+            if isinstance(entry[1], Subscription) and entry[1].topic_name == resolved:
+                self._entities.remove(entry)
+                self.destroy_subscription(entry[1])
+
+    def require_input(self, topic: str, instead: str = '') -> None:
         """Take a topic as an input. Raises ConfigError where this node itself publishes on it."""
-        resolved = self._resolved[topic] = self.resolve_topic_name(topic)
+        resolved = self._resolved[topic] = self.resolve_topic_name(instead or topic)
         outputs = [made for _, made in self._entities if isinstance(made, Publisher)]
         if any(made.topic_name == resolved for made in outputs):
             raise ConfigError(

@@ -29,6 +29,7 @@ from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import parameters
 from sfa_localization.nodes.conversions import read_image, to_compressed, to_image, to_info
+from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
     latched_qos,
@@ -60,6 +61,8 @@ class OmnicamNode(LocalizationNode):
         self._size: tuple[int, int] | None = None
         self._frozen = FrozenWatch()
         self._subscription: Any = None
+        self._discovery: Discovery | None = None
+        self._instead = ''
         self._listening_since_s = 0.0
         self._feed: Feed | None = None
         self._arrival: Any = None
@@ -79,8 +82,11 @@ class OmnicamNode(LocalizationNode):
         self._info = self.publisher(String, self.following('panorama/info'), latched_qos())
         raw = self._config.image_transport == 'raw'
         self._input = 'image_raw' if raw else self.following('image_raw/compressed')
+        self._discovery, self._instead = None, ''
         if self._source.source == 'topic':
             self.require_input(self._input)
+            self._discovery = Discovery(self, self._input, self._kind())
+            self.every(1.0, self._find_images)
         else:
             self._input = self._source.source_path
             guarded = self._guarded(self._input, self._use_newest)
@@ -117,12 +123,23 @@ class OmnicamNode(LocalizationNode):
         elif not self._wanted():
             self._unsubscribe()
 
+    def _kind(self) -> Any:
+        """What the images come as."""
+        return CompressedImage if self._config.image_transport == 'compressed' else ImageMessage
+
+    def _find_images(self) -> None:
+        """Take the only topic with images where nobody publishes on the expected one."""
+        found = self._discovery.found(self.monitor(self._input)) if self._discovery else ''
+        if found:
+            self.require_input(self._input, found)
+            self._instead = found
+            self._unsubscribe()
+
     def _subscribe(self) -> None:
-        kind = CompressedImage if self._config.image_transport == 'compressed' else ImageMessage
         self._listening_since_s = steady_s()
         self._subscription = self.create_subscription(
-            kind,
-            self._input,
+            self._kind(),
+            self._instead or self._input,
             self._guarded(self._input, self._use_message),
             sensor_qos(1),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),

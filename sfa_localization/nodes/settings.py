@@ -56,6 +56,11 @@ class EkfNodeConfig(Settings):
     transform_tolerance: float = setting(
         0.1, 'how long map -> odom holds beyond odometry', unit='s', low=0.0, high=10.0, live=True
     )
+    pose_file: str = setting(
+        '',
+        'file of the last sure pose: written while LOCALISED, and where to look first after a '
+        'restart; empty: none',
+    )
     silence_timeout: float = setting(
         1.0,
         'time without odometry, or three times this without images, after which the state is '

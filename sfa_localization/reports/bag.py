@@ -1,33 +1,43 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a bag: a contact sheet of its images, and the path of its odometry."""
+"""Figures and page of a bag: a contact sheet of its images, the path of its odometry."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
+from sfa_localization.reports import page
 from sfa_localization.reports.evaluation import save
 
 
-def write_contact_sheet(samples: Sequence[Image], title: str, path: Path) -> None:
-    """Write BGR images (H, W, 3) as one PNG, in reading order. Raises LocalizationError."""
+def write_contact_sheet(
+    samples: Sequence[Image], title: str, path: Path, captions: Sequence[str] = ()
+) -> None:
+    """Write BGR images (H, W, 3) as one PNG, in reading order, each below its caption.
+
+    Raises LocalizationError.
+    """
     height, width = samples[0].shape[:2]
     columns = max(1, round(np.sqrt(len(samples) * height / width)))
     rows = -(-len(samples) // columns)
     inches = 10 / columns
-    figure = Figure((10, rows * inches * height / width + 0.5), layout='constrained')
+    row = inches * height / width + (0.3 if captions else 0.0)
+    figure = Figure((10, rows * row + 0.5), layout='constrained')
     figure.suptitle(title, fontsize=10)
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
     for axis in axes:
         axis.set_axis_off()
     for axis, sample in zip(axes, samples, strict=False):
         axis.imshow(sample[..., ::-1], interpolation='lanczos')
+    for axis, caption in zip(axes, captions, strict=False):
+        axis.set_title(caption, fontsize=9)
     save(figure, path)
 
 
@@ -48,3 +58,29 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     axes.legend(loc='upper right')
     figure.colorbar(dots, label='images, % of the drive', shrink=0.7)
     save(figure, path)
+
+
+def bag_sections(
+    found: Mapping[str, Any], facts: Sequence[str], shown: Mapping[Path, str]
+) -> list[str]:
+    """The sections of a page about a bag: enough or not, what to drive next, what is in it.
+
+    `found` are the findings as plain values, `facts` sentences about images, drive and clocks,
+    `shown` figures with their captions. Raises LocalizationError.
+    """
+    enough = found['enough_to_train_on']
+    answer = 'is enough to train on.' if enough else 'is not enough to train on yet.'
+    lacks = [found['error']] if found['error'] else found['lacks']
+    topics = found['topics'].items()
+    rows = [[name, str(t['count']), f'{t["rate_hz"]:.1f}', f'{t["largest_gap_s"]:.1f}']
+            for name, t in topics]  # fmt: skip
+    damage = [f'{name}: {problem}' for name, t in topics for problem in t['problems']]
+    head = ('topic', 'messages', 'Hz', 'longest pause (s)')
+    return [
+        page.verdict(page.GOOD if enough else page.BAD, f'{Path(found["path"]).name} {answer}'),
+        page.section('What do I drive or change next?', page.items(lacks)),
+        page.section('What is in it?', page.items(facts), page.table(head, rows) if rows else ''),
+        page.section('What is damaged?', page.items([*found['problems'], *damage])),
+        page.section('Path and images', *(page.figure(*one) for one in shown.items())),
+        page.section('Notes', page.items(found['notes'])),
+    ]

@@ -148,7 +148,7 @@ def overview_figure(
 
 def table(scores: Scores) -> str:
     """Position errors in meters, one line per estimate, as a Markdown table."""
-    rows = {name: [_number(score[c], c) for c in COLUMNS] for name, score in scores.items()}
+    rows = {name: [number(score[c], c) for c in COLUMNS] for name, score in scores.items()}
     return _markdown('position error (m)', COLUMNS, rows)
 
 
@@ -225,7 +225,7 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
     x, y = truth.poses[0, :2]
     axes.annotate('start', (x, y), xytext=(7, 7), textcoords='offset points')
     for name, estimate in estimates.items():
-        mean = f': {_number(scores[name]["mean"], "mean")} m' if name in scores else ''
+        mean = f': {number(scores[name]["mean"], "mean")} m' if name in scores else ''
         points = estimate.poses[truth.covers(estimate.stamps_ns)]
         axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **STYLES.get(name, OTHER))
     _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
@@ -312,7 +312,8 @@ def _label(name: str) -> str:
     return LABELS.get(name, name)
 
 
-def _number(value: float | None, column: str) -> str:
+def number(value: float | None, column: str) -> str:
+    """A score as text, by its column; '-' where there is none."""
     if value is None:
         return '-'
     return f'{int(value)}' if column == 'n' else f'{value:.3f}'

@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
-from tqdm import tqdm
 
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.lenses import CameraModel, make_camera
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.progress import progress_over
 from sfa_localization.data.run import Image, Odometry, Stamps, Trajectory, YawRate, integrate
 from sfa_localization.simulation.garden import Garden, rounded
 from sfa_localization.simulation.rendering import Light, View, panorama_view, raw_view
@@ -279,7 +279,7 @@ def simulate(
     with BagWriter(out, config.storage) as bag:
         noisy = render_images(garden, recorded, config, view)
         count = len(recorded.image_stamps_ns)
-        shown = tqdm(noisy, out.name, count, unit='image', disable=not progress)
+        shown = progress_over(noisy, f'render the images of {out.name}', count, shown=progress)
         _write(bag, recorded, shown, config)
     return recorded
 

@@ -1,0 +1,67 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The last sure pose in a small file: where a robot that is switched on again looks first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.files import atomic_write, read_regular
+from sfa_localization.data.geometry import Array
+from sfa_localization.fusion.inputs import read_pose
+
+SAVE_PERIOD_S = 10.0
+"""Time between two writes: a robot loses that much of its way, and a flash card lives for years."""
+MOVED_STD_M, MOVED_YAW_STD = 0.5, 0.3
+"""m and rad that a robot may be moved by while it is off, as when it is pushed to its charger. What
+is more, the first images show: the pose is a hypothesis, and they overrule it."""
+_LARGEST_FILE = 65536  # bytes, many times what is written
+_VERSION = 1
+
+
+class SavedPose(NamedTuple):
+    """A pose (3,) of x m, y m, yaw rad in `frame`, with its covariance (3, 3), at a stamp."""
+
+    stamp_ns: int
+    frame: str
+    pose: Array
+    covariance: Array
+
+    def moved(self) -> Array:
+        """The covariance (3, 3) after the robot was off."""
+        added = np.diag(np.square([MOVED_STD_M, MOVED_STD_M, MOVED_YAW_STD]))
+        return np.asarray(self.covariance + added)
+
+
+def save_pose(path: Path, saved: SavedPose) -> None:
+    """Write the file, completely or not at all. Raises LocalizationError."""
+    content = {
+        'version': _VERSION,
+        'stamp_ns': saved.stamp_ns,
+        'frame': saved.frame,
+        'pose': saved.pose.tolist(),
+        'covariance': saved.covariance.tolist(),
+    }
+    with atomic_write(path, make_folder=True) as file:
+        file.write((json.dumps(content) + '\n').encode())
+
+
+def load_pose(path: Path, frame: str) -> SavedPose | None:
+    """What was saved, checked; None where there is no file yet. Raises DataError."""
+    try:
+        content = json.loads(read_regular(path, _LARGEST_FILE))
+        if content['version'] != _VERSION or content['frame'] != frame:
+            raise DataError(f'it is no pose of version {_VERSION} in the frame {frame!r}')
+        pose, covariance = read_pose(content['pose'], content['covariance'])
+        return SavedPose(int(content['stamp_ns']), frame, pose, covariance)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
+        raise DataError(f'{path}: holds no saved pose: {error}') from None
+    except DataError as error:
+        raise DataError(f'{path}: cannot be used: {error}') from None

@@ -1,0 +1,100 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""One self-contained HTML page: figures are part of the file, nothing is loaded, no script runs."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.reports.evaluation import save_text
+
+GOOD, WEAK, BAD = 'good', 'weak', 'bad'
+PAGE = 'index.html'
+_STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { font: 1rem/1.5 system-ui, sans-serif; color: #222; background: #fff; margin: 0 auto;
+  max-width: 56rem; padding: 1rem; overflow-wrap: break-word; }
+h1 { font-size: 1.5rem; line-height: 1.2; margin: 0.5rem 0; }
+h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; border-bottom: 1px solid #ddd; }
+p, ul { margin: 0.5rem 0; }
+.verdict { padding: 0.6rem 0.9rem; border-left: 0.5rem solid; border-radius: 0.25rem; }
+.good { background: #e6f4ea; border-color: #1e8e3e; }
+.weak { background: #fef7e0; border-color: #e37400; }
+.bad { background: #fce8e6; border-color: #d93025; }
+figure { margin: 1rem 0; }
+figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
+figcaption { font-size: 0.9rem; color: #555; text-align: center; }
+.wide { overflow-x: auto; margin: 0.75rem 0; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid #ddd; text-align: right; }
+th:first-child, td:first-child { text-align: left; }
+pre { overflow-x: auto; font-size: 0.8rem; background: #f6f6f6; padding: 0.5rem; }
+"""
+
+
+def paragraph(text: str) -> str:
+    """A paragraph of plain text."""
+    return f'<p>{escape(text)}</p>'
+
+
+def verdict(level: str, text: str) -> str:
+    """The answer of the page, in the color of GOOD, WEAK or BAD."""
+    return f'<p class="verdict {level}"><strong>{escape(text)}</strong></p>'
+
+
+def items(texts: Sequence[str]) -> str:
+    """A list of plain texts; '' for none."""
+    rows = ''.join(f'<li>{escape(text)}</li>' for text in texts)
+    return f'<ul>{rows}</ul>' if rows else ''
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of plain texts, which scrolls sideways where the screen is narrow."""
+    top = ''.join(f'<th>{escape(cell)}</th>' for cell in head)
+    body = ''.join(
+        '<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>' for row in rows
+    )
+    return (
+        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
+
+
+def text_block(text: str) -> str:
+    """Text as it is, with its line breaks."""
+    return f'<pre>{escape(text)}</pre>'
+
+
+def figure(path: Path, caption: str) -> str:
+    """A PNG file, as a part of the page. Raises LocalizationError."""
+    try:
+        data = base64.b64encode(path.read_bytes()).decode()
+    except OSError as error:
+        raise LocalizationError(f'{path}: cannot be read: {error.strerror}') from None
+    words = escape(caption)
+    return (
+        f'<figure><img src="data:image/png;base64,{data}" alt="{words}">'
+        f'<figcaption>{words}</figcaption></figure>'
+    )
+
+
+def section(title: str, *parts: str) -> str:
+    """Parts below a heading; '' where there are none."""
+    body = '\n'.join(part for part in parts if part)
+    return f'<section>\n<h2>{escape(title)}</h2>\n{body}\n</section>' if body else ''
+
+
+def write_page(folder: Path, title: str, *parts: str) -> None:
+    """Write `folder`/index.html, completely or not at all. Raises LocalizationError."""
+    body = '\n'.join(part for part in parts if part)
+    save_text(
+        folder / PAGE,
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n'
+        f'<body>\n<h1>{escape(title)}</h1>\n{body}\n</body>\n</html>\n',
+    )

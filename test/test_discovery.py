@@ -1,0 +1,95 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs that are named otherwise are found by their type, where there is no choice to make."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+pytestmark = pytest.mark.ros
+
+from nav_msgs.msg import Odometry  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
+from sensor_msgs.msg import Image  # noqa: E402
+
+from sfa_localization.nodes import discovery  # noqa: E402
+from sfa_localization.nodes.conversions import to_image, to_odometry  # noqa: E402
+from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
+from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    monkeypatch.setattr(discovery, 'PATIENCE_S', 0.0)
+    made = Bench(63)
+    yield made
+    made.close()
+
+
+def driving(stamp_ns):
+    return to_odometry(
+        np.zeros(3), np.eye(3), (0.0, 0.0), np.eye(2), stamp_ns, ('odom', 'base_link')
+    )
+
+
+def heard(bench, node, topic, message, stamps=range(1, 400)):
+    """Publish until the node has used something as its input `topic`."""
+    publisher = bench.node.create_publisher(type(message(1)), topic, 10)
+    moving = iter(stamps)
+
+    def used():
+        publisher.publish(message(next(moving) * 50_000_000))
+        return bool(until(lambda: used_of(node), 0.1))
+
+    return until(used)
+
+
+def used_of(node):
+    return sum(monitor.used for name, monitor in node.monitors.items() if 'timer' not in name)
+
+
+def test_odometry_of_another_name_is_found(bench):
+    node = bench.run(EkfNode)
+    assert heard(bench, node, '/wheel_odometry', driving)
+    assert node.shown('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
+    bench.node.create_publisher(Odometry, '/odom', 10)
+    assert until(lambda: node.shown('odom') == '/odom'), 'its own name comes first'
+
+
+def test_images_of_another_name_are_found(bench):
+    node = bench.run(OmnicamNode)
+    bench.listen(Image, 'panorama')
+    picture = np.full((640, 640, 3), 90, np.uint8)
+    assert heard(bench, node, '/camera/image', lambda stamp: to_image(picture, stamp, 'camera'))
+
+
+@pytest.mark.parametrize(
+    ('others', 'arguments'),
+    [
+        (['/one', '/two'], []),
+        (['/one', '/odom'], []),
+        (['/one'], ['--ros-args', '-r', 'odom:=/mine']),
+        ([], []),
+    ],
+)
+def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
+    publishers = [bench.node.create_publisher(Odometry, name, 10) for name in others]
+    node = bench.run(EkfNode, options={'cli_args': arguments})
+    assert until(lambda: all(node.count_publishers(name) for name in others))
+    assert node._discovery.found(node.monitor('odom')) == ''
+    assert len(publishers) == len(others)
+
+
+def test_a_topic_of_another_robot_is_not_taken(bench):
+    bench.node.create_publisher(Odometry, '/robot2/wheels', 10)
+    node = bench.run(EkfNode, options={'namespace': 'robot1'})
+    assert until(lambda: node.count_publishers('/robot2/wheels'))
+    assert node._discovery.found(node.monitor('odom')) == ''
+
+
+def test_what_has_been_heard_stays(bench):
+    bench.node.create_publisher(Odometry, '/wheels', 10)
+    node = bench.run(EkfNode)
+    assert until(lambda: node.count_publishers('/wheels'))
+    node.monitor('odom').receive()
+    assert node._discovery.found(node.monitor('odom')) == ''

@@ -1,0 +1,110 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a user sees of long work, and of --help."""
+
+import importlib
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_training import RECIPE, write_bag
+
+from sfa_localization import cli
+from sfa_localization.data import progress
+from sfa_localization.training import STEPS, train
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that only the test moves."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, 'monotonic', lambda: now[0])
+    return now
+
+
+def test_a_log_gets_a_line_each_ten_seconds(clock, capsys):
+    with progress.progress_bar('read', 100, shown=True) as bar:
+        for _ in range(50):
+            clock[0] += 0.5
+            bar.update()
+    assert capsys.readouterr().err.splitlines() == [
+        'read: 20% of 100 images, 40 s left',
+        'read: 40% of 100 images, 30 s left',
+    ]
+
+
+def test_work_that_was_resumed_is_as_fast_as_its_own_part(clock, capsys):
+    bar = progress.progress_bar('train', 100, initial=80, shown=True)
+    clock[0] = 10.0
+    bar.update(10)
+    assert capsys.readouterr().err == 'train: 90% of 100 images, 10 s left\n'
+
+
+def test_a_total_that_is_not_known_is_left_out(clock, capsys):
+    for _ in progress.progress_over(range(3), 'read', shown=True):
+        clock[0] += 11.0
+    assert capsys.readouterr().err.splitlines()[0] == 'read: 1 images'
+
+
+def test_short_work_leaves_nothing_in_a_log(capsys):
+    assert list(progress.progress_over(range(5), 'read', 5, shown=True)) == [0, 1, 2, 3, 4]
+    assert capsys.readouterr() == ('', '')
+
+
+def test_without_progress_nothing_is_shown(clock, capsys):
+    with progress.progress_bar('read', 2, shown=False) as bar:
+        clock[0] += 100.0
+        bar.update(2)
+    assert capsys.readouterr() == ('', '')
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_terminal_gets_a_bar(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, 'stderr', screen)
+    assert list(progress.progress_over(range(4), 'read', 4, shown=True)) == [0, 1, 2, 3]
+    assert '\r' in screen.getvalue() and 'read: 100%' in screen.getvalue()
+
+
+def test_a_training_says_what_it_does(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, 'LOG_PERIOD_S', 0.0)
+    train([write_bag(tmp_path / 'garden')], tmp_path / 'model.npz', RECIPE, progress=True)
+    text = capsys.readouterr().err
+    for words in ('read garden: ', 'learn slow features in ', 'compute the slow features of all',
+                  'learn the map from ', 'learn the heading ', 'refine the map ',
+                  'choose keyframes, and check the map '):  # fmt: skip
+        assert words in text, text
+    for step in (2, 3, 5, 6, 7, 8):
+        assert f'(step {step} of {STEPS})' in text
+    assert '100% of' in text and ' s left' in text
+
+
+@pytest.mark.parametrize('name', cli.COMMANDS)
+def test_a_command_says_what_it_writes(name):
+    command = importlib.import_module(f'sfa_localization.commands.{name}')
+    assert command.WRITES
+    assert f'writes: {command.WRITES}' in cli.command_parser(name).format_help()
+
+
+@pytest.mark.parametrize('name', cli.NODES)
+def test_a_node_explains_itself_without_ros(name):
+    """And does not start: the process ends."""
+    without_ros = 'import sys; sys.modules["rclpy"] = None; '
+    for run in (f'sys.argv = ["{name}", "--help"]; from sfa_localization.nodes import entry; '
+                f'sys.exit(entry.{name}())',
+                f'from sfa_localization.cli import main; sys.exit(main(["{name}", "-h"]))',
+                ):  # fmt: skip
+        done = subprocess.run([sys.executable, '-c', without_ros + run], cwd=ROOT, timeout=60,
+                              capture_output=True, text=True)  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert f'usage: {name} ' in done.stdout and 'autostart: true' in done.stdout
+        other = 'novelty_limit:' if name != 'sfa_node' else 'slip_per_metre:'
+        assert other not in done.stdout, 'parameters of another node'
