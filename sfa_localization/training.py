@@ -238,7 +238,12 @@ def _learn_map(
             )
             heading = learn_heading(images, segments, first)
             learned = segments, first, heading
-            found = against_compass(heading, segments, first) if heading else None
+            # Along one route nothing but the odometry gives the compass its headings.
+            found = (
+                against_compass(heading, segments, first)
+                if heading and not first.diagnostics.one_route
+                else None
+            )
         except DataError:
             if learned is not None:
                 break
