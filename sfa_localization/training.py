@@ -59,7 +59,7 @@ from sfa_localization.metric.refinement import LearnedRefinement, learn_refineme
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
-from sfa_localization.metric.turn_noise import against_compass, against_images, expected_noise
+from sfa_localization.metric.turn_noise import against_images, expected_noise
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
@@ -69,8 +69,6 @@ COARSE_POINTS = 700
 no better, and the model file is larger."""
 _NOISE_FACTOR = 2.0
 """Noise of turns that differs by less bends no map: links weigh a little more or less."""
-_NOISE_ROUNDS = 3
-"""With the noise that is stated, with the one found, and once more where that was a bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,48 +221,28 @@ def _learn_map(
     recipe: Recipe,
     points: int | None,
 ) -> tuple[Segments, MetricResult, LearnedHeading | None]:
-    """Steps 4 to 6, and once more where turns are much noisier than stated or assumed.
-
-    Wheels that slip would bend the map. Where a map cannot even be learned with the noise that is
-    stated, the shifts of the images, `seen` in each run (N,) rad, bound it.
+    """Steps 4 to 6; where no map can be learned with the noise of turns that is stated or assumed,
+    once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
-    learned: tuple[Segments, MetricResult, LearnedHeading | None] | None = None
-    noise: float | None = None
-    for _ in range(_NOISE_ROUNDS):
-        segments = _cut_odometry(runs, clocks, recipe.segments, noise)
-        try:
-            first = learn_metric(
-                images.slow, segments, recipe.metric, recipe.network.seed, points=points
-            )
-            heading = learn_heading(images, segments, first)
-            learned = segments, first, heading
-            # Along one route nothing but the odometry gives the compass its headings.
-            found = (
-                against_compass(heading, segments, first)
-                if heading and not first.diagnostics.one_route
-                else None
-            )
-        except DataError:
-            if learned is not None:
-                break
-            found = _bound(runs, clocks, seen, recipe.segments) if noise is None else None
-            if found is None or _agree(found, segments, recipe.segments):
-                raise
-        if found is None or _agree(found, segments, recipe.segments):
-            break
-        noise = found
-    assert learned is not None
-    return learned
+    segments = _cut_odometry(runs, clocks, recipe.segments, None)
+    try:
+        return segments, *_map_and_compass(images, segments, recipe, points)
+    except DataError:
+        found = _bound(runs, clocks, seen, recipe.segments)
+        assumed = SegmentConfig().yaw_noise
+        own = recipe.segments.yaw_noise != assumed
+        if own or found is None or found < _NOISE_FACTOR * max(assumed, expected_noise(segments)):
+            raise
+    segments = _cut_odometry(runs, clocks, recipe.segments, found)
+    return segments, *_map_and_compass(images, segments, recipe, points)
 
 
-def _agree(found: float, segments: Segments, config: SegmentConfig) -> bool:
-    """Whether a noise of turns confirms the one in use, or that is the user's."""
-    if config.yaw_noise != SegmentConfig().yaw_noise:
-        return True
-    used = expected_noise(segments)
-    return found <= _NOISE_FACTOR * max(used, config.yaw_noise) and (
-        used <= _NOISE_FACTOR * max(found, config.yaw_noise)
-    )
+def _map_and_compass(
+    images: ImageFeatures, segments: Segments, recipe: Recipe, points: int | None
+) -> tuple[MetricResult, LearnedHeading | None]:
+    seed = recipe.network.seed
+    first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
+    return first, learn_heading(images, segments, first)
 
 
 def _bound(
