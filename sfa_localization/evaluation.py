@@ -14,7 +14,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
@@ -204,7 +206,8 @@ def _scores(
 
 
 def _locate(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
-    """Run the model over a bag. Raises BagError or DataError."""
+    """Run the model over an aligning drive. Raises BagError or DataError."""
+    recipe = replace(recipe, topics=_present(bag, recipe.topics))
     with _cache() as cache:
         run = _read(bag, cache, recipe, progress)
         with _bar(run, progress) as bar:
@@ -228,6 +231,19 @@ def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
     counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
     sure = np.array([level is Level.LOCALISED for _, level in fused], bool)
     return _Replay(located, sure, tracks, counts)
+
+
+def _present(path: Path, topics: TopicNames) -> TopicNames:
+    """The names of topics that a bag has; others are found by their types there."""
+    with Bag(path) as bag:
+        known = {f'/{name.lstrip("/")}' for name in bag.topics}
+    names = {item.name: getattr(topics, item.name) for item in fields(topics)}
+    return TopicNames(
+        **{
+            key: name if f'/{name.partition(":")[0].lstrip("/")}' in known else ''
+            for key, name in names.items()
+        }
+    )
 
 
 def _cache() -> AbstractContextManager[Path]:

@@ -43,6 +43,8 @@ MAX_LOST = 0.1
 """Share of images that may lack odometry: more means that recording or clocks are wrong."""
 MAX_GAP_S = 2.0
 """Longest pause of a topic (s) that is not reported."""
+EVEN, EVEN_SHARE = 3.0, 0.9
+"""A topic keeps time where this share of its intervals is no longer than this many usual ones."""
 SAMPLES = 16
 """Images on the contact sheet: as many as can be seen at once."""
 SAMPLE_SIDE = 640
@@ -74,13 +76,33 @@ class InspectionConfig(Settings):
 
 @dataclass
 class TopicReport:
-    """One topic: `problems` are sentences; stamps are those of the sender where it set them."""
+    """One topic: `problems` are sentences; stamps are those of the sender where it set them.
+
+    `recorded` is the count of the bag's metadata or index.
+    """
 
     name: str
     kind: str
-    count: int
+    recorded: int
     stamps_ns: Stamps
     problems: list[str] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        """Messages that can be read."""
+        return len(self.stamps_ns)
+
+    @property
+    def unreadable(self) -> bool:
+        """Whether messages were recorded, and none can be read."""
+        return self.recorded > 0 and self.count == 0
+
+    @property
+    def keeps_time(self) -> bool:
+        """Whether messages come evenly: a topic that speaks only on change does not pause."""
+        intervals = np.diff(self.stamps_ns)
+        usual = float(np.median(intervals)) if len(intervals) else 0.0
+        return bool(len(intervals) and np.mean(intervals <= EVEN * usual) >= EVEN_SHARE)
 
     @property
     def rate_hz(self) -> float:
@@ -105,6 +127,7 @@ class TopicReport:
         return {
             'type': self.kind,
             'count': self.count,
+            'recorded': self.recorded,
             'first_stamp_ns': int(self.stamps_ns[0]) if known else None,
             'last_stamp_ns': int(self.stamps_ns[-1]) if known else None,
             'rate_hz': round(self.rate_hz, 3),
@@ -319,10 +342,11 @@ class _Survey:
 
     def _problems(self, stream: Stream, report: TopicReport) -> Iterator[str]:
         for reason, number in stream.tally.count.skipped.items():
-            yield f'{number} of {report.count} messages: {reason}'
-        if report.count == 0:
+            yield f'{number} of {report.recorded} messages: {reason}'
+        if report.recorded == 0:
             yield 'no messages'
-        if report.largest_gap_s > max(MAX_GAP_S, 5 / max(report.rate_hz, 1e-9)):
+        longest = max(MAX_GAP_S, 5 / max(report.rate_hz, 1e-9))
+        if report.largest_gap_s > longest and report.keeps_time:
             yield f'pause of {report.largest_gap_s:.1f} s'
         if stream.topic == self._image and len(self._sizes) > 1:
             sizes = ', '.join(f'{w}x{h}' for h, w in self._sizes)

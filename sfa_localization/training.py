@@ -62,7 +62,7 @@ from sfa_localization.metric.refinement import LearnedRefinement, learn_refineme
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
-from sfa_localization.metric.turn_noise import against_compass, against_images, expected_noise
+from sfa_localization.metric.turn_noise import against_images, expected_noise
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)
@@ -74,8 +74,6 @@ COARSE_POINTS = 700
 no better, and the model file is larger."""
 _NOISE_FACTOR = 2.0
 """Noise of turns that differs by less bends no map: links weigh a little more or less."""
-_NOISE_ROUNDS = 3
-"""With the noise that is stated, with the one found, and once more where that was a bound."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,46 +258,34 @@ def _learn_map(
     points: int | None,
     progress: bool,
 ) -> tuple[Segments, MetricResult, LearnedHeading | None]:
-    """Steps 5 to 7, and once more where turns are much noisier than stated or assumed.
-
-    Wheels that slip would bend the map. Where a map cannot even be learned with the noise that is
-    stated, the shifts of the images, `seen` in each run (N,) rad, bound it.
+    """Steps 5 to 7; where no map can be learned with the noise of turns that is stated or assumed,
+    once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
-    learned: tuple[Segments, MetricResult, LearnedHeading | None] | None = None
-    noise: float | None = None
-    for _ in range(_NOISE_ROUNDS):
-        segments = _cut_odometry(runs, clocks, recipe.segments, noise)
-        segments = replace(segments, closures=closures)
-        announce(f'learn the map from {len(segments)} segments (step 6 of {STEPS})', shown=progress)
-        try:
-            first = learn_metric(
-                images.slow, segments, recipe.metric, recipe.network.seed, points=points
-            )
-            announce(f'learn the heading (step 7 of {STEPS})', shown=progress)
-            heading = learn_heading(images, segments, first)
-            learned = segments, first, heading
-            found = against_compass(heading, segments, first) if heading else None
-        except DataError:
-            if learned is not None:
-                break
-            found = _bound(runs, clocks, seen, recipe.segments) if noise is None else None
-            if found is None or _agree(found, segments, recipe.segments):
-                raise
-        if found is None or _agree(found, segments, recipe.segments):
-            break
-        noise = found
-    assert learned is not None
-    return learned
+    segments = replace(_cut_odometry(runs, clocks, recipe.segments, None), closures=closures)
+    try:
+        return segments, *_map_and_compass(images, segments, recipe, points, progress)
+    except DataError:
+        found = _bound(runs, clocks, seen, recipe.segments)
+        assumed = SegmentConfig().yaw_noise
+        own = recipe.segments.yaw_noise != assumed
+        if own or found is None or found < _NOISE_FACTOR * max(assumed, expected_noise(segments)):
+            raise
+    segments = replace(_cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
+    return segments, *_map_and_compass(images, segments, recipe, points, progress)
 
 
-def _agree(found: float, segments: Segments, config: SegmentConfig) -> bool:
-    """Whether a noise of turns confirms the one in use, or that is the user's."""
-    if config.yaw_noise != SegmentConfig().yaw_noise:
-        return True
-    used = expected_noise(segments)
-    return found <= _NOISE_FACTOR * max(used, config.yaw_noise) and (
-        used <= _NOISE_FACTOR * max(found, config.yaw_noise)
-    )
+def _map_and_compass(
+    images: ImageFeatures,
+    segments: Segments,
+    recipe: Recipe,
+    points: int | None,
+    progress: bool,
+) -> tuple[MetricResult, LearnedHeading | None]:
+    seed = recipe.network.seed
+    announce(f'learn the map from {len(segments)} segments (step 6 of {STEPS})', shown=progress)
+    first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
+    announce(f'learn the heading (step 7 of {STEPS})', shown=progress)
+    return first, learn_heading(images, segments, first)
 
 
 def _bound(

@@ -266,7 +266,7 @@ def test_a_missing_file_of_several_is_counted(tmp_path: Path, messages: list[Mes
         (b'\x89MCAP0\r\n', 'holds no readable message'),
         (b'#ROSBAG V2.0\n', 'unreadable ROS 1 bag'),
         (b'#ROSBAG V1.2\n', 'unreadable ROS 1 bag'),
-        (b'\x28\xb5\x2f\xfd', 'is empty'),
+        (b'\x28\xb5\x2f\xfd', 'cut-off zstd data'),
     ],
 )
 def test_a_file_without_content_is_one_error(

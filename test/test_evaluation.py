@@ -11,6 +11,8 @@ import pytest
 from picture_readers import PictureReader, Recording
 
 from sfa_localization import evaluation, tuning
+from sfa_localization.bags.settings import TopicNames
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
@@ -205,3 +207,12 @@ def test_the_map_is_laid_on_the_truth_where_late_images_were_taken(tmp_path, mon
         means[name] = judged.scores['sfa']['mean'], judged.counts.get('camera_delay_s', 0.0)
     assert means['late'][1] == pytest.approx(0.3, abs=0.05) and means['in time'][1] == 0.0
     assert means['late'][0] < 1.2 * means['in time'][0] + 0.005
+
+
+def test_topics_are_named_for_the_aligning_drive_only_where_it_has_them(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.odometry('/odom', 10**9, (0, 0, 0), (0, 0), (0, 0))
+        writer.pose('/truth', 10**9, (0, 0, 0))
+    asked = TopicNames(image='/other/image', odometry='odom', ground_truth='/truth')
+    present = evaluation._present(tmp_path / 'bag', asked)
+    assert present == TopicNames(odometry='odom', ground_truth='/truth')

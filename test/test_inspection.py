@@ -3,6 +3,7 @@
 """Reports of `inspect`: contents, problems, the camera, and whether the drive suffices."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.storage import ZSTD_MAGIC
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
@@ -96,6 +98,7 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
     assert told['topics']['/panorama'] == {
         'type': 'sensor_msgs/msg/Image',
         'count': 600,
+        'recorded': 600,
         'first_stamp_ns': START,
         'last_stamp_ns': START + 599 * STEP,
         'rate_hz': 5.0,
@@ -168,6 +171,62 @@ def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
     problems = {topic.name: topic.problems for topic in inspect(tmp_path / 'bag').topics}
     assert problems['/panorama'] == ['pause of 10.2 s', 'images of several sizes: 80x8, 60x8']
     assert problems['/odom'] == ['1 of 20 messages: zero or negative stamp', 'pause of 10.2 s']
+
+
+def test_a_topic_that_speaks_only_on_change_does_not_pause(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for at in (0, 0.1, 7, 7.5, 30, 30.1, 30.2, 55, 56, 80):
+            bag.pose('/goal', START + round(at * 1e9), (0, 0, 0))
+        for index in range(500):
+            bag.odometry('/odom', START + index * STEP, (0, 0, 0), (0, 0), (0, 0))
+    topics = {topic.name: topic for topic in inspect(tmp_path / 'bag').topics}
+    assert topics['/goal'].problems == [] and topics['/goal'].largest_gap_s > 20
+
+
+def test_a_topic_of_which_nothing_can_be_read_is_an_error(tmp_path: Path, capsys) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(5):
+            bag.odometry('/odom', 0, (0, 0, 0), (0, 0), (0, 0))
+            bag.imu('/imu', START + index * STEP, 0.0, 0.0)
+    assert main(['inspect', str(tmp_path / 'bag'), '--json', str(tmp_path / 'found.json')]) == 1
+    found = json.loads((tmp_path / 'found.json').read_text())['bags'][0]['topics']
+    assert (found['/odom']['count'], found['/odom']['recorded']) == (0, 5)
+    assert (found['/imu']['count'], found['/imu']['recorded']) == (5, 5)
+    assert '5 of 5 messages: zero or negative stamp' in capsys.readouterr().out
+
+
+def test_a_bag_recorded_while_the_nodes_ran_is_read_by_its_inputs(tmp_path: Path) -> None:
+    picture = np.zeros((8, 60, 3), np.uint8)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(5):
+            at = START + index * STEP
+            bag.image('/camera/image_raw', at, picture, 'camera')
+            bag.image('/robot/panorama', at, picture, 'camera')
+            for topic in ('/wheels/odometry', '/robot/ekf/odometry'):
+                bag.odometry(topic, at, (0, 0, 0), (0, 0), (0, 0))
+            for topic in ('/truth', '/robot/sfa/pose'):
+                bag.pose(topic, at, (0, 0, 0))
+    with Bag(tmp_path / 'bag') as bag:
+        names = [bag.find(kind) for kind in ('image', 'odometry', 'ground_truth')]
+    assert names == ['/camera/image_raw', '/wheels/odometry', '/truth']
+
+
+def test_a_file_beside_the_metadata_and_a_missing_split_are_named(tmp_path: Path) -> None:
+    path = write(tmp_path / 'bag', pictures=20)
+    (file,) = path.glob('*.mcap')
+    shutil.copy(file, path / 'bag_1.mcap')
+    assert 'bag_1.mcap is in the folder, but not in metadata.yaml' in inspect(path).problems[0]
+    (path / 'metadata.yaml').unlink()
+    for number in (0, 2, 3):
+        shutil.copy(file, path / f'split_{number}.mcap')
+    assert any('split_1.mcap is missing' in problem for problem in inspect(path).problems)
+
+
+def test_damaged_zstd_is_not_called_empty(tmp_path: Path, capsys) -> None:
+    (tmp_path / 'bag.mcap.zstd').write_bytes(ZSTD_MAGIC + b'\xff' * 200)
+    assert main(['inspect', str(tmp_path / 'bag.mcap.zstd')]) == 1
+    error = capsys.readouterr().err
+    assert 'damaged zstd data' in error and 'is empty' not in error
 
 
 # The numbers.

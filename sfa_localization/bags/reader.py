@@ -8,6 +8,7 @@ message that is not used is counted with its reason. Bags are never written to.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +33,8 @@ from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
 
 SERIALIZATIONS = ('cdr', 'ros1')
+OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
+"""What omnicam_node, sfa_node and ekf_node publish is no input where others are recorded too."""
 MOST_TOPICS = 8
 """Topics that an error message lists."""
 _RESETS_MIN, _RESETS_SHARE = 20, 0.01
@@ -140,6 +143,8 @@ class Bag:
         if topic:
             return self._named(wanted, topic)
         found = [t for t in self.topics.values() if t.kind in wanted.found and t.count]
+        if len(found) > 1:
+            found = [t for t in found if not _is_own(t.name)] or found
         if len(found) == 1:
             return self._readable(found[0]).name
         if not found:
@@ -308,6 +313,11 @@ class Bag:
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
+
+
+def _is_own(name: str) -> bool:
+    """Whether a topic is what the nodes of this package publish, perhaps in a namespace."""
+    return OWN_TOPICS.search(name) is not None
 
 
 def _nothing(_: Any) -> None:

@@ -10,6 +10,7 @@ missing or its metadata is damaged or newer, opens no compressed file without me
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import tempfile
@@ -23,6 +24,7 @@ from sfa_localization.bags import mcap as bag_mcap
 from sfa_localization.bags import ros1 as bag_ros1
 from sfa_localization.bags import sqlite as bag_sqlite
 from sfa_localization.bags.storage import (
+    MOST_PROBLEMS,
     ZSTD_MAGIC,
     Channel,
     Record,
@@ -125,18 +127,28 @@ class Recording:
         except ValueError as error:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files')
             return self._rebuilt()
+        unlisted = sorted(set(self._found()) - set(metadata.files), key=_natural)
+        for name in unlisted[:MOST_PROBLEMS]:
+            text = f'{name} is in the folder, but not in {METADATA}: it is not read'
+            add_problem(self.problems, text)
         if metadata.version > NEWEST_METADATA:
             self.notes.append(f'{METADATA} has version {metadata.version}, newer than known')
         return metadata
 
     def _rebuilt(self) -> Metadata:
-        try:
-            names = [file.name for file in self.path.iterdir() if file.name.endswith(SUFFIXES)]
-        except OSError as error:
-            raise BagError(f'{self.path}: cannot be read: {error.strerror}') from None
+        names = sorted(self._found(), key=_natural)
         if not names:
             raise BagError(f'{self.path}: no bag: neither {METADATA} nor .db3, .mcap, .bag')
-        return Metadata(sorted(names, key=_natural))
+        for name in _missing_splits(names):
+            add_problem(self.problems, f'{name} is missing between other files; copy all files')
+        return Metadata(names)
+
+    def _found(self) -> list[str]:
+        """Names of the bag files in the folder. Raises BagError."""
+        try:
+            return [file.name for file in self.path.iterdir() if file.name.endswith(SUFFIXES)]
+        except OSError as error:
+            raise BagError(f'{self.path}: cannot be read: {error.strerror}') from None
 
     def _open_files(self) -> None:
         folder = self.path if self.path.is_dir() else self.path.parent
@@ -182,6 +194,8 @@ class Recording:
             self._folder = tempfile.TemporaryDirectory(prefix='bag-')
         target = Path(self._folder.name) / path.stem
         damage = inflate_file(path, target)
+        if damage and not target.stat().st_size:
+            raise BagError(f'{path}: {damage}: nothing of it can be read')
         if damage:
             self.problems.append(f'{path.name}: {damage}')
         return target
@@ -204,6 +218,23 @@ def _natural(name: str) -> list[Any]:
     """Sorting key that puts bag_10 after bag_2."""
     parts = re.split(r'(\d+)', name)
     return [(int(part), '') if part.isdigit() else (-1, part) for part in parts]
+
+
+def _missing_splits(names: list[str]) -> list[str]:
+    """Files that a recorder must have numbered between the first and the last of the names."""
+    numbered: dict[tuple[str, str], set[int]] = {}
+    for name in names:
+        match = re.fullmatch(r'(.*_)(\d{1,6})(\.[a-z3.]+)', name)
+        if match:
+            numbered.setdefault((match[1], match[3]), set()).add(int(match[2]))
+    gaps = (
+        f'{start}{number}{end}'
+        for (start, end), known in numbered.items()
+        if max(known) - min(known) < 2 * len(known)
+        for number in range(min(known), max(known))
+        if number not in known
+    )
+    return list(itertools.islice(gaps, MOST_PROBLEMS))
 
 
 def open_storage(plain: Path, path: Path) -> Storage:

@@ -23,8 +23,9 @@ EXAMPLES = """\
   inspect bags/coverage bags/test
   inspect recording_0.mcap --json bag.json --report report
 
-JSON: {"bags": [{"path", "topics": {NAME: {"type", "count", "first_stamp_ns",
-"last_stamp_ns", "rate_hz", "largest_gap_s", "problems"}}, "problems", "lacks", ...}]}"""
+JSON: {"bags": [{"path", "topics": {NAME: {"type", "count", "recorded",
+"first_stamp_ns", "last_stamp_ns", "rate_hz", "largest_gap_s", "problems"}}, "problems", "lacks",
+...}]}"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
         _write_page(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
-    return 1 if any(report.error for report in reports) else 0
+    return 1 if any(map(_unreadable, reports)) else 0
+
+
+def _unreadable(report: BagReport) -> bool:
+    """Whether a bag, or all that a topic of it recorded, cannot be read."""
+    return bool(report.error) or any(topic.unreadable for topic in report.topics)
 
 
 def write_json(path: Path, reports: Sequence[BagReport]) -> None:

@@ -3,8 +3,8 @@
 """How noisy the turns of the odometry are, from the headings that the images of the drive show.
 
 Wheels slip in turns by what no data sheet says. Where the heading of the images and that of the
-odometry drift apart, one of both errs: a compass errs alike at all times, so that the growth of
-their difference with time is the noise of the odometry.
+odometry drift apart, one of both errs, so that the growth of their difference with time bounds the
+noise of the odometry.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.metric.compass_training import LearnedHeading
 from sfa_localization.metric.dead_reckoning import OdometryTrack
-from sfa_localization.metric.learning import MetricResult, headings
 from sfa_localization.metric.segments import ImagePoses, Segments
 from sfa_localization.metric.settings import SegmentConfig
 
@@ -70,39 +68,10 @@ def _pairs(times_s: Array, chains: Indices, lag_s: float) -> tuple[Indices, Indi
     return np.concatenate(firsts), np.concatenate(lasts)
 
 
-def against_compass(
-    heading: LearnedHeading, segments: Segments, result: MetricResult
-) -> float | None:
-    """Noise of the odometry's turns by a compass that was learned without each of the segments.
-
-    The yaw-rate biases of the periods are no noise: metric learning has estimated them.
-    """
-    images, certified = headings(result, segments)
-    at = np.searchsorted(images, heading.images)
-    times, odometry, chains = _odometry_headings(segments, result.yaw_bias)
-    residuals = certified[at] + heading.left_out_error - odometry[at]
-    return turn_noise(times[at], residuals, chains[at])
-
-
 def expected_noise(segments: Segments) -> float:
     """Noise of the turns between segments that is stated or assumed, rad per square root of s."""
     rates = [s.turn_variance / s.turn_time_s for s in segments if s.linked and s.turn_time_s > 0]
     return float(np.sqrt(np.median(rates))) if rates else 0.0
-
-
-def _odometry_headings(segments: Segments, bias: Array) -> tuple[Array, Array, Indices]:
-    """Times (M,) s, the odometry's yaw (M,) rad without its biases, and the unbroken chains (M,)
-    of the images of the segments."""
-    times, yaws, chains = [], [], []
-    chain, drift = 0, 0.0
-    for segment in segments:
-        own = float(bias[segment.period])
-        times.append(segment.since_start_s + segment.times_s - segment.times_s[0])
-        yaws.append(segment.start[2] + segment.headings - drift - own * segment.times_s)
-        chains.append(np.full(len(segment.images), chain))
-        drift = drift + own * segment.turn_time_s if segment.linked else 0.0
-        chain += not segment.linked
-    return np.concatenate(times), np.concatenate(yaws), np.concatenate(chains)
 
 
 def against_images(
