@@ -50,6 +50,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
+from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
 from sfa_localization.metric.fast_expansions import fast_map
 from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
@@ -59,6 +60,7 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
 )
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
+from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
@@ -261,14 +263,21 @@ def _learn_map(
     """Steps 5 to 7; where no map can be learned with the noise of turns that is stated or assumed,
     once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
-    segments = replace(_cut_odometry(runs, clocks, recipe.segments, None), closures=closures)
+    turns = _seen_turns(runs, clocks, seen, closures, recipe.segments)
+    segments = _cut_odometry(runs, clocks, recipe.segments, None, turns)
+    segments = replace(segments, closures=closures)
     try:
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
     except DataError:
         found = _bound(runs, clocks, seen, recipe.segments)
         assumed = SegmentConfig().yaw_noise
         own = recipe.segments.yaw_noise != assumed
-        if own or found is None or found < _NOISE_FACTOR * max(assumed, expected_noise(segments)):
+        if (
+            own
+            or turns
+            or found is None
+            or found < _NOISE_FACTOR * max(assumed, expected_noise(segments))
+        ):
             raise
     segments = replace(_cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
     return segments, *_map_and_compass(images, segments, recipe, points, progress)
@@ -305,16 +314,43 @@ def _bound(
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
+def _seen_turns(
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    seen: Sequence[Sequence[float]],
+    closures: Closures,
+    config: SegmentConfig,
+) -> list[TurnCorrection] | None:
+    """By the headings `seen` in each run (N,) rad; None where the odometry is as good."""
+    drives = [
+        Headings.of(
+            OdometryTrack.of(run.odometry, config, run.yaw_rate),
+            run.panoramas.stamps_ns - clock.delay_ns,
+            own,
+        )
+        for run, clock, own in zip(runs, clocks, seen, strict=True)
+    ]
+    return corrections(drives, closures)
+
+
 def _cut_odometry(
     runs: Sequence[Run],
     clocks: Sequence[CameraClock],
     config: SegmentConfig,
     noise: float | None,
+    turns: Sequence[TurnCorrection] | None = None,
 ) -> Segments:
     """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""
     parts = [
-        cut(run.odometry, run.panoramas.stamps_ns - clock.delay_ns, config, run.yaw_rate, noise)
-        for run, clock in zip(runs, clocks, strict=True)
+        cut(
+            run.odometry,
+            run.panoramas.stamps_ns - clock.delay_ns,
+            config,
+            run.yaw_rate,
+            noise,
+            turns[k] if turns else None,
+        )
+        for k, (run, clock) in enumerate(zip(runs, clocks, strict=True))
     ]
     counts = [len(run.panoramas) for run in runs]
     return join(parts, [sum(counts[:k]) for k in range(len(runs))])

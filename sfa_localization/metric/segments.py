@@ -26,6 +26,7 @@ from sfa_localization.metric.dead_reckoning import (
     TURNED,
     YAW_VARIANCE,
     OdometryTrack,
+    TurnCorrection,
     seconds_since_start,
     tally,
 )
@@ -142,6 +143,7 @@ def cut(
     config: SegmentConfig,
     yaw_rate: YawRate | None = None,
     turn_noise: float | None = None,
+    turns: TurnCorrection | None = None,
 ) -> Segments:
     """Cut a drive into segments at the stamps of its images (N,).
 
@@ -149,11 +151,13 @@ def cut(
     translational and angular velocity, as the paper does; 'any' cuts the whole drive into pieces
     bounded by length and by accumulated odometry error. Images without odometry, of a standing
     robot, or in too short a piece are left out and counted in `Segments.images`. A known
-    `turn_noise` (rad per square root of s) replaces what the messages state.
+    `turn_noise` (rad per square root of s) replaces what the messages state; `turns` correct those
+    of the odometry, and state their noise.
 
     Raises DataError when no segment is left.
     """
     track = OdometryTrack.of(odometry, config, yaw_rate, turn_noise)
+    track = track if turns is None else track.corrected(turns)
     skipped: dict[str, int] = {}
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
