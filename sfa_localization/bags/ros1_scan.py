@@ -133,12 +133,12 @@ class ScannedRos1Storage:
 
     def _define(self, part: Part) -> None:
         """Take a connection: its number, topic and type."""
-        key, told = _number(part.fields.get(b'conn')), _fields(part.data)
-        if part.cut_off or key < 0 or told is None or key in self._known:
+        key, names = _number(part.fields.get(b'conn')), _fields(part.data)
+        if part.cut_off or key < 0 or names is None or key in self._known:
             return
         if len(self._known) >= MOST_TOPICS:
             raise BagError(f'{self._path}: has more than {MOST_TOPICS} topics')
-        topic, kind = part.fields.get(b'topic', b''), told.get(b'type', b'')
+        topic, kind = part.fields.get(b'topic', b''), names.get(b'type', b'')
         name, title = (text.decode(errors='replace') for text in (topic, kind))
         self._known[key] = make_channel(name, title, 'ros1', '')
 
