@@ -114,3 +114,17 @@ def test_segments_have_the_corrected_turns_and_their_noise():
         true = wrap_angle(known[b.images[0]] - known[a.images[0]])
         assert abs(wrap_angle(a.turn_rad - true)) < 1e-6
         assert a.turn_variance >= 0.002**2 * a.turn_time_s * 0.99
+
+
+def test_pieces_with_known_turns_are_longer():
+    """Without: what turns may have misplaced uses them up, and links as weak shrink the map."""
+    (run, _) = drives(0.0)
+    nothing = TurnCorrection(run.stamps_ns, np.zeros(len(run.stamps_ns)), CONFIG.yaw_noise)
+    before = cut(run.odometry, run.stamps_ns, CONFIG)
+    after = cut(run.odometry, run.stamps_ns, CONFIG, turns=nothing)
+    assert len(after) < len(before)
+    rates = [
+        np.median([s.displacement_variance / s.turn_time_s for s in part if s.linked])
+        for part in (before, after)
+    ]
+    assert rates[1] < rates[0]
