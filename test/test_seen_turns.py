@@ -6,10 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from cylinder_worlds import Spheres, recipe, run_in, wander
 from metric_worlds import Drive, drive, meander
 
+from sfa_localization import training
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.run import integrate
 from sfa_localization.features.closures import Closures
+from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
 from sfa_localization.metric.seen_turns import CLOSURES_MIN, Headings, corrections
 from sfa_localization.metric.segments import cut
@@ -128,3 +133,31 @@ def test_pieces_with_known_turns_are_longer():
         for part in (before, after)
     ]
     assert rates[1] < rates[0]
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+def test_a_training_turns_by_its_images_where_wheels_slip(clockwise):
+    """The steps of a training up to the segments, with wheels that slip and with good ones."""
+    config = dataclasses.replace(recipe(clockwise), panorama=PanoramaConfig(
+        width=120, height=24, clockwise=clockwise))  # fmt: skip
+    true = wander(600, 2, hz=4.0)
+    run = run_in(Spheres.about(1), true, config.panorama)
+    twists = true.twists.copy()
+    twists[:, 1] += 0.1 * np.random.default_rng(0).standard_normal(len(twists))
+    slipping = dataclasses.replace(
+        true, twists=twists, poses=integrate(true.stamps_ns, twists, true.poses[0])
+    )
+    closures = training.match_images([run], config).closures
+    seen = [list(training.visual_headings(run.panoramas))]
+    clocks = [CameraClock()]
+    given = (clocks, seen, closures, config.segments)
+    assert training._seen_turns([run], *given) is None
+    runs = [dataclasses.replace(run, odometry=slipping)]
+    found = training._seen_turns(runs, *given)
+    assert found is not None
+    errors = []
+    for turns in (None, found):
+        segments = training._cut_odometry(runs, clocks, config.segments, None, turns)
+        turned = np.array([s.start[2] - true.poses[s.images[0], 2] for s in segments])
+        errors.append(np.abs(wrap_angle(turned - turned[0])).mean())
+    assert errors[1] < 0.5 * errors[0]
