@@ -164,8 +164,8 @@ def learn_place(
 ) -> Trained:
     """Steps 3 to 8: maps, compass and keyframes for a trained network. Raises DataError."""
     images = _slow_features(network, runs, progress)
-    clocks = [_clock_of(run) for run in runs]
-    segments = _cut_odometry(runs, clocks, recipe.segments)
+    clocks = [clock_of(run) for run in runs]
+    segments = cut_odometry(runs, clocks, recipe.segments)
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
     first = learn_metric(images.slow, segments, recipe.metric, seed, points=points)
@@ -185,7 +185,7 @@ def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> Ima
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 
-def _clock_of(run: Run) -> CameraClock:
+def clock_of(run: Run) -> CameraClock:
     """The delay of the camera's clock; warns of one that the filter cannot compensate."""
     clock = camera_clock(run.odometry, run.panoramas.stamps_ns, visual_headings(run.panoramas))
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
@@ -196,7 +196,7 @@ def _clock_of(run: Run) -> CameraClock:
     return clock
 
 
-def _cut_odometry(
+def cut_odometry(
     runs: Sequence[Run], clocks: Sequence[CameraClock], config: SegmentConfig
 ) -> Segments:
     """Step 4: segments of all runs, at the stamps of the images by the clock of the odometry."""
