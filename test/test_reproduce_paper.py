@@ -11,12 +11,12 @@ import pytest
 from test_commands import gardens, small_network  # noqa: F401
 
 from sfa_localization.bags.reader import Bag
-from sfa_localization.commands import comparisons, paper_tables, reproduction, sites
+from sfa_localization.commands import comparisons, paper_results, paper_tables, reproduction, sites
 from sfa_localization.commands.comparisons import BASELINES, VARIANTS
 from sfa_localization.commands.paper_results import random_parameters
 from sfa_localization.commands.paper_tables import NAMES, Work
 from sfa_localization.commands.reproduce import ReproduceConfig
-from sfa_localization.commands.reproduction import Progress
+from sfa_localization.commands.reproduction import Progress, Results
 from sfa_localization.commands.sites import FULL, Plan, spaced
 from sfa_localization.commands.trials import known_start, start_of
 from sfa_localization.data.errors import LocalizationError
@@ -131,7 +131,9 @@ def test_a_random_start_is_in_the_ranges_of_section_4():
 def work(tmp_path_factory, gardens, small_network):  # noqa: F811
     """Both experiments and the baselines in one folder, and what was printed."""
     made = Work(tmp_path_factory.mktemp('paper') / 'out', CONFIG, PLAN, Progress(False))
-    return made, {name: made.reproduced(name) for name in ('simulator', 'robot', 'baselines')}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_results, 'SNAPSHOTS', {0: '', 1000: 'random', 2000: 'random_long'})
+        return made, {name: made.reproduced(name) for name in ('simulator', 'robot', 'baselines')}
 
 
 def cells_of(work, name):
@@ -143,13 +145,15 @@ def test_an_experiment_has_all_columns(work):
     made, texts = work
     (simulator,), (robot,) = (cells_of(made, name) for name in ('simulator', 'robot'))
     assert simulator['images'][:2] == [150, 120] and robot['images'][0] == 260
-    assert set(simulator['columns']) == {'random', 'paper', 'certified', 'ours'}
+    assert set(simulator['columns']) == {'random', 'random_long', 'paper', 'certified', 'ours'}
     assert set(robot['columns']) == {'paper', 'certified', 'ours'}
+    random, long = (simulator['columns'][name] for name in ('random', 'random_long'))
+    assert long['training'] != random['training']
     for cell in (simulator, robot):
         assert cell['odometry'] == pytest.approx(0.31, abs=0.03)
         ours = cell['columns']['ours']
         assert ours['training_supervised'] <= ours['training'] < 1.0 and ours['ekf'] < 1.0
-        assert 0 < ours['test'] < 2.0 and ours['image'] != ours['test']
+        assert 0 < ours['test'] < 2.0 and ours['scaled'] < ours['image'] != ours['test']
     assert rows(texts['robot'])['test, EKF'][0] == '0.11'
     assert (made.out / 'robot.md').read_text() == texts['robot'] + '\n'
 
@@ -227,11 +231,25 @@ def test_ablations_leave_out_what_they_name(work, monkeypatch):
 @pytest.mark.slow
 def test_the_folder_is_that_of_one_setting(work):
     made, _ = work
+    before = {path: path.read_bytes() for path in made.out.glob('*.json')}
     for other in (replace(made, config=replace(CONFIG, world=2)),
                   replace(made, plan=replace(PLAN, area=(7.0, 7.0)))):  # fmt: skip
         for name in ('robot', 'ablations'):
             with pytest.raises(LocalizationError, match='--out'):
                 other.reproduced(name)
+    assert {path: path.read_bytes() for path in made.out.glob('*.json')} == before
+
+
+def test_a_result_beside_one_of_other_settings_is_not_begun(tmp_path):
+    first = Results.opened(tmp_path / 'robot.json', {'world': 1}, ('robot.json', 'baselines.json'))
+    first.keep({'seed': 3})
+    with pytest.raises(LocalizationError, match='--out'):
+        Results.opened(tmp_path / 'baselines.json', {'world': 2}, ('robot.json',))
+    assert [path.name for path in tmp_path.iterdir()] == ['robot.json']
+    second = Results.opened(tmp_path / 'baselines.json', {'world': 1}, ('robot.json',))
+    assert second.cells == [] and second.find(seed=3) is None
+    again = Results.opened(tmp_path / 'robot.json', {'world': 1})
+    assert again.find(seed=3) == {'seed': 3} and again.find(seed=4) is None
 
 
 @pytest.mark.slow

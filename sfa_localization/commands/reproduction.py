@@ -44,11 +44,7 @@ class Results:
         """
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            kin = [file.with_name(name) for name in beside if file.with_name(name).exists()]
-            if not file.exists() and (kin or not any(file.parent.iterdir())):
-                found = _read(kin[0]) if kin else {'settings': settings}
-                write_json(file, {'settings': found['settings'], 'cells': []})
-            found = _read(file)
+            found = _found(file, beside, settings)
             same, cells = found['settings'] == settings, list(found['cells'])
         except OSError as error:
             reason = error.strerror or error
@@ -58,11 +54,16 @@ class Results:
         if not same:
             other = 'holds results of other settings: name another --out'
             raise LocalizationError(f'{file.parent}: {other}')
-        return cls(file, settings, cells)
+        results = cls(file, settings, cells)
+        results._write()
+        return results
 
     def keep(self, cell: Cell) -> None:
         """Add a finished cell."""
         self.cells.append(cell)
+        self._write()
+
+    def _write(self) -> None:
         write_json(self.file, {'settings': self.settings, 'cells': self.cells})
 
     def find(self, **names: Any) -> Cell | None:
@@ -70,8 +71,14 @@ class Results:
         return next((c for c in self.cells if names.items() <= c.items()), None)
 
 
-def _read(file: Path) -> dict[str, Any]:
-    return dict(json.loads(file.read_text(encoding='utf-8')))
+def _found(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What the file holds; the settings of one beside it, or the new ones in an empty folder."""
+    kin = [file.with_name(name) for name in beside if file.with_name(name).exists()]
+    if not file.exists() and not kin and not any(file.parent.iterdir()):
+        return {'settings': settings, 'cells': []}
+    source = kin[0] if kin and not file.exists() else file
+    found = dict(json.loads(source.read_text(encoding='utf-8')))
+    return found if source == file else {**found, 'cells': []}
 
 
 def settings_of(

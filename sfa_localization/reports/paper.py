@@ -35,6 +35,7 @@ PAPER: dict[str, dict[str, float]] = {
 """Section 4 and section 5.1 of the paper."""
 COLUMNS = {
     'random': "paper's descent of C, random start",
+    'random_long': 'same, 50,000 iterations',
     'paper': "paper's recipe, C' from odometry",
     'certified': 'same, certified optimum',
     'ours': 'ours',
@@ -45,6 +46,7 @@ ROWS = {
     'test_supervised': 'test, supervised',
     'test': 'test, unsupervised map',
     'image': 'test, one image with keyframes',
+    'scaled': 'same, scale and frame fitted on the test',
     'odometry': 'test, odometry',
     'ekf': 'test, EKF',
     'gain': 'EKF against odometry',
