@@ -11,13 +11,20 @@ import pytest
 from test_commands import gardens, small_network  # noqa: F401
 
 from sfa_localization.bags.reader import Bag
-from sfa_localization.commands import comparisons, paper_results, paper_tables, reproduction, sites
+from sfa_localization.commands import (
+    comparisons,
+    light_matrix,
+    paper_results,
+    paper_tables,
+    reproduction,
+    sites,
+)
 from sfa_localization.commands.comparisons import BASELINES, VARIANTS
 from sfa_localization.commands.paper_results import random_parameters
 from sfa_localization.commands.paper_tables import NAMES, Work
 from sfa_localization.commands.reproduce import ReproduceConfig
 from sfa_localization.commands.reproduction import Progress, Results
-from sfa_localization.commands.sites import FULL, Plan, spaced
+from sfa_localization.commands.sites import FULL, QUICK, Plan, spaced
 from sfa_localization.commands.trials import known_start, start_of
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.geometry import RigidTransform, compose
@@ -262,6 +269,20 @@ def test_the_known_start_is_the_true_one(work):
     start = np.array(known_start(run, transform).initial_pose)
     laid = compose(np.array([3.0, -2.0, 2.5]), start)
     assert laid == pytest.approx(start_of(run)) and laid == pytest.approx(truth.poses[0])
+
+
+def test_all_of_it_in_one_go_after_its_time_is_stated(tmp_path, monkeypatch, capsys):
+    from sfa_localization import cli
+    from sfa_localization.commands import reproduce
+
+    done = []
+    monkeypatch.setattr(Work, 'reproduced', lambda _work, name: done.append(name))
+    monkeypatch.setattr(reproduce, '_light', lambda out, *_others: done.append(out.name))
+    assert cli.main(['reproduce', 'all', '--quick', '--seeds', '3', '--out', str(tmp_path)]) == 0
+    assert done == [*NAMES, 'light']
+    minutes = light_matrix.QUICK.minutes + QUICK.minutes['ablations']
+    minutes += 3 * sum(QUICK.minutes[name] for name in ('simulator', 'robot', 'baselines'))
+    assert f'takes about {minutes} minutes' in capsys.readouterr().err
 
 
 def test_bags_without_a_drive_to_test_on_are_rejected(capsys):

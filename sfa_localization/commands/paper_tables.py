@@ -37,10 +37,11 @@ class Work:
     bags: tuple[Path, ...] = ()
     test: Path | None = None
 
-    def announce(self, names: Sequence[str]) -> None:
-        """Say how long these results take."""
-        seeds = {'ablations': 1}
-        minutes = sum(self.plan.minutes[n] * seeds.get(n, self.config.seeds) for n in names)
+    def announce(self, names: Sequence[str], minutes: int = 0) -> None:
+        """Say how long these results take, beside the `minutes` of others."""
+        for name in names:
+            seeds = 1 if name == 'ablations' else self.config.seeds
+            minutes += seeds * self.plan.minutes[name]
         kept = 'what is finished is kept, and not made again'
         self.progress.say(f'this takes about {minutes} minutes on two cores; {kept}')
 

@@ -91,12 +91,14 @@ def _paper(
     names: Sequence[str], out: Path, config: ReproduceConfig, arguments: argparse.Namespace
 ) -> None:
     """Those results that share a folder: say how long they take, then make what is missing."""
+    from sfa_localization.commands import light_matrix
     from sfa_localization.commands.paper_tables import Work
     from sfa_localization.commands.reproduction import Progress
     from sfa_localization.commands.sites import FULL, QUICK
 
     plan = QUICK if arguments.quick else FULL
     work = Work(out, config, plan, Progress(shown=True), tuple(arguments.bags), arguments.test)
-    work.announce(names)
+    light = light_matrix.QUICK if arguments.quick else light_matrix.FULL
+    work.announce(names, light.minutes if arguments.result == 'all' else 0)
     for name in names:
         print(work.reproduced(name))
