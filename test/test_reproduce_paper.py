@@ -26,7 +26,7 @@ from sfa_localization.commands.reproduce import ReproduceConfig
 from sfa_localization.commands.reproduction import Progress, Results
 from sfa_localization.commands.sites import FULL, QUICK, Plan, spaced
 from sfa_localization.commands.trials import known_start, start_of
-from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.errors import DataError, LocalizationError
 from sfa_localization.data.geometry import RigidTransform, compose
 from sfa_localization.reports.paper import (
     PAPER,
@@ -172,6 +172,25 @@ def test_figures_are_those_of_the_paper(work):
     numbers = ('1d_simulator', '1d_robot', '4', '5', '6', '7', '8', '9')
     assert names == {f'figure_{number}.png' for number in numbers}
     assert all(cv2.imread(str(made.out / name)).std() > 5 for name in names)
+
+
+@pytest.mark.slow
+def test_what_the_papers_solver_cannot_do_is_a_problem_of_its_column(work, tmp_path, monkeypatch):
+    def diverging(*_args):
+        raise DataError('it diverges')
+
+    made, _ = work
+    monkeypatch.setattr(paper_results, 'learn_metric', diverging)
+    monkeypatch.setattr(paper_results, 'descend', diverging)
+    site = sites.Site.simulated(made.out, 'simulator', 1, 1, PLAN, Progress(False))
+    results = Results(tmp_path / 'simulator.json', {})
+    paper_results.experiment(site, results, 'simulator', 1, tmp_path)
+    columns = results.cells[0]['columns']
+    assert columns.pop('ours')['test'] > 0
+    assert set(columns) == {'random', 'random_long', 'paper', 'certified'}
+    assert all(column == {'problem': 'it diverges'} for column in columns.values())
+    assert 'figure_6.png' in {path.name for path in tmp_path.iterdir()}
+    assert rows(paper_table('simulator', results.cells))['test, supervised'][1:] == ['-'] * 4
 
 
 @pytest.mark.slow

@@ -69,8 +69,7 @@ def experiment(site: Site, results: Results, name: str, seed: int, figures: Path
         columns['ours'], paths['ours'] = _ours(site, study, model)
         descent: list[report.Panel] = []
         if name == 'simulator':
-            found, descent = _random_start(study, features, seed)
-            columns |= found
+            descent = _random_start(study, features, seed, columns)
         if figures is not None:
             firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
             if descent:
@@ -123,10 +122,10 @@ def _ours(site: Site, study: Study, model: PlaceModel) -> tuple[Cell, Paths]:
 
 
 def _random_start(
-    study: Study, features: tuple[Array, Array], seed: int
-) -> tuple[dict[str, Cell], list[report.Panel]]:
-    """Errors of the paper's descent of C from random parameters, as its simulator experiment has
-    it, by column, and its training lines. Only the frame is fitted, or its mirror image, which C
+    study: Study, features: tuple[Array, Array], seed: int, columns: dict[str, Cell]
+) -> list[report.Panel]:
+    """Training lines by the paper's descent of C from random parameters, as its simulator
+    experiment has it; adds its columns. Only the frame is fitted, or its mirror image, which C
     admits.
     """
     segments = study.segments(STRAIGHT, only_last=True)
@@ -135,16 +134,20 @@ def _random_start(
     training, truth = training[stack.images], study.places[stack.images]
     lines = Lines(training, stack.path.real, stack.owner, np.zeros(0))
     start = random_parameters(len(segments), training.shape[1], size, seed)
-    panels, columns = [], dict[str, Cell]()
+    panels = []
     for iterations, column in SNAPSHOTS.items():
-        weights = descend(lines, start, iterations)[0].weights if iterations else start.weights
+        try:
+            weights = descend(lines, start, iterations)[0].weights
+        except DataError as error:
+            columns |= {column: {'problem': str(error)}} if column else {}
+            continue
         side, transform = _nearest_frame(training @ weights, truth)
         found, unseen = (transform.apply(t @ weights * [1, side]) for t in (training, test))
         places = study.test_truth.poses[:, :2]
         cell = {'training': mean_error(found, truth), 'test': mean_error(unseen, places)}
         columns |= {column: cell} if column else {}
         panels.append(report.Panel(f'iteration {iterations}', truth, found, stack.owner))
-    return columns, panels
+    return panels
 
 
 def random_parameters(lines: int, terms: int, size: Array, seed: int) -> Parameters:
@@ -165,14 +168,15 @@ def _nearest_frame(places: Array, truth: Array) -> tuple[float, RigidTransform]:
 def _figures(folder: Path, name: str, study: Study, paths: dict[str, Paths]) -> None:
     """Figures 5 and 6, or 7 to 9: a row for the paper's recipe, and one for this package."""
     numbers = {'simulator': (5, 6), 'robot': (7, 8)}[name]
-    chosen = {"paper's recipe": paths.get('paper', paths['certified']), 'ours': paths['ours']}
+    rows = {"paper's recipe": paths.get('paper') or paths.get('certified'), 'ours': paths['ours']}
+    chosen = {row: made for row, made in rows.items() if made is not None}
     owner = assignment(study.segments(STRAIGHT, only_last=True), len(study.places))
     for part, number in enumerate(numbers):
-        rows = {row: _panels(trial, part, owner) for row, (trial, *_) in chosen.items()}
-        report.panels_figure(folder / f'figure_{number}.png', rows)
+        shown = {row: _panels(trial, part, owner) for row, (trial, *_) in chosen.items()}
+        report.panels_figure(folder / f'figure_{number}.png', shown)
     if name == 'robot':
-        rows = {row: _fusion_panels(study, *made[1:]) for row, made in chosen.items()}
-        report.panels_figure(folder / 'figure_9.png', rows)
+        shown = {row: _fusion_panels(study, *made[1:]) for row, made in chosen.items()}
+        report.panels_figure(folder / 'figure_9.png', shown)
 
 
 def _panels(trial: Trial, part: int, owner: NDArray[np.int64]) -> list[report.Panel]:

@@ -40,14 +40,14 @@ FULL = Plan(
     (16.0, 18.0),
     (600, 60),
     {'coverage': 1773, 'lines': 862, 'mower': 1346},
-    {'simulator': 7, 'robot': 6, 'baselines': 8, 'ablations': 60},
+    {'simulator': 4, 'robot': 3, 'baselines': 4, 'ablations': 30},
 )
 """The sizes of section 4."""
 QUICK = Plan(
     (8.0, 8.0),
     (300, 30),
     {'coverage': 400, 'lines': 300, 'mower': 600},
-    {'simulator': 1, 'robot': 1, 'baselines': 1, 'ablations': 8},
+    {'simulator': 1, 'robot': 1, 'baselines': 2, 'ablations': 8},
 )
 ROUTES = {'simulator': ('coverage', 'lines'), 'robot': ('mower',)}
 """Training drives of the experiments: the network is trained on the first, and the map is laid on
