@@ -30,6 +30,7 @@ from sfa_localization.nodes.settings import EkfNodeConfig
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md')])
+DOCUMENTS.append(ROOT / 'test/EVALUATION.md')
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 COMMANDS = set(cli.COMMANDS)
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
