@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfa_localization.commands.comparisons import MEASURES, SCORES, ablations, baselines
+from sfa_localization.commands.comparisons import MEASURES, SCORES, VARIANTS, ablations, baselines
 from sfa_localization.commands.paper_results import experiment
 from sfa_localization.commands.reproduction import Progress, Results, settings_of
 from sfa_localization.commands.sites import ROUTES, Plan, Site
@@ -60,7 +60,8 @@ class Work:
         else:
             world = f'garden {config.world}'
             ablations(self._site('simulator', 0), results, world)
-            text = comparison_table(results.cells, 'variant', SCORES)
+            cells = [c for name in VARIANTS for c in results.cells if c['variant'] == name]
+            text = comparison_table(cells, 'variant', SCORES)
         save_text(self.out / f'{name}.md', text + '\n')
         self.progress.say(f'see {self.out / f"{name}.md"}')
         return text

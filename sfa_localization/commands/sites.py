@@ -97,7 +97,7 @@ class Site:
         if not path.exists():
             self.progress.say(f'train on {study.training[0].name}')
             network = network_of(study.training[:1], self.recipe)
-            learned(network, study, self.recipe).save(path)
+            learned(network, study.training, self.recipe).save(path)
         return PlaceModel.load(path)
 
 
@@ -108,10 +108,10 @@ def network_of(runs: Sequence[Run], recipe: Recipe) -> Network:
     return train_network(architecture, [ImageSequence.of(run) for run in runs], recipe.network.seed)
 
 
-def learned(network: Network, study: Study, recipe: Recipe) -> PlaceModel:
-    """What a recipe makes of a trained network and all training drives."""
+def learned(network: Network, runs: Sequence[Run], recipe: Recipe) -> PlaceModel:
+    """What a recipe makes of a trained network and training drives."""
     with one_core():
-        return learn_place(network, study.training, recipe).model
+        return learn_place(network, runs, recipe).model
 
 
 def spaced(config: SimulationConfig, images: int | None) -> SimulationConfig:
