@@ -206,7 +206,7 @@ def learn_place(
     known = known or match_images(runs, recipe, progress)
     images = _slow_features(network, runs, progress)
     seen = [list(visual_headings(run.panoramas)) for run in runs]
-    clocks = [_clock_of(run, own) for run, own in zip(runs, seen, strict=True)]
+    clocks = [clock_of(run, own) for run, own in zip(runs, seen, strict=True)]
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
     segments, first, heading = _learn_map(
@@ -236,12 +236,13 @@ def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> Ima
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 
-def _clock_of(run: Run, seen: Sequence[float]) -> CameraClock:
+def clock_of(run: Run, seen: Sequence[float] | None = None) -> CameraClock:
     """The delay of the camera's clock, by the headings rad that its images show.
 
     Warns of one that the filter cannot compensate.
     """
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, seen)
+    shown = visual_headings(run.panoramas) if seen is None else seen
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, shown)
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
             '%s: the stamps of images and odometry are %.2f s apart: the filter compensates half '
@@ -264,22 +265,18 @@ def _learn_map(
     once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
     turns = _seen_turns(runs, clocks, seen, closures, recipe.segments)
-    segments = _cut_odometry(runs, clocks, recipe.segments, None, turns)
+    segments = cut_odometry(runs, clocks, recipe.segments, turns=turns)
     segments = replace(segments, closures=closures)
     try:
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
     except DataError:
         found = _bound(runs, clocks, seen, recipe.segments)
         assumed = SegmentConfig().yaw_noise
-        own = recipe.segments.yaw_noise != assumed
-        if (
-            own
-            or turns
-            or found is None
-            or found < _NOISE_FACTOR * max(assumed, expected_noise(segments))
-        ):
+        known = turns is not None or recipe.segments.yaw_noise != assumed
+        least = _NOISE_FACTOR * max(assumed, expected_noise(segments))
+        if known or found is None or found < least:
             raise
-    segments = replace(_cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
+    segments = replace(cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
     return segments, *_map_and_compass(images, segments, recipe, points, progress)
 
 
@@ -333,11 +330,11 @@ def _seen_turns(
     return corrections(drives, closures)
 
 
-def _cut_odometry(
+def cut_odometry(
     runs: Sequence[Run],
     clocks: Sequence[CameraClock],
     config: SegmentConfig,
-    noise: float | None,
+    noise: float | None = None,
     turns: Sequence[TurnCorrection] | None = None,
 ) -> Segments:
     """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""

@@ -20,6 +20,7 @@ from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.retracing import tracks
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -168,6 +169,43 @@ def test_closures_of_images_without_a_segment_are_left_out():
     images = np.array([[10**6, stack.images[0]], [stack.images[0], stack.images[-1]]])
     assert len(Loops.of(Closures(images, np.zeros(2)), stack).turn) == 1
     assert len(Loops.of(Closures.none(), stack).turn) == 0
+
+
+def twice_along_one_track(sideways=0.1):
+    """A drive, and a second one along the same track, somewhat aside."""
+    twists, start = criss_cross(8, seed=1)
+    aside = (start[0], start[1] + sideways, start[2])
+    drives = [drive(twists, start=place, yaw_noise=0.002) for place in (start, aside)]
+    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in drives]
+    first = len(drives[0].poses)
+    poses = np.vstack([run.poses for run in drives])
+    segments = join(parts, [0, first])
+    return poses, dataclasses.replace(segments, closures=true_closures(poses, first))
+
+
+def test_a_segment_along_an_earlier_track_has_its_number():
+    _, segments = twice_along_one_track()
+    track = tracks(segments)
+    half = [s.run for s in segments].count(0)
+    assert (track[:half] == np.arange(half)).mean() > 0.9
+    assert (track[half:] < half).mean() > 0.8
+    again = [n for n in range(half, len(track)) if track[n] < half]
+    assert np.median([abs(track[n] - (n - half)) for n in again]) <= 1
+
+
+def test_crossing_tracks_keep_their_own_numbers():
+    poses, _, segments, first = in_two_lights()
+    tied = dataclasses.replace(segments, closures=true_closures(poses, first))
+    assert (tracks(tied) == np.arange(len(tied))).mean() > 0.9
+    assert (tracks(segments) == np.arange(len(segments))).all()
+
+
+def test_what_is_left_out_is_left_out_of_every_drive_along_the_track():
+    _, segments = twice_along_one_track()
+    stack, track = Stack.of(segments), tracks(segments)
+    for rows in selection.folds(stack, 0):
+        inside = np.isin(np.arange(len(segments)), stack.owner[rows])
+        assert (inside == inside[track]).all()
 
 
 # --- in the network ---------------------------------------------------------------------------

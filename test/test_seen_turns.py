@@ -157,7 +157,7 @@ def test_a_training_turns_by_its_images_where_wheels_slip(clockwise):
     assert found is not None
     errors = []
     for turns in (None, found):
-        segments = training._cut_odometry(runs, clocks, config.segments, None, turns)
+        segments = training.cut_odometry(runs, clocks, config.segments, turns=turns)
         turned = np.array([s.start[2] - true.poses[s.images[0], 2] for s in segments])
         errors.append(np.abs(wrap_angle(turned - turned[0])).mean())
     assert errors[1] < 0.5 * errors[0]
