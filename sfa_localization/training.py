@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,7 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
 )
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
+from sfa_localization.metric.retracing import with_closures
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
@@ -262,7 +263,7 @@ def _learn_map(
     """Steps 5 to 7; where no map can be learned with the noise of turns that is stated or assumed,
     once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
-    segments = replace(cut_odometry(runs, clocks, recipe.segments), closures=closures)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments), closures)
     try:
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
     except DataError:
@@ -271,7 +272,7 @@ def _learn_map(
         own = recipe.segments.yaw_noise != assumed
         if own or found is None or found < _NOISE_FACTOR * max(assumed, expected_noise(segments)):
             raise
-    segments = replace(cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, found), closures)
     return segments, *_map_and_compass(images, segments, recipe, points, progress)
 
 
