@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,7 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
 )
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
+from sfa_localization.metric.retracing import with_closures
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -265,8 +266,7 @@ def _learn_map(
     once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
     turns = _seen_turns(runs, clocks, seen, closures, recipe.segments)
-    segments = cut_odometry(runs, clocks, recipe.segments, turns=turns)
-    segments = replace(segments, closures=closures)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, turns=turns), closures)
     try:
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
     except DataError:
@@ -276,7 +276,7 @@ def _learn_map(
         least = _NOISE_FACTOR * max(assumed, expected_noise(segments))
         if known or found is None or found < least:
             raise
-    segments = replace(cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, found), closures)
     return segments, *_map_and_compass(images, segments, recipe, points, progress)
 
 
