@@ -4,12 +4,10 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, place, recipe, run_in, wander
-from test_commands import data, gardens, run, small_network  # noqa: F401
 
 from sfa_localization import updating
 from sfa_localization.camera.settings import WatchConfig
@@ -127,7 +125,7 @@ def test_an_updated_model_survives_its_file(tmp_path):
 
 def test_places_where_the_filter_was_not_localised_are_not_used(monkeypatch):
     """Of a robot that is sure only at the end, only the images of the end are added."""
-    late = drive().panoramas.stamps_ns[160]
+    late = drive().panoramas.stamps_ns[80]
     monkeypatch.setattr(
         updating,
         '_replayed',
@@ -137,7 +135,7 @@ def test_places_where_the_filter_was_not_localised_are_not_used(monkeypatch):
             if seen is not None
         ),
     )
-    early = {texture.tobytes() for texture in textures_of(drive())[:160]}
+    early = {texture.tobytes() for texture in textures_of(drive())[:80]}
     new = new_views(place().model, drive())
     assert len(new) > 5
     assert not early & {texture.tobytes() for texture in new.textures}
@@ -210,9 +208,6 @@ def test_a_long_drive_is_spread_over_the_ground():
     assert gaps.max() < 1.0
 
 
-# The command
-
-
 def test_a_sentence_says_what_was_added():
     model, new, newer = updated()
     assert Updated(model, (('a', 0), ('b', 0))).sentence() == (
@@ -224,27 +219,3 @@ def test_a_sentence_says_what_was_added():
         f'added as keyframes: 0 images of a, {len(new)} images of b; '
         f'the model has {total} keyframes now'
     )
-
-
-def unchanging(monkeypatch, data):  # noqa: F811
-    """Nothing is new; the inputs of the command."""
-    shape = PlaceModel.load(data / 'model.npz').keyframes.textures.shape[1:]
-    nothing = Additions(np.zeros((0, *shape), np.int8), np.zeros((0, 3)))
-    monkeypatch.setattr(updating, 'new_views', lambda *_args, **_named: nothing)
-    return '{data}/bag --update {data}/model.npz --output {out}/same.npz'
-
-
-@pytest.mark.slow
-def test_where_nothing_is_new_the_same_bytes_are_written(data, tmp_path, monkeypatch):  # noqa: F811
-    done = run('train', unchanging(monkeypatch, data), tmp_path, data=data)
-    assert done.code == 0 and 'nothing is new' in done.text
-    assert (tmp_path / 'same.npz').read_bytes() == (data / 'model.npz').read_bytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('option', ['--resume', '--report {out}/r', '--segments straight'])
-def test_options_without_effect_are_refused(option, data, tmp_path):  # noqa: F811
-    words = f'{{data}}/bag --update {{data}}/model.npz --output {{out}}/same.npz {option}'
-    done = run('train', words, tmp_path, data=data)
-    assert done.code == 1 and f'{option.split()[0]} has no effect' in done.text
-    assert list(Path(tmp_path).iterdir()) == []

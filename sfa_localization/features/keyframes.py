@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -350,8 +351,14 @@ class Keyframes:
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle; `drives` where some were added."""
         noise = np.array([*dataclasses.astuple(self.noise), float(self.clockwise)])
-        arrays = {'textures': self.textures, 'poses': self.poses, 'noise': noise}
-        return {**arrays, 'drives': self.drives} if self.drives.any() else arrays
+        arrays: dict[str, NDArray[Any]] = {
+            'textures': self.textures,
+            'poses': self.poses,
+            'noise': noise,
+        }
+        if self.drives.any():
+            arrays['drives'] = self.drives
+        return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Keyframes:
