@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reproduce a published result in simulation; so far that of light and season."""
+"""Reproduce a published result in simulation: that of light and season, or that of a year."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from sfa_localization.data.settings import Settings, setting
 WRITES = 'in its folder bags, models, report.md and results'
 EXAMPLES = """\
   reproduce light --quick
+  reproduce year --quick
   reproduce light --world 12 --out light_of_world_12"""
 
 
@@ -29,8 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the result, the folder and the settings."""
     parser.add_argument(
         'result',
-        choices=('light',),
-        help='light: train in one or two lights, test in every light and season',
+        choices=('light', 'year'),
+        help='light: train in one or two lights, test in every light and season; year: train '
+        'once, then a drive a month, with and without updates of the model',
     )
     parser.add_argument(
         '--out',
@@ -46,6 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reproduce; print the table."""
+    if arguments.result == 'year':
+        return _year(arguments)
     from sfa_localization.commands.light_matrix import FULL, QUICK, reproduce_light
     from sfa_localization.reports.light import table
 
@@ -53,4 +57,14 @@ def run(arguments: argparse.Namespace) -> int:
     plan = QUICK if arguments.quick else FULL
     cells = reproduce_light(out, settings(ReproduceConfig, arguments), plan, progress=True)
     print(table(cells))
+    return 0
+
+
+def _year(arguments: argparse.Namespace) -> int:
+    from sfa_localization.commands.year import QUICK_YEAR, YEAR, reproduce_year
+    from sfa_localization.reports.year import table
+
+    plan = QUICK_YEAR if arguments.quick else YEAR
+    out = arguments.out or Path('reproduce_year')
+    print(table(reproduce_year(out, settings(ReproduceConfig, arguments), plan, progress=True)))
     return 0
