@@ -41,6 +41,8 @@ MOST_OF_DRIVE = MOST_ADDED // 4
 CERTAIN_M, CERTAIN_RAD = 0.15, 0.03
 """Largest standard deviations of a smoothed pose that a keyframe may have: those of the error of
 one image in a trained place, so that an added keyframe is about as well placed as a first one."""
+_REMEMBERED = 1000
+"""Updates whose bags a model names: more than its keyframes come from, and few beside its size."""
 _APART_M, _COARSER = 0.2, 1.2
 """Two images of one drive in a cell of so many meters show the same; where there are too many, by
 this factor larger cells are tried."""
@@ -219,7 +221,8 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
         np.append(old.drives[rows], np.full(count, old.drives.max() + 1, np.int32)),
     )
     updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': count}]
-    return replace(model, keyframes=keyframes, quality={**model.quality, 'updates': updates})
+    quality = {**model.quality, 'updates': updates[-_REMEMBERED:]}
+    return replace(model, keyframes=keyframes, quality=quality)
 
 
 def _kept(old: Keyframes, new: Array) -> NDArray[np.int64]:

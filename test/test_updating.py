@@ -199,6 +199,13 @@ def test_added_keyframes_are_bounded_and_the_old_near_ones_give_way():
     assert [one['images'] for one in newer.quality['updates']] == [500, 500, 100]
 
 
+def test_the_names_of_bags_are_bounded():
+    model = place().model
+    named = replace(model, quality={'updates': [{'bag': 'old', 'images': 1}] * 1000})
+    updates = added(named, 2, 100.0, 'new').quality['updates']
+    assert len(updates) == 1000 and updates[-1] == {'bag': 'new', 'images': 2}
+
+
 def test_a_long_drive_is_spread_over_the_ground():
     x, y = np.meshgrid(np.arange(0, 20, 0.25), np.arange(0, 5, 0.25))
     poses = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
