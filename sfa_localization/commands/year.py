@@ -4,28 +4,28 @@
 
 Each drive is judged before anything learns from it. The first model stays frozen; a copy of it is
 updated after each drive; in some months another is trained anew, on the first drive and the last.
-Bags and models that are finished are used again when the command is repeated.
+Bags, models and cells that are finished are used again when the command is repeated.
 """
 
 from __future__ import annotations
 
-import json
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from sfa_localization import __version__
-from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.data.errors import DataError, LocalizationError
+from sfa_localization.commands.reproduction import (
+    Cell,
+    Progress,
+    Results,
+    recorded,
+    settings_of,
+)
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform
-from sfa_localization.evaluation import evaluate, write_json
+from sfa_localization.evaluation import evaluate
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.evaluation import save_text
 from sfa_localization.reports.year import table, year_figure
-from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import train
 from sfa_localization.updating import update
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from sfa_localization.commands.reproduce import ReproduceConfig
 
 RESULTS = 'year.json'
-Cell = dict[str, Any]
 FIRST = ('day', 'summer')
 """Light and season of the training drive, in June."""
 MONTHS = (
@@ -57,7 +56,8 @@ MONTHS = (
 @dataclass(frozen=True, slots=True)
 class YearPlan:
     """Size of the garden (m) and of the panoramas, the months (1 to 12) before which a model is
-    trained anew, and about how many minutes it takes on two cores.
+    trained anew, and about how many minutes it takes on two cores: measured for the quick one, and
+    from it, by the number of pixels, for the other.
     """
 
     area: tuple[float, float]
@@ -67,44 +67,40 @@ class YearPlan:
 
 
 YEAR = YearPlan((16.0, 18.0), (600, 60), tuple(range(2, 13)), 240)
-QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), (12,), 10)
+QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), (6, 11), 8)
 
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """The folder, the garden in it, and who is told of the next step."""
+    """The folder, the garden in it, and how its steps are shown."""
 
     out: Path
     config: ReproduceConfig
     plan: YearPlan
-    announce: Callable[[str], None]
+    progress: Progress
 
     def drive(self, number: int) -> Path:
         """The training drive, 0, or that of a month, each with a route of its own."""
         bag = self.out / (f'month_{number:02d}' if number else 'first')
         light, season = MONTHS[number - 1][1:] if number else FIRST
-        if not bag.exists():
-            self.announce(f'simulate {bag.name}: {light}, {season}')
-            config = SimulationConfig(
-                trajectory='test' if number else 'coverage',
-                world=self.config.world,
-                seed=self.config.seed + number,
-                area=self.plan.area,
-                light=light,
-                season=season,
-                images='panorama',
-                compression='jpeg',
-            )
-            width, height = self.plan.panorama
-            simulate(config, bag, PanoramaConfig(width=width, height=height))
-        return bag
+        config = SimulationConfig(
+            trajectory='test' if number else 'coverage',
+            world=self.config.world,
+            seed=self.config.seed + number,
+            area=self.plan.area,
+            light=light,
+            season=season,
+            images='panorama',
+            compression='jpeg',
+        )
+        return recorded(bag, config, self.plan.panorama, self.progress)
 
     def trained(self, name: str, *drives: int) -> PlaceModel:
         """The model of some drives."""
         path = self.out / f'{name}.npz'
         if not path.exists():
             bags = [self.drive(number) for number in drives]
-            self.announce(f'train {path.name}')
+            self.progress.say(f'train {path.name}')
             train(bags, path, resume=True)
         return PlaceModel.load(path)
 
@@ -114,9 +110,9 @@ class _Work:
         if not path.exists():
             try:
                 done = update(model, [self.drive(number)], path)
-                self.announce(done.sentence())
+                self.progress.say(done.sentence())
             except DataError as error:
-                self.announce(str(error))
+                self.progress.say(str(error))
                 model.save(path)
         return PlaceModel.load(path)
 
@@ -129,48 +125,19 @@ def reproduce_year(
 
     Raises LocalizationError, also for a folder with anything else.
     """
-    start = time.monotonic()
-
-    def announce(step: str) -> None:
-        if progress:
-            print(f'[{time.monotonic() - start:4.0f} s] {step}', file=sys.stderr)
-
-    settings = {
-        'version': __version__,
-        'world': config.world,
-        'seed': config.seed,
-        'area': list(plan.area),
-        'panorama': list(plan.panorama),
-    }
-    _prepare(out, settings)
-    announce(f'this takes about {plan.minutes} minutes on two cores')
-    cells = _year(_Work(out, config, plan, announce))
-    write_json(out / RESULTS, {'settings': settings, 'cells': cells})
-    save_text(out / 'year.md', table(cells) + '\n')
-    year_figure(out / 'year.png', cells)
-    announce(f'see {out / "year.png"}')
-    return cells
+    report = Progress(progress)
+    settings = settings_of(config.world, config.seed, plan.area, plan.panorama)
+    results = Results.opened(out / RESULTS, settings)
+    report.say(f'this takes about {plan.minutes} minutes on two cores')
+    _fill(_Work(out, config, plan, report), results)
+    save_text(out / 'year.md', table(results.cells) + '\n')
+    year_figure(out / 'year.png', results.cells)
+    report.say(f'see {out / "year.png"}')
+    return results.cells
 
 
-def _prepare(out: Path, settings: dict[str, Any]) -> None:
-    """Make the folder, or require that it is one of the same settings."""
-    file = out / RESULTS
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if not any(out.iterdir()):
-            write_json(file, {'settings': settings, 'cells': []})
-        same = json.loads(file.read_text(encoding='utf-8'))['settings'] == settings
-    except OSError as error:
-        reason = error.strerror or error
-        raise LocalizationError(f'{file}: {reason}: choose another folder with --out') from None
-    except (ValueError, LookupError, TypeError):
-        raise LocalizationError(f'{file}: not of this command: name another --out') from None
-    if not same:
-        raise LocalizationError(f'{out}: holds results of other settings: name another --out')
-
-
-def _year(work: _Work) -> list[Cell]:
-    cells: list[Cell] = []
+def _fill(work: _Work, results: Results) -> None:
+    """Judge every model that is not judged yet, month by month."""
     frozen = updated = work.trained('frozen', 0)
     transform = None
     for number, (month, light, season) in enumerate(MONTHS, 1):
@@ -178,15 +145,16 @@ def _year(work: _Work) -> list[Cell]:
         if number in work.plan.retrained:
             models['retrained'] = work.trained(f'retrained_{number:02d}', 0, number - 1)
         for name, model in models.items():
-            work.announce(f'{month}, {light}, {season}: {name}')
+            if results.find(model=name, month=month):
+                continue
+            work.progress.say(f'{month}, {light}, {season}: {name}')
             # The map of a model that was trained anew lies elsewhere.
             known = None if name == 'retrained' else transform
             scores, fitted = _judged(model, work.drive(number), work.drive(0), known)
             transform = transform if name == 'retrained' else fitted
             names = {'model': name, 'month': month, 'light': light, 'season': season}
-            cells.append({**names, **scores})
+            results.keep({**names, **scores})
         updated = work.updated(updated, number)
-    return cells
 
 
 def _judged(

@@ -23,6 +23,8 @@ MEASURES = {
     'sfa_m': ('SFA mean (m)', '{:.3f}'),
     'false_localised_s': ('falsely LOCALISED (s)', '{:.1f}'),
 }
+# Of an axis, so that small noise does not fill it.
+_LEAST_TOP = {'ekf_m': 0.1, 'sfa_m': 0.1, 'false_localised_s': 1.0}
 _STYLES = {'frozen': ('o', '#D55E00'), 'updated': ('s', '#0072B2'), 'retrained': ('D', '#009E73')}
 
 
@@ -48,7 +50,7 @@ def year_figure(path: Path, cells: Cells) -> None:
     for axes, (name, (title, _)) in zip(panels, MEASURES.items(), strict=True):
         _draw(axes, cells, name)
         axes.set_ylabel(title)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(bottom=0, top=max(axes.get_ylim()[1], _LEAST_TOP[name]))
         axes.grid(axis='y', alpha=0.3)
     panels[0].legend()
     months = {cell['month']: cell for cell in cells}
@@ -75,9 +77,9 @@ def _models(cells: Cells) -> list[str]:
 
 
 def _mean(cells: Cells, name: str, model: str) -> float | None:
-    """Over the months in which the model was judged."""
+    """Of a model that was judged in every month: other months are easier or harder."""
     known = [c[name] for c in cells if c['model'] == model and c.get(name) is not None]
-    return sum(known) / len(known) if known else None
+    return sum(known) / len(known) if len(known) == len(_months(cells)) else None
 
 
 def _text(name: str, value: float | None) -> str:
