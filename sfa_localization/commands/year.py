@@ -56,8 +56,8 @@ MONTHS = (
 @dataclass(frozen=True, slots=True)
 class YearPlan:
     """Size of the garden (m) and of the panoramas, the months (1 to 12) before which a model is
-    trained anew, and about how many minutes it takes on two cores: measured for the quick one, and
-    from it, by the number of pixels, for the other.
+    trained anew, and about how many minutes it takes on two cores: measured for the quick one,
+    estimated by the number of pixels for the other.
     """
 
     area: tuple[float, float]
@@ -67,7 +67,7 @@ class YearPlan:
 
 
 YEAR = YearPlan((16.0, 18.0), (600, 60), tuple(range(2, 13)), 240)
-QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), (6, 11), 8)
+QUICK_YEAR = YearPlan((8.0, 8.0), (300, 30), (6, 11), 10)
 
 
 @dataclass(frozen=True, slots=True)
