@@ -60,12 +60,13 @@ def year_figure(path: Path, cells: Cells) -> None:
 
 
 def _draw(axes: Axes, cells: Cells, name: str) -> None:
-    months = _months(cells)
+    """A line for each model, open at months in which it was not judged."""
     for model in _models(cells):
-        own = [c for c in cells if c['model'] == model and c.get(name) is not None]
+        own = {c['month']: c.get(name) for c in cells if c['model'] == model}
+        known = [own.get(month) for month in _months(cells)]
+        values = [float('nan') if value is None else value for value in known]
         marker, color = _STYLES.get(model, ('x', '0.3'))
-        at, values = [months.index(c['month']) for c in own], [c[name] for c in own]
-        axes.plot(at, values, marker=marker, color=color, label=model)
+        axes.plot(values, marker=marker, color=color, label=model)
 
 
 def _months(cells: Cells) -> list[str]:
