@@ -50,6 +50,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
+from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
 from sfa_localization.metric.fast_expansions import fast_map
 from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
@@ -60,6 +61,7 @@ from sfa_localization.metric.learning import (
 )
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
 from sfa_localization.metric.retracing import with_closures
+from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
@@ -263,14 +265,16 @@ def _learn_map(
     """Steps 5 to 7; where no map can be learned with the noise of turns that is stated or assumed,
     once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
-    segments = with_closures(cut_odometry(runs, clocks, recipe.segments), closures)
+    turns = _seen_turns(runs, clocks, seen, closures, recipe.segments)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, turns=turns), closures)
     try:
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
     except DataError:
         found = _bound(runs, clocks, seen, recipe.segments)
         assumed = SegmentConfig().yaw_noise
-        own = recipe.segments.yaw_noise != assumed
-        if own or found is None or found < _NOISE_FACTOR * max(assumed, expected_noise(segments)):
+        known = turns is not None or recipe.segments.yaw_noise != assumed
+        least = _NOISE_FACTOR * max(assumed, expected_noise(segments))
+        if known or found is None or found < least:
             raise
     segments = with_closures(cut_odometry(runs, clocks, recipe.segments, found), closures)
     return segments, *_map_and_compass(images, segments, recipe, points, progress)
@@ -307,16 +311,43 @@ def _bound(
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
+def _seen_turns(
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    seen: Sequence[Sequence[float]],
+    closures: Closures,
+    config: SegmentConfig,
+) -> list[TurnCorrection] | None:
+    """By the headings `seen` in each run (N,) rad; None where the odometry is as good."""
+    drives = [
+        Headings.of(
+            OdometryTrack.of(run.odometry, config, run.yaw_rate),
+            run.panoramas.stamps_ns - clock.delay_ns,
+            own,
+        )
+        for run, clock, own in zip(runs, clocks, seen, strict=True)
+    ]
+    return corrections(drives, closures)
+
+
 def cut_odometry(
     runs: Sequence[Run],
     clocks: Sequence[CameraClock],
     config: SegmentConfig,
     noise: float | None = None,
+    turns: Sequence[TurnCorrection] | None = None,
 ) -> Segments:
     """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""
     parts = [
-        cut(run.odometry, run.panoramas.stamps_ns - clock.delay_ns, config, run.yaw_rate, noise)
-        for run, clock in zip(runs, clocks, strict=True)
+        cut(
+            run.odometry,
+            run.panoramas.stamps_ns - clock.delay_ns,
+            config,
+            run.yaw_rate,
+            noise,
+            turns[k] if turns else None,
+        )
+        for k, (run, clock) in enumerate(zip(runs, clocks, strict=True))
     ]
     counts = [len(run.panoramas) for run in runs]
     return join(parts, [sum(counts[:k]) for k in range(len(runs))])

@@ -316,11 +316,14 @@ def _statistics(messages: Sequence[Message], chunks: int) -> bytes:
     return _record(11, head + _text(told))
 
 
-def write_ros1(path: Path, messages: Sequence[Message], compression: str = '') -> Path:
+def write_ros1(
+    path: Path, messages: Sequence[Message], compression: str = '', chunk_size: int = 1 << 20
+) -> Path:
     """Write a ROS 1 .bag."""
     path.parent.mkdir(parents=True, exist_ok=True)
     ros2, ros1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
     writer, cache = Ros1Writer(path), {}
+    writer.chunk_threshold = chunk_size
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression.upper()])
     with writer:

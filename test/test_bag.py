@@ -288,8 +288,35 @@ def test_a_database_of_something_else_is_rejected(tmp_path: Path) -> None:
         pass
 
 
-def test_a_cut_off_ros1_bag_names_the_remedy(tmp_path: Path, messages: list[Message]) -> None:
-    path = cut(write_ros1(tmp_path / 'bag.bag', messages), 0.5)
+@pytest.mark.parametrize('compression', ['', 'lz4', 'bz2'])
+def test_a_cut_off_ros1_bag_is_read_up_to_the_cut(
+    compression: str, tmp_path: Path, messages: list[Message]
+) -> None:
+    path = write_ros1(tmp_path / 'bag.bag', messages, compression, chunk_size=2000)
+    with Bag(path) as bag:
+        every = list(bag.messages(bag.topics))
+    with Bag(cut(path, 0.5)) as bag:
+        found = list(bag.messages(bag.topics))
+        assert 'has no index, recording cut off?' in bag.problems[0]
+    assert 0.3 * len(every) < len(found) < 0.7 * len(every)
+    assert found == every[: len(found)]
+
+
+def test_a_ros1_bag_that_lost_its_index_only_is_read_whole(
+    tmp_path: Path, messages: list[Message]
+) -> None:
+    path = write_ros1(tmp_path / 'bag.bag', messages)
+    with Bag(path) as bag:
+        every, topics = list(bag.messages(bag.topics)), bag.topics
+    path.write_bytes(path.read_bytes()[:-20])
+    with Bag(path) as bag:
+        assert (list(bag.messages(bag.topics)), bag.topics) == (every, topics)
+
+
+def test_a_ros1_bag_with_nothing_to_read_names_the_remedy(
+    tmp_path: Path, messages: list[Message]
+) -> None:
+    path = cut(write_ros1(tmp_path / 'bag.bag', messages), 0.005)
     with pytest.raises(BagError, match='rosbag reindex'), Bag(path):
         pass
 

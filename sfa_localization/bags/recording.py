@@ -15,7 +15,7 @@ import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
@@ -44,10 +44,10 @@ NEWEST_METADATA = 9
 MOST_FILES = 10_000
 """Files of a bag: a week of a new one every minute."""
 SUFFIXES = ('.db3', '.mcap', '.bag', '.db3.zstd', '.mcap.zstd')
-READERS: dict[bytes, type[Storage]] = {
+READERS: dict[bytes, Callable[[Path], Storage]] = {
     bag_sqlite.MAGIC: bag_sqlite.SqliteStorage,
     bag_mcap.MAGIC: bag_mcap.McapStorage,
-    bag_ros1.MAGIC: bag_ros1.Ros1Storage,
+    bag_ros1.MAGIC: bag_ros1.open_ros1,
 }
 
 
@@ -249,7 +249,7 @@ def open_storage(plain: Path, path: Path) -> Storage:
     for magic, reader in READERS.items():
         if start.startswith(magic):
             try:
-                return reader(plain)  # type: ignore[call-arg]
+                return reader(plain)
             except BagError as error:
                 raise BagError(str(error).replace(str(plain), str(path))) from None
     raise BagError(f'{path}: is no bag file: its first bytes are not of sqlite3, mcap or ROS 1')

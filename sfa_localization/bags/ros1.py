@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bag files of ROS 1 (format 2.0), read by rosbags."""
+"""Bag files of ROS 1 (format 2.0), read by rosbags; without an index, see ros1_scan.py."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Chunk, ChunkInfo, IndexData, ReaderError, decompressors
 
+from sfa_localization.bags.ros1_scan import ScannedRos1Storage
 from sfa_localization.bags.storage import (
     MOST_TOPICS,
     Record,
+    Storage,
     make_channel,
     one_line,
     pieces,
@@ -84,18 +86,22 @@ class BoundedReader(Reader):
         return len(seen) < sum(connection.msgcount for connection in self.connections)
 
 
-class Ros1Storage:
-    """One .bag file. Raises BagError when it has no index or is damaged."""
+def open_ros1(path: Path) -> Storage:
+    """One .bag file, by its index or, without one, as far as it goes. Raises BagError."""
+    reader = BoundedReader(path)
+    try:
+        reader.open()
+    except Exception as error:  # a parser of foreign bytes fails in many ways
+        return ScannedRos1Storage(path, _text(error))
+    return Ros1Storage(path, reader)
 
-    def __init__(self, path: Path) -> None:
+
+class Ros1Storage:
+    """One .bag file with an index. Raises BagError."""
+
+    def __init__(self, path: Path, reader: BoundedReader) -> None:
         self._path, self.problems, self.notes = path, list[str](), list[str]()
-        self._reader = BoundedReader(path)
-        try:
-            self._reader.open()
-        except Exception as error:  # a parser of foreign bytes fails in many ways
-            raise BagError(
-                f'{path}: unreadable ROS 1 bag ({_text(error)}); repair it with `rosbag reindex`'
-            ) from None
+        self._reader = reader
         if len(self._reader.connections) > MOST_TOPICS:
             raise BagError(f'{path}: has more than {MOST_TOPICS} topics')
         if self._reader.keep_first():

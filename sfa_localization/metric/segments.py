@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from sfa_localization.metric.dead_reckoning import (
     TURNED,
     YAW_VARIANCE,
     OdometryTrack,
+    TurnCorrection,
     seconds_since_start,
     tally,
 )
@@ -62,8 +63,6 @@ DISTANCE_NOISE = 0.01
 """m per square root of m: random error of the driven distance, usual for wheel encoders."""
 YAW_SLIP = 0.005
 """rad per rad: error of a turn, usual for a differential drive."""
-TURN_SLIDE = 0.05
-"""m per rad: how far the wheels slide sideways in a turn on the spot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +141,7 @@ def cut(
     config: SegmentConfig,
     yaw_rate: YawRate | None = None,
     turn_noise: float | None = None,
+    turns: TurnCorrection | None = None,
 ) -> Segments:
     """Cut a drive into segments at the stamps of its images (N,).
 
@@ -149,11 +149,13 @@ def cut(
     translational and angular velocity, as the paper does; 'any' cuts the whole drive into pieces
     bounded by length and by accumulated odometry error. Images without odometry, of a standing
     robot, or in too short a piece are left out and counted in `Segments.images`. A known
-    `turn_noise` (rad per square root of s) replaces what the messages state.
+    `turn_noise` (rad per square root of s) replaces what the messages state; `turns` correct those
+    of the odometry, and state their noise.
 
     Raises DataError when no segment is left.
     """
     track = OdometryTrack.of(odometry, config, yaw_rate, turn_noise)
+    track = track if turns is None else track.corrected(turns)
     skipped: dict[str, int] = {}
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
@@ -224,6 +226,7 @@ class ImagePoses:
     yaw: Array
     part: Indices
     sums: Array
+    slide: float
 
     @classmethod
     def on(cls, track: OdometryTrack, stamps: Stamps, skipped: dict[str, int]) -> ImagePoses:
@@ -241,10 +244,13 @@ class ImagePoses:
         sums = np.column_stack([np.interp(own, t, column) for column in track.sums.T])
         place = poses[:, 0] + 1j * poses[:, 1]
         yaw = np.interp(own, t, track.yaw)
-        return cls(images, own, place, yaw, track.part[before[images]], sums.reshape(-1, 5))
+        return cls(
+            images, own, place, yaw, track.part[before[images]], sums.reshape(-1, 5), track.slide
+        )
 
     def take(self, keep: Mask) -> ImagePoses:
-        return ImagePoses(*(getattr(self, name)[keep] for name in self.__slots__))
+        rows = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != 'slide'}
+        return replace(self, **rows)
 
     def yaw_variance(self, first: int, last: int) -> float:
         """Of the turn between two images, rad^2."""
@@ -256,7 +262,7 @@ class ImagePoses:
         change = self.sums[last] - self.sums[first]
         length = float(change[LENGTH])
         yaw = self.yaw_variance(first, last)
-        slide = (TURN_SLIDE * float(change[TURNED])) ** 2
+        slide = (self.slide * float(change[TURNED])) ** 2
         return DISTANCE_NOISE**2 * length + yaw * length**2 / 3 + slide
 
     def drift(self, first: int, rows: Indices, heading: float, time_s: float) -> Complex:
@@ -340,7 +346,7 @@ def _wear(poses: ImagePoses, group: Indices) -> Array:
     yaw = np.cbrt(length**2 * driven[:, YAW_VARIANCE] / (3 * limit))
     # Variances add up: the error of k equal steps is sqrt(k) times that of one.
     random = DISTANCE_NOISE**2 * length / limit + yaw
-    turned = (TURN_SLIDE + YAW_SLIP * PIECE_LENGTH_M / 2) * driven[:, TURNED]
+    turned = (poses.slide + YAW_SLIP * PIECE_LENGTH_M / 2) * driven[:, TURNED]
     wear = np.maximum(length / PIECE_LENGTH_M, random) + turned / PIECE_STD_M
     return np.concatenate([[0.0], np.cumsum(wear)])
 
