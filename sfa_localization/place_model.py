@@ -50,6 +50,8 @@ FARTHEST_M = 1e6
 """
 _STEEPEST = 1e9
 """Weights of a map, m: a million times those of any training."""
+_MOST_DRIVES = 1e6
+"""Drives that added keyframes: more than a robot ever makes."""
 _AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
 _PROCESS = {
     'kind': ArrayRule('', 'U'),
@@ -75,6 +77,11 @@ _BASIS = {
     'ridge': ArrayRule('P'),
     'features': ArrayRule('', 'i', all_positive=True),
 }
+_KEYFRAMES = {
+    'textures': ArrayRule('NRC', 'i'),
+    'poses': ArrayRule('N3', largest=FARTHEST_M),
+    'noise': ArrayRule('8', positive=(0, 1, 2, 3, 4, 5, 6)),
+}
 SCHEMA: Schema = {
     'network/#/': [
         {
@@ -87,13 +94,7 @@ SCHEMA: Schema = {
     ],
     'metric/': [_PROCESS, _MONOMIALS],
     'metric/basis_': [_BASIS],
-    'keyframes/': [
-        {
-            'textures': ArrayRule('NRC', 'i'),
-            'poses': ArrayRule('N3', largest=FARTHEST_M),
-            'noise': ArrayRule('8', positive=(0, 1, 2, 3, 4, 5, 6)),
-        }
-    ],
+    'keyframes/': [_KEYFRAMES, {**_KEYFRAMES, 'drives': ArrayRule('N', 'i', largest=_MOST_DRIVES)}],
     'agreement/': _AGREEMENT,
     'yaw_agreement/': _AGREEMENT,
     'compass/': [

@@ -282,6 +282,7 @@ OPTIONS: dict[str, dict[str, Case]] = {
             '--config {data}/fewer.yaml',
             lambda a, b: b.model().quality['features_used'] < a.model().quality['features_used'],
         ),
+        '--update': Case('--update {data}/model.npz', says('the model')),
         '--report': Case('--report {out}/report', written('report/index.html')),
         '--resume': Case(
             '--resume',

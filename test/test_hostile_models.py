@@ -90,6 +90,14 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: {**a, 'keyframes/textures': a['keyframes/textures'][:, 1:]},
         'damaged',
     ),
+    'no keyframes of the training': (
+        lambda a: {**a, 'keyframes/drives': np.ones(len(a['keyframes/poses']), np.int32)},
+        'too few for keyframes',
+    ),
+    'keyframes of more drives than there are': (
+        lambda a: {**a, 'keyframes/drives': np.full(len(a['keyframes/poses']), 2**40)},
+        'keyframes/drives holds a number beyond 1e',
+    ),
     'too few keyframes': (
         lambda a: {
             **a,

@@ -63,6 +63,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'training': (CORE | {'place_model'}, {'numpy'}),
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
     'tuning': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
+    'updating': (CORE - {'metric'} | {'place_model', 'localizer'}, NUMERIC),
     'inspection': ({'data', 'camera', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'metric', 'training'}, {'numpy', 'matplotlib'}),
@@ -74,7 +75,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'commands': (
         CORE
         | {'config', 'place_model', 'localizer', 'training', 'evaluation', 'tuning', 'inspection'}
-        | {'filtering', 'simulation', 'reports', 'nodes', '__init__'},
+        | {'updating', 'filtering', 'simulation', 'reports', 'nodes', '__init__'},
         {'numpy', 'rosbags'} | ROS,
     ),
     'cli': ({'data', 'commands', 'nodes', '__init__'}, set()),
@@ -83,7 +84,9 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
 SETTINGS_ONLY = {('config', 'nodes')}
 # Never at run time on the robot, nor in anything its nodes import.
 NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'dask', 'tqdm'}
-OWN_NOT_ON_THE_ROBOT = {f'{NAME}.{word}' for word in ('training', 'evaluation', 'simulation')}
+OWN_NOT_ON_THE_ROBOT = {
+    f'{NAME}.{word}' for word in ('training', 'evaluation', 'updating', 'simulation')
+}
 # Modules that run code from the files that they read.
 UNSAFE = {'pickle', 'marshal', 'shelve', 'dill', 'joblib'}
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reproduce published results: the paper's tables and figures, baselines, ablations, and light."""
+"""Reproduce published results: the paper's tables, figures, baselines, ablations, light, a year."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ EXAMPLES = """\
   reproduce all --quick
   reproduce simulator --seeds 5
   reproduce baselines bags/coverage bags/lines --test bags/test
-  reproduce light --world 12 --out light_of_world_12"""
+  reproduce light --world 12 --out light_of_world_12
+  reproduce year --quick"""
 RESULTS = ('simulator', 'robot', 'baselines', 'ablations', 'light')
 PAPER_RESULTS = RESULTS[:-1]
 """They share a folder, with drives and models."""
@@ -40,10 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the result, the bags, the folder and the settings."""
     parser.add_argument(
         'result',
-        choices=('all', *RESULTS),
+        choices=('all', *RESULTS, 'year'),
         help="simulator, robot: the paper's experiments; baselines: other features; ablations: "
         'this package without some of its parts; light: train in one or two lights, test in every '
-        'light and season',
+        'light and season; all: these; year: train once, then a drive a month, with and without '
+        'updates of the model',
     )
     parser.add_argument(
         'bags', nargs='*', type=Path, metavar='BAG', help='training drives of baselines'
@@ -78,6 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
     if 'light' in chosen:
         own = arguments.out and (arguments.out / 'light' if wanted else arguments.out)
         _light(own or Path(f'{start}light'), config, arguments.quick)
+    if 'year' in chosen:
+        _year(arguments.out or Path(f'{start}year'), config, arguments.quick)
     return 0
 
 
@@ -86,6 +90,13 @@ def _light(out: Path, config: ReproduceConfig, quick: bool) -> None:
     from sfa_localization.reports.light import table
 
     print(table(reproduce_light(out, config, QUICK if quick else FULL, progress=True)))
+
+
+def _year(out: Path, config: ReproduceConfig, quick: bool) -> None:
+    from sfa_localization.commands.year import QUICK_YEAR, YEAR, reproduce_year
+    from sfa_localization.reports.year import table
+
+    print(table(reproduce_year(out, config, QUICK_YEAR if quick else YEAR, progress=True)))
 
 
 def _paper(

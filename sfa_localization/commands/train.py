@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a place model from bags."""
+"""Learn a place model from bags, or add what is new on later drives to one."""
 
 from __future__ import annotations
 
@@ -9,8 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfa_localization.commands.options import add_settings, add_topics, recipe
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.commands.options import (
+    add_settings,
+    add_topics,
+    given,
+    recipe,
+    require_same_panorama,
+    settings,
+)
+from sfa_localization.data.errors import ConfigError
 from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 if TYPE_CHECKING:
@@ -20,13 +30,21 @@ WRITES = 'MODEL.npz; with --report index.html (one page for a browser), its figu
 EXAMPLES = """\
   train bags/coverage --output garden.npz
   train bags/a bags/b --output garden.npz --config localization.yaml --report report
-  train recording --output garden.npz --image-topic /front/image_raw --odom-topic /odom"""
+  train recording --output garden.npz --image-topic /front/image_raw --odom-topic /odom
+  train --update garden.npz recording --output newer.npz"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add bags, model, topics, and the settings that are often changed."""
     parser.add_argument('bags', nargs='+', type=Path, metavar='BAG', help='drives to learn from')
     parser.add_argument('--output', type=Path, required=True, metavar='MODEL.npz')
+    parser.add_argument(
+        '--update',
+        type=Path,
+        metavar='MODEL',
+        help='instead of learning anew, add to this model what is new on the drives: images in '
+        'another light or season, where the robot was sure of its place',
+    )
     parser.add_argument('--config', type=Path, help='parameter file')
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures of the training')
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
@@ -41,7 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train; print the summary."""
+    """Train or update; print the summary."""
+    if arguments.update:
+        return _update(arguments)
     from sfa_localization import training
     from sfa_localization.features.cluster import executor_at
     from sfa_localization.reports.summary import summary
@@ -60,6 +80,34 @@ def run(arguments: argparse.Namespace) -> int:
     print(summary(trained))
     if arguments.report:
         _write_report(arguments.report, arguments.bags, trained, used)
+    print(f'{arguments.output}: written')
+    return 0
+
+
+def _update(arguments: argparse.Namespace) -> int:
+    """Extend a model; say what was added."""
+    unused = [name for name in ('report', 'resume', 'dask') if getattr(arguments, name)]
+    for group in (SegmentConfig, MetricConfig, NetworkConfig):
+        unused += given(group, arguments)
+    if unused:
+        option = unused[0].replace('_', '-')
+        raise ConfigError(f'--{option} has no effect on --update: leave one of them out')
+    from sfa_localization.place_model import PlaceModel
+    from sfa_localization.updating import update
+
+    model = PlaceModel.load(arguments.update)
+    require_same_panorama(arguments.config, model.panorama)
+    updated = update(
+        model,
+        arguments.bags,
+        arguments.output,
+        recipe(arguments),
+        config=settings(FilterConfig, arguments, arguments.config),
+        watch=settings(WatchConfig, arguments, arguments.config),
+        progress=True,
+        strict=arguments.strict,
+    )
+    print(updated.sentence())
     print(f'{arguments.output}: written')
     return 0
 

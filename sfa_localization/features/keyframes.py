@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -214,26 +215,40 @@ def _low(spectra: Spectra) -> Spectra:
 
 @dataclass(frozen=True, slots=True)
 class Keyframes:
-    """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map."""
+    """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
+
+    `drives` (K,) is 0 for those of the training, then the number of the drive that added them.
+    """
 
     textures: NDArray[np.int8]
     poses: Array
     noise: MatchNoise
     clockwise: bool
+    drives: NDArray[np.int32]
     spectra: Spectra
     coarse: Spectra
     tree: cKDTree
 
     @classmethod
     def of(
-        cls, textures: NDArray[np.int8], poses: Array, noise: MatchNoise, clockwise: bool
+        cls,
+        textures: NDArray[np.int8],
+        poses: Array,
+        noise: MatchNoise,
+        clockwise: bool,
+        drives: NDArray[np.int32] | None = None,
     ) -> Keyframes:
-        """Keyframes ready to be matched. Raises DataError for too few."""
-        if len(textures) < _FEWEST:
-            raise DataError(f'{len(textures)} images are too few for keyframes')
+        """Keyframes ready to be matched, of the training without `drives`. Raises DataError for
+        too few.
+        """
+        if drives is None:
+            drives = np.zeros(len(poses), np.int32)
+        first = np.count_nonzero(drives == 0)
+        if first < _FEWEST:
+            raise DataError(f'{first} images are too few for keyframes')
         spectra = spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
         tree = cKDTree(poses[:, :2])
-        return cls(textures, poses, noise, clockwise, spectra, coarse(spectra), tree)
+        return cls(textures, poses, noise, clockwise, drives, spectra, coarse(spectra), tree)
 
     def match(self, panorama: Image, guess: Array | None = None) -> Match:
         """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
@@ -304,7 +319,10 @@ class Keyframes:
         return Match(pose, covariance, float(scores[best]), support)
 
     def _top_of_surface(self, scores: NDArray[np.float32], best: int) -> Array:
-        """Top of the paraboloid through the correlations with the neighbors of the best."""
+        """Top of the paraboloid through the correlations with the neighbors of the best.
+
+        A drive in the light of the image correlates better everywhere: each has its own level.
+        """
         center = self.poses[best, :2]
         near = self.nearest(center)
         near = near[np.isfinite(scores[near])]
@@ -312,11 +330,12 @@ class Keyframes:
         square = (offset**2).sum(1)
         reach = max(_REACH_SHARE * float(np.sqrt(square.max())), 1e-6)
         weight = np.exp(-square / (2 * reach**2))
-        terms = np.column_stack([np.ones(len(near)), offset, -0.5 * square]) * weight[:, None]
+        levels = np.equal.outer(self.drives[near], np.unique(self.drives[near]))
+        terms = np.column_stack([levels, offset, -0.5 * square]) * weight[:, None]
         solution = np.linalg.lstsq(terms, scores[near] * weight, rcond=None)[0]
-        if solution[3] <= 0:
+        if solution[-1] <= 0:
             return np.array(center)
-        step = solution[1:3] / solution[3]
+        step = solution[-3:-1] / solution[-1]
         return np.asarray(center + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9)))
 
     def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
@@ -330,9 +349,16 @@ class Keyframes:
         return np.asarray((offset * weight[:, None]).T @ offset)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Arrays to save, without pickle."""
+        """Arrays to save, without pickle; `drives` where some were added."""
         noise = np.array([*dataclasses.astuple(self.noise), float(self.clockwise)])
-        return {'textures': self.textures, 'poses': self.poses, 'noise': noise}
+        arrays: dict[str, NDArray[Any]] = {
+            'textures': self.textures,
+            'poses': self.poses,
+            'noise': noise,
+        }
+        if self.drives.any():
+            arrays['drives'] = self.drives
+        return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Keyframes:
@@ -340,4 +366,5 @@ class Keyframes:
         *noise, clockwise = (float(n) for n in np.asarray(arrays['noise'], float))
         textures = np.asarray(arrays['textures'], np.int8)
         poses = np.asarray(arrays['poses'], float)
-        return cls.of(textures, poses, MatchNoise(*noise), bool(clockwise))
+        drives = np.asarray(arrays.get('drives', np.zeros(len(poses))), np.int32)
+        return cls.of(textures, poses, MatchNoise(*noise), bool(clockwise), drives)

@@ -1,0 +1,238 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Learn on the job: images of later drives become keyframes of a model, without ground truth.
+
+A drive is replayed and smoothed. Where the robot was LOCALISED and its smoothed pose is certain, an
+image that the keyframes recognize less well than each other shows a place between them, or in
+another light or season: it becomes a keyframe with the smoothed pose. Network, maps, compass and
+first keyframes stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sfa_localization.bags.drives import ReadingRecipe, as_live, image_cache, read_drive
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.camera.turns import headings
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.progress import progress_bar
+from sfa_localization.data.run import Run, Trajectory
+from sfa_localization.features.keyframes import Keyframes, correlate, quantized, texture
+from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.smoother import Smoother
+from sfa_localization.fusion.status import Level
+from sfa_localization.localizer import Localizer, Observation
+from sfa_localization.place_model import PlaceModel
+
+MOST_ADDED = 1000
+"""Keyframes beside those of the training: half as many, 2 MB."""
+MOST_OF_DRIVE = MOST_ADDED // 4
+"""Keyframes added from one drive, so that several lights and seasons find room."""
+CERTAIN_M, CERTAIN_RAD = 0.15, 0.03
+"""Largest standard deviations of a smoothed pose that a keyframe may have: those of the error of
+one image in a trained place, so that an added keyframe is about as well placed as a first one."""
+_REMEMBERED = 1000
+"""Updates whose bags a model names: more than its keyframes come from, and few beside its size."""
+_APART_M, _COARSER = 0.2, 1.2
+"""Two images of one drive in a cell of so many meters show the same; where there are too many, by
+this factor larger cells are tried."""
+_CONTRADICTS = 11.3
+"""Squared Mahalanobis distance of a pose that 1 of 100 right ones exceeds."""
+_RARELY, _SAMPLE = 0.05, 200
+"""Share of keyframes that are unlike all others, and how many keyframes it is taken from."""
+_GAP_NS = 500_000_000
+"""A smoothed pose farther in time from odometry is a guess."""
+
+
+@dataclass(frozen=True, slots=True)
+class Additions:
+    """What a drive adds: `textures` (N, rows, columns) int8 at `poses` (N, 3) in the map."""
+
+    textures: NDArray[np.int8]
+    poses: Array
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+@dataclass(frozen=True, slots=True)
+class Updated:
+    """The model after all drives, and how many images each of them added, by name of the bag."""
+
+    model: PlaceModel
+    added: tuple[tuple[str, int], ...]
+
+    def sentence(self) -> str:
+        """What was added, in one line."""
+        if not any(count for _, count in self.added):
+            return 'nothing is new on these drives: the model stays as it is'
+        counts = ', '.join(f'{count} images of {name}' for name, count in self.added)
+        total = len(self.model.keyframes.poses)
+        return f'added as keyframes: {counts}; the model has {total} keyframes now'
+
+
+def update(
+    model: PlaceModel,
+    bags: Sequence[Path],
+    output: Path,
+    recipe: ReadingRecipe | None = None,
+    *,
+    config: FilterConfig | None = None,
+    watch: WatchConfig | None = None,
+    progress: bool = False,
+    strict: bool = False,
+) -> Updated:
+    """Add what is new on the drives in bags, one after the other, and write the model to `output`.
+
+    Raises BagError, DataError or ModelError; then no model is written.
+    """
+    recipe, added = as_live(recipe or ReadingRecipe(), model.panorama), []
+    with image_cache(Path(output)) as cache:
+        for bag in bags:
+            run = read_drive(bag, cache, recipe, progress, strict=strict, odometry_tolerance_s=0.0)
+            new = new_views(model, run, config, watch, progress=progress)
+            model = extended(model, new, Path(bag).name)
+            added.append((Path(bag).name, len(new)))
+        model.save(Path(output))
+    return Updated(model, tuple(added))
+
+
+def new_views(
+    model: PlaceModel,
+    run: Run,
+    config: FilterConfig | None = None,
+    watch: WatchConfig | None = None,
+    *,
+    progress: bool = False,
+) -> Additions:
+    """The images of a drive that are worth keeping, MOST_OF_DRIVE at most.
+
+    Raises DataError where the robot is never LOCALISED, and ModelError for images of another size.
+    """
+    localizer = Localizer(model, config, watch, Smoother)
+    seen, sure = [], []
+    with progress_bar(f'replay {run.name}', len(run.panoramas), shown=progress) as bar:
+        for observation, localized in _replayed(localizer, run):
+            seen.append(observation)
+            sure.append(localized)
+            bar.update()
+    if not any(sure):
+        raise DataError(
+            f'{run.name}: the robot is never LOCALISED on this drive, so that the places of its '
+            'images are unknown: train anew, with the bags of the first training and this one'
+        )
+    assert isinstance(localizer.filter, Smoother)
+    poses, certain = _smoothed(localizer.filter, model, run)
+    known = model.keyframes.noise.novelty(familiar_score(model))
+    novel = np.array([not one.problem and one.estimate.novelty > known for one in seen], bool)
+    agree = np.array([_agrees(one, pose) for one, pose in zip(seen, poses, strict=True)], bool)
+    chosen = np.flatnonzero(np.array(sure, bool) & certain & novel & agree)
+    chosen = chosen[_spread(poses[chosen])]
+    return Additions(_textures(run, chosen, model.keyframes), poses[chosen])
+
+
+def _replayed(localizer: Localizer, run: Run) -> Iterator[tuple[Observation, bool]]:
+    """Each image of a run, and whether the robot was LOCALISED with it."""
+    for _, observation, _ in localizer.replay(run):
+        if observation is not None:
+            yield observation, localizer.status.level is Level.LOCALISED
+
+
+def familiar_score(model: PlaceModel) -> float:
+    """The correlation with its likest neighbor that 19 of 20 keyframes of the training reach."""
+    first = np.flatnonzero(model.keyframes.drives == 0)
+    spectra, columns = model.keyframes.spectra[first], model.keyframes.textures.shape[2]
+    best = list[float]()
+    for row in np.unique(np.linspace(0, len(first) - 1, _SAMPLE).round()).astype(int).tolist():
+        scores = correlate(spectra[row][None], spectra, columns)[0][0]
+        best.append(float(np.delete(scores, row).max()))
+    return float(np.quantile(best, _RARELY))
+
+
+def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, NDArray[np.bool_]]:
+    """Smoothed poses (N, 3) where the images were taken, and which of them are certain (N,)."""
+    states = smoother.smoothed()
+    stamps = run.panoramas.stamps_ns
+    clock = camera_clock(run.odometry, stamps, headings(run.panoramas))
+    delay_ns = clock.delay_ns if clock.known else round(model.camera_delay_s * 1e9)
+    taken = stamps - delay_ns
+    at = np.array([state.stamp_ns for state in states], np.int64)
+    track = Trajectory(at, np.reshape([state.pose for state in states], (-1, 3)))
+    spreads = np.reshape([state.pose_covariance for state in states], (-1, 3, 3))
+    place_std = np.sqrt(np.linalg.eigvalsh(spreads[:, :2, :2])[:, 1])
+    sharp = (place_std <= CERTAIN_M) & (spreads[:, 2, 2] <= CERTAIN_RAD**2)
+    after = np.clip(np.searchsorted(at, taken), 0, len(at) - 1)
+    both = sharp[after] & sharp[np.maximum(after - 1, 0)]
+    return track.at(taken), both & track.covers(taken, _GAP_NS)
+
+
+def _agrees(observation: Observation, pose: Array) -> bool:
+    """Whether an image's own pose does not contradict the smoothed one (3,), of which then nobody
+    could say which is right.
+    """
+    apart = observation.pose - pose
+    apart[2] = wrap_angle(apart[2])
+    return float(apart @ np.linalg.solve(observation.covariance, apart)) <= _CONTRADICTS
+
+
+def _spread(poses: Array) -> NDArray[np.int64]:
+    """At most MOST_OF_DRIVE of N images, by poses (N, 3): of each cell of a grid the first."""
+    cell_m = _APART_M
+    while True:
+        cells = np.floor(poses[:, :2] / cell_m)
+        first = np.unique(cells, axis=0, return_index=True)[1]
+        if len(first) <= MOST_OF_DRIVE:
+            return np.sort(first)
+        cell_m *= _COARSER
+
+
+def _textures(run: Run, chosen: NDArray[np.int64], like: Keyframes) -> NDArray[np.int8]:
+    """Textures (M, rows, columns) of the chosen images (M,) of a run, as keyframes hold them."""
+    if not len(chosen):
+        return np.zeros((0, *like.textures.shape[1:]), np.int8)
+    images = (run.panoramas.read(i, i + 1)[0] for i in chosen.tolist())
+    return quantized(np.stack([texture(image) for image in images]))
+
+
+def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
+    """The model with the keyframes that drive `name` adds; itself where there are none.
+
+    Of added keyframes the older ones near the new ones give way beyond MOST_ADDED.
+    """
+    if not len(new):
+        return model
+    old, count = model.keyframes, len(new)
+    rows = _kept(old, new.poses)
+    keyframes = Keyframes.of(
+        np.concatenate([old.textures[rows], new.textures]),
+        np.concatenate([old.poses[rows], new.poses]),
+        old.noise,
+        old.clockwise,
+        np.append(old.drives[rows], np.full(count, old.drives.max() + 1, np.int32)),
+    )
+    updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': count}]
+    quality = {**model.quality, 'updates': updates[-_REMEMBERED:]}
+    return replace(model, keyframes=keyframes, quality=quality)
+
+
+def _kept(old: Keyframes, new: Array) -> NDArray[np.int64]:
+    """Which keyframes (K,) stay beside new ones at poses (M, 3): all those of the training.
+
+    Of twice as many as have to go, the oldest added ones, the nearest to new ones go.
+    """
+    added = np.flatnonzero(old.drives)
+    surplus = max(len(added) + len(new) - MOST_ADDED, 0)
+    oldest = added[np.argsort(old.drives[added], kind='stable')][: 2 * surplus]
+    apart = cKDTree(new[:, :2]).query(old.poses[oldest, :2])[0]
+    going = oldest[np.argsort(apart, kind='stable')[:surplus]]
+    return np.asarray(np.delete(np.arange(len(old.poses)), going), np.int64)

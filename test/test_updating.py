@@ -1,0 +1,228 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Learning on the job: what a later drive adds to a model, and what stays as it was."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres, place, recipe, run_in, wander
+
+from sfa_localization import updating
+from sfa_localization.camera.settings import WatchConfig
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.run import Odometry
+from sfa_localization.fusion.status import Level
+from sfa_localization.localizer import Localizer
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.updating import Additions, Updated, extended, familiar_score, new_views
+
+
+def repainted(share):
+    """The trained world with so much of other colors."""
+    world = Spheres.about(1)
+    other = np.random.default_rng(7).uniform(-90, 90, world.colors.shape)
+    return replace(world, colors=(1 - share) * world.colors + share * other)
+
+
+@cache
+def drive(share=0.5, seed=5, count=240):
+    """A drive in the trained place in another season, with truth for odometry."""
+    return run_in(repainted(share), wander(count, seed, hz=4.0), recipe().panorama, 'later')
+
+
+@cache
+def updated():
+    """The model of the place, and with what `drive()` adds."""
+    model = place().model
+    new = new_views(model, drive())
+    return model, new, extended(model, new, 'later')
+
+
+@cache
+def map_of_truth():
+    """The transform that lays the true poses of the training on the map."""
+    model = place().model
+    run = run_in(Spheres.about(1), wander(400, 2, hz=4.0), recipe().panorama)
+    found = [e.position for e in model.locate_all(run.panoramas.read(0, 400))]
+    return align(run.odometry.poses[:, :2], np.array(found))
+
+
+def errors(model, run):
+    """Distances (N,) m of single images' positions from the truth."""
+    found = [e.position for e in model.locate_all(run.panoramas.read(0, len(run.panoramas)))]
+    return np.hypot(*(np.array(found) - map_of_truth().apply(run.odometry.poses[:, :2])).T)
+
+
+def test_what_a_changed_place_adds_lies_where_it_was_seen():
+    _, new, _ = updated()
+    assert 20 < len(new) <= updating.MOST_OF_DRIVE
+    shown = {texture.tobytes(): i for i, texture in enumerate(textures_of(drive()))}
+    at = drive().odometry.poses[[shown[texture.tobytes()] for texture in new.textures]]
+    truth = map_of_truth()
+    apart = np.hypot(*(new.poses[:, :2] - truth.apply(at[:, :2])).T)
+    assert np.percentile(apart, 95) < 2 * updating.CERTAIN_M
+    assert np.abs(wrap_angle(new.poses[:, 2] - truth.apply_yaw(at[:, 2]))).max() < 0.1
+
+
+def textures_of(run):
+    images = run.panoramas.read(0, len(run.panoramas))
+    return updating.quantized(np.stack([updating.texture(image) for image in images]))
+
+
+def usable(model, run):
+    """The share of a run's images that are like those of the model."""
+    estimates = model.locate_all(run.panoramas.read(0, len(run.panoramas)))
+    return np.mean([e.novelty <= WatchConfig().novelty_limit for e in estimates])
+
+
+def test_an_updated_model_still_knows_the_place_when_the_season_goes_on():
+    model, _, newer = updated()
+    further = drive(share=0.7, seed=8)
+    assert usable(model, further) < 0.5 < 0.9 < usable(newer, further)
+    assert errors(newer, further).mean() < errors(model, further).mean()
+
+
+def test_the_old_season_gets_no_worse():
+    model, _, newer = updated()
+    old = drive(share=0.0, seed=8)
+    assert errors(newer, old).mean() < 1.05 * errors(model, old).mean()
+
+
+def test_network_maps_and_first_keyframes_stay():
+    model, new, newer = updated()
+    assert newer.network is model.network and newer.metric is model.metric
+    assert newer.compass is model.compass and newer.keyframes.noise == model.keyframes.noise
+    first = len(model.keyframes.poses)
+    np.testing.assert_array_equal(newer.keyframes.textures[:first], model.keyframes.textures)
+    np.testing.assert_array_equal(newer.keyframes.poses[first:], new.poses)
+    assert newer.quality['updates'] == [{'bag': 'later', 'images': len(new)}]
+    assert 'updates' not in model.quality
+
+
+def test_the_same_drive_is_new_only_once():
+    _, new, newer = updated()
+    assert len(new_views(newer, drive())) < 0.2 * len(new)
+
+
+def test_a_copied_drive_of_the_training_adds_little():
+    run = run_in(Spheres.about(1), wander(400, 2, hz=4.0), recipe().panorama, 'again')
+    assert len(new_views(place().model, run)) < 10
+
+
+def test_an_updated_model_survives_its_file(tmp_path):
+    _, _, newer = updated()
+    newer.save(tmp_path / 'model.npz')
+    read = PlaceModel.load(tmp_path / 'model.npz')
+    np.testing.assert_array_equal(read.keyframes.drives, newer.keyframes.drives)
+    assert read.quality['updates'] == newer.quality['updates']
+    assert familiar_score(read) == pytest.approx(familiar_score(place().model))
+    image = drive().panoramas.read(30, 31)[0]
+    np.testing.assert_allclose(read.locate(image).position, newer.locate(image).position)
+
+
+def test_places_where_the_filter_was_not_localised_are_not_used(monkeypatch):
+    """Of a robot that is sure only at the end, only the images of the end are added."""
+    late = drive().panoramas.stamps_ns[80]
+    monkeypatch.setattr(
+        updating,
+        '_replayed',
+        lambda localizer, run: (
+            (seen, localizer.status.level is Level.LOCALISED and seen.stamp_ns >= late)
+            for _, seen, _ in Localizer.replay(localizer, run)
+            if seen is not None
+        ),
+    )
+    early = {texture.tobytes() for texture in textures_of(drive())[:80]}
+    new = new_views(place().model, drive())
+    assert len(new) > 5
+    assert not early & {texture.tobytes() for texture in new.textures}
+
+
+def test_uncertain_poses_are_not_used(monkeypatch):
+    monkeypatch.setattr(updating, 'CERTAIN_M', 1e-6)
+    assert len(new_views(place().model, drive())) == 0
+
+
+def test_a_place_that_was_never_trained_is_refused_with_the_remedy():
+    foreign = run_in(Spheres.about(99), wander(120, 5, hz=4.0), recipe().panorama, 'elsewhere')
+    with pytest.raises(DataError, match=r'elsewhere: .* never LOCALISED .* train anew'):
+        new_views(place().model, foreign)
+
+
+def test_images_stamped_late_are_placed_where_they_were_taken():
+    """The driver stamps images 0.2 s late: the same keyframes, not 0.16 m farther along."""
+    run = replace(drive(count=200), odometry=finer(drive(count=200).odometry))
+    stamps_ns = run.panoramas.stamps_ns + 200_000_000
+    late = replace(run, panoramas=replace(run.panoramas, stamps_ns=stamps_ns))
+    found = [new_views(place().model, one) for one in (run, late)]
+    right, placed = (dict(zip(map(bytes, n.textures), n.poses, strict=True)) for n in found)
+    both = right.keys() & placed.keys()
+    assert len(both) > 20
+    apart = [np.hypot(*(right[one] - placed[one])[:2]) for one in both]
+    assert np.mean(apart) < 0.06
+
+
+def finer(odometry, times=10):
+    """Odometry (N,) with so many messages for each, of the same motion."""
+    stamps = np.linspace(
+        odometry.stamps_ns[0], odometry.stamps_ns[-1], times * (len(odometry.stamps_ns) - 1) + 1
+    ).astype(np.int64)
+    held = np.minimum(-(-np.arange(len(stamps)) // times), len(odometry.twists) - 1)
+    twists, variances = odometry.twists[held], odometry.variances[held]
+    return Odometry(stamps, odometry.trajectory.at(stamps), twists, variances)
+
+
+# Bounds
+
+
+def added(model, count, x_m, name='later'):
+    """The model with so many more keyframes in a row that begins at x."""
+    poses = np.column_stack([x_m + 0.01 * np.arange(count), np.zeros((count, 2))])
+    textures = np.repeat(model.keyframes.textures[:1], count, 0)
+    return extended(model, Additions(textures, poses), name)
+
+
+def test_added_keyframes_are_bounded_and_the_old_near_ones_give_way():
+    model = place().model
+    first = len(model.keyframes.poses)
+    full = added(added(model, 500, 100.0), 500, 200.0)
+    assert len(full.keyframes.poses) == first + updating.MOST_ADDED
+    newer = added(full, 100, 101.0)
+    x = newer.keyframes.poses[first:, 0]
+    np.testing.assert_array_equal(newer.keyframes.poses[:first], model.keyframes.poses[:first])
+    assert len(x) == updating.MOST_ADDED
+    assert np.count_nonzero(x >= 200.0) == 500, 'the newer half stays'
+    assert np.count_nonzero(x < 101.0) == 100, 'of the oldest 200 those far from new ones stay'
+    assert [one['images'] for one in newer.quality['updates']] == [500, 500, 100]
+
+
+def test_the_names_of_bags_are_bounded():
+    model = place().model
+    named = replace(model, quality={'updates': [{'bag': 'old', 'images': 1}] * 1000})
+    updates = added(named, 2, 100.0, 'new').quality['updates']
+    assert len(updates) == 1000 and updates[-1] == {'bag': 'new', 'images': 2}
+
+
+def test_a_long_drive_is_spread_over_the_ground():
+    x, y = np.meshgrid(np.arange(0, 20, 0.25), np.arange(0, 5, 0.25))
+    poses = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    kept = poses[updating._spread(poses)]
+    assert 0.5 * updating.MOST_OF_DRIVE < len(kept) <= updating.MOST_OF_DRIVE
+    gaps = np.linalg.norm(poses[:, None, :2] - kept[None, :, :2], axis=2).min(1)
+    assert gaps.max() < 1.0
+
+
+def test_a_sentence_says_what_was_added():
+    model, new, newer = updated()
+    assert Updated(model, (('a', 0), ('b', 0))).sentence() == (
+        'nothing is new on these drives: the model stays as it is'
+    )
+    text = Updated(newer, (('a', 0), ('b', len(new)))).sentence()
+    total = len(newer.keyframes.poses)
+    assert text == (
+        f'added as keyframes: 0 images of a, {len(new)} images of b; '
+        f'the model has {total} keyframes now'
+    )
