@@ -10,7 +10,7 @@ from cylinder_worlds import Spheres
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.features.keyframe_training import fit_keyframes
+from sfa_localization.features.keyframe_training import MOST, fit_keyframes, spread
 from sfa_localization.features.keyframes import Keyframes, quantized, texture
 
 CONFIG = PanoramaConfig(width=120, height=24)
@@ -177,3 +177,14 @@ def test_any_size_has_a_texture(shape):
     assert small.shape == (min(shape[0], 20), min(shape[1], 100))
     assert abs(small.mean()) < 1e-6 and np.linalg.norm(small) == pytest.approx(1, abs=1e-4)
     assert np.allclose(texture(cv2.convertScaleAbs(image, alpha=1.0)), small)
+
+
+def test_a_long_drive_is_thinned_evenly():
+    """An even drive over a square: no part of it is left without keyframes."""
+    t = np.linspace(0, 1, 3000)
+    poses = np.column_stack([10 * np.abs((40 * t) % 2 - 1), 10 * t, np.zeros(3000)])
+    kept = spread(poses)
+    assert len(kept) == MOST and len(np.unique(kept)) == MOST
+    shares = np.histogram(kept, bins=10, range=(0, 3000))[0] / MOST
+    assert shares.min() > 0.07
+    assert np.array_equal(kept, spread(poses))

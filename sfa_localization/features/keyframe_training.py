@@ -95,18 +95,20 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
 
 def spread(poses: Array) -> NDArray[np.int64]:
     """At most `MOST` of N images, by their poses (N, 3), spread over the ground: of each cell of
-    a grid the first ones.
+    a grid as many, chosen at random, always the same.
     """
     if len(poses) <= MOST:
         return np.arange(len(poses))
     extent = np.ptp(poses[:, :2], axis=0)
-    cell = float(np.sqrt(extent[0] * extent[1] / MOST)) / 4
+    cell = float(np.sqrt(extent[0] * extent[1] / MOST))
     places = np.floor(poses[:, :2] / max(cell, 1e-6)).astype(np.int64)
+    order = np.random.default_rng(0).permutation(len(poses))
     rank = np.zeros(len(poses), np.int64)
     filled: dict[tuple[int, int], int] = {}
-    for i, (x, y) in enumerate(places.tolist()):
+    for i in order.tolist():
+        x, y = places[i].tolist()
         rank[i] = filled[x, y] = filled.get((x, y), -1) + 1
-    return np.sort(np.argsort(rank, kind='stable')[:MOST])
+    return np.sort(order[np.argsort(rank[order], kind='stable')[:MOST]])
 
 
 def _likeliest(squared_errors: Array, scatters: Array) -> tuple[int, float]:
