@@ -10,7 +10,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test robustness animation fuzz soak bench lint format colcon matrix clean
+.PHONY: help env demo reproduce test robustness animation fuzz soak bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -22,6 +22,9 @@ $(READY): setup.py .ci/env
 
 demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (about 5 minutes)
 	$(PY) -m sfa_localization demo $(ARGS)
+
+reproduce: $(READY)  ## the tables and figures of test/EVALUATION.md: hours, which go on where they ended (ARGS=--quick)
+	$(PY) -m sfa_localization reproduce all $(ARGS)
 
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)

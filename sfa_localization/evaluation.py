@@ -48,6 +48,7 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer, Observation, Observer
+from sfa_localization.metric.expansions import Basis
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -410,17 +411,21 @@ def _summary(values: Array) -> dict[str, float]:
 
 def _supervised(model: PlaceModel, trained: _Located, drive: _Located) -> Trajectory:
     """The drive by the model's own regression, fitted on the ground truth of a training drive."""
-    basis = model.metric.basis
     stamps = trained.images.poses.stamps_ns
     mask = known(trained.truth, stamps)
-    expanded = basis.expand(trained.features[mask])
     places = trained.truth.at(stamps[mask])[:, :2]
-    normal = expanded.T @ expanded + np.diag(basis.ridge)
-    weights = np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
-    positions = basis.expand(drive.features) @ weights
+    weights = regression(model.metric.basis, trained.features[mask], places)
+    positions = model.metric.basis.expand(drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
     stamps = drive.images.poses.stamps_ns
     return Trajectory(stamps, np.column_stack([positions, unknown]))
+
+
+def regression(basis: Basis, features: Array, places: Array) -> Array:
+    """Weights (m, 2) from the expansion of features (M, K) to true places (M, 2) m."""
+    expanded = basis.expand(features)
+    normal = expanded.T @ expanded + np.diag(basis.ridge)
+    return np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -226,7 +226,7 @@ class PlaceModel:
         spread = disagreement(maps[-1])
         positions, covariances = self.metric.predict(slow)
         covariances = covariances * self.agreement.factor(spread)[:, None, None]
-        yaw, yaw_variance = self._headings(maps, slow)
+        yaw, yaw_variance = self.headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
         if self.refinement is not None:
@@ -243,7 +243,10 @@ class PlaceModel:
     def _matched(self, panorama: Image, guess: Array) -> Match:
         return self.keyframes.match(panorama, guess if np.isfinite(guess).all() else None)
 
-    def _headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
+    def headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
+        """Yaw (T,) rad in the map, NaN without a compass, and its variance (T,), from the maps of
+        all layers and the slow features (T, K).
+        """
         if self.compass is None:
             return np.full(len(slow), np.nan), np.full(len(slow), UNKNOWN_YAW_VARIANCE)
         return self.compass.predict(slow, layer_harmonics(maps, self.heading_layers))

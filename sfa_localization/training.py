@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,7 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
 )
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
+from sfa_localization.metric.retracing import with_closures
 from sfa_localization.metric.segments import Segments, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
@@ -204,7 +205,7 @@ def learn_place(
     known = known or match_images(runs, recipe, progress)
     images = _slow_features(network, runs, progress)
     seen = [list(visual_headings(run.panoramas)) for run in runs]
-    clocks = [_clock_of(run, own) for run, own in zip(runs, seen, strict=True)]
+    clocks = [clock_of(run, own) for run, own in zip(runs, seen, strict=True)]
     points = COARSE_POINTS if _refines(recipe.metric, images) else None
     seed = recipe.network.seed
     segments, first, heading = _learn_map(
@@ -234,12 +235,13 @@ def _slow_features(network: Network, runs: Sequence[Run], progress: bool) -> Ima
         return features_of_runs(network, runs, compass_layers(len(network.nodes)), bar.update)
 
 
-def _clock_of(run: Run, seen: Sequence[float]) -> CameraClock:
+def clock_of(run: Run, seen: Sequence[float] | None = None) -> CameraClock:
     """The delay of the camera's clock, by the headings rad that its images show.
 
     Warns of one that the filter cannot compensate.
     """
-    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, seen)
+    shown = visual_headings(run.panoramas) if seen is None else seen
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, shown)
     if abs(clock.delay_ns) > DELAY_LIMIT_NS:
         logger.warning(
             '%s: the stamps of images and odometry are %.2f s apart: the filter compensates half '
@@ -261,7 +263,7 @@ def _learn_map(
     """Steps 5 to 7; where no map can be learned with the noise of turns that is stated or assumed,
     once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
     """
-    segments = replace(_cut_odometry(runs, clocks, recipe.segments, None), closures=closures)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments), closures)
     try:
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
     except DataError:
@@ -270,7 +272,7 @@ def _learn_map(
         own = recipe.segments.yaw_noise != assumed
         if own or found is None or found < _NOISE_FACTOR * max(assumed, expected_noise(segments)):
             raise
-    segments = replace(_cut_odometry(runs, clocks, recipe.segments, found), closures=closures)
+    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, found), closures)
     return segments, *_map_and_compass(images, segments, recipe, points, progress)
 
 
@@ -305,11 +307,11 @@ def _bound(
     return float(np.sqrt(np.mean(squares))) if squares else None
 
 
-def _cut_odometry(
+def cut_odometry(
     runs: Sequence[Run],
     clocks: Sequence[CameraClock],
     config: SegmentConfig,
-    noise: float | None,
+    noise: float | None = None,
 ) -> Segments:
     """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""
     parts = [

@@ -13,8 +13,9 @@ PACKAGE = Path(errors.__file__).parents[1]
 ERRORS = {name for name in vars(errors) if name.endswith('Error')}
 REASONS = {
     'fusion/status.py': ('status_of', 'uncertainty', '_missing', '_contradictions', '_silences'),
-    'fusion/consistency.py': ('doubts', 'contradiction'),
-    'fusion/pose_filter.py': ('status', '_require_place', '_require_others_ahead'),
+    'fusion/consistency.py': ('doubts', 'compared', '_turned'),
+    'fusion/turn_watch.py': ('problem',),
+    'fusion/pose_filter.py': ('_apart_in_time', '_require_place', '_require_others_ahead'),
     'fusion/update.py': ('_fused', '_followed', '_gated'),
     'fusion/recover.py': ('weighed',),
     'camera/watch.py': ('judge', 'judge_novelty'),

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres
-from metric_worlds import criss_cross, drive, garden_features, meander
+from metric_worlds import criss_cross, drive, garden_features, meander, straight, turn
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
@@ -20,6 +20,7 @@ from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.retracing import tracks, with_closures
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -155,8 +156,8 @@ def test_the_form_is_the_sum_of_the_weighted_squares():
     yaw = np.angle(z)[stack.owner] + stack.headings
     yaw = yaw - bias[stack.period[stack.owner]] * stack.times_s
     places = o[stack.owner] + z[stack.owner] * stack.corrected(bias)
-    for (a, b), turn, share in zip(loops.rows, loops.turn, loops.share, strict=True):
-        total += share / 0.01**2 * abs(np.exp(1j * yaw[b]) - np.exp(1j * (yaw[a] + turn))) ** 2
+    for (a, b), angle, share in zip(loops.rows, loops.turn, loops.share, strict=True):
+        total += share / 0.01**2 * abs(np.exp(1j * yaw[b]) - np.exp(1j * (yaw[a] + angle))) ** 2
         total += share / 0.3**2 * abs(places[b] - places[a]) ** 2
     assert np.vdot(x, form @ x).real == pytest.approx(total, rel=1e-4)
     assert np.abs(form - form.conj().T).max() < 1e-9 * np.abs(form).max()
@@ -168,6 +169,56 @@ def test_closures_of_images_without_a_segment_are_left_out():
     images = np.array([[10**6, stack.images[0]], [stack.images[0], stack.images[-1]]])
     assert len(Loops.of(Closures(images, np.zeros(2)), stack).turn) == 1
     assert len(Loops.of(Closures.none(), stack).turn) == 0
+
+
+def twice_along_one_track(sideways=0.1):
+    """A drive, and a second one along the same track, somewhat aside."""
+    twists, start = criss_cross(8, seed=1)
+    aside = (start[0], start[1] + sideways, start[2])
+    drives = [drive(twists, start=place, yaw_noise=0.002) for place in (start, aside)]
+    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in drives]
+    first = len(drives[0].poses)
+    poses = np.vstack([run.poses for run in drives])
+    segments = join(parts, [0, first])
+    return poses, dataclasses.replace(segments, closures=true_closures(poses, first))
+
+
+def test_a_segment_along_an_earlier_track_has_its_number():
+    _, segments = twice_along_one_track()
+    track = tracks(segments)
+    half = [s.run for s in segments].count(0)
+    assert (track[:half] == np.arange(half)).mean() > 0.9
+    assert (track[half:] < half).mean() > 0.8
+    again = [n for n in range(half, len(track)) if track[n] < half]
+    assert np.median([abs(track[n] - (n - half)) for n in again]) <= 1
+
+
+def test_doors_of_a_corridor_that_look_alike_close_no_loop():
+    run = drive(np.vstack([straight(30.0), turn(np.pi), straight(30.0)]), yaw_noise=0.01)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    x = run.poses[:, 0]
+    back = int(np.argmax(x))
+    there = [int(np.argmin(np.abs(x[:back] - m))) for m in range(2, 28, 5)]
+    again = [back + int(np.argmin(np.abs(x[back:] - m))) for m in range(2, 28, 5)]
+    true = np.column_stack([there, again])
+    alike = np.column_stack([there[:-1], there[1:]])
+    closures = Closures(np.vstack([true, alike]), np.zeros(len(true) + len(alike)))
+    assert with_closures(segments, closures).closures.images.tolist() == true.tolist()
+
+
+def test_crossing_tracks_keep_their_own_numbers():
+    poses, _, segments, first = in_two_lights()
+    tied = dataclasses.replace(segments, closures=true_closures(poses, first))
+    assert (tracks(tied) == np.arange(len(tied))).mean() > 0.9
+    assert (tracks(segments) == np.arange(len(segments))).all()
+
+
+def test_what_is_left_out_is_left_out_of_every_drive_along_the_track():
+    _, segments = twice_along_one_track()
+    stack, track = Stack.of(segments), tracks(segments)
+    for rows in selection.folds(stack, 0):
+        inside = np.isin(np.arange(len(segments)), stack.owner[rows])
+        assert (inside == inside[track]).all()
 
 
 # --- in the network ---------------------------------------------------------------------------

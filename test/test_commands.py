@@ -399,6 +399,14 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--quick': Case('--quick', noted(('area', (8.0, 8.0)))),
         '--world': Case('--world 3', noted(('world', 3))),
         '--seed': Case('--seed 40', noted(('seed', 40), ('seed', 41))),
+        '--seeds': Case(
+            '--seeds 2', noted(('simulator', 2)), base='simulator --out {out}/simulator'
+        ),
+        '--test': Case(
+            '--test {data}/test',
+            lambda a, b: a.code == 1 and b.code == 0 and ('test', 'test') in b.noted,
+            base='baselines {data}/bag --out {out}/baselines',
+        ),
     },
 }
 SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
@@ -492,7 +500,7 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
 
 def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Drives are noted instead of simulated, and none is trained on or judged."""
-    from sfa_localization.commands import light_matrix
+    from sfa_localization.commands import light_matrix, paper_tables, reproduction
 
     def simulated(settings, out, panorama, progress):
         notes.extend((name, getattr(settings, name)) for name in ('world', 'seed', 'area'))
@@ -500,7 +508,16 @@ def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     def judged(_model, _bag, _align_bag, transform):
         return {'sfa': {'mean_m': 0.1}, 'localized': 1.0}, transform
 
-    patch.setattr(light_matrix, 'simulate', simulated)
+    def noted_experiment(_site, _results, name, seed, _figures):
+        notes.append((name, seed))
+
+    def noted_baselines(site, _results, _world):
+        notes.append(('test', site.test.name))
+
+    patch.setattr(paper_tables.Site, 'simulated', lambda *_args: None)
+    patch.setattr(paper_tables, 'experiment', noted_experiment)
+    patch.setattr(paper_tables, 'baselines', noted_baselines)
+    patch.setattr(reproduction, 'simulate', simulated)
     patch.setattr(light_matrix, 'train', lambda *_args, **_named: None)
     patch.setattr(light_matrix.PlaceModel, 'load', lambda _path: None)
     patch.setattr(light_matrix, '_read', lambda *_args: None)

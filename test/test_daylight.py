@@ -17,6 +17,8 @@ from sfa_localization.simulation.rendering import Dome, Light, Scene, metered, p
 from sfa_localization.simulation.seasons import SEASONS
 from sfa_localization.simulation.settings import SimulationConfig
 
+pytestmark = pytest.mark.slow  # trains, or replays many drives
+
 SMALL = PanoramaConfig(width=300, height=30)
 TINY = SimulationConfig(area=(8.0, 8.0), length=20.0, images='panorama')
 SUNNY = [name for name, light in LIGHTS.items() if any(light.sun)]

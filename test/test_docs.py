@@ -35,6 +35,7 @@ DOCUMENTS = sorted(
         *ROOT.glob('config/*.md'),
         *ROOT.glob('bags/*.md'),
         ROOT / 'test/README.md',
+        ROOT / 'test/EVALUATION.md',
     ]
 )
 README_LINES = 130

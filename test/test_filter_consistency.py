@@ -21,6 +21,8 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.recover import BIAS_STD, SCALE_STD
 from sfa_localization.fusion.settings import FilterConfig
 
+pytestmark = pytest.mark.slow  # trains, or replays many drives
+
 SHIPPED = FilterConfig()
 V_STD, OMEGA_STD = 0.03, 0.02
 PICTURE_STD = np.array([0.15, 0.15, 0.04])

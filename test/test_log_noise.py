@@ -15,6 +15,8 @@ from sfa_localization.fusion.log_noise import NEARLY_WHITE
 from sfa_localization.fusion.motion import ODOMETRY_CORRELATION_S
 from sfa_localization.fusion.settings import FilterConfig
 
+pytestmark = pytest.mark.slow  # trains, or replays many drives
+
 USUAL = {'v_std': 0.05, 'omega_std': 0.02, 'position_std': 0.2, 'scale': 1.01, 'bias': 0.002}
 
 

@@ -82,7 +82,7 @@ def test_a_training_says_what_it_does(tmp_path, capsys, monkeypatch):
                   'learn the map from ', 'learn the heading ', 'refine the map ',
                   'choose keyframes, and check the map '):  # fmt: skip
         assert words in text, text
-    for step in (2, 3, 5, 6, 7, 8):
+    for step in (2, 3, 4, 6, 7, 8, 9):
         assert f'(step {step} of {STEPS})' in text
     assert '100% of' in text and ' s left' in text
 

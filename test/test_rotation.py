@@ -117,6 +117,28 @@ def test_samples_equal_brute_force(joined):
     assert_equal(sample_statistics(of, joined), brute_force(explicit, 12, joined))
 
 
+def without_rotation(signals: np.ndarray, joined: np.ndarray) -> tuple[float, np.ndarray]:
+    """Steps and differences between images (T, rows, R, D) at the same view, divided by R."""
+    rotations, d = signals.shape[2], signals.shape[-1]
+    difference = np.diff(signals, axis=0)[joined].reshape(-1, d)
+    return len(difference) / rotations, difference.T @ difference / rotations
+
+
+@pytest.mark.parametrize('joined', [JOINED, BROKEN])
+def test_without_rotation_only_images_at_the_same_view_are_compared(joined):
+    of, field = maps(1, 6), FIELDS[1]
+    seen = views(of, field)
+    plain = fed(FieldStatistics(field, 12, 6, rotate=False), of, joined, batch=4)
+    signals = of.transpose(3, 0, 1, 2).copy()
+    samples = fed(SampleStatistics(12, 3, rotate=False), signals, joined, batch=4, axis=1)
+    for ours, explicit in ((plain, seen), (samples, of.astype(np.float64))):
+        steps, difference = without_rotation(explicit, joined)
+        assert ours.steps == pytest.approx(steps)
+        assert np.abs(ours.difference - difference).max() < 1e-5 * np.abs(difference).max()
+        flat = explicit.reshape(-1, explicit.shape[-1])
+        assert np.allclose(ours.second, flat.T @ flat, rtol=1e-5)
+
+
 def test_paper_sized_field_equals_brute_force():
     """60 rotations, fields of 14 columns."""
     of, field, joined = maps(3, 2, 3, 60, 4), Field(2, 14, 1), np.ones(1, bool)

@@ -18,6 +18,8 @@ from sfa_localization.fusion.recover import Recovery
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 
+pytestmark = pytest.mark.slow  # trains, or replays many drives
+
 NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.2, 'yaw_std': 0.05}
 
 

@@ -8,9 +8,6 @@ finished are kept, and used again when the command is repeated.
 
 from __future__ import annotations
 
-import json
-import sys
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,18 +15,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfa_localization import __version__
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.data.errors import DataError, LocalizationError
+from sfa_localization.commands.reproduction import (
+    BATCH,
+    Cell,
+    Progress,
+    Results,
+    recorded,
+    settings_of,
+)
+from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.data.run import Run, Trajectory
-from sfa_localization.evaluation import evaluate, moved, score, write_json
+from sfa_localization.evaluation import evaluate, moved, score
 from sfa_localization.features.retrieval import ImageRetrieval
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.evaluation import save_text
 from sfa_localization.reports.light import matrix_figure, table
-from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import Recipe, train
 
@@ -37,9 +40,6 @@ if TYPE_CHECKING:
     from sfa_localization.commands.reproduce import ReproduceConfig
 
 RESULTS = 'matrix.json'
-BATCH = 64
-"""Images that are read together."""
-Cell = dict[str, Any]
 Condition = tuple[str, str]
 """Light and season."""
 LIGHTS, SEASONS = ('day', 'morning', 'overcast', 'evening'), ('summer', 'autumn', 'winter')
@@ -71,13 +71,12 @@ QUICK = Plan(
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """The folder, the garden in it, and whether bars show the progress of its steps."""
+    """The folder, the garden in it, and how its steps are shown."""
 
     out: Path
     config: ReproduceConfig
     plan: Plan
-    announce: Callable[[str], None]
-    progress: bool
+    progress: Progress
 
     def training(self, light: str) -> Path:
         """The training drive in a light; each light has its own route."""
@@ -89,21 +88,17 @@ class _Work:
         return self._recorded('test_' + '_'.join(condition), 'test', 0, condition)
 
     def _recorded(self, name: str, route: str, drive: int, condition: Condition) -> Path:
-        bag = self.out / name
-        if not bag.exists():
-            self.announce(f'simulate {name}')
-            config = SimulationConfig(
-                trajectory=route,
-                world=self.config.world,
-                seed=self.config.seed + drive,
-                area=self.plan.area,
-                light=condition[0],
-                season=condition[1],
-                images='panorama',
-                compression='jpeg',
-            )
-            simulate(config, bag, self.panorama, progress=self.progress)
-        return bag
+        config = SimulationConfig(
+            trajectory=route,
+            world=self.config.world,
+            seed=self.config.seed + drive,
+            area=self.plan.area,
+            light=condition[0],
+            season=condition[1],
+            images='panorama',
+            compression='jpeg',
+        )
+        return recorded(self.out / name, config, self.plan.panorama, self.progress)
 
     @property
     def panorama(self) -> PanoramaConfig:
@@ -114,8 +109,8 @@ class _Work:
         """The model of some training drives."""
         path = self.out / f'{name.replace(" + ", "_")}.npz'
         if not path.exists():
-            self.announce(f'train on {name}')
-            train(bags, path, progress=self.progress, resume=True)
+            self.progress.say(f'train on {name}')
+            train(bags, path, progress=self.progress.shown, resume=True)
         return PlaceModel.load(path)
 
 
@@ -128,68 +123,25 @@ def reproduce_light(
     image `retrieval` and of `slow` features alone. Raises LocalizationError, also for a folder with
     results of other settings.
     """
-    start = time.monotonic()
-
-    def announce(step: str) -> None:
-        if progress:
-            print(f'[{time.monotonic() - start:4.0f} s] {step}', file=sys.stderr)
-
-    settings = _settings(config, plan)
-    cells = opened(out, settings)
+    report = Progress(progress)
+    settings = settings_of(config.world, config.seed, plan.area, plan.panorama)
+    results = Results.opened(out / RESULTS, settings)
+    cells = results.cells
     done = f'; {len(cells)} cells are finished' if cells else ''
-    announce(f'this takes about {plan.minutes} minutes on two cores{done}')
-    work = _Work(out, config, plan, announce, progress)
+    report.say(f'this takes about {plan.minutes} minutes on two cores{done}')
+    work = _Work(out, config, plan, report)
     for trained, lights in TRAININGS.items():
-        missing = [test for test in plan.tests if not _found(cells, trained, test)]
+        missing = [test for test in plan.tests if not _found(results, trained, test)]
         if missing:
-            _fill_row(
-                work, trained, lights, missing, lambda cell: _keep(out, settings, cells, cell)
-            )
+            _fill_row(work, trained, lights, missing, results.keep)
     save_text(out / 'matrix.md', table(cells) + '\n')
     matrix_figure(out / 'matrix.png', cells)
-    announce(f'see {out / "matrix.png"}')
+    report.say(f'see {out / "matrix.png"}')
     return cells
 
 
-def _settings(config: ReproduceConfig, plan: Plan) -> dict[str, Any]:
-    """Everything that decides the results, as JSON has it."""
-    return {
-        'version': __version__,
-        'world': config.world,
-        'seed': config.seed,
-        'area': list(plan.area),
-        'panorama': list(plan.panorama),
-    }
-
-
-def opened(out: Path, settings: Mapping[str, Any]) -> list[Cell]:
-    """The finished cells in a folder, which is created. Raises LocalizationError for a folder of
-    anything else, and leaves it as it is.
-    """
-    file = out / RESULTS
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if not any(out.iterdir()):
-            write_json(file, {'settings': settings, 'cells': []})
-        found = json.loads(file.read_text(encoding='utf-8'))
-        same, cells = found['settings'] == settings, list(found['cells'])
-    except OSError as error:
-        reason = error.strerror or error
-        raise LocalizationError(f'{file}: {reason}: choose another folder with --out') from None
-    except (ValueError, LookupError, TypeError):
-        raise LocalizationError(f'{file}: not of this command: name another --out') from None
-    if not same:
-        raise LocalizationError(f'{out}: holds results of other settings: name another --out')
-    return cells
-
-
-def _keep(out: Path, settings: Mapping[str, Any], cells: list[Cell], cell: Cell) -> None:
-    cells.append(cell)
-    write_json(out / RESULTS, {'settings': settings, 'cells': cells})
-
-
-def _found(cells: Sequence[Cell], trained: str, test: Condition) -> bool:
-    return any((c['trained'], c['light'], c['season']) == (trained, *test) for c in cells)
+def _found(results: Results, trained: str, test: Condition) -> bool:
+    return results.find(trained=trained, light=test[0], season=test[1]) is not None
 
 
 def _fill_row(
@@ -208,7 +160,7 @@ def _fill_row(
         retrieval = _retrieval([_read(bag, cache / bag.name, recipe) for bag in bags])
         transform = None
         for test, drive in zip(tests, drives, strict=True):
-            work.announce(f'{trained}, tested in {" ".join(test)}')
+            work.progress.say(f'{trained}, tested in {" ".join(test)}')
             run = _read(drive, cache / drive.name, recipe)
             cell, transform = _judged(model, drive, bags[0], transform)
             beside = {'retrieval': _retrieved(retrieval, run)}

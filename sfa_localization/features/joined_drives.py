@@ -19,7 +19,7 @@ from sfa_localization.data.run import Image, Panoramas, Stamps
 from sfa_localization.features.closures import Closures, Indices
 from sfa_localization.features.network_training import ImageSequence
 
-_MOST = 400
+_MOST = 200
 """Edges of a training: enough for statistics, a small part of its time."""
 
 

@@ -162,7 +162,7 @@ def _cores() -> int:
 class Partial:
     """A partly trained network: finished layers, and perhaps the linear half of the next one.
 
-    `stages` counts the finished halves of layers.
+    `stages` counts the finished halves of layers; `rotate`: the simulated rotation is not left out.
     """
 
     architecture: Architecture
@@ -170,6 +170,7 @@ class Partial:
     linear: Solution | None = None
     deltas: tuple[NDArray[np.float64], ...] = field(default=())
     ranks: tuple[tuple[int, int], ...] = field(default=())
+    rotate: bool = True
 
     @property
     def depth(self) -> int:
@@ -225,9 +226,9 @@ def _sums(partial: Partial) -> Sums:
     architecture, depth = partial.architecture, partial.depth
     layer, receptive = architecture.layers[depth], architecture.fields[depth]
     if partial.linear is not None:
-        return SampleStatistics(architecture.rotations, layer.expanded)
+        return SampleStatistics(architecture.rotations, layer.expanded, partial.rotate)
     strip = receptive.rows * architecture.channels[depth]
-    return FieldStatistics(receptive, architecture.rotations, strip)
+    return FieldStatistics(receptive, architecture.rotations, strip, partial.rotate)
 
 
 def _signals(partial: Partial) -> Callable[[Map], Map]:
@@ -280,6 +281,7 @@ def train_network(
     *,
     light_std: float = LIGHT_STD,
     relative_cut: float = RELATIVE_CUT,
+    rotate: bool = True,
     start: Partial | None = None,
     executor: Executor = in_this_process,
     on_stage: Callable[[Partial], object] = lambda partial: None,
@@ -287,12 +289,13 @@ def train_network(
 ) -> Network:
     """Train all layers on the full simulated rotation of every sequence (section 2.2).
 
-    `start` continues a training that was interrupted; `on_stage` receives each finished stage,
+    `rotate` false leaves out the simulated rotation, for comparison. `start` continues a training
+    that was interrupted; `on_stage` receives each finished stage,
     `on_shard` the number of images worked through since the last call.
     Raises DataError when the images vary too little.
     """
     require_pairs(sequences)
-    partial = start or Partial(architecture)
+    partial = start or Partial(architecture, rotate=rotate)
     shards = shards_of(sequences, seed, light_std)
     while not partial.finished:
         total = executor(_Stage(partial), shards, on_shard)

@@ -13,6 +13,8 @@ row, are sums over the columns of one map per image:
     between images               sum_c        (x_{t+1,c} - x_{t,c-1}) (...)^T
 
 all indices cyclic. Everything here is divided by R. Maps are (T, rows, R, channels) float32.
+
+The rotation can be left out, for comparison: then only the differences x_{t+1,c} - x_{t,c} count.
 """
 
 from __future__ import annotations
@@ -113,9 +115,10 @@ class FieldStatistics:
     sums need comes from one product of the strips with their shifted copies.
     """
 
-    def __init__(self, field: Field, rotations: int, strip: int) -> None:
+    def __init__(self, field: Field, rotations: int, strip: int, rotate: bool = True) -> None:
         self.field = field
         self.rotations = rotations
+        self.rotate = rotate
         self.lags = self._lags()
         self.total = np.zeros(strip)
         self.same = np.zeros((strip, len(self.lags) * strip))
@@ -136,7 +139,7 @@ class FieldStatistics:
         self.samples += columns.shape[0] * columns.shape[1]
         self.total += columns.sum((0, 1, 2), dtype=np.float64)
         self.same += _product(columns, shifted(columns, self.lags))
-        difference = _between_images(columns, self._last, joined)
+        difference = _between_images(columns, self._last, joined, int(self.rotate))
         self.pairs += difference.shape[0] * difference.shape[1]
         if len(difference):
             neighbors = windows(difference, self.field.columns, self.field.spacing)
@@ -152,7 +155,7 @@ class FieldStatistics:
 
     def result(self) -> Statistics:
         count, r = self.samples * self.rotations, self.rotations
-        steps = self.samples * (r - 1) + self.pairs
+        steps = self.pairs + (self.samples * (r - 1) if self.rotate else 0)
         total = np.tile(self.total, self.field.columns)
         second, difference = self._blocks(self._lag), self._blocks(self._difference)
         return Statistics(float(count), total, second, float(steps), difference)
@@ -171,6 +174,8 @@ class FieldStatistics:
     def _difference(self, lag: int) -> Array:
         """Within images R - 1 times, between images once."""
         r = self.rotations
+        if not self.rotate:
+            return self._lag_between(lag) / r
         within = 2 * self._lag(lag) - self._lag(lag + 1) - self._lag(lag - 1)
         return within * ((r - 1) / r) + self._lag_between(lag) / r
 
@@ -183,12 +188,12 @@ class FieldStatistics:
         return self.between[:, at * p : (at + 1) * p]
 
 
-def _between_images(columns: Map, last: Map | None, joined: Mask) -> Map:
-    """x_{t,c} - x_{t-1,c-1} of the pairs that are joined: (pairs, rows, R, P)."""
+def _between_images(columns: Map, last: Map | None, joined: Mask, turn: int) -> Map:
+    """x_{t,c} - x_{t-1,c-turn} of the pairs that are joined: (pairs, rows, R, P)."""
     if last is None:
         columns, last, joined = columns[1:], columns[:1], joined[1:]
     before = np.concatenate([last, columns[:-1]]) if len(columns) else columns
-    return np.asarray(columns[joined] - np.roll(before[joined], 1, axis=2))
+    return np.asarray(columns[joined] - np.roll(before[joined], turn, axis=2))
 
 
 def _product(a: Map, b: Map) -> Map:
@@ -199,8 +204,9 @@ def _product(a: Map, b: Map) -> Map:
 class SampleStatistics:
     """Statistics of linear SFA on signals of D dimensions, given signal-major: (D, T, rows, R)."""
 
-    def __init__(self, rotations: int, dimensions: int) -> None:
+    def __init__(self, rotations: int, dimensions: int, rotate: bool = True) -> None:
         self.rotations = rotations
+        self.rotate = rotate
         self.samples = self.pairs = 0
         self.total = np.zeros(dimensions)
         self.second, self.within, self.between = np.zeros((3, dimensions, dimensions))
@@ -213,7 +219,8 @@ class SampleStatistics:
         self.samples += maps.shape[1] * maps.shape[2]
         self.total += maps.sum((1, 2, 3), dtype=np.float64)
         self.second += _square(maps)
-        self.within += _square(_turned(maps))
+        if self.rotate:
+            self.within += _square(_turned(maps))
         self._add_pairs(maps, joined)
         self._last = maps[:, -1].copy()
 
@@ -228,13 +235,15 @@ class SampleStatistics:
     def result(self) -> Statistics:
         r = self.rotations
         difference = self.within * ((r - 1) / r) + self.between / r
-        steps = self.samples * (r - 1) + self.pairs
+        steps = self.pairs + (self.samples * (r - 1) if self.rotate else 0)
         return Statistics(
             float(self.samples * r), self.total, self.second, float(steps), difference
         )
 
     def _add_pairs(self, maps: Map, joined: Mask) -> None:
-        """Add x_{t,c} - x_{t-1,c-1}, cyclic in the last axis, of the pairs that are joined."""
+        """Add x_{t,c} - x_{t-1,c-1}, cyclic in the last axis, of the pairs that are joined; without
+        rotation x_{t,c} - x_{t-1,c}.
+        """
         seconds = np.flatnonzero(joined)
         if self._last is None:
             seconds = seconds[seconds > 0]
@@ -242,6 +251,9 @@ class SampleStatistics:
         for k, t in enumerate(seconds.tolist()):
             before = self._last if t == 0 else maps[:, t - 1]
             assert before is not None
+            if not self.rotate:
+                np.subtract(maps[:, t], before, out=pairs[:, k])
+                continue
             np.subtract(maps[:, t, :, 1:], before[..., :-1], out=pairs[:, k, :, 1:])
             np.subtract(maps[:, t, :, 0], before[..., -1], out=pairs[:, k, :, 0])
         if len(seconds):

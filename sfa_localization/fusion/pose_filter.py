@@ -313,8 +313,10 @@ class PoseFilter:
         count, apart_ns = self._apart
         if count >= AHEAD_COUNT:
             where = 'ahead of' if apart_ns > 0 else 'behind'
-            far = f'{abs(apart_ns) * 1e-9:.0f} s {where} the odometry'
-            return [f'images are stamped {far}: are the clocks synchronized?']
+            apart = f'{abs(apart_ns) * 1e-9:.0f} s'
+            return [
+                f'images are stamped {apart} {where} the odometry: are the clocks synchronized?'
+            ]
         measured = abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS
         return [self._watch.problem(self._compensated_s)] if self._off and not measured else []
 

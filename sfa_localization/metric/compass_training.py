@@ -26,6 +26,7 @@ from sfa_localization.metric.compass import (
 )
 from sfa_localization.metric.forecast import nearest_used
 from sfa_localization.metric.learning import MetricResult, headings, positions
+from sfa_localization.metric.retracing import tracks
 from sfa_localization.metric.segments import Segments, assignment
 
 Complex = NDArray[np.complex128]
@@ -93,7 +94,8 @@ def learn_heading(
     """The compass from the certified headings of the sampled images; None with too few of them."""
     in_segments, yaw = headings(result, segments)
     labeled, at_sample, at_label = np.intersect1d(images.sampled, in_segments, return_indices=True)
-    part = assignment(segments, len(images.slow))[labeled] % FOLDS
+    owner = assignment(segments, len(images.slow))[labeled]
+    part = tracks(segments)[owner] % FOLDS
     try:
         fit = fit_compass(images.slow[labeled], images.harmonic[at_sample], yaw[at_label], part)
     except DataError as error:

@@ -15,7 +15,8 @@ from sfa_localization.features.closures import Views
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.metric.learning import MetricResult, headings, positions
-from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.retracing import tracks
+from sfa_localization.metric.segments import Segments, assignment
 
 # Between the drives: farther than any stretch.
 _ANOTHER_DRIVE_M = 1e6
@@ -48,11 +49,22 @@ def learn_keyframes(
     labeled, places = positions(result, segments)
     _, seen, row = np.intersect1d(views.images, labeled, return_indices=True)
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
-    path = views.path_m[seen] + _ANOTHER_DRIVE_M * views.run[seen]
+    path = _along_tracks(views, segments)[seen]
     keyframes = fit_keyframes(views.textures[seen], poses, path, clockwise)
     kept = spread(poses)
     variance = result.left_out_variance * agreement.factor(disagreement[labeled])
     return _judged(keyframes, path[kept], row[kept], result, variance)
+
+
+def _along_tracks(views: Views, segments: Segments) -> Array:
+    """Distance (S,) m driven until each image, far apart between drives; of a segment along an
+    earlier track it is that of the earlier one."""
+    path = views.path_m + _ANOTHER_DRIVE_M * views.run
+    owner = assignment(segments, int(views.images.max()) + 1)[views.images]
+    for n, first in enumerate(tracks(segments).tolist()):
+        if first != n and (owner == first).any():
+            path[owner == n] = path[owner == first].mean()
+    return path
 
 
 def _judged(

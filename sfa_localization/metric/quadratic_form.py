@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.phases import Certificate, refine, synchronize
+from sfa_localization.metric.retracing import tracks
 from sfa_localization.metric.segments import Segments
 
 Complex = NDArray[np.complex128]
@@ -66,6 +67,8 @@ class Stack:
     """(N,) period of each segment, in which the yaw-rate bias is constant."""
     starts: Array
     """(N, 3) odometry poses of the segments' frames."""
+    track: Indices
+    """(N,) the first segment along the same track: see retracing.py."""
 
     @classmethod
     def of(cls, segments: Segments) -> Stack:
@@ -80,6 +83,7 @@ class Stack:
             np.concatenate([[0], np.cumsum(sizes)[:-1]]),
             np.array([s.period for s in segments]),
             np.array([s.start for s in segments]),
+            tracks(segments),
         )
 
     @property

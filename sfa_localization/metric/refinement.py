@@ -114,7 +114,7 @@ class Refinement:
 
         Of spectra (T, H, J) at headings yaw (T,) rad, with the disagreement (T,) of the views.
         """
-        features = self._features(spectra, yaw)
+        features = self.features(spectra, yaw)
         places, covariances = self.metric.predict(features)
         return places, covariances * self.agreement.factor(views)[:, None, None]
 
@@ -158,9 +158,10 @@ class Refinement:
 
     def _place(self, spectra: Spectrum, yaw: Array) -> Array:
         """Positions (T, 2) without their covariances, for far less work."""
-        return self.metric.positions(self._features(spectra, yaw))
+        return self.metric.positions(self.features(spectra, yaw))
 
-    def _features(self, spectra: Spectrum, yaw: Array) -> Array:
+    def features(self, spectra: Spectrum, yaw: Array) -> Array:
+        """What the finer map reads, (T, K), of spectra (T, H, J) at headings yaw (T,) rad."""
         return self.projection.features(turned_back(spectra, yaw, self.sign))
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:

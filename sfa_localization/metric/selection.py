@@ -67,14 +67,15 @@ def folds(stack: Stack, seed: int) -> list[Indices]:
     """Rows of the stack left out in turn: whole segments, in stretches of the drive.
 
     Stretches of a short drive are shorter: there are LEFT_OUT_FOLDS parts, as far as there are
-    segments, and always at least two. Raises DataError for a drive of one segment.
+    segments, and always at least two. Segments along one track are left out together. Raises
+    DataError for a drive of one segment.
     """
     steps = np.abs(np.diff(stack.path, prepend=0)) * (np.diff(stack.owner, prepend=-1) == 0)
     lengths = np.bincount(stack.owner, steps)
     length = min(LEFT_OUT_LENGTH_M, lengths.sum() / LEFT_OUT_FOLDS)
     # The middles of the first and the last segment are at least half the drive apart.
     middles = np.cumsum(lengths) - lengths / 2
-    stretch = np.floor(middles / max(length, 1e-9)).astype(int)
+    stretch = np.floor(middles / max(length, 1e-9)).astype(int)[stack.track]
     names = np.unique(stretch)
     if len(names) < 2:
         raise DataError(

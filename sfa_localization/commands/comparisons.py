@@ -1,0 +1,233 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The steps of `reproduce baselines` and `reproduce ablations`: other features, and fewer parts.
+
+Baselines replace the features, and go through the same metric learning and evaluation; ablations
+leave out a part of this package, and are evaluated as the nodes would work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sfa_localization.commands.reproduction import BATCH, Cell, Results
+from sfa_localization.commands.sites import Site, learned
+from sfa_localization.commands.trials import (
+    Features,
+    Study,
+    Trial,
+    mean_error,
+    slow_of,
+    turned_of,
+)
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.evaluation import evaluate
+from sfa_localization.features.network import (
+    PAPER_LAYERS,
+    Architecture,
+    Layer,
+    standard_architecture,
+)
+from sfa_localization.features.network_training import (
+    LIGHT_STD,
+    ImageSequence,
+    train_network,
+)
+from sfa_localization.features.retrieval import ImageRetrieval
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.signatures import FourierSignature, TurnedComponents
+from sfa_localization.metric.learning import learn_metric
+from sfa_localization.metric.paper_solver import PAPER_FEATURES
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.training import Recipe
+
+BASELINES: dict[str, Callable[[Study, PlaceModel], Features]] = {
+    'principal components of all rotations': (
+        lambda study, _model: TurnedComponents.fit(study.batches).features
+    ),
+    'Fourier signatures of rows': lambda study, _model: (
+        FourierSignature.fit(study.batches).features
+    ),
+    'slow features, first pass': lambda _study, model: slow_of(model.network),
+}
+"""Features that metric learning is given, of the images alone."""
+SECOND, WHOLE, RETRIEVAL = (
+    'turned maps, second pass', 'this package, one image', 'nearest image, at true positions',
+)  # fmt: skip
+MEASURES = {
+    'test': 'test (m)',
+    'test_supervised': 'test, supervised (m)',
+    'training': 'training (m)',
+    'training_supervised': 'training, supervised (m)',
+}
+STRAIGHT = SegmentConfig(segments='straight')
+MONOMIALS = MetricConfig(metric_map='monomials', slow_features=PAPER_FEATURES)
+
+
+def baselines(site: Site, results: Results, world: str) -> None:
+    """Add the cells of a world: errors in m, as `MEASURES` names them, by `features`."""
+    names = (*BASELINES, SECOND, WHOLE, RETRIEVAL)
+    missing = [n for n in names if results.find(world=world, features=n) is None]
+    if not missing:
+        return
+    with site.study() as study:
+        model = site.model(study)
+        for name in missing:
+            site.progress.say(f'{world}: {name}')
+            results.keep({'world': world, 'features': name, **_judged(site, study, model, name)})
+
+
+def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
+    """Errors of one kind of features, or the `problem` that they have."""
+    rows = study.laid_on(SegmentConfig())
+    if name == RETRIEVAL:
+        return _retrieved(study)
+    if name == WHOLE:
+        judged = evaluate(model, site.test, align_bag=site.training[-1], recipe=site.recipe)
+        return {'test': judged.scores['sfa']['mean'], 'ekf': judged.scores['ekf']['mean']}
+    segments = study.segments(SegmentConfig())
+    fitted = np.concatenate([segment.images for segment in segments])
+    if name == SECOND:
+        if model.refinement is None:
+            return {'problem': 'the network has no layer for a second pass'}
+        features = study.features(turned_of(model))
+        return Trial.of(study, model.refinement.metric, features, rows, fitted).errors()
+    features = study.features(BASELINES[name](study, model))
+    try:
+        metric = learn_metric(features[0], segments, MetricConfig()).map
+    except LocalizationError as error:
+        return {'problem': str(error)}
+    return Trial.of(study, metric, features, rows, fitted).errors()
+
+
+def _retrieved(study: Study) -> Cell:
+    """The true position of the training image that is likest."""
+    poses = np.column_stack([study.places, np.zeros(len(study.places))])
+    retrieval = ImageRetrieval.of((image for batch in study.batches() for image in batch), poses)
+    images = (i for batch in study.test.panoramas.batches(BATCH) for i in batch)
+    found = np.array([retrieval.locate(image)[:2] for image in images])
+    return {'test_supervised': mean_error(found, study.test_truth.poses[:, :2])}
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """This package with one thing different. `layers` empty: the standard network."""
+
+    metric: MetricConfig = field(default_factory=MetricConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    normalization: str = NetworkConfig().normalization
+    layers: tuple[Layer, ...] = ()
+    rotate: bool = True
+    light_std: float = LIGHT_STD
+    second_pass: bool = True
+    keyframes: bool = True
+    one_drive: bool = False
+    """The map is learned from the last training drive: the paper's descent starts from odometry,
+    whose frame is another one in each drive."""
+
+    @property
+    def same_network(self) -> bool:
+        """Whether it uses the network of the whole package."""
+        mine = self.normalization, self.layers, self.rotate, self.light_std
+        return mine == (NetworkConfig().normalization, (), True, LIGHT_STD)
+
+    def recipe(self, base: Recipe) -> Recipe:
+        """How it trains."""
+        network = replace(base.network, normalization=self.normalization)
+        return replace(base, network=network, metric=self.metric, segments=self.segments)
+
+    def reduced(self, model: PlaceModel) -> PlaceModel:
+        """A model without the parts that it does without."""
+        if not self.second_pass:
+            model = replace(model, refinement=None)
+        if not self.keyframes:
+            # No correlation is high enough to be believed.
+            noise = replace(model.keyframes.noise, lowest=np.inf)
+            model = replace(model, keyframes=replace(model.keyframes, noise=noise))
+        return model
+
+    def architecture(self, size: tuple[int, int]) -> Architecture:
+        """Its network for panoramas of (rows, columns)."""
+        standard = standard_architecture(size, self.normalization)
+        return replace(standard, layers=self.layers) if self.layers else standard
+
+
+FIRST, SECOND_LAYER, TOP = PAPER_LAYERS
+TWO_LAYERS = (FIRST, replace(TOP, field=(6, 20)))
+FOUR_LAYERS = (FIRST, SECOND_LAYER, Layer((2, 5), (1, 1), 32, 32), replace(TOP, field=(3, 20)))
+VARIANTS = {
+    'everything': Variant(),
+    'no keyframes': Variant(keyframes=False),
+    'no second pass': Variant(second_pass=False),
+    'neither: slow features alone': Variant(second_pass=False, keyframes=False),
+    'straight segments only': Variant(segments=STRAIGHT),
+    'monomials, 8 features; no second pass': Variant(metric=MONOMIALS),
+    'the same, straight lines of one drive': Variant(
+        metric=MONOMIALS, segments=STRAIGHT, one_drive=True
+    ),
+    "the same, paper's solver": Variant(
+        metric=replace(MONOMIALS, solver='paper'), segments=STRAIGHT, one_drive=True
+    ),
+    'no simulated rotation': Variant(rotate=False),
+    'no random light': Variant(light_std=0.0),
+    'two layers; no second pass': Variant(layers=TWO_LAYERS),
+    'four layers': Variant(layers=FOUR_LAYERS),
+    'gray': Variant(normalization='grey'),
+    'color as it is': Variant(normalization='none'),
+}
+"""The rows of the table of ablations."""
+SCORES = {
+    'slow': 'slow features alone (m)',
+    'sfa': 'one image (m)',
+    'ekf': 'EKF (m)',
+    'heading': 'EKF heading (°)',
+}
+
+
+def ablations(site: Site, results: Results, world: str) -> None:
+    """Add the cells of a world: errors in m and degrees, as `SCORES` names them, by `variant`."""
+    missing = [n for n in VARIANTS if results.find(world=world, variant=n) is None]
+    if not missing:
+        return
+    with site.study() as study:
+        whole = site.model(study)
+        for name in missing:
+            site.progress.say(f'{world}: {name}')
+            try:
+                cell = _ablated(site, study, whole, VARIANTS[name])
+            except LocalizationError as error:
+                cell = {'problem': str(error)}
+            results.keep({'world': world, 'variant': name, **cell})
+
+
+def _ablated(site: Site, study: Study, whole: PlaceModel, variant: Variant) -> Cell:
+    """Scores of a variant, aligned on the last training drive."""
+    recipe, network = variant.recipe(site.recipe), whole.network
+    runs = study.training[-1:] if variant.one_drive else study.training
+    if not variant.same_network:
+        first = study.training[0]
+        network = train_network(
+            variant.architecture(first.panoramas.shape[:2]),
+            [ImageSequence.of(first)],
+            recipe.network.seed,
+            light_std=variant.light_std,
+            rotate=variant.rotate,
+        )
+    same = variant.same_network and (variant.metric, variant.segments) == (
+        MetricConfig(), SegmentConfig(),
+    )  # fmt: skip
+    model = variant.reduced(whole if same else learned(network, runs, recipe))
+    judged = evaluate(model, site.test, align_bag=site.training[-1], recipe=site.recipe)
+    alone = Variant(second_pass=False, keyframes=False).reduced(model)
+    slow = evaluate(alone, site.test, align_bag=site.training[-1], recipe=site.recipe)
+    heading = judged.scores['ekf']['yaw_deg']
+    return {
+        'slow': slow.scores['sfa']['mean'],
+        'sfa': judged.scores['sfa']['mean'],
+        'ekf': judged.scores['ekf']['mean'],
+        'heading': heading['mean'] if heading else None,
+    }

@@ -1,0 +1,91 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's results, one after the other: what is missing is made, then tables are written."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfa_localization.commands.comparisons import MEASURES, SCORES, VARIANTS, ablations, baselines
+from sfa_localization.commands.paper_results import experiment
+from sfa_localization.commands.reproduction import Progress, Results, settings_of
+from sfa_localization.commands.sites import ROUTES, Plan, Site
+from sfa_localization.reports.evaluation import save_text
+from sfa_localization.reports.paper import comparison_table, paper_table
+from sfa_localization.training import Recipe
+
+if TYPE_CHECKING:
+    from sfa_localization.commands.reproduce import ReproduceConfig
+
+NAMES = ('simulator', 'robot', 'baselines', 'ablations')
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """The folder of the paper's results, and what they are made with; baselines perhaps on `bags`
+    and the drive `test`.
+    """
+
+    out: Path
+    config: ReproduceConfig
+    plan: Plan
+    progress: Progress
+    bags: tuple[Path, ...] = ()
+    test: Path | None = None
+
+    def announce(self, names: Sequence[str], minutes: int = 0) -> None:
+        """Say how long these results take, beside the `minutes` of others."""
+        for name in names:
+            seeds = 1 if name == 'ablations' else self.config.seeds
+            minutes += seeds * self.plan.minutes[name]
+        kept = 'what is finished is kept, and not made again'
+        self.progress.say(f'this takes about {minutes} minutes on two cores; {kept}')
+
+    def reproduced(self, name: str) -> str:
+        """Make what is missing of a result; write and return its table. LocalizationError."""
+        config, plan = self.config, self.plan
+        settings = settings_of(config.world, config.seed, plan.area, plan.panorama)
+        files = [f'{name}.json' for name in NAMES]
+        results = Results.opened(self.out / f'{name}.json', settings, files)
+        if name in ROUTES:
+            self._experiments(name, results)
+            text = paper_table(name, results.cells)
+        elif name == 'baselines':
+            self._baselines(results)
+            text = comparison_table(results.cells, 'features', MEASURES)
+        else:
+            world = f'garden {config.world}'
+            ablations(self._site('simulator', 0), results, world)
+            cells = [c for name in VARIANTS for c in results.cells if c['variant'] == name]
+            text = comparison_table(cells, 'variant', SCORES)
+        save_text(self.out / f'{name}.md', text + '\n')
+        self.progress.say(f'see {self.out / f"{name}.md"}')
+        return text
+
+    def _site(self, experiment_name: str, number: int) -> Site:
+        world, seed = self.config.world + number, self.config.seed + number
+        return Site.simulated(self.out, experiment_name, world, seed, self.plan, self.progress)
+
+    def _experiments(self, name: str, results: Results) -> None:
+        """Figures are those of the first seed."""
+        for number in range(self.config.seeds):
+            seed = self.config.seed + number
+            if results.find(seed=seed) is None:
+                figures = None if number else self.out
+                experiment(self._site(name, number), results, name, seed, figures)
+
+    def _baselines(self, results: Results) -> None:
+        if self.test is not None:
+            paths = [str(path) for path in (*self.bags, self.test)]
+            folder = self.out / f'bags_{zlib.crc32(" ".join(paths).encode()):08x}'
+            folder.mkdir(exist_ok=True)
+            site = Site(folder, self.bags, self.test, Recipe(), self.progress)
+            baselines(site, results, f'{" + ".join(paths[:-1])}, tested on {paths[-1]}')
+            return
+        for number in range(self.config.seeds):
+            site = self._site('simulator', number)
+            baselines(site, results, f'garden {self.config.world + number}')

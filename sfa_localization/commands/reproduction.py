@@ -1,0 +1,119 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the results of `reproduce` share: a folder of finished cells, drives and messages.
+
+A result is a list of cells. Cells, bags and models that are finished are kept, and used again when
+the command is repeated.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sfa_localization import __version__
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.evaluation import write_json
+from sfa_localization.simulation.drive import simulate
+from sfa_localization.simulation.settings import SimulationConfig
+
+BATCH = 64
+"""Images that are read together."""
+Cell = dict[str, Any]
+
+
+@dataclass(slots=True)
+class Results:
+    """The finished cells of a result in a JSON file, beside the settings that they depend on."""
+
+    file: Path
+    settings: Mapping[str, Any]
+    cells: list[Cell] = field(default_factory=list)
+
+    @classmethod
+    def opened(cls, file: Path, settings: Mapping[str, Any], beside: Sequence[str] = ()) -> Results:
+        """Those in a folder, which is created. Raises LocalizationError for a folder of anything
+        else than this result, or those `beside` it (their files) with the same settings, and
+        leaves it as it is.
+        """
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            found = _found(file, beside, settings)
+            same, cells = found['settings'] == settings, list(found['cells'])
+        except OSError as error:
+            reason = error.strerror or error
+            raise LocalizationError(f'{file}: {reason}: choose another folder with --out') from None
+        except (ValueError, LookupError, TypeError):
+            raise LocalizationError(f'{file}: not of this command: name another --out') from None
+        if not same:
+            raise LocalizationError(
+                f'{file.parent}: holds results of other settings: name another --out'
+            )
+        results = cls(file, settings, cells)
+        results._write()
+        return results
+
+    def keep(self, cell: Cell) -> None:
+        """Add a finished cell."""
+        self.cells.append(cell)
+        self._write()
+
+    def _write(self) -> None:
+        write_json(self.file, {'settings': self.settings, 'cells': self.cells})
+
+    def find(self, **names: Any) -> Cell | None:
+        """The cell with these names, if it is finished."""
+        return next((c for c in self.cells if names.items() <= c.items()), None)
+
+
+def _found(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What the file holds; the settings of one beside it, or the new ones in an empty folder."""
+    kin = [file.with_name(name) for name in beside if file.with_name(name).exists()]
+    if not file.exists() and not kin and not any(file.parent.iterdir()):
+        return {'settings': settings, 'cells': []}
+    source = kin[0] if kin and not file.exists() else file
+    found = dict(json.loads(source.read_text(encoding='utf-8')))
+    return found if source == file else {**found, 'cells': []}
+
+
+def settings_of(
+    world: int, seed: int, area: Sequence[float], panorama: Sequence[int]
+) -> dict[str, Any]:
+    """What decides the results of a garden, as JSON has it."""
+    return {
+        'version': __version__,
+        'world': world,
+        'seed': seed,
+        'area': list(area),
+        'panorama': list(panorama),
+    }
+
+
+@dataclass(slots=True)
+class Progress:
+    """Messages and bars of long work, where they are wanted."""
+
+    shown: bool
+    start: float = field(default_factory=time.monotonic)
+
+    def say(self, step: str) -> None:
+        """Name the next step, with the seconds since the start."""
+        if self.shown:
+            print(f'[{time.monotonic() - self.start:4.0f} s] {step}', file=sys.stderr)
+
+
+def recorded(
+    bag: Path, config: SimulationConfig, panorama: tuple[int, int], progress: Progress
+) -> Path:
+    """The bag of a simulated drive with panoramas of (width, height), made where it is missing."""
+    if not bag.exists():
+        progress.say(f'simulate {bag.name}')
+        width, height = panorama
+        simulate(config, bag, PanoramaConfig(width=width, height=height), progress=progress.shown)
+    return bag

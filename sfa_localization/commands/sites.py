@@ -1,0 +1,127 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Gardens of the paper's sizes, with the drives and models that the paper's results share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sfa_localization.bags.drives import as_live, image_cache
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.commands.reproduction import Progress, recorded
+from sfa_localization.commands.trials import Study
+from sfa_localization.data.run import Run
+from sfa_localization.data.threads import one_core
+from sfa_localization.features.network import Network, standard_architecture
+from sfa_localization.features.network_training import ImageSequence, train_network
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.simulation.drive import drive
+from sfa_localization.simulation.garden import Garden
+from sfa_localization.simulation.settings import SimulationConfig
+from sfa_localization.training import Recipe, learn_place
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Size of the garden (m) and of the panoramas, images of the training drives, and minutes of
+    each result and seed, as measured on two cores.
+    """
+
+    area: tuple[float, float]
+    panorama: tuple[int, int]
+    images: dict[str, int]
+    minutes: dict[str, int]
+
+
+FULL = Plan(
+    (16.0, 18.0),
+    (600, 60),
+    {'coverage': 1773, 'lines': 862, 'mower': 1346},
+    {'simulator': 4, 'robot': 3, 'baselines': 4, 'ablations': 30},
+)
+"""The sizes of section 4."""
+QUICK = Plan(
+    (8.0, 8.0),
+    (300, 30),
+    {'coverage': 400, 'lines': 300, 'mower': 600},
+    {'simulator': 1, 'robot': 1, 'baselines': 2, 'ablations': 8},
+)
+ROUTES = {'simulator': ('coverage', 'lines'), 'robot': ('mower',)}
+"""Training drives of the experiments: the network is trained on the first, and the map is laid on
+the truth by the last."""
+# The count of images settles in three or four.
+_TRIES = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One garden, or somewhere real: its training bags, the one to test on, and models of it."""
+
+    folder: Path
+    training: tuple[Path, ...]
+    test: Path
+    recipe: Recipe
+    progress: Progress
+
+    @classmethod
+    def simulated(
+        cls, out: Path, experiment: str, world: int, seed: int, plan: Plan, progress: Progress
+    ) -> Site:
+        """The garden `world` with drives of `seed`, below the folder `out`."""
+        folder = out / f'garden_{world}_{seed}'
+        base = SimulationConfig(
+            world=world, seed=seed, area=plan.area, images='panorama', compression='jpeg'
+        )
+        bags = []
+        for route in (*ROUTES[experiment], 'test'):
+            config = replace(base, trajectory=route)
+            if not (folder / route).exists():
+                config = spaced(config, plan.images.get(route))
+            bags.append(recorded(folder / route, config, plan.panorama, progress))
+        width, height = plan.panorama
+        recipe = as_live(Recipe(), PanoramaConfig(width=width, height=height))
+        return cls(folder, tuple(bags[:-1]), bags[-1], recipe, progress)
+
+    @contextmanager
+    def study(self) -> Iterator[Study]:
+        """The drives, read; their images are in a folder that is removed in the end."""
+        with image_cache(self.folder / 'images') as cache:
+            yield Study.read(self.training, self.test, cache, self.recipe)
+
+    def model(self, study: Study) -> PlaceModel:
+        """What this package makes of all training drives, with the network of the first one."""
+        path = self.folder / f'{"_".join(bag.name for bag in self.training)}.npz'
+        if not path.exists():
+            self.progress.say(f'train on {study.training[0].name}')
+            network = network_of(study.training[:1], self.recipe)
+            learned(network, study.training, self.recipe).save(path)
+        return PlaceModel.load(path)
+
+
+def network_of(runs: Sequence[Run], recipe: Recipe) -> Network:
+    """The network of a recipe, trained on runs."""
+    size = runs[0].panoramas.shape[:2]
+    architecture = recipe.architecture or standard_architecture(size, recipe.network.normalization)
+    return train_network(architecture, [ImageSequence.of(run) for run in runs], recipe.network.seed)
+
+
+def learned(network: Network, runs: Sequence[Run], recipe: Recipe) -> PlaceModel:
+    """What a recipe makes of a trained network and training drives."""
+    with one_core():
+        return learn_place(network, runs, recipe).model
+
+
+def spaced(config: SimulationConfig, images: int | None) -> SimulationConfig:
+    """The settings of a drive with so many images, as far as their distance decides."""
+    if images is None:
+        return config
+    garden = Garden(config.world, config)
+    for _ in range(_TRIES):
+        count = len(drive(garden, config).image_stamps_ns)
+        if count == images:
+            break
+        config = replace(config, images_every=config.images_every * count / images)
+    return config

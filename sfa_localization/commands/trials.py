@@ -1,0 +1,242 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""One place, some training drives and one to test on; and maps from any features, judged there.
+
+Every map is judged by the paper's protocol (section 4): laid on the truth by its estimates of a
+training drive, and compared with a regression of the same features on the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.bags.drives import read_drive
+from sfa_localization.commands.reproduction import BATCH, Cell
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import (
+    Array,
+    RigidTransform,
+    align,
+    compose,
+    invert,
+    rotation,
+)
+from sfa_localization.data.run import Image, Run, Trajectory
+from sfa_localization.evaluation import known, regression, score
+from sfa_localization.features.image_features import (
+    REFINING_LAYER,
+    slow_features,
+    spectrum,
+)
+from sfa_localization.features.network import Network
+from sfa_localization.filtering import Table, run_filter
+from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.metric.fast_expansions import Predictor
+from sfa_localization.metric.segments import Segments, join
+from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.training import Recipe, clock_of, cut_odometry
+
+Rows = NDArray[np.int64]
+Features = Callable[[Image], Array]
+KNOWN_START = FilterConfig(initial_position_std=0.02, initial_yaw_std=0.02)
+"""Section 5.1: the robot starts from a known location, with known heading; as from a dock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """Training drives and a drive to test on, with the true positions (N, 2) and (T, 2) m of
+    their images; the map is laid on the truth by the last training drive.
+    """
+
+    training: tuple[Run, ...]
+    test: Run
+    clocks: tuple[CameraClock, ...]
+    places: Array
+    test_truth: Trajectory
+
+    @classmethod
+    def read(cls, bags: Sequence[Path], test: Path, cache: Path, recipe: Recipe) -> Study:
+        """From bags; their images go to the folder `cache`. Raises BagError or DataError."""
+        runs = []
+        for bag in [*bags, test]:
+            folder = cache / bag.name
+            folder.mkdir(exist_ok=True)
+            runs.append(read_drive(bag, folder, recipe, want_truth=True))
+        clocks = tuple(clock_of(run) for run in runs)
+        truths = [_truth(run, clock) for run, clock in zip(runs, clocks, strict=True)]
+        places = np.concatenate([truth.poses[:, :2] for truth in truths[:-1]])
+        return cls(tuple(runs[:-1]), runs[-1], clocks[:-1], places, truths[-1])
+
+    @property
+    def truth(self) -> Trajectory:
+        """The true path of the test drive."""
+        assert self.test.ground_truth is not None
+        return self.test.ground_truth
+
+    @property
+    def starts(self) -> list[int]:
+        """The first row of each training drive, among the images of all."""
+        counts = [len(run.panoramas) for run in self.training]
+        return [sum(counts[:k]) for k in range(len(counts))]
+
+    def segments(self, config: SegmentConfig, only_last: bool = False) -> Segments:
+        """Segments of all training drives, or of the last one; by rows among the images of all."""
+        first = len(self.training) - 1 if only_last else 0
+        parts = zip(self.training[first:], self.clocks[first:], strict=True)
+        cut = [cut_odometry([run], [clock], config) for run, clock in parts]
+        return join(cut, self.starts[first:])
+
+    def laid_on(self, config: SegmentConfig) -> Rows:
+        """Rows of the images that the map is laid on the truth by: in segments of the last one."""
+        segments = self.segments(config, only_last=True)
+        return self.known(np.concatenate([segment.images for segment in segments]))
+
+    def known(self, rows: Rows) -> Rows:
+        """Those of the rows (M,) of training images whose true position is known."""
+        return np.asarray(rows[np.isfinite(self.places[rows, 0])])
+
+    def batches(self) -> Iterator[Image]:
+        """All training images in batches (T, H, W, 3)."""
+        return (batch for run in self.training for batch in run.panoramas.batches(BATCH))
+
+    def features(self, of: Features) -> tuple[Array, Array]:
+        """Features (N, K) of all training images, and (T, K) of the test drive's."""
+        training = np.concatenate([of(batch) for batch in self.batches()])
+        return training, np.concatenate([of(b) for b in self.test.panoramas.batches(BATCH)])
+
+
+def _truth(run: Run, clock: CameraClock) -> Trajectory:
+    """True poses where the images were taken, NaN where unknown."""
+    if run.ground_truth is None:
+        raise DataError(f'{run.name}: no ground truth to judge by')
+    stamps = run.panoramas.stamps_ns - clock.delay_ns
+    poses = run.ground_truth.at(stamps)
+    poses[~known(run.ground_truth, stamps)] = np.nan
+    return Trajectory(stamps, poses)
+
+
+def slow_of(network: Network) -> Features:
+    """The slow features of images."""
+    return lambda images: slow_features(network.maps(images))
+
+
+def turned_of(model: PlaceModel) -> Features:
+    """What a model's finer map reads: maps turned by the compass, reduced."""
+    refinement = model.refinement
+    assert refinement is not None
+
+    def turned(images: Image) -> Array:
+        maps = model.network.maps(images)
+        yaw, _ = model.headings(maps, slow_features(maps))
+        return refinement.features(spectrum(maps[REFINING_LAYER]), yaw)
+
+    return turned
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Positions of the images by a map: in its own frame, in that of the truth, and by regression
+    on the truth of the images `fitted`; `rows` (R,) of the training images lay it on the truth.
+
+    `raw`, `laid` and `supervised` are pairs: (R, 2) m of these rows, and (T, 2) m of the test
+    drive; `covariances` (T, 2, 2) m^2 are in the frame of the truth.
+    """
+
+    study: Study
+    rows: Rows
+    transform: RigidTransform
+    raw: tuple[Array, Array]
+    laid: tuple[Array, Array]
+    supervised: tuple[Array, Array]
+    covariances: Array
+
+    @classmethod
+    def of(
+        cls,
+        study: Study,
+        metric: Predictor,
+        features: tuple[Array, Array],
+        rows: Rows,
+        fitted: Rows,
+    ) -> Trial:
+        """A map's estimates from features (N, K) and (T, K). Raises DataError."""
+        training, test = features
+        raw_test, covariances = metric.predict(test)
+        raw = metric.predict(training[rows])[0], raw_test
+        transform = align(raw[0], study.places[rows])
+        fitted = study.known(fitted)
+        weights = regression(metric.basis, training[fitted], study.places[fitted])
+        turn = rotation(transform.yaw_rad)
+        return cls(
+            study,
+            rows,
+            transform,
+            raw,
+            (transform.apply(raw[0]), transform.apply(raw[1])),
+            (metric.basis.expand(training[rows]) @ weights, metric.basis.expand(test) @ weights),
+            turn @ covariances @ turn.T,
+        )
+
+    @property
+    def truth(self) -> tuple[Array, Array]:
+        """True positions (R, 2) and (T, 2) m."""
+        return self.study.places[self.rows], self.study.test_truth.poses[:, :2]
+
+    def errors(self) -> Cell:
+        """Mean distances (m) from the truth: `training` and `test`, each also `supervised`."""
+        parts = enumerate(('training', 'test'))
+        return {
+            f'{part}{name}': mean_error(estimates[k], self.truth[k])
+            for k, part in parts
+            for name, estimates in (('', self.laid), ('_supervised', self.supervised))
+        }
+
+    def fused(self, correlation: ErrorCorrelation) -> Trajectory:
+        """The filter's path in the frame of the truth, from a known start; images give positions
+        only, whose errors have this correlation.
+        """
+        run, (x, y), var = self.study.test, self.laid[1].T, self.covariances
+        stamps, odometry = self.study.test_truth.stamps_ns, run.odometry
+        (v, omega), (var_v, var_omega) = odometry.twists.T, odometry.variances.T
+        driven = {'v': v, 'omega': omega, 'var_v': var_v, 'var_omega': var_omega}
+        seen = {'x': x, 'y': y, 'var_x': var[:, 0, 0], 'var_y': var[:, 1, 1]}
+        filtered = run_filter(
+            Table(odometry.stamps_ns, driven),
+            Table(stamps, {**seen, 'var_xy': var[:, 0, 1]}),
+            KNOWN_START,
+            start=start_of(run).tolist(),
+            correlation=correlation,
+        )
+        return Trajectory(filtered.stamps_ns, filtered.poses)
+
+
+def start_of(run: Run) -> Array:
+    """The true pose (3,) where the odometry begins."""
+    assert run.ground_truth is not None
+    return np.asarray(run.ground_truth.at(run.odometry.stamps_ns[:1])[0])
+
+
+def known_start(run: Run, transform: RigidTransform) -> FilterConfig:
+    """The filter's settings for a start at the true pose, in the map that `transform` lays on the
+    truth.
+    """
+    laid = np.array([transform.x_m, transform.y_m, transform.yaw_rad])
+    return replace(KNOWN_START, initial_pose=tuple(compose(invert(laid), start_of(run)).tolist()))
+
+
+def mean_distance(path: Trajectory, truth: Trajectory) -> float:
+    """Mean distance (m) of a path from the true one, where that is known."""
+    return float(score(truth, path)['mean'])
+
+
+def mean_error(places: Array, truth: Array) -> float:
+    """Mean distance (m) of places (N, 2) from true ones (N, 2), where these are known."""
+    return float(np.nanmean(np.hypot(*(places - truth).T)))
