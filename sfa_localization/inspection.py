@@ -287,6 +287,7 @@ class _Survey:
     """One pass over all topics of a bag."""
 
     def __init__(self, bag: Bag, image: str, odometry: str) -> None:
+        # Empty where there is none: damaged bags also have topics without a name.
         self._bag, self._image, self._odometry = bag, image, odometry
         self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
         self._motion: list[tuple[int, Any]] = []
@@ -302,17 +303,17 @@ class _Survey:
         self._streams = [self._stream(name) for name in self._bag.topics]
         for stream, stamp_ns, value in self._bag.read(self._streams):
             self._stamps[stream.topic].append(stamp_ns)
-            if stream.topic == self._odometry.partition(':')[0]:
+            if self._odometry and stream.topic == self._odometry.partition(':')[0]:
                 self._motion.append((stamp_ns, value))
-            elif stream.topic == self._image:
+            elif self._image and stream.topic == self._image:
                 self._turned.append((stamp_ns, value))
 
     def _stream(self, name: str) -> Stream:
-        if name == self._odometry.partition(':')[0]:
+        if self._odometry and name == self._odometry.partition(':')[0]:
             stream = self._bag.stream(self._odometry, decoding.odometry_of)
             stream.required = False
             return stream
-        if name == self._image:
+        if self._image and name == self._image:
             return self._bag.any_stream(name, self._sample)
         if self._bag.topics[name].kind in KINDS['image'].found:
             return self._bag.any_stream(name, decoding.image_of)
@@ -348,7 +349,7 @@ class _Survey:
         longest = max(MAX_GAP_S, 5 / max(report.rate_hz, 1e-9))
         if report.largest_gap_s > longest and report.keeps_time:
             yield f'pause of {report.largest_gap_s:.1f} s'
-        if stream.topic == self._image and len(self._sizes) > 1:
+        if self._image and stream.topic == self._image and len(self._sizes) > 1:
             sizes = ', '.join(f'{w}x{h}' for h, w in self._sizes)
             yield f'images of several sizes: {sizes}'
 

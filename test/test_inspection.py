@@ -195,6 +195,19 @@ def test_a_topic_of_which_nothing_can_be_read_is_an_error(tmp_path: Path, capsys
     assert '5 of 5 messages: zero or negative stamp' in capsys.readouterr().out
 
 
+def test_a_topic_without_a_name_is_not_taken_for_missing_images(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(20):
+            bag.odometry('/odom', START + index * STEP, (index * 0.1, 0, 0), (0.5, 0), (0, 0))
+            bag.pose('', START + index * STEP, (0, 0, 0))
+    (stored,) = (tmp_path / 'bag').glob('*.mcap')
+    content = stored.read_bytes()
+    assert b'msg/PoseStamped' in content
+    stored.write_bytes(content.replace(b'msg/PoseStamped', b'msg/PoseUnknown'))
+    report = inspect(tmp_path / 'bag')
+    assert report.images is None and report.drive is not None
+
+
 def test_a_bag_recorded_while_the_nodes_ran_is_read_by_its_inputs(tmp_path: Path) -> None:
     picture = np.zeros((8, 60, 3), np.uint8)
     with BagWriter(tmp_path / 'bag') as bag:
