@@ -335,7 +335,8 @@ def test_the_command_writes_json_and_figures(
     for name in ('0_good_pictures.png', '0_good_path.png'):
         picture = cv2.imread(str(report / name))
         assert picture is not None and picture.std() > 5
-    assert {file.name for file in report.iterdir()} == {'0_good_pictures.png', '0_good_path.png'}
+    pictures = {'0_good_pictures.png', '0_good_path.png'}
+    assert {file.name for file in report.iterdir()} == pictures | {'index.html'}
 
 
 def test_the_command_takes_topics_and_limits(
