@@ -14,6 +14,7 @@ from sfa_localization import training
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, integrate
+from sfa_localization.features.closures import Closures
 from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.metric.settings import SegmentConfig
@@ -90,7 +91,9 @@ def test_where_no_map_can_be_learned_the_images_bound_the_noise(monkeypatch, giv
     monkeypatch.setattr(training, '_map_and_compass', fail)
     monkeypatch.setattr(training, 'against_images', lambda *a: 0.05)
     with pytest.raises(DataError, match='uncertain'):
-        training._learn_map(None, [run], [CameraClock()], [[]], config, None)
+        training._learn_map(
+            None, Closures.none(), [run], [CameraClock()], [[]], config, None, progress=False
+        )
     assert len(noises) == calls
     assert calls == 1 or noises[1] > 3 * noises[0]
 
