@@ -308,7 +308,7 @@ def test_a_hostile_model_is_refused_live_and_ends_nothing(bench, tmp_path):
     broken = {**arrays, 'compass/features': arrays['compass/features'][:, :3]}
     write_arrays(bad, broken)
     node = bench.run(SfaNode, model=str(whole))
-    for path, reason in ((bad, 'is damaged'), (300 * 'x', 'no such'), ('/dev/zero', 'no such')):
+    for path, reason in ((bad, 'is damaged'), (300 * 'x', 'no such'), ('/dev/zero', 'no regular')):
         refused = node.set_parameters([Parameter('model', value=str(path))])[0]
         assert not refused.successful and reason in refused.reason
     whole.write_bytes(bad.read_bytes())

@@ -64,9 +64,9 @@ class Loops:
         their residuals in the solution `before`."""
         turns, moves = self._rows(stack)
         turn_weight, move_weight = self._weights(turns, moves, stack, before)
-        rows = sparse.vstack([turns, moves])
-        weight = sparse.diags_array(np.concatenate([turn_weight, move_weight]))
-        return np.asarray((rows.conj().T @ (weight @ rows)).toarray())
+        weight = np.sqrt(np.concatenate([turn_weight, move_weight]))
+        rows = sparse.vstack([turns, moves]).multiply(weight[:, None]).tocsr()
+        return np.asarray((rows.conj().T @ rows).toarray())
 
     def _rows(self, stack: Stack) -> tuple[sparse.sparray, sparse.sparray]:
         """Rows (L, 3N) whose squares are the turns' and the places' costs; turns to first order
