@@ -17,11 +17,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, align_complex, wrap_angle
+from sfa_localization.data.geometry import align_complex, wrap_angle
 from sfa_localization.fusion.belief import Evidence, Trust
 from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
 
-_Complex = NDArray[np.complex128]
 SPACING_M = 0.1
 """Images nearer than this to the last one kept show no motion of their own."""
 WINDOW_M, WINDOW_IMAGES = 1.5 * AGREEING_DISTANCE_M, 8
@@ -40,8 +39,6 @@ in twenty such moves is wrong, by all of it; and its limit (m), because a robot 
 is not lost."""
 _HEADING_DRIFT_RAD = 0.05  # of odometry over the window
 _FIT_STEPS = 5  # of reweighting, from where the fit hardly changes
-PACED_SHARE = 0.8
-"""Share of the images that must lie on the path for their pace to mean anything: fewer jump."""
 
 
 def watched(trust: Trust, newest: Evidence) -> Trust:
@@ -90,7 +87,9 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     span_m = recent[-1].traveled_m - recent[0].traveled_m
     if len(recent) < WINDOW_IMAGES or span_m < AGREEING_DISTANCE_M:
         return '', (0.0, 0.0)
-    path, places, variance = _beside(recent, span_m)
+    path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
+    places = np.array([complex(*item.position) for item in recent])
+    variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
     weight = 1 / variance
     for _ in range(_FIT_STEPS):
         along = path - np.average(path, weights=weight)
@@ -105,35 +104,6 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     # Neighboring images err alike, over about a meter.
     dependence = max(1.0, len(recent) / (1 + span_m))
     return _turned(recent, agree, float(np.angle(turn)), dependence / max(lever, 1e-9))
-
-
-def behind(recent: Sequence[Evidence]) -> float:
-    """The share of the odometry's way by which images moved less; 0 where that is not clear.
-
-    The odometry is the one that the filter has corrected by the scale learned so far.
-    """
-    span_m = recent[-1].traveled_m - recent[0].traveled_m
-    if len(recent) < WINDOW_IMAGES or span_m < AGREEING_DISTANCE_M:
-        return 0.0
-    path, places, variance = _beside(recent, span_m)
-    weight = 1 / variance
-    for _ in range(_FIT_STEPS):
-        along = path - np.average(path, weights=weight)
-        moved_by = places - np.average(places, weights=weight)
-        pace = np.sum(weight * np.conj(along) * moved_by) / np.sum(weight * np.abs(along) ** 2)
-        square = np.abs(moved_by - pace * along) ** 2 / variance
-        weight = 1 / (variance * (1 + square))
-    if np.mean(square <= AGREEING_VARIANCES) < PACED_SHARE:
-        return 0.0
-    return 1.0 - float(np.abs(pace))
-
-
-def _beside(recent: Sequence[Evidence], span_m: float) -> tuple[_Complex, _Complex, Array]:
-    """Dead-reckoned and seen positions (N,), and variances of their differences."""
-    path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
-    places = np.array([complex(*item.position) for item in recent])
-    variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
-    return path, places, variance
 
 
 def _turned(

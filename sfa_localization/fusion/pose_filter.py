@@ -20,16 +20,8 @@ from numpy.typing import ArrayLike
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.belief import (
-    Belief,
-    Event,
-    Evidence,
-    OdometryEvent,
-    PoseEvent,
-    Update,
-)
+from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
-from sfa_localization.fusion.consistency import behind
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import read_measurement, read_pose, read_twist
 from sfa_localization.fusion.motion import BIAS, State
@@ -103,7 +95,6 @@ class PoseFilter:
         # Stamps may start anew; the camera's delay stays what it was.
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
         self._watch.forget_time()
-        self._paced: Evidence | None = None
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._backward = 0
         self._ahead = (0, 0)
@@ -195,8 +186,7 @@ class PoseFilter:
         assert update is not None
         if update.reason == 'restarted elsewhere':
             self._watch.doubt()
-        self._note_pace(taken_ns)
-        self._judge_time()
+            self._judge_time()
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
@@ -216,13 +206,6 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
-
-    def _note_pace(self, stamp_ns: int) -> None:
-        """Images that fall behind the odometry become late."""
-        recent = self._history.newest.memory.trust.recent
-        if recent and recent[-1] is not self._paced:
-            self._paced = recent[-1]
-            self._watch.fall_behind(stamp_ns, behind(recent))
 
     def _judge_time(self) -> None:
         """Whether images are likely of another time; once they were, until that is unlikely."""

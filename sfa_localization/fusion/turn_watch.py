@@ -7,8 +7,7 @@ smooth curve all of them lie on the odometry's path, meters away from the robot.
 that the robot turned at another time. A Bayes filter holds the probability of each delay, and of
 images that have nothing to do with the odometry. It forgets by evidence, not by time: on a straight
 line, which shows no delay, it keeps what it found for minutes. `CameraClockFinder` measures a delay
-that lasts; this one watches for any that is not compensated. Where the robot circles, turns show
-nothing: there a delay grows by as much as images fall behind the odometry's way.
+that lasts; this one watches for any that is not compensated.
 """
 
 from __future__ import annotations
@@ -65,8 +64,6 @@ _NEAR_NS, _APART_NS = 150_000_000, 1_500_000_000
 _SOON_NS, _FINALLY_NS = 300_000_000, round(-EARLIEST_S * 1e9)
 """A pair counts after so long, with odometry that goes on as before where images may be early; and
 for good when all of the odometry is there."""
-_MOST_BEHIND = 0.3
-"""Images that fall behind faster are rather of another place than late."""
 _PAUSE_NS = 500_000_000
 _REMEMBERED_NS = round((LATEST_S + 4.0) * 1e9)
 
@@ -99,7 +96,6 @@ class TurnWatch:
         self._pairs: deque[Pair] = deque()
         self._counted = 0
         self._last: tuple[int, float] | None = None
-        self._paced_ns: int | None = None
 
     def add_odometry(self, stamp_ns: int, omega: float) -> None:
         """Take a turn rate rad/s, without bias, held since the one before; skip late ones."""
@@ -124,18 +120,6 @@ class TurnWatch:
         if last and 0 < gap < _APART_NS:
             self._pairs.append(Pair(last[0], stamp_ns, float(wrap_angle(yaw_rad - last[1]))))
         self._last = stamp_ns, yaw_rad
-
-    def fall_behind(self, stamp_ns: int, share: float) -> None:
-        """Images moved less than the odometry by this share of its way, up to a stamp.
-
-        The odds also spread between steps: about as much as the pace along a map is uncertain.
-        """
-        elapsed_ns = stamp_ns - self._paced_ns if self._paced_ns is not None else 0
-        self._paced_ns = stamp_ns
-        if 0 < elapsed_ns < _APART_NS:
-            later_s = min(max(share, -_MOST_BEHIND), _MOST_BEHIND) * elapsed_ns * 1e-9
-            self._settled = _shifted(self._settled, later_s / _STEP_S)
-            self._odds = _shifted(self._odds, later_s / _STEP_S)
 
     def doubt(self) -> None:
         """Images have moved the estimate: perhaps they are of another time."""
@@ -238,18 +222,6 @@ def _moved(odds: Array) -> Array:
     moved = drifted * (1 - np.where(_NEAR, _BREAK, _HEAL)) + _BREAK * good / len(drifted)
     moved[_NEAR] += _HEAL * (1 - good) / _NEAR.sum()
     return np.asarray(moved / moved.sum())
-
-
-def _shifted(odds: Array, steps: float) -> Array:
-    """The odds when all delays have grown by so many steps; the outermost ones stay there."""
-    last = len(_DELAYS) - 1
-    whole = math.floor(steps)
-    lower = np.clip(np.arange(last + 1) + whole, 0, last)
-    upper = np.clip(np.arange(last + 1) + whole + 1, 0, last)
-    part = steps - whole
-    moved = np.bincount(lower, (1 - part) * odds[:-1], last + 1)
-    moved += np.bincount(upper, part * odds[:-1], last + 1)
-    return np.append(moved, odds[-1])
 
 
 def _at(times: Array, known: Array, yaws: Array, rate: float) -> Array:
