@@ -8,7 +8,7 @@ learned. They tie the stretches of a drive to each other, and drives in differen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +18,12 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
 from sfa_localization.features.image_features import sample
 from sfa_localization.features.keyframes import (
+    Spectra,
     coarse,
     coarse_scores,
     correlate,
-    normalized,
     quantized,
-    spectrum,
+    spectra_of,
     texture,
 )
 
@@ -96,22 +96,38 @@ def _path(run: Run) -> Array:
     return np.cumsum(np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T))
 
 
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """The views of one drive, ready to be correlated: `spectra` of the columns, and their `rough`
+    part."""
+
+    views: Views
+    spectra: Spectra
+    rough: Spectra
+
+    @classmethod
+    def of(cls, views: Views) -> _Drive:
+        spectra = spectra_of(views.textures)
+        return cls(views, spectra, coarse(spectra))
+
+
 def find_closures(views: Views, clockwise: bool) -> Closures:
     """Images of two drives, or of a drive with itself, each of which is the likest of the other,
     if they are like enough. `clockwise`: whether columns grow clockwise seen from above.
     """
-    drives = [views.of(run) for run in np.unique(views.run).tolist()]
+    drives = [_Drive.of(views.of(run)) for run in np.unique(views.run).tolist()]
     images, turns = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
     step = (2 if clockwise else -2) * np.pi / views.textures.shape[2]
     for number, one in enumerate(drives):
         for other in drives[number:]:
             rows, shifts = _mutual(one, other)
-            images.append(np.column_stack([one.images[rows[:, 0]], other.images[rows[:, 1]]]))
+            first, second = one.views.images[rows[:, 0]], other.views.images[rows[:, 1]]
+            images.append(np.column_stack([first, second]))
             turns.append(step * shifts)
     return Closures(np.concatenate(images), np.concatenate(turns))
 
 
-def _mutual(one: Views, other: Views) -> tuple[Indices, Array]:
+def _mutual(one: _Drive, other: _Drive) -> tuple[Indices, Array]:
     """Rows (L, 2) of closures between two drives, and the shifts (L,) of their columns."""
     there, score, shift = _likest(one, other)
     same = one is other
@@ -121,31 +137,29 @@ def _mutual(one: Views, other: Views) -> tuple[Indices, Array]:
     return np.column_stack([at, there])[kept], shift[kept]
 
 
-def _likest(one: Views, other: Views) -> tuple[Indices, Array, Array]:
+def _likest(one: _Drive, other: _Drive) -> tuple[Indices, Array, Array]:
     """For each image (S,) of one drive the row of the likest of another, the correlation, -inf
     without any, and the shift of the columns.
     """
-    spectra, keyframes = (
-        spectrum(np.stack([normalized(t.astype(np.float32)) for t in v.textures]))
-        for v in (one, other)
-    )
-    rough, columns = coarse(keyframes), one.textures.shape[2]
-    best, score, shift = np.zeros(len(spectra), np.int64), *np.full((2, len(spectra)), -np.inf)
-    for start in range(0, len(spectra), _AT_ONCE):
-        scores = coarse_scores(spectra[start : start + _AT_ONCE], rough)
-        if one is other:
-            path = one.path_m[start : start + _AT_ONCE]
-            scores[np.abs(path[:, None] - other.path_m) < STRETCH_M] = -np.inf
-        number = min(_CANDIDATES, len(keyframes))
-        likely = np.sort(np.argpartition(-scores, number - 1, axis=1)[:, :number])
-        for row in range(len(scores)):
-            rows = likely[row][np.isfinite(scores[row, likely[row]])]
-            if not len(rows):
-                continue
-            found, shifts = correlate(
-                spectra[start + row : start + row + 1], keyframes[rows], columns
-            )
+    count, columns = len(one.spectra), one.views.textures.shape[2]
+    best, score, shift = np.zeros(count, np.int64), *np.full((2, count), -np.inf)
+    for row, rows in enumerate(_candidates(one, other)):
+        if len(rows):
+            image = one.spectra[row : row + 1]
+            found, shifts = correlate(image, other.spectra[rows], columns)
             top = int(found[0].argmax())
-            best[start + row] = rows[top]
-            score[start + row], shift[start + row] = found[0, top], shifts[0, top]
+            best[row], score[row], shift[row] = rows[top], found[0, top], shifts[0, top]
     return best, score, shift
+
+
+def _candidates(one: _Drive, other: _Drive) -> Iterator[Indices]:
+    """For each image of one drive the rows of another that are likest by the rough correlation."""
+    number = min(_CANDIDATES, len(other.spectra))
+    for start in range(0, len(one.spectra), _AT_ONCE):
+        scores = coarse_scores(one.spectra[start : start + _AT_ONCE], other.rough)
+        if one is other:
+            path = one.views.path_m[start : start + _AT_ONCE]
+            scores[np.abs(path[:, None] - other.views.path_m) < STRETCH_M] = -np.inf
+        likely = np.sort(np.argpartition(-scores, number - 1, axis=1)[:, :number])
+        for own, rows in zip(scores, likely, strict=True):
+            yield rows[np.isfinite(own[rows])]

@@ -177,6 +177,11 @@ def quantized(textures: Texture) -> NDArray[np.int8]:
     return np.asarray(np.clip(np.rint(textures * (_STEPS / deviation)), -127, 127), np.int8)
 
 
+def spectra_of(textures: NDArray[np.int8]) -> Spectra:
+    """Spectra (K, rows, F) of quantized textures (K, rows, columns), each of unit norm."""
+    return spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
+
+
 def correlate(
     spectra: Spectra, keyframes: Spectra, columns: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -246,7 +251,7 @@ class Keyframes:
         first = np.count_nonzero(drives == 0)
         if first < _FEWEST:
             raise DataError(f'{first} images are too few for keyframes')
-        spectra = spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
+        spectra = spectra_of(textures)
         tree = cKDTree(poses[:, :2])
         return cls(textures, poses, noise, clockwise, drives, spectra, coarse(spectra), tree)
 
