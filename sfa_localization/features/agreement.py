@@ -20,6 +20,8 @@ from scipy import stats
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.rotation import Map
 
+MEDIAN_TO_STD = 1.4826
+"""Standard deviation of a normal variable over the median of its absolute value."""
 _EXPONENTS = np.linspace(0.0, 6.0, 25)
 # Degrees of freedom of Student's t, for the few images with large errors.
 _HEAVY_TAIL = 4.0

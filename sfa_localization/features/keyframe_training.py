@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.agreement import needed_factor, quantile
+from sfa_localization.features.agreement import MEDIAN_TO_STD, needed_factor, quantile
 from sfa_localization.features.keyframes import (
     LOWEST,
     LOWEST_SHARE,
@@ -89,7 +89,7 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
     factor = needed_factor(squared / (variances[:, at] + floor**2), 2, alike)
     lowest = max(LOWEST, LOWEST_SHARE * float(np.median(best)))
     usual = max(quantile(np.array(best), _USUAL_SHARE, alike), lowest + _LEAST_RANGE)
-    yaw_std = max(1.4826 * float(np.median(yaws)), _LEAST_YAW_STD)
+    yaw_std = max(MEDIAN_TO_STD * float(np.median(yaws)), _LEAST_YAW_STD)
     return MatchNoise(float(_TEMPERATURES[at]), floor, max(factor, 1.0), yaw_std, lowest, usual)
 
 

@@ -13,7 +13,7 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.agreement import Agreement, share_within
+from sfa_localization.features.agreement import MEDIAN_TO_STD, Agreement, share_within
 from sfa_localization.features.image_features import ImageFeatures
 from sfa_localization.metric.compass import (
     Compass,
@@ -229,7 +229,7 @@ def _calibrate(error: Array, raw: Array) -> Array:
     The floor is the error where the process is most certain, the power the largest that covers.
     """
     most_certain = np.abs(error[raw <= np.quantile(raw, 0.25)])
-    floor = float((1.4826 * np.median(most_certain)) ** 2) + 1e-8
+    floor = float((MEDIAN_TO_STD * np.median(most_certain)) ** 2) + 1e-8
     for power in _POWERS:
         variance = calibrated(raw, np.array([power, floor]))
         if (error**2 <= 1.96**2 * variance).mean() >= _COVERAGE:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.features.agreement import MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.quadratic_form import Solution, Stack
 
@@ -32,7 +33,6 @@ _FIRST_TURN_STD, _LEAST_TURN_STD = 0.01, 0.002
 _FIRST_PLACE_STD_M, _LEAST_PLACE_STD_M = 0.3, 0.05
 # Residual, in standard deviations, at which a closure counts half.
 _HALF = 2.4
-_MEDIAN_TO_STD = 1.4826  # of a normal distribution
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Loops:
             return self.share / _FIRST_TURN_STD**2, self.share / _FIRST_PLACE_STD_M**2
         x = before.coefficients(stack.period)
         turned, apart = np.abs(turns @ x), np.abs(moves @ x)
-        turn_std = max(_MEDIAN_TO_STD * _median(turned), _LEAST_TURN_STD)
+        turn_std = max(MEDIAN_TO_STD * _median(turned), _LEAST_TURN_STD)
         # Of two axes.
         place_std = max(_median(apart) / np.sqrt(2.0 * np.log(2.0)), _LEAST_PLACE_STD_M)
         doubt = 1.0 + (turned / (_HALF * turn_std)) ** 2 + (apart / (_HALF * place_std)) ** 2 / 2

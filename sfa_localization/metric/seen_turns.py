@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Stamps
+from sfa_localization.features.agreement import MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import (
     OdometryTrack,
@@ -32,8 +33,6 @@ CLOSURES_MIN = 30
 BETTER = 2.0
 """Images are used where the noise of their turns is smaller by this factor: others change little,
 and their errors are not as white as those of good odometry."""
-# Standard deviation of a normal variable over its median absolute value.
-_MEDIAN_TO_STD = 1.4826
 # rad per square root of s: closures, exact to a fraction of a degree, show no smaller noise.
 _LEAST_NOISE = 1e-4
 
@@ -71,7 +70,7 @@ def corrections(drives: Sequence[Headings], closures: Closures) -> list[TurnCorr
     errors, time_s = _errors(drives, closures)
     if len(time_s) < CLOSURES_MIN:
         return None
-    noise = _MEDIAN_TO_STD * np.median(np.abs(errors) / np.sqrt(time_s), axis=1)
+    noise = MEDIAN_TO_STD * np.median(np.abs(errors) / np.sqrt(time_s), axis=1)
     odometry, same, opposite = np.maximum(noise, _LEAST_NOISE).tolist()
     sign, images = min((1.0, same), (-1.0, opposite), key=lambda pair: pair[1])
     if BETTER * images > odometry:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
+from sfa_localization.features.agreement import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.segments import ImagePoses, Segments
 from sfa_localization.metric.settings import SegmentConfig
@@ -28,8 +29,6 @@ _LATE = 1.3
 """A pair of images may be this factor farther apart in time than the lag."""
 _PAIRS_MIN = 30
 """With fewer pairs of images at a lag, chance decides."""
-# Standard deviation of a normal variable over its median absolute deviation.
-_MAD = 1.4826
 
 
 def turn_noise(times_s: Array, residuals: Array, chains: Indices) -> float | None:
@@ -44,7 +43,7 @@ def turn_noise(times_s: Array, residuals: Array, chains: Indices) -> float | Non
         first, last = _pairs(times_s, chains, lag)
         if len(first) >= _PAIRS_MIN:
             turns = wrap_angle(residuals[last] - residuals[first])
-            spread = _MAD * float(np.median(np.abs(turns - np.median(turns))))
+            spread = MEDIAN_TO_STD * float(np.median(np.abs(turns - np.median(turns))))
             found.append((float(np.mean(times_s[last] - times_s[first])), spread**2))
     if len(found) < 2:
         return None
