@@ -45,6 +45,12 @@ class CameraClock:
         significant = self.assumed or abs(self.delay_s) > _SIGNIFICANT_STDS * self.std_s
         return round(self.delay_s * 1e9) if significant else 0
 
+    def unless(self, found: CameraClock) -> CameraClock:
+        """This delay, where it is assumed and another one that was found agrees; else that."""
+        if not self.assumed or abs(found.delay_s - self.delay_s) > _SIGNIFICANT_STDS * found.std_s:
+            return found
+        return CameraClock(self.delay_s, min(self.std_s, found.std_s), True)
+
 
 _SIGNIFICANT_STDS = 2.0
 # Mean absolute value of a standard normal variable: sqrt(2 / pi).
@@ -65,10 +71,11 @@ _SCALE_RAD, _OUTLIER = 0.05, 4.0
 # A turn by less does not show how well images and odometry agree on turns, rad.
 _TURN_RAD = 0.05
 _TURNS_MIN = 10
-# Factor on the standard deviation, because neighboring pairs err alike.
-_CAUTION = 2.0
+# Factor on the standard deviation, because neighboring pairs err alike: on a slow curve, things
+# that pass near the camera look like turns for seconds.
+_CAUTION = 4.0
 _SCALE_MIN_RAD = 1e-3
-_STD_MAX_S = 0.03
+_STD_MAX_S = 0.06
 
 
 class CameraClockFinder:
@@ -80,7 +87,8 @@ class CameraClockFinder:
 
     def __init__(self, memory: float = np.inf, start: CameraClock | None = None) -> None:
         self._keep = 1.0 - 1.0 / memory
-        self._found: deque[tuple[int, CameraClock]] = deque([(0, start or CameraClock())])
+        self._start = start or CameraClock()
+        self._found: deque[tuple[int, CameraClock]] = deque([(0, self._start)])
         self._stamps: deque[int] = deque()
         self._yaws: deque[float] = deque()
         self._pauses: deque[int] = deque()
@@ -92,6 +100,7 @@ class CameraClockFinder:
 
     def expect(self, clock: CameraClock) -> None:
         """Use this estimate until another is found."""
+        self._start = clock
         self._found[0] = 0, clock
 
     @property
@@ -158,7 +167,7 @@ class CameraClockFinder:
             total += new
         found = self._estimate()
         if found.known:
-            self._found.append((last, found))
+            self._found.append((last, self._start.unless(found)))
         while len(self._found) > 2 and self._found[1][0] < last - _REMEMBERED_NS:
             self._found.popleft()
 
