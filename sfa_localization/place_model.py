@@ -44,7 +44,7 @@ from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 5
+VERSION = 6
 FARTHEST_M = 1e6
 """No place is farther from the origin of its map: there a pose's last digits are still micrometers.
 """
@@ -80,7 +80,7 @@ _BASIS = {
 _KEYFRAMES = {
     'textures': ArrayRule('NRC', 'i'),
     'poses': ArrayRule('N3', largest=FARTHEST_M),
-    'noise': ArrayRule('8', positive=(0, 1, 2, 3, 4, 5, 6)),
+    'noise': ArrayRule('9', positive=(0, 1, 2, 3, 4, 5, 6, 7)),
 }
 SCHEMA: Schema = {
     'network/#/': [

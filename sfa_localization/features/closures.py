@@ -18,7 +18,6 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
 from sfa_localization.features.image_features import sample
 from sfa_localization.features.keyframes import (
-    Spectra,
     coarse,
     coarse_scores,
     correlate,
@@ -26,6 +25,7 @@ from sfa_localization.features.keyframes import (
     spectra_of,
     texture,
 )
+from sfa_localization.features.nearby import Spectra
 
 Indices = NDArray[np.int64]
 

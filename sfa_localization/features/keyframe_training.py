@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array
 from sfa_localization.features.agreement import MEDIAN_TO_STD, needed_factor, quantile
 from sfa_localization.features.keyframes import (
     LOWEST,
@@ -31,7 +33,8 @@ _TRIALS = 400
 _STRETCH_M = 3.0
 _AT_ONCE = 64  # bounds the memory
 _TEMPERATURES = np.geomspace(0.003, 0.1, 12)
-_FLOORS_M = np.geomspace(0.03, 1.0, 15)
+_FLOORS_M = np.geomspace(0.01, 1.0, 15)
+_SLOPES_M = np.geomspace(0.03, 3.0, 13)
 _HEAVY_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
 _USUAL_SHARE = 0.05
 _LEAST_YAW_STD = 1e-3
@@ -56,7 +59,8 @@ def fit_keyframes(
 
 def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     """Some keyframes, each correlated with those of other stretches: index, (K,) correlations,
-    -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance driven until each.
+    -inf for its own stretch, and (K,) shifts from its heading. `path_m` (K,) is the distance
+    driven until each.
     """
     count = len(keyframes.poses)
     sample = np.unique(np.linspace(0, count - 1, min(_TRIALS, count)).round().astype(np.int64))
@@ -70,27 +74,51 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
                 yield row, scores, shifts
 
 
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """The match of a keyframe that is left out: `squared_error` m^2, `turn` rad, the error of its
+    yaw, `unlike` and `score` of the match, and the variance m^2 by keyframes elsewhere at each
+    temperature."""
+
+    squared_error: float
+    turn: float
+    unlike: float
+    score: float
+    scatters: tuple[float, ...]
+
+    @classmethod
+    def of(
+        cls,
+        keyframes: Keyframes,
+        row: int,
+        scores: NDArray[np.float32],
+        shifts: NDArray[np.float32],
+    ) -> _Trial:
+        match = keyframes.located(keyframes.spectra[row], scores, shifts)
+        error = match.pose[:2] - keyframes.poses[row, :2]
+        scatters = []
+        for temperature in _TEMPERATURES.tolist():
+            weight, offset = keyframes.elsewhere(scores, match.pose[:2], temperature)
+            scatters.append(float(weight @ (offset**2).sum(1)) / 2)
+        turn = abs(float(match.pose[2]))
+        return cls(float(error @ error), turn, match.unlike, match.score, tuple(scatters))
+
+
 def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
     """What the errors of keyframes that are left out are like; the default for too few."""
-    errors, yaws, scatters, best = [], [], [], []
-    for row, scores, shifts in left_out(keyframes, path_m):
-        match, pose = keyframes.located(scores, shifts), keyframes.poses[row]
-        best.append(match.score)
-        errors.append(float(((match.pose - pose)[:2] ** 2).sum()))
-        yaws.append(abs(float(wrap_angle(match.pose[2] - pose[2]))))
-        known, place = np.flatnonzero(np.isfinite(scores)), match.pose[:2]
-        weights = (keyframes.likelihood(scores[known], t) for t in _TEMPERATURES)
-        scatters.append([np.trace(keyframes.scatter(w, known, place)) / 2 for w in weights])
-    if len(errors) < NEIGHBORS:
+    trials = [_Trial.of(keyframes, *left) for left in left_out(keyframes, path_m)]
+    if len(trials) < NEIGHBORS:
         return MatchNoise()
-    squared, variances = np.array(errors), np.array(scatters)
-    at, floor = _likeliest(squared, variances)
-    alike = np.ones(len(squared))
-    factor = needed_factor(squared / (variances[:, at] + floor**2), 2, alike)
+    noise, variance = _likeliest(trials)
+    squared = np.array([trial.squared_error for trial in trials])
+    best = np.array([trial.score for trial in trials])
+    alike = np.ones(len(trials))
+    factor = max(needed_factor(squared / variance, 2, alike), 1.0)
     lowest = max(LOWEST, LOWEST_SHARE * float(np.median(best)))
-    usual = max(quantile(np.array(best), _USUAL_SHARE, alike), lowest + _LEAST_RANGE)
-    yaw_std = max(MEDIAN_TO_STD * float(np.median(yaws)), _LEAST_YAW_STD)
-    return MatchNoise(float(_TEMPERATURES[at]), floor, max(factor, 1.0), yaw_std, lowest, usual)
+    usual = max(quantile(best, _USUAL_SHARE, alike), lowest + _LEAST_RANGE)
+    turns = [trial.turn / (1 + trial.unlike) for trial in trials]
+    yaw_std = max(MEDIAN_TO_STD * float(np.median(turns)), _LEAST_YAW_STD)
+    return dataclasses.replace(noise, factor=factor, yaw_std=yaw_std, lowest=lowest, usual=usual)
 
 
 def spread(poses: Array) -> NDArray[np.int64]:
@@ -111,14 +139,20 @@ def spread(poses: Array) -> NDArray[np.int64]:
     return np.sort(order[np.argsort(rank[order], kind='stable')[:MOST]])
 
 
-def _likeliest(squared_errors: Array, scatters: Array) -> tuple[int, float]:
-    """Number of the temperature, and floor m, under which errors (M,) are likeliest."""
-    best, found = np.inf, (0, float(_FLOORS_M[0]))
-    for column in range(len(_TEMPERATURES)):
-        for floor in _FLOORS_M:
-            variance = scatters[:, column] + floor**2
-            tails = (_HEAVY_TAIL + 2) / 2 * np.log1p(squared_errors / (variance * _HEAVY_TAIL))
+def _likeliest(trials: Sequence[_Trial]) -> tuple[MatchNoise, Array]:
+    """The noise under which the errors of M trials are likeliest, and the variances (M,) m^2 that
+    it gives them.
+    """
+    squared = np.array([trial.squared_error for trial in trials])
+    unlike = np.array([trial.unlike for trial in trials])
+    scatters = np.array([trial.scatters for trial in trials]).T
+    best, found = np.inf, (MatchNoise(), squared)
+    # Of equals the largest temperature, which doubts most.
+    for temperature, scatter in reversed([*zip(_TEMPERATURES.tolist(), scatters, strict=True)]):
+        for floor, slope in itertools.product(_FLOORS_M.tolist(), _SLOPES_M.tolist()):
+            variance = scatter + floor**2 + (slope * unlike) ** 2
+            tails = (_HEAVY_TAIL + 2) / 2 * np.log1p(squared / (variance * _HEAVY_TAIL))
             surprise = float(np.mean(tails + np.log(variance)))
             if surprise < best:
-                best, found = surprise, (column, float(floor))
+                best, found = surprise, (MatchNoise(temperature, floor, slope), variance)
     return found

@@ -4,9 +4,9 @@
 
 Slow features are regressed to a pose, and a regression always has an answer. A correlation with
 the training images says whether the place was seen at all: local contrast survives another light
-and season, and what matches nothing is unknown. The match is a pose of its own: the correlation
-with the neighbors of the best keyframe is a surface over the ground whose top is the position,
-and the shift of the columns is the heading.
+and season, and what matches nothing is unknown. The match is a pose of its own: the keyframes
+around the best one show how the image changes with the place, and the shift of the columns is the
+heading.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
+from sfa_localization.features.nearby import Spectra, place_among, turned
 
 Texture = NDArray[np.float32]
-Spectra = NDArray[np.complex64]
 
 _COLUMNS, _ROWS = 100, 20
 # Standard deviation of the blur that takes light and its slow changes out, of the columns: 10 deg.
@@ -38,9 +38,12 @@ _DARKEST, _FLATTEST = 8.0, 0.1
 # Textures are stored with one byte a pixel.
 _STEPS = 127 / 4.0  # for a standard deviation
 NEIGHBORS = 24
-"""Keyframes about a place whose correlations make its surface."""
-_FEWEST = 6  # numbers of a paraboloid
-_REACH_SHARE = 0.6  # of the distance to the farthest of them: width of the weights
+"""Keyframes about a place that may be it."""
+_FEWEST = 6  # a place, its slopes along both axes, and as many to spare
+# Keyframes of the regression, and how often it moves to where it has put the image.
+_REGRESSED, _REPEATED = 64, 2
+# How far it may put the image from the best keyframe, of the distance to its farthest neighbor.
+_REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
 _COARSE, _CANDIDATES = 15, 64
 # Correlations that unknown places do not reach (foreign and mirrored gardens: 0.40), and the same
@@ -48,9 +51,6 @@ _COARSE, _CANDIDATES = 15, 64
 LOWEST, LOWEST_SHARE = 0.42, 0.5
 # Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
 _DOUBT = 4.0
-# Beside slow features that agree, a match counts with so many times its variance: the errors of
-# both have those of the map in common, so that the less certain one adds little.
-_CAUTION = 4.0
 # Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
 _APART = 6.0
 
@@ -60,19 +60,32 @@ class MatchNoise:
     """How well keyframes of other stretches of driving are found, learned by `fit_keyframes`.
 
     `temperature` is the difference of correlation that matters, `floor_m` the least standard
-    deviation of a position, `factor` what the variances of positions lack, `yaw_std` rad that of
-    a heading. `lowest` is the correlation below which a place is unknown, `usual` the one that
-    19 of 20 images of known places reach. `joint_factor` is what the variances lack of estimates
-    that slow features and keyframes agree on.
+    deviation of a position, `slope_m` what it grows by with `Nearby.unlike`, `factor` what the
+    variances of positions lack, `yaw_std` rad the least standard deviation of a heading, which
+    grows by as much when `unlike` grows by 1. `lowest` is the correlation below which a place is
+    unknown, `usual` the one that 19 of 20 images of known places reach. `joint_factor` is what
+    the variances lack of estimates that slow features and keyframes agree on.
     """
 
     temperature: float = 0.02
     floor_m: float = 0.3
+    slope_m: float = 0.5
     factor: float = 1.0
     yaw_std: float = 0.03
     lowest: float = LOWEST
     usual: float = 0.6
     joint_factor: float = 1.0
+
+    def with_map(self, common_m: float, turn_std: float) -> MatchNoise:
+        """With the errors of a map, which keyframes that are left out share: standard deviations
+        along each axis, m, and of its directions, rad.
+        """
+        floor, yaw_std = np.hypot(self.floor_m, common_m), np.hypot(self.yaw_std, turn_std)
+        return dataclasses.replace(self, floor_m=float(floor), yaw_std=float(yaw_std))
+
+    def variance(self, unlike: float) -> float:
+        """Variance m^2 of a position along each axis, of an image that is so unlike."""
+        return self.floor_m**2 + (self.slope_m * unlike) ** 2
 
     def novelty(self, score: float) -> float:
         """1 for a correlation that is just usual, 3 for the lowest of a known place, more below."""
@@ -86,13 +99,15 @@ class Match:
 
     `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
     with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
-    near a guess minus `score`, in temperatures: 0 where the best is among them.
+    near a guess minus `score`, in temperatures: 0 where the best is among them; `unlike` that of
+    `Nearby`.
     """
 
     pose: Array
     covariance: Array
     score: float
     support: float
+    unlike: float = 0.0
 
     def distance(self, position: Array, covariance: Array) -> float:
         """Half the squared Mahalanobis distance from another estimate's position (2,) m, with its
@@ -119,7 +134,7 @@ class Match:
         if self.support < -_DOUBT or distance > _APART:
             return self.pose[:2], float(self.pose[2]), self.covariance
         joint = np.zeros((3, 3))
-        gain = _CAUTION * mine @ np.linalg.inv(_CAUTION * mine + its)
+        gain = mine @ np.linalg.inv(mine + its)
         rest = np.eye(2) - gain
         both = gain @ its @ gain.T + rest @ mine @ rest.T
         joint[:2, :2] = noise.joint_factor * max(1.0, distance) * both
@@ -223,6 +238,7 @@ class Keyframes:
     """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
     `drives` (K,) is 0 for those of the training, then the number of the drive that added them.
+    `spectra` (K, rows, F) are those of the textures, turned to yaw 0.
     """
 
     textures: NDArray[np.int8]
@@ -251,7 +267,7 @@ class Keyframes:
         first = np.count_nonzero(drives == 0)
         if first < _FEWEST:
             raise DataError(f'{first} images are too few for keyframes')
-        spectra = spectra_of(textures)
+        spectra = turned(spectra_of(textures), poses[:, 2] * (1 if clockwise else -1))
         tree = cKDTree(poses[:, :2])
         return cls(textures, poses, noise, clockwise, drives, spectra, coarse(spectra), tree)
 
@@ -269,8 +285,9 @@ class Keyframes:
         if guess is not None:
             wanted.append(self.nearest(guess))
         self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
-        self._add(image, self.nearest(self.poses[int(scores.argmax()), :2]), scores, shifts)
-        return self.located(scores, shifts, guess)
+        best = self.poses[int(scores.argmax()), :2]
+        self._add(image, self.nearest(best, _REGRESSED), scores, shifts)
+        return self.located(image[0], scores, shifts, guess)
 
     def _add(
         self,
@@ -282,7 +299,7 @@ class Keyframes:
         """Fill in what is still missing of the wanted keyframes' correlations."""
         wanted = wanted[np.isneginf(scores[wanted])]
         if len(wanted):
-            found, shift = correlate(image, self.spectra[wanted], self.textures.shape[2])
+            found, shift = correlate(image, self.spectra[wanted], self._columns)
             scores[wanted], shifts[wanted] = found[0], shift[0]
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
@@ -291,29 +308,30 @@ class Keyframes:
         number = min(_CANDIDATES, len(scores))
         return np.sort(np.argpartition(-scores, number - 1)[:number])
 
-    def nearest(self, place: Array) -> NDArray[np.int64]:
-        """The keyframes nearest to a place (2,) m."""
-        return np.asarray(self.tree.query(place, min(NEIGHBORS, len(self.poses)))[1], np.int64)
+    def nearest(self, place: Array, number: int = NEIGHBORS) -> NDArray[np.int64]:
+        """So many keyframes nearest to a place (2,) m."""
+        return np.asarray(self.tree.query(place, min(number, len(self.poses)))[1], np.int64)
 
     def located(
         self,
+        spectrum: Spectra,
         scores: NDArray[np.float32],
         shifts: NDArray[np.float32],
         guess: Array | None = None,
     ) -> Match:
-        """The match of correlations (K,), -inf where unknown, and shifts (K,) of the columns."""
-        best, known = int(scores.argmax()), np.flatnonzero(np.isfinite(scores))
-        place = self._top_of_surface(scores, best)
-        turn = (-2 if self.clockwise else 2) * np.pi / self.textures.shape[2]
-        yaws = self.poses[known, 2] + turn * shifts[known]
-        yaw = float(self.poses[best, 2] + turn * shifts[best])
-        weight = self.likelihood(scores[known], self.noise.temperature)
+        """The match of the spectrum (rows, F) of an image, by its correlations (K,), -inf where
+        unknown, and shifts (K,) of the columns.
+        """
+        best = int(scores.argmax())
+        yaws = shifts * ((-2.0 if self.clockwise else 2.0) * np.pi / self._columns)
+        place, yaw, unlike = self.regressed(spectrum, scores, np.asarray(yaws, float))
+        weight, offset = self.elsewhere(scores, place, self.noise.temperature)
+        apart = np.square(wrap_angle(np.asarray(yaws[np.isfinite(scores)] - yaw, float)))
+        variance = self.noise.variance(unlike)
+        scatter = (offset * weight[:, None]).T @ offset
         covariance = np.zeros((3, 3))
-        floor = self.noise.floor_m**2 * np.eye(2)
-        scatter = self.scatter(weight, known, place)
-        covariance[:2, :2] = self.noise.factor * (scatter + floor)
-        scattered = float(weight @ wrap_angle(yaws - yaw) ** 2)
-        covariance[2, 2] = self.noise.yaw_std**2 + scattered
+        covariance[:2, :2] = self.noise.factor * (variance * np.eye(2) + scatter)
+        covariance[2, 2] = (self.noise.yaw_std * (1 + unlike)) ** 2 + float(weight @ apart)
         support = 0.0
         if guess is not None:
             near = scores[self.nearest(guess)]
@@ -321,37 +339,52 @@ class Keyframes:
             if len(near):
                 support = float(near.max() - scores[best]) / self.noise.temperature
         pose = np.array([*place, wrap_angle(yaw)])
-        return Match(pose, covariance, float(scores[best]), support)
+        return Match(pose, covariance, float(scores[best]), support, unlike)
 
-    def _top_of_surface(self, scores: NDArray[np.float32], best: int) -> Array:
-        """Top of the paraboloid through the correlations with the neighbors of the best.
-
-        A drive in the light of the image correlates better everywhere: each has its own level.
+    def regressed(
+        self, spectrum: Spectra, scores: NDArray[np.float32], yaws: NDArray[np.float32]
+    ) -> tuple[Array, float, float]:
+        """Place (2,) m and yaw rad of the spectrum (rows, F) of an image, and how `unlike` the
+        keyframes around the best one it is, of those whose correlations (K,) are known; `yaws`
+        (K,) rad are what each of them shows.
         """
-        center = self.poses[best, :2]
-        near = self.nearest(center)
-        near = near[np.isfinite(scores[near])]
-        offset = self.poses[near, :2] - center
-        square = (offset**2).sum(1)
-        reach = max(_REACH_SHARE * float(np.sqrt(square.max())), 1e-6)
-        weight = np.exp(-square / (2 * reach**2))
-        levels = np.equal.outer(self.drives[near], np.unique(self.drives[near]))
-        terms = np.column_stack([levels, offset, -0.5 * square]) * weight[:, None]
-        solution = np.linalg.lstsq(terms, scores[near] * weight, rcond=None)[0]
-        if solution[-1] <= 0:
-            return np.array(center)
-        step = solution[-3:-1] / solution[-1]
-        return np.asarray(center + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9)))
+        best, sign, columns = int(scores.argmax()), 1 if self.clockwise else -1, self._columns
+        start, reach = self.poses[best, :2], self._reach(best)
+        place, yaw, unlike = np.array(start), float(yaws[best]), _unlike(float(scores[best]))
+        for _ in range(_REPEATED):
+            near = self.nearest(place, _REGRESSED)
+            near = near[np.isfinite(scores[near])]
+            if len(near) < _FEWEST:
+                break
+            image = turned(spectrum, np.array(sign * yaw))
+            found = place_among(image, self.spectra[near], self.poses[near, :2], columns)
+            step, limit = found.place - start, 2 * np.pi / columns
+            place = start + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9))
+            yaw += sign * float(np.clip(found.angle, -limit, limit))
+            unlike = found.unlike
+        return place, yaw, unlike
 
-    def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
-        """How likely each keyframe is the place, of sum 1, by its correlation."""
-        weight = np.exp((scores - scores.max()) / temperature, dtype=np.float64)
-        return np.asarray(weight / weight.sum())
+    def elsewhere(
+        self, scores: NDArray[np.float32], place: Array, temperature: float
+    ) -> tuple[Array, Array]:
+        """Of the keyframes whose correlations (K,) are known, how likely each is the place, by
+        its correlation, 0 for those that are near it; and their offsets (M, 2) m from it.
+        """
+        known = np.isfinite(scores)
+        offset = self.poses[known, :2] - place
+        weight = np.exp((scores[known] - scores[known].max()) / temperature, dtype=np.float64)
+        near = np.hypot(*offset.T) <= 2 * self._reach(int(scores.argmax()))
+        return np.where(near, 0.0, weight / weight.sum()), offset
 
-    def scatter(self, weight: Array, rows: NDArray[np.int64], place: Array) -> Array:
-        """Covariance (2, 2) m^2 of the places of keyframes `rows` about one, by weight."""
-        offset = self.poses[rows, :2] - place
-        return np.asarray((offset * weight[:, None]).T @ offset)
+    @property
+    def _columns(self) -> int:
+        return int(self.textures.shape[2])
+
+    def _reach(self, best: int) -> float:
+        """How far, m, the regression may put an image from the best keyframe."""
+        start = self.poses[best, :2]
+        farthest = self.poses[self.nearest(start)[-1], :2] - start
+        return _REACH_SHARE * max(float(np.hypot(*farthest)), 1e-6)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle; `drives` where some were added."""
@@ -373,3 +406,8 @@ class Keyframes:
         poses = np.asarray(arrays['poses'], float)
         drives = np.asarray(arrays.get('drives', np.zeros(len(poses))), np.int32)
         return cls.of(textures, poses, MatchNoise(*noise), bool(clockwise), drives)
+
+
+def _unlike(score: float) -> float:
+    """What an image has beside its correlation with another, as a share of what both have."""
+    return max(score, 0.1) ** -2 - 1

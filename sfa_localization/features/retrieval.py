@@ -17,12 +17,12 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.features.keyframes import (
-    Spectra,
     Texture,
     normalized,
     small_gray,
     spectrum,
 )
+from sfa_localization.features.nearby import Spectra
 
 COLUMNS, ROWS = 150, 30
 

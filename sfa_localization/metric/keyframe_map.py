@@ -50,7 +50,9 @@ def learn_keyframes(
     _, seen, row = np.intersect1d(views.images, labeled, return_indices=True)
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
     path = _along_tracks(views, segments)[seen]
-    keyframes = fit_keyframes(views.textures[seen], poses, path, clockwise)
+    own = fit_keyframes(views.textures[seen], poses, path, clockwise)
+    turn_std = float(np.sqrt(np.diag(result.angle_covariance).mean()))
+    keyframes = replace(own, noise=own.noise.with_map(result.common_m, turn_std))
     kept = spread(poses)
     variance = result.left_out_variance * agreement.factor(disagreement[labeled])
     return _judged(keyframes, path[kept], row[kept], result, variance)
@@ -79,7 +81,7 @@ def _judged(
     for k, scores, shifts in left_out(keyframes, path_m):
         row, place = rows[k], keyframes.poses[k, :2]
         guess = place + result.left_out[row]
-        match = keyframes.located(scores, shifts, guess)
+        match = keyframes.located(keyframes.spectra[k], scores, shifts, guess)
         claimed = np.diag([variance[row], variance[row], 1.0])
         found, _, covariance = match.combined(guess, np.nan, claimed, keyframes.noise)
         errors.append(found - place)

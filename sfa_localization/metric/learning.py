@@ -56,6 +56,8 @@ class MetricResult:
     residuals: Array
     """(M, 2) m: where the segments put an image minus where the map does."""
     noise_m: float
+    common_m: float
+    """m: standard deviation along each axis of what the drive's positions have in common errors."""
     left_out: Array
     """(M, 2) m: as `residuals`, of a map learned without that stretch of the drive."""
     left_out_variance: Array
@@ -161,6 +163,7 @@ def _result(
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
         noise_m=float(np.sqrt(fit.variance)),
+        common_m=float(np.sqrt(inflation * sway_variance.mean() / 2)),
         left_out=plane(left.errors * turn),
         left_out_variance=left.variances * inflation,
         left_out_weight=weight,
