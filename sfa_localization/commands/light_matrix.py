@@ -58,7 +58,7 @@ class Plan:
     """Size of the garden (m) and of the panoramas, where to test, the lights that `ALL_BUT` is
     filled in for, and about how long it takes.
 
-    `minutes` were measured on two cores.
+    `minutes` are for two cores: measured of `QUICK`, of `FULL` estimated from two of its models.
     """
 
     area: tuple[float, float]
