@@ -523,6 +523,7 @@ def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     patch.setattr(light_matrix.PlaceModel, 'load', lambda _path: None)
     patch.setattr(light_matrix, '_read', lambda *_args: None)
     patch.setattr(light_matrix, '_retrieval', lambda _runs: None)
+    patch.setattr(light_matrix, '_paper_recipe', lambda *_args: lambda _run: {'mean_m': 0.4})
     patch.setattr(light_matrix, '_slow_alone', lambda *_args: {'mean_m': 0.3})
     patch.setattr(light_matrix, '_retrieved', lambda *_args: {'mean_m': 0.2})
     patch.setattr(light_matrix, '_judged', judged)

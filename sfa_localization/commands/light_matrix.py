@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps of `reproduce light`: one garden, trained in some lights, tested in all of them.
 
-The test drives have the same poses in every light. Bags, models and cells of the matrix that are
-finished are kept, and used again when the command is repeated.
+A row of the matrix tests one model in every light; the last row tests in each light the model of
+the other three. The test drives have the same poses in every light. Bags, models and cells of the
+matrix that are finished are kept, and used again when the command is repeated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.commands.paper_results import RECIPES, STRAIGHT, flat
 from sfa_localization.commands.reproduction import (
     BATCH,
     Cell,
@@ -25,16 +27,18 @@ from sfa_localization.commands.reproduction import (
     recorded,
     settings_of,
 )
+from sfa_localization.commands.trials import Features, slow_of
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import RigidTransform
+from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory
-from sfa_localization.evaluation import evaluate, moved, score
+from sfa_localization.evaluation import evaluate, fit_transform, moved, score
 from sfa_localization.features.retrieval import ImageRetrieval
+from sfa_localization.metric.learning import learn_metric
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.evaluation import save_text
 from sfa_localization.reports.light import matrix_figure, table
 from sfa_localization.simulation.settings import SimulationConfig
-from sfa_localization.training import Recipe, train
+from sfa_localization.training import Recipe, clock_of, cut_odometry, train
 
 if TYPE_CHECKING:
     from sfa_localization.commands.reproduce import ReproduceConfig
@@ -44,29 +48,52 @@ Condition = tuple[str, str]
 """Light and season."""
 LIGHTS, SEASONS = ('day', 'morning', 'overcast', 'evening'), ('summer', 'autumn', 'winter')
 TRAININGS: dict[str, tuple[str, ...]] = {'day': ('day',), 'day + overcast': ('day', 'overcast')}
-"""Rows of the matrix: the lights of the training drives, in summer."""
+"""Rows of the matrix with one model: the lights of its training drives, in summer."""
+ALL_BUT = 'all but the tested'
+"""The row with a model for each tested light: trained in the other three, in summer."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Size of the garden (m) and of the panoramas, where to test, and about how long it takes.
+    """Size of the garden (m) and of the panoramas, where to test, the lights that `ALL_BUT` is
+    filled in for, and about how long it takes.
 
-    `minutes` were measured on two cores.
+    `minutes` are for two cores: measured of `QUICK`, of `FULL` estimated from two of its models.
     """
 
     area: tuple[float, float]
     panorama: tuple[int, int]
     tests: tuple[Condition, ...]
+    left_out: tuple[str, ...]
     minutes: int
 
 
-FULL = Plan((16.0, 18.0), (600, 60), tuple((li, s) for s in SEASONS for li in LIGHTS), 60)
+FULL = Plan((16.0, 18.0), (600, 60), tuple((li, s) for s in SEASONS for li in LIGHTS), LIGHTS, 60)
 QUICK = Plan(
     (8.0, 8.0),
     (300, 30),
     (*((light, 'summer') for light in LIGHTS), ('overcast', 'autumn'), ('day', 'winter')),
-    6,
+    ('evening', 'overcast'),
+    5,
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """A model's training `lights`, in summer, and its `tests`, cells of the row `trained`."""
+
+    trained: str
+    lights: tuple[str, ...]
+    tests: tuple[Condition, ...]
+
+
+def trainings(plan: Plan) -> Iterator[Training]:
+    """The models of a plan: one for each row, and for `ALL_BUT` one for each light left out."""
+    for trained, lights in TRAININGS.items():
+        yield Training(trained, lights, plan.tests)
+    for light in plan.left_out:
+        others = tuple(other for other in LIGHTS if other != light)
+        yield Training(ALL_BUT, others, tuple(test for test in plan.tests if test[0] == light))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +132,12 @@ class _Work:
         """Size of the simulated panoramas."""
         return PanoramaConfig(width=self.plan.panorama[0], height=self.plan.panorama[1])
 
-    def model(self, name: str, bags: Sequence[Path]) -> PlaceModel:
-        """The model of some training drives."""
-        path = self.out / f'{name.replace(" + ", "_")}.npz'
+    def model(self, lights: Sequence[str]) -> PlaceModel:
+        """The model of the training drives in some lights."""
+        path = self.out / f'{"_".join(lights)}.npz'
         if not path.exists():
-            self.progress.say(f'train on {name}')
+            self.progress.say(f'train on {" + ".join(lights)}')
+            bags = [self.training(light) for light in lights]
             train(bags, path, progress=self.progress.shown, resume=True)
         return PlaceModel.load(path)
 
@@ -120,8 +148,9 @@ def reproduce_light(
     """Fill the matrix; write it as JSON, table and figure below `out`. Returns its cells.
 
     A cell has `trained`, `light` and `season`, the scores that `_judged` names, and those of plain
-    image `retrieval` and of `slow` features alone. Raises LocalizationError, also for a folder with
-    results of other settings.
+    image `retrieval` and of `slow` features alone; where there is one training drive, also those
+    of the `paper`'s recipe. Raises LocalizationError, also for a folder with results of other
+    settings.
     """
     report = Progress(progress)
     settings = settings_of(config.world, config.seed, plan.area, plan.panorama)
@@ -130,10 +159,10 @@ def reproduce_light(
     done = f'; {len(cells)} cells are finished' if cells else ''
     report.say(f'this takes about {plan.minutes} minutes on two cores{done}')
     work = _Work(out, config, plan, report)
-    for trained, lights in TRAININGS.items():
-        missing = [test for test in plan.tests if not _found(results, trained, test)]
+    for training in trainings(plan):
+        missing = [test for test in training.tests if not _found(results, training.trained, test)]
         if missing:
-            _fill_row(work, trained, lights, missing, results.keep)
+            _fill(work, replace(training, tests=tuple(missing)), results.keep)
     save_text(out / 'matrix.md', table(cells) + '\n')
     matrix_figure(out / 'matrix.png', cells)
     report.say(f'see {out / "matrix.png"}')
@@ -144,29 +173,27 @@ def _found(results: Results, trained: str, test: Condition) -> bool:
     return results.find(trained=trained, light=test[0], season=test[1]) is not None
 
 
-def _fill_row(
-    work: _Work,
-    trained: str,
-    lights: Sequence[str],
-    tests: Sequence[Condition],
-    keep: Callable[[Cell], None],
-) -> None:
+def _fill(work: _Work, training: Training, keep: Callable[[Cell], None]) -> None:
     """Train once and test in some lights; every finished cell is handed to `keep`."""
-    bags = [work.training(light) for light in lights]
-    drives = [work.test(test) for test in tests]
-    model = work.model(trained, bags)
+    bags = [work.training(light) for light in training.lights]
+    drives = [work.test(test) for test in training.tests]
+    model = work.model(training.lights)
     recipe = as_live(Recipe(), work.panorama)
     with image_cache(work.out / 'images') as cache:
-        retrieval = _retrieval([_read(bag, cache / bag.name, recipe) for bag in bags])
-        transform = None
-        for test, drive in zip(tests, drives, strict=True):
-            work.progress.say(f'{trained}, tested in {" ".join(test)}')
+        runs = [_read(bag, cache / bag.name, recipe) for bag in bags]
+        retrieval, transform = _retrieval(runs), None
+        paper = _paper_recipe(model, runs[0]) if len(runs) == 1 else None
+        for test, drive in zip(training.tests, drives, strict=True):
+            work.progress.say(f'{" + ".join(training.lights)}, tested in {" ".join(test)}')
             run = _read(drive, cache / drive.name, recipe)
             cell, transform = _judged(model, drive, bags[0], transform)
             beside = {'retrieval': _retrieved(retrieval, run)}
             if transform is not None:
                 beside['slow'] = _slow_alone(model, run, transform)
-            keep({'trained': trained, 'light': test[0], 'season': test[1], **cell, **beside})
+            if paper is not None:
+                beside['paper'] = paper(run)
+            names = {'trained': training.trained, 'light': test[0], 'season': test[1]}
+            keep({**names, **cell, **beside})
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe) -> Run:
@@ -213,6 +240,36 @@ def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
     poses = np.array([[*view.position, view.yaw] for view in views])
     truth = _truth(run)
     return _summary(score(truth, moved(Trajectory(truth.stamps_ns, poses), transform)))
+
+
+def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
+    """The paper's recipe (section 4) on a model's one training drive, as a function that scores
+    single images of a test drive: monomials of the slow features, learned from straight lines.
+
+    It is laid on the truth as the model is, by its estimates of all images of the training drive,
+    and has no heading. Where these lines give no map, there is only the `problem`.
+    """
+    slow = slow_of(model.network)
+    features = _features(slow, training)
+    try:
+        segments = cut_odometry([training], [clock_of(training)], STRAIGHT)
+        metric = learn_metric(features, segments, RECIPES['paper']).map
+    except DataError as error:
+        nothing: Cell = {'mean_m': None, 'problem': str(error)}
+        return lambda _drive: nothing
+
+    def located(run: Run, features: Array) -> Trajectory:
+        return Trajectory(run.panoramas.stamps_ns, flat(metric.predict(features)[0]))
+
+    transform = fit_transform(_truth(training), located(training, features))
+    return lambda drive: _summary(
+        score(_truth(drive), moved(located(drive, _features(slow, drive)), transform))
+    )
+
+
+def _features(of: Features, run: Run) -> Array:
+    """Features (N, K) of all images of a drive."""
+    return np.concatenate([of(batch) for batch in run.panoramas.batches(BATCH)])
 
 
 def _retrieval(runs: Sequence[Run]) -> ImageRetrieval:

@@ -92,13 +92,13 @@ def _by_recipe(
         return {'problem': str(error)}, None
     trial = Trial.of(study, result.map, features, rows, rows)
     fused = trial.fused(correlation_along_drive(result, segments, TURN_RADIUS_M))
-    single = Trajectory(study.test_truth.stamps_ns, _flat(trial.laid[1]))
+    single = Trajectory(study.test_truth.stamps_ns, flat(trial.laid[1]))
     ekf = mean_distance(fused, study.truth)
     cell = {**trial.errors(), 'ekf': ekf, 'lines': len(segments), 'points': len(rows)}
     return cell, (trial, single, fused)
 
 
-def _flat(places: Array) -> Array:
+def flat(places: Array) -> Array:
     """Places (T, 2) as poses (T, 3) of unknown heading."""
     return np.column_stack([places, np.full(len(places), np.nan)])
 

@@ -43,9 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'result',
         choices=('all', *RESULTS, 'year'),
         help="simulator, robot: the paper's experiments; baselines: other features; ablations: "
-        'this package without some of its parts; light: train in one or two lights, test in every '
-        'light and season; all: these; year: train once, then a drive a month, with and without '
-        'updates of the model',
+        'this package without some of its parts; light: train in one, two or three lights, test '
+        "in every light and season, beside image retrieval and the paper's recipe; all: these; "
+        'year: train once, then a drive a month, with and without updates of the model',
     )
     parser.add_argument(
         'bags', nargs='*', type=Path, metavar='BAG', help='training drives of baselines'

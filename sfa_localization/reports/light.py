@@ -49,17 +49,24 @@ def _angle(degrees: float) -> float:
 
 MEASURES = (
     Measure('slow features alone (m)', ('slow', 'mean_m'), '{:.3f}'.format, _distance),
-    Measure('SFA mean (m)', ('sfa', 'mean_m'), '{:.3f}'.format, _distance),
+    Measure(
+        "the paper's recipe, one training drive (m)",
+        ('paper', 'mean_m'),
+        '{:.3f}'.format,
+        _distance,
+    ),
+    Measure('one image (m)', ('sfa', 'mean_m'), '{:.3f}'.format, _distance),
     Measure('EKF mean (m)', ('ekf', 'mean_m'), '{:.3f}'.format, _distance),
     Measure('EKF heading (°)', ('ekf', 'heading_deg'), '{:.2f}'.format, _angle),
     Measure('in 95 % ellipse', ('ekf', 'within_95'), _percent, lambda s: abs(s - 0.95) / 0.95),
     Measure('LOCALISED', ('localized',), _percent, lambda share: 1 - share),
     Measure('falsely LOCALISED (s)', ('false_localised_s',), '{:.1f}'.format, lambda s: s / 10),
-    Measure('retrieval mean (m)', ('retrieval', 'mean_m'), '{:.3f}'.format, _distance),
+    Measure('retrieval at true poses (m)', ('retrieval', 'mean_m'), '{:.3f}'.format, _distance),
     Measure('retrieval heading (°)', ('retrieval', 'heading_deg'), '{:.2f}'.format, _angle),
 )
 _COLORS = LinearSegmentedColormap.from_list('good to bad', ['#FFFFFF', '#F6D9A8', '#D55E00'])
 _UNKNOWN = '-'
+_LEGEND = 'tested in; rows: trained in, one drive for each light, in summer; gray: no result'
 
 
 def table(cells: Cells) -> str:
@@ -89,7 +96,7 @@ def matrix_figure(path: Path, cells: Cells) -> None:
         axes.set_yticks(range(len(rows)), rows)
     names = [name.replace(', ', ',\n') for name in columns]
     panels[-1].set_xticks(range(len(columns)), names)
-    panels[-1].set_xlabel('tested in; rows: trained in')
+    panels[-1].set_xlabel(_LEGEND)
     save(figure, path)
 
 
