@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         node = importlib.import_module(f'sfa_localization.nodes.{name}')
         return guarded(lambda: int(node.main(words)))
     if name in COMMANDS:
-        arguments = command_parser(name).parse_args(words[1:])
+        arguments = command_parser(name).parse_intermixed_args(words[1:])
         with nullcontext() if name in ROS_COMMANDS else terminable():
             return guarded(lambda: int(arguments.run(arguments)))
     _overview().parse_args(words)  # prints help, version or error, and exits

@@ -311,3 +311,14 @@ def test_bags_without_a_drive_to_test_on_are_rejected(capsys):
                   ['robot', 'bag', '--test', 'bag']):  # fmt: skip
         assert cli.main(['reproduce', *words]) == 1
         assert 'bags are for baselines, together with --test' in capsys.readouterr().err
+
+
+def test_bags_may_stand_behind_options(tmp_path, capsys):
+    from sfa_localization import cli
+
+    bag, test = str(tmp_path / 'drive'), str(tmp_path / 'test')
+    assert (
+        cli.main(['reproduce', 'baselines', '--out', str(tmp_path / 'out'), bag, '--test', test])
+        == 1
+    )
+    assert f'{bag}: no such bag' in capsys.readouterr().err
