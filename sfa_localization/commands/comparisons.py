@@ -16,6 +16,8 @@ import numpy as np
 from sfa_localization.commands.reproduction import BATCH, Cell, Results
 from sfa_localization.commands.sites import Site, learned
 from sfa_localization.commands.trials import (
+    MONOMIALS,
+    STRAIGHT,
     Features,
     Study,
     Trial,
@@ -40,7 +42,6 @@ from sfa_localization.features.retrieval import ImageRetrieval
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.features.signatures import FourierSignature, TurnedComponents
 from sfa_localization.metric.learning import learn_metric
-from sfa_localization.metric.paper_solver import PAPER_FEATURES
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
@@ -64,8 +65,6 @@ MEASURES = {
     'training': 'training (m)',
     'training_supervised': 'training, supervised (m)',
 }
-STRAIGHT = SegmentConfig(segments='straight')
-MONOMIALS = MetricConfig(metric_map='monomials', slow_features=PAPER_FEATURES)
 
 
 def baselines(site: Site, results: Results, world: str) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.commands.paper_results import RECIPES, STRAIGHT, flat
+from sfa_localization.commands.paper_results import RECIPES, flat
 from sfa_localization.commands.reproduction import (
     BATCH,
     Cell,
@@ -27,7 +27,7 @@ from sfa_localization.commands.reproduction import (
     recorded,
     settings_of,
 )
-from sfa_localization.commands.trials import Features, slow_of
+from sfa_localization.commands.trials import STRAIGHT, Features, slow_of
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory

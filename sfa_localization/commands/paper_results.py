@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from sfa_localization.commands.reproduction import Cell, Results
 from sfa_localization.commands.sites import Site
 from sfa_localization.commands.trials import (
+    MONOMIALS,
+    STRAIGHT,
     Study,
     Trial,
     known_start,
@@ -40,8 +42,6 @@ from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports import paper as report
 from sfa_localization.reports.evaluation import firing_maps_figure
 
-STRAIGHT = SegmentConfig(segments='straight')
-MONOMIALS = MetricConfig(metric_map='monomials', slow_features=PAPER_FEATURES)
 RECIPES = {'paper': replace(MONOMIALS, solver='paper'), 'certified': MONOMIALS}
 """Section 4: C' from odometry, by the paper's descent; and the optimum of the same problem."""
 SNAPSHOTS = {0: '', 500: '', 1000: 'random', 50_000: 'random_long'}

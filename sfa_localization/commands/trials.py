@@ -39,8 +39,9 @@ from sfa_localization.filtering import Table, run_filter
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.fast_expansions import Predictor
+from sfa_localization.metric.paper_solver import PAPER_FEATURES
 from sfa_localization.metric.segments import Segments, join
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe, clock_of, cut_odometry
 
@@ -48,6 +49,9 @@ Rows = NDArray[np.int64]
 Features = Callable[[Image], Array]
 KNOWN_START = FilterConfig(initial_position_std=0.02, initial_yaw_std=0.02)
 """Section 5.1: the robot starts from a known location, with known heading; as from a dock."""
+STRAIGHT = SegmentConfig(segments='straight')
+MONOMIALS = MetricConfig(metric_map='monomials', slow_features=PAPER_FEATURES)
+"""Of the paper's recipe."""
 
 
 @dataclass(frozen=True, slots=True)

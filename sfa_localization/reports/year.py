@@ -20,7 +20,7 @@ from sfa_localization.reports.evaluation import save
 Cells = Sequence[Mapping[str, Any]]
 MEASURES = {
     'ekf_m': ('EKF mean (m)', '{:.3f}'),
-    'sfa_m': ('SFA mean (m)', '{:.3f}'),
+    'sfa_m': ('one image (m)', '{:.3f}'),
     'false_localised_s': ('falsely LOCALISED (s)', '{:.1f}'),
 }
 # Of an axis, so that small noise does not fill it.
