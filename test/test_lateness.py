@@ -193,3 +193,15 @@ def test_the_trail_holds_the_last_seconds_in_steps():
     assert trail[-1][0] - trail[0][0] >= lateness.LATEST_S * 1e9
     assert len(trail) <= lateness.LATEST_S / 0.05 + 3
     assert all(b[0] - a[0] >= lateness.KNOT_NS for a, b in pairwise(trail))
+
+
+def test_a_first_image_that_contradicts_a_young_estimate_is_a_doubt():
+    drive, fused = drive_of(winding(5)), PoseFilter(FilterConfig())
+    for event in drive.events():
+        stamp_ns, kind, index = event
+        if kind == 1 and index == 2:
+            wrong = drive.seen[index] + [0.0, 0.0, 0.7]
+            assert not fused.add_measurement(stamp_ns, wrong, drive.covariance(True)).accepted
+            assert fused.status.level is Level.DEGRADED
+            return
+        drive.give(fused, event, heading=True)
