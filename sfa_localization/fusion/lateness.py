@@ -7,8 +7,9 @@ of before, laid into the map where images in time have put it. A Bayes filter ov
 for each the transform from odometry to the map, a small Kalman filter, which a delay that begins or
 grows takes over from the one before. So a delay that grows on a circle shows, where turns alone do
 not, and a video that loops, at its first images: hardly any robot is carried onto its own path to a
-decimeter. Slip is no delay, because it turns no heading. Images that lie elsewhere have an own
-hypothesis. `turn_watch` compares turns, which also show images that are early.
+decimeter. In a curve, slip is no delay, because it turns no heading; on a straight line, large slip
+looks like one. Images that lie elsewhere have an own hypothesis. `turn_watch` compares turns, which
+also show images that are early.
 """
 
 from __future__ import annotations
