@@ -258,7 +258,8 @@ def test_the_memory_is_bounded_and_its_newer_half_complete():
     ({'rejected': 5, 'gate_excess': 1.1}, 0.6, Level.LOST),
     ({'rejected': 5, 'gate_excess': 1.1}, 0.4, Level.DEGRADED),  # LOST_DISTANCE_M
     ({'rejected': 4, 'gate_excess': 9.0}, 9.0, Level.DEGRADED),  # ENOUGH_IMAGES
-    ({'rejected': 2, 'gate_excess': 9.0}, 9.0, Level.LOCALISED),  # FEW_IMAGES
+    ({'rejected': 2, 'gate_excess': 9.0, 'support': 3}, 9.0, Level.LOCALISED),  # FEW_IMAGES
+    ({'rejected': 1, 'gate_excess': 9.0, 'support': 2}, 9.0, Level.DEGRADED),  # FEW_IMAGES
     ({'rejected': 9, 'gate_excess': 9.0, 'doubt': (0.2, 0.2, 0.0)}, 9.0, Level.DEGRADED),  # LOST_M
     ({'rejected': 9, 'gate_excess': 9.0, 'doubt': (0.0, 0.0, 0.1)}, 9.0, Level.LOST),  # LOST_RAD
 ])  # fmt: skip

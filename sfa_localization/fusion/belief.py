@@ -11,6 +11,7 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import symmetric
+from sfa_localization.fusion.lateness import Knot, Lateness
 from sfa_localization.fusion.motion import SIZE, State, Twist
 from sfa_localization.fusion.turn_noise import TurnNoise
 
@@ -136,7 +137,8 @@ class Belief(NamedTuple):
     """Everything that the next event changes. `located` is False before the first pose.
 
     `added` are the variances that driving has added so far, to the heading (as expected, without
-    the factor of `turns`) and to the position along each axis.
+    the factor of `turns`) and to the position along each axis. `trail` is the dead-reckoned path of
+    the last seconds, and `lateness` what images beside it show about their time.
     """
 
     stamp_ns: int
@@ -152,6 +154,8 @@ class Belief(NamedTuple):
     added: tuple[float, float] = (0.0, 0.0)
     turns: TurnNoise | None = None
     turn_factor: float = 1.0
+    trail: tuple[Knot, ...] = ()
+    lateness: Lateness | None = None
 
     @property
     def state(self) -> State | None:

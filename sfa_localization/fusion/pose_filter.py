@@ -24,6 +24,7 @@ from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEve
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import read_measurement, read_pose, read_twist
+from sfa_localization.fusion.lateness import CLEARED, SUSPECTED
 from sfa_localization.fusion.motion import BIAS, State
 from sfa_localization.fusion.predict import COAST_S, ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.rules import Rules
@@ -45,9 +46,6 @@ BACKWARD_COUNT = 5
 """Odometry messages in a row that are too late until the clock is taken to have gone back."""
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
-SUSPECTED, CLEARED = 0.5, 0.3
-"""Probability of images of another time from which the estimate is not trusted, and below which it
-is again."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
@@ -251,7 +249,7 @@ class PoseFilter:
     @property
     def state(self) -> State | None:
         """The estimate at the newest message; None before there is any."""
-        return self._spread(self._history.newest.state)
+        return self._spread(self._history.newest)
 
     def at(self, stamp_ns: int) -> State | None:
         """The estimate at a stamp: predicted beyond the newest message, recalled within history.
@@ -262,15 +260,17 @@ class PoseFilter:
         if self._history.newest_ns is None or not self._history.reaches(stamp_ns):
             return self.state if stamp_ns == self._history.newest.stamp_ns else None
         before = self._history.before(stamp_ns)
-        return self._spread(self._rules.prediction.coast(before, stamp_ns).state)
+        return self._spread(self._rules.prediction.coast(before, stamp_ns))
 
-    def _spread(self, state: State | None) -> State | None:
+    def _spread(self, belief: Belief) -> State | None:
         """The estimate, less certain by how far the robot moves while images may be off in time."""
-        compensated_s = self._compensated_s
-        if state is None or not self._off:
+        state, late = belief.state, belief.lateness
+        off_s = self._watch.error_s(self._compensated_s) if self._off else 0.0
+        if late is not None and late.suspected:
+            off_s = max(off_s, late.error_s)
+        if state is None or off_s == 0.0:
             return state
         v, omega = state.twist.tolist()
-        off_s = self._watch.error_s(compensated_s)
         covariance = state.covariance.copy()
         covariance[:3, :3] += np.diag(np.square([v * off_s, v * off_s, omega * off_s]))
         return replace(state, covariance=covariance)
@@ -285,7 +285,7 @@ class PoseFilter:
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
         status = status_of(self._history.newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
-        reasons = self._apart_in_time()
+        reasons = [why for why in self._apart_in_time() if why not in status.reasons]
         if not reasons:
             return status
         level = Level.DEGRADED if status.level is Level.LOCALISED else status.level
@@ -300,8 +300,12 @@ class PoseFilter:
             return [
                 f'images are stamped {apart} {where} the odometry: are the clocks synchronized?'
             ]
-        measured = abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS
-        return [self._watch.problem(self._compensated_s)] if self._off and not measured else []
+        if abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS:
+            return []
+        late = self._history.newest.lateness
+        if late is not None and late.suspected:
+            return [late.problem]
+        return [self._watch.problem(self._compensated_s)] if self._off else []
 
     # Whether a message can be placed in time.
 

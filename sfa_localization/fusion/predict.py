@@ -9,6 +9,7 @@ import math
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import Belief, OdometryEvent, capped
 from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.lateness import extended
 from sfa_localization.fusion.motion import SIZE, MotionNoise, Step, Twist
 
 ODOMETRY_TIMEOUT_S = 0.5
@@ -83,6 +84,7 @@ class Prediction:
         x, y, yaw = belief.dead_reckoned
         c, s = math.cos(yaw - before_yaw), math.sin(yaw - before_yaw)
         turned = motion.wrap(yaw + after_yaw - before_yaw)
+        reckoned = (x + c * dx - s * dy, y + s * dx + c * dy, turned)
         located = belief.located
         # Positional, and not _replace, which would cost half as much as the arithmetic above.
         return Belief(
@@ -90,7 +92,7 @@ class Prediction:
             step.mean,
             self._kalman.predicted(belief, step) if located else belief.covariance,
             located,
-            (x + c * dx - s * dy, y + s * dx + c * dy, turned),
+            reckoned,
             belief.traveled_m + math.hypot(dx, dy),
             event.twist if event else belief.twist,
             event.stamp_ns if event else belief.odometry_ns,
@@ -99,6 +101,8 @@ class Prediction:
             self._added(belief, step),
             belief.turns,
             belief.turn_factor,
+            extended(belief.trail, (stamp_ns, *reckoned)),
+            belief.lateness,
         )
 
     @staticmethod

@@ -87,7 +87,8 @@ class Recovery:
     def placed(self, belief: Belief, event: PoseEvent) -> Belief:
         """The pose was set from outside: earlier images do not count any more."""
         memory = Memory(accepted_m=belief.traveled_m)
-        return _at_pose(belief, event.pose, event.covariance, 0.0)._replace(memory=memory)
+        placed = _at_pose(belief, event.pose, event.covariance, 0.0)
+        return placed._replace(memory=memory, lateness=None)
 
     def started(
         self, belief: Belief, event: MeasurementEvent, evidence: tuple[Evidence, ...]

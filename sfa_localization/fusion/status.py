@@ -58,8 +58,11 @@ def status_of(
     degraded = []
     if config.degraded_std < state.position_std <= config.lost_std:
         degraded.append(f'position known to {state.position_std:.1f} m only')
-    if belief.memory.rejected >= FEW_IMAGES:
-        degraded.append(f'{belief.memory.rejected} images in a row did not match')
+    # An estimate that rests on one or two images is doubted by the first that contradicts it.
+    if belief.memory.rejected >= (FEW_IMAGES if belief.memory.support >= FEW_IMAGES else 1):
+        images = belief.memory.rejected
+        many = 'an image' if images == 1 else f'{images} images in a row'
+        degraded.append(f'{many} did not match')
     # Only images confirm: what was driven since the last one, or before it came late, does not.
     degraded += doubts(belief.memory.trust, belief.memory.accepted_m)
     degraded += _silences(belief)

@@ -7,7 +7,7 @@ smooth curve all of them lie on the odometry's path, meters away from the robot.
 that the robot turned at another time. A Bayes filter holds the probability of each delay, and of
 images that have nothing to do with the odometry. It forgets by evidence, not by time: on a straight
 line, which shows no delay, it keeps what it found for minutes. `CameraClockFinder` measures a delay
-that lasts; this one watches for any that is not compensated.
+that lasts; this one watches for any that is not compensated; `lateness` does so by poses.
 """
 
 from __future__ import annotations

@@ -22,11 +22,14 @@ from sfa_localization.fusion.evidence import (
 )
 from sfa_localization.fusion.inputs import lower_root
 from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.lateness import Lateness, followed, unrelated
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, X, Y
+from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.recover import Recovery
 from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, begun, weighed
 
-STARTS = ('started', 'restarted elsewhere')
+ELSEWHERE = 'restarted elsewhere'
+STARTS = ('started', ELSEWHERE)
 """Reasons of updates that take a pose from measurements alone."""
 GATE_PROBABILITY = 0.999
 """Share of correct measurements that the gate accepts: one in a thousand is rejected."""
@@ -77,6 +80,7 @@ class Correction:
         """The belief, predicted to the event's stamp before, after a measurement."""
         belief = self._fused(self._weighed(belief, event), event)
         update = belief.memory.update
+        belief = belief._replace(lateness=_late(belief, event, update))
         if belief.located and update is not None and update.reason in STARTS:
             return belief._replace(turns=self._begun(belief))
         return belief
@@ -163,6 +167,19 @@ class Correction:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, belief.covariance, lighter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
+
+
+def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lateness | None:
+    """What is known about the time of images after another one; positions alone show none."""
+    if event.value.size == 2:
+        return belief.lateness
+    now, trail = (belief.stamp_ns, *belief.dead_reckoned), belief.trail
+    if belief.odometry_ns is None:
+        return None
+    if belief.stamp_ns - belief.odometry_ns > ODOMETRY_TIMEOUT_S * 1e9:
+        return unrelated(belief.lateness, trail, now, event.value, event.covariance)
+    restarted = update is not None and update.reason == ELSEWHERE
+    return followed(belief.lateness, trail, now, event.value, event.covariance, restarted)
 
 
 def _scatter(usual: float, distance: float) -> float:

@@ -1,0 +1,275 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether images show where the robot was some seconds ago: the odds of every delay, by poses.
+
+Late images show poses that the robot has had, one after the other: they lie on the odometry's path
+of before, laid into the map where images in time have put it. A Bayes filter over the delay holds
+for each the transform from odometry to the map, a small Kalman filter, which a delay that begins or
+grows takes over from the one before. So a delay that grows on a circle shows, where turns alone do
+not, and a video that loops, at its first images: hardly any robot is carried onto its own path to a
+decimeter. In a curve, slip is no delay, because it turns no heading; on a straight line, large slip
+looks like one. Images that lie elsewhere have an own hypothesis. `turn_watch` compares turns, which
+also show images that are early.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array, wrap_angle
+
+LATEST_S = 10.0
+"""Delays that are distinguished; images that are later look like images of elsewhere."""
+TOLERATED_S = 0.55
+"""Smaller delays are no fault: 0.55 m at walking speed, by which images err in places."""
+SUSPECTED, CLEARED = 0.5, 0.3
+"""Probability of images of another time from which the estimate is not trusted, and below which it
+is again."""
+KNOT_NS = 50_000_000
+"""The odometry's path is remembered at this distance in time: no robot turns far meanwhile."""
+TRAIL_NS = round(LATEST_S * 1e9) + KNOT_NS
+_STEP_S = 0.1
+_DELAYS: Array = _STEP_S * np.arange(LATEST_S / _STEP_S + 0.5)
+_COUNT = len(_DELAYS)
+_NEAR = _DELAYS <= TOLERATED_S
+_NEAR_SHARE = _NEAR / _NEAR.sum()
+_SURPRISE = 1e-2
+"""Probability of larger delays at the start."""
+_BREAK, _HEAL, _ELSEWHERE = 1e-4, 1e-3, 1e-4
+"""Probabilities, per image, that images in time come to any other delay, that others come to be in
+time, and that any are of elsewhere from now on."""
+_DRIFT, _LEAVE = 0.1, 0.2
+"""Probability, per image, that a delay moves by a step, and the share of it with which one that is
+tolerated grows beyond."""
+_ELSEWHERE_DENSITY = 1 / (100.0 * 2 * math.pi)
+"""Of poses anywhere in 100 m^2, 1/(m^2 rad)."""
+_OUTLIERS = 0.05
+"""Share of the images that lie anywhere."""
+_FLOOR_M, _FLOOR_RAD, _CAUTION = 0.1, 0.015, 2.0
+"""Least standard deviations of images, and a factor on their variances: neighbors err alike."""
+_SLIP, _YAW_PER_RADIAN, _YAW_PER_METER = 0.06, 0.03, 0.005
+"""Errors of the odometry, m and rad per root of m or rad: thrice and one and a half times those
+that the filter expects, because slip lasts for some meters."""
+_LEAST_M, _LEAST_RAD = 0.08, 0.05
+"""An image after less motion shows nothing new."""
+_USELESS_VARIANCE = 4.0
+"""m^2: images less certain than the robot moves in a few seconds show no delay."""
+_DENSITY = (2 * math.pi) ** -1.5
+_TINY = 1e-300  # keeps quotients of vanishing odds finite
+
+Knot = tuple[int, float, float, float]
+_Complex = NDArray[np.complex128]
+
+
+class Path(NamedTuple):
+    """Odometry's positions (K,), x + iy, and headings (K,) at each delay before a stamp.
+
+    `known` (K,): whether the odometry had begun.
+    """
+
+    places: _Complex
+    yaws: Array
+    known: NDArray[np.bool_]
+
+
+class Lateness(NamedTuple):
+    """The odds (K + 1,) of each delay and of elsewhere, and transforms from odometry to the map.
+
+    A position p of the odometry's frame, x + iy, lies at turn p + shift, both (K,). `variance` (K,)
+    is that of the place along each axis, at the point of `path` that the newest image shows.
+    """
+
+    odds: Array
+    turn: _Complex
+    shift: _Complex
+    variance: Array
+    yaw_variance: Array
+    path: Path
+    suspected: bool = False
+
+    @property
+    def apart(self) -> float:
+        """Probability of images of another time or place."""
+        return 1.0 - float(self.odds[:-1][_NEAR].sum())
+
+    @property
+    def error_s(self) -> float:
+        """Root mean square of the delay; those that are tolerated count nothing."""
+        return math.sqrt(float(self.odds[:-1] @ np.where(_NEAR, 0.0, _DELAYS**2)))
+
+    @property
+    def problem(self) -> str:
+        """What is most likely the matter; '' where nothing is suspected."""
+        if not self.suspected:
+            return ''
+        far = np.where(np.append(_NEAR, False), 0.0, self.odds)
+        best = int(np.argmax(far))
+        if best == _COUNT:
+            return 'images and odometry show different motions'
+        return f'images are stamped {_DELAYS[best]:.1f} s late, or delayed: synchronize the clocks'
+
+
+def extended(trail: tuple[Knot, ...], knot: Knot) -> tuple[Knot, ...]:
+    """The odometry's path with another pose: stamp ns, x m, y m, yaw rad."""
+    if trail and 0 <= knot[0] - trail[-1][0] < KNOT_NS:
+        return trail
+    first = 0
+    while first + 1 < len(trail) and trail[first + 1][0] <= knot[0] - TRAIL_NS:
+        first += 1
+    return (*trail[first:], knot)
+
+
+def followed(
+    late: Lateness | None,
+    trail: tuple[Knot, ...],
+    now: Knot,
+    pose: Array,
+    covariance: Array,
+    restarted: bool,
+) -> Lateness | None:
+    """The odds after an image of a pose (3,) with covariance (3, 3), at the pose by odometry `now`.
+
+    `restarted`: the filter has taken it for the robot's new place.
+    """
+    variance, yaw_variance = _noise(covariance)
+    if variance > _USELESS_VARIANCE:
+        return late
+    path = _path(trail, now)
+    if late is None:
+        return _begun(path, pose, variance, yaw_variance)
+    if restarted or _moved(late.path, path):
+        late = _corrected(_predicted(late, path), pose, variance, yaw_variance)
+    if restarted:
+        late = _replaced(late, _begun(path, pose, variance, yaw_variance))
+    return _judged(late)
+
+
+def _path(trail: tuple[Knot, ...], now: Knot) -> Path:
+    knots = (*trail, now)
+    seconds = np.array([(knot[0] - now[0]) * 1e-9 for knot in knots])
+    x, y, yaw = np.array([knot[1:] for knot in knots]).T
+    places = np.interp(-_DELAYS, seconds, x) + 1j * np.interp(-_DELAYS, seconds, y)
+    known = seconds[0] - 1e-9 <= -_DELAYS
+    return Path(places, np.interp(-_DELAYS, seconds, np.unwrap(yaw)), known)
+
+
+def _begun(path: Path, pose: Array, variance: float, yaw_variance: float) -> Lateness:
+    """By each delay, the image shows where the robot was then."""
+    odds = (1 - _SURPRISE) * _NEAR_SHARE + _SURPRISE / (_COUNT + 1)
+    odds = np.append(odds, _SURPRISE / (_COUNT + 1))
+    turn = np.exp(1j * (float(pose[2]) - path.yaws))
+    shift = complex(pose[0], pose[1]) - turn * path.places
+    stds = np.full(_COUNT, variance), np.full(_COUNT, yaw_variance)
+    return Lateness(odds / odds.sum(), turn, shift, *stds, path)
+
+
+def _moved(before: Path, path: Path) -> bool:
+    turned = abs(float(wrap_angle(path.yaws[0] - before.yaws[0])))
+    return bool(abs(path.places[0] - before.places[0]) >= _LEAST_M or turned >= _LEAST_RAD)
+
+
+def unrelated(
+    late: Lateness | None, trail: tuple[Knot, ...], now: Knot, pose: Array, covariance: Array
+) -> Lateness | None:
+    """After an image without odometry: the odds remain, the transforms begin anew."""
+    variance, yaw_variance = _noise(covariance)
+    if late is None or variance > _USELESS_VARIANCE:
+        return late
+    odds = np.append(late.odds[:-1] + late.odds[-1] * _NEAR_SHARE, 0.0)
+    begun = _begun(_path(trail, now), pose, variance, yaw_variance)
+    return _judged(begun._replace(odds=odds, suspected=late.suspected))
+
+
+def _judged(late: Lateness) -> Lateness:
+    return late._replace(suspected=late.apart > (CLEARED if late.suspected else SUSPECTED))
+
+
+def _noise(covariance: Array) -> tuple[float, float]:
+    """Variances of an image's place, along each axis, and heading."""
+    place = float(covariance[0, 0] + covariance[1, 1]) / 2
+    return _CAUTION * place + _FLOOR_M**2, _CAUTION * float(covariance[2, 2]) + _FLOOR_RAD**2
+
+
+def _replaced(late: Lateness, begun: Lateness) -> Lateness:
+    """Images of elsewhere are perhaps in time: the robot is elsewhere."""
+    odds = late.odds.copy()
+    odds[-1] /= 2
+    odds[:-1] += odds[-1] * _NEAR_SHARE
+    turn, shift, variance, yaw_variance = (
+        np.where(_NEAR, getattr(begun, name), getattr(late, name))
+        for name in ('turn', 'shift', 'variance', 'yaw_variance')
+    )
+    return Lateness(odds, turn, shift, variance, yaw_variance, begun.path, late.suspected)
+
+
+def _predicted(late: Lateness, path: Path) -> Lateness:
+    """Before the next image: delays drift, begin and end, and the odometry errs."""
+    came, near = _came(late.odds[:-1])
+    total = came.sum(axis=0)
+    came /= np.maximum(total, _TINY)
+    turns, shifts, variances, yaw_variances = (
+        np.array([np.roll(each, 1), each, np.roll(each, -1), np.full(_COUNT, near @ each)])
+        for each in (late.turn, late.shift, late.variance, late.yaw_variance)
+    )
+    turn, places = (came * turns).sum(axis=0), turns * path.places + shifts
+    place, length = (came * places).sum(axis=0), np.abs(turn)
+    turn = turn / np.maximum(length, _TINY)
+    way, turned = np.abs(path.places - late.path.places), np.abs(path.yaws - late.path.yaws)
+    # Directions that differ have a mean shorter than 1, by half their variance.
+    yaw_variance = (came * yaw_variances).sum(axis=0) + 2 * np.maximum(1 - length, 0.0)
+    yaw_variance += _YAW_PER_RADIAN**2 * turned + _YAW_PER_METER**2 * way
+    variance = (came * (variances + np.abs(places - place) ** 2 / 2)).sum(axis=0)
+    variance += _SLIP**2 * way + way**2 * yaw_variance
+    healed = _HEAL * (float(late.odds[:-1][~_NEAR].sum()) + float(late.odds[-1])) * _NEAR_SHARE
+    elsewhere = (1 - _HEAL) * late.odds[-1] + _ELSEWHERE
+    odds = np.append((1 - _ELSEWHERE) * (total + healed), elsewhere)
+    shift = place - turn * path.places
+    return late._replace(
+        odds=odds, turn=turn, shift=shift, variance=variance, yaw_variance=yaw_variance, path=path
+    )
+
+
+def _came(odds: Array) -> tuple[Array, Array]:
+    """The odds (4, K) that come to a delay from the one before, itself, the next, and all in time.
+
+    And the shares (K,) of those that are in time.
+    """
+    later = _DRIFT * np.where(_NEAR[:-1] & ~_NEAR[1:], _LEAVE, 1.0)
+    stay = 1 - np.append(later, 0.0) - np.append(0.0, np.full(_COUNT - 1, _DRIFT))
+    near = np.where(_NEAR, odds, 0.0)
+    in_time = float(near.sum())
+    came = [
+        np.append(0.0, later * odds[:-1]),
+        stay * odds * np.where(_NEAR, 1 - _BREAK, 1 - _HEAL),
+        np.append(_DRIFT * odds[1:], 0.0),
+        np.full(_COUNT, _BREAK * in_time / _COUNT),
+    ]
+    return np.array(came), near / max(in_time, _TINY)
+
+
+def _corrected(late: Lateness, pose: Array, variance: float, yaw_variance: float) -> Lateness:
+    """Bayes' rule, by each delay's Kalman filter, where the image is no outlier."""
+    path = late.path
+    place = late.turn * path.places + late.shift
+    miss = complex(pose[0], pose[1]) - place
+    yaw_miss = wrap_angle(float(pose[2]) - np.angle(late.turn) - path.yaws)
+    total, yaw_total = late.variance + variance, late.yaw_variance + yaw_variance
+    fits = np.exp(-0.5 * (np.abs(miss) ** 2 / total + yaw_miss**2 / yaw_total))
+    fits *= (1 - _OUTLIERS) * _DENSITY / (total * np.sqrt(yaw_total))
+    fits = np.where(path.known, fits, 0.0)
+    likely = fits + np.where(path.known, _OUTLIERS, 1.0) * _ELSEWHERE_DENSITY
+    odds = late.odds * np.append(likely, _ELSEWHERE_DENSITY)
+    gain = fits / likely * late.variance / total
+    yaw_gain = fits / likely * late.yaw_variance / yaw_total
+    turn = late.turn * np.exp(1j * yaw_gain * yaw_miss)
+    return late._replace(
+        odds=odds / odds.sum(),
+        turn=turn,
+        shift=place + gain * miss - turn * path.places,
+        variance=late.variance * (1 - gain),
+        yaw_variance=late.yaw_variance * (1 - yaw_gain),
+    )

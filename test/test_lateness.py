@@ -1,0 +1,207 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Images that show where the robot was before are noticed by their poses, and nothing else is."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from filter_drives import START_NS, Drive
+
+from sfa_localization.fusion import lateness
+from sfa_localization.fusion.lateness import CLEARED, Lateness, extended, followed, unrelated
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import Level
+
+HZ, EVERY = 25, 5
+NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.08, 'yaw_std': 0.02, 'rate_hz': HZ}
+COVARIANCE = np.diag([0.05**2, 0.05**2, 0.01**2])
+
+
+def drive_of(omega, **options):
+    """A noisy drive at 1 m/s with turn rates (N,)."""
+    return Drive(every=EVERY, twists=np.column_stack([np.ones(len(omega)), omega]),
+                 **{**NOISY, **options})  # fmt: skip
+
+
+def winding(seconds):
+    t = np.arange(round(seconds * HZ)) / HZ
+    return 0.3 + 0.25 * np.sin(0.5 * t)
+
+
+def driven(drive, shown, turned=False):
+    """A filter, and per picture: its stamp s, level, error m, lateness; pictures show shown(t)."""
+    fused, found = PoseFilter(FilterConfig()), []
+    for stamp_ns, kind, index in drive.events():
+        if kind == 0:
+            drive.give(fused, (stamp_ns, kind, index))
+            continue
+        at_s = (stamp_ns - START_NS) * 1e-9
+        content = min(max(round(shown(at_s) * HZ / EVERY) - 1, 0), index)
+        if turned:
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[content], 2]))
+        fused.add_measurement(stamp_ns, drive.seen[content], drive.covariance(True))
+        error = math.hypot(*(fused.state.pose - drive.poses[drive.pictures[index]])[:2])
+        found.append((at_s, fused.status.level, error, fused._history.newest.lateness))
+    return fused, found
+
+
+def sure_and_wrong_s(found):
+    return (
+        sum(level is Level.LOCALISED and error > 1.0 for _, level, error, _ in found) * EVERY / HZ
+    )
+
+
+@pytest.mark.parametrize('omega', [np.zeros(60 * HZ), np.full(60 * HZ, 0.3), winding(60)])
+@pytest.mark.parametrize('seed', [0, 1])
+def test_images_in_time_are_never_suspected(omega, seed):
+    _, found = driven(drive_of(omega, seed=seed), lambda t: t)
+    assert max(late.apart for *_, late in found) < 0.3
+    assert all(level is Level.LOCALISED for _, level, *_ in found)
+
+
+@pytest.mark.parametrize('rate', [0.1, 0.15, 0.2])
+@pytest.mark.parametrize('omega', [0.3, 0.5])
+def test_on_a_circle_a_delay_that_grows_is_noticed_before_it_is_large(rate, omega):
+    drive = drive_of(np.full(50 * HZ, omega))
+    _, found = driven(drive, lambda t: t - rate * max(t - 10.0, 0.0))
+    assert sure_and_wrong_s(found) <= 2.0
+    assert max(late.apart for at_s, *_, late in found if at_s < 10.0) < 0.1
+
+
+def test_a_video_that_loops_is_noticed_at_once_and_its_delay_is_named():
+    fused, found = driven(
+        drive_of(winding(22)), lambda t: t if t < 14.0 else 6.0 + (t - 14.0) % 8.0
+    )
+    assert sure_and_wrong_s(found) == 0.0
+    first_s = next(at_s for at_s, *_, late in found if late.suspected)
+    assert 14.0 <= first_s < 15.0
+    assert found[-1][-1].error_s == pytest.approx(8.0, abs=0.3)
+    assert 'images are stamped 8.' in ' '.join(fused.status.reasons)
+    assert fused.state.position_std > 2.0
+
+
+@pytest.mark.parametrize('delay_s', [1.0, 3.0, 7.0])
+def test_a_delay_that_begins_is_measured_and_its_end_is_noticed(delay_s):
+    _, found = driven(drive_of(winding(40)), lambda t: t - delay_s if 12.0 <= t < 24.0 else t)
+    during = [late for at_s, *_, late in found if 14.0 < at_s < 23.5]
+    assert min(late.apart for late in during) > 0.9
+    assert during[-1].error_s == pytest.approx(delay_s, abs=0.25)
+    assert all(late.apart < CLEARED for at_s, *_, late in found if at_s > 30.0)
+
+
+def test_a_robot_that_was_carried_is_not_late_where_it_is_found_again():
+    drive = drive_of(winding(40))
+    drive.kidnap(75, (6.0, -9.0, 2.0))
+    fused, found = driven(drive, lambda t: t)
+    assert fused.status.level is Level.LOCALISED and found[-1][2] < 0.5
+    assert any(late.odds[-1] > 0.5 for *_, late in found[75:85])
+    assert found[-1][-1].apart < 0.1
+
+
+@pytest.mark.parametrize('scale', [0.94, 1.06])
+def test_wheels_of_another_size_make_no_images_late(scale):
+    _, found = driven(
+        drive_of(0.3 * np.sin(0.5 * np.arange(50 * HZ) / HZ), scale=scale), lambda t: t
+    )
+    assert not any(late.suspected for *_, late in found)
+
+
+def test_without_odometry_nothing_is_concluded_from_motion():
+    drive, fused = drive_of(winding(40)), PoseFilter(FilterConfig())
+    for event in drive.events():
+        if event[1] == 1 or not 15.0 <= (event[0] - START_NS) * 1e-9 < 25.0:
+            drive.give(fused, event, heading=True)
+    late = fused._history.newest.lateness
+    assert late.apart < 0.1 and fused.status.level is Level.LOCALISED
+
+
+def test_the_lateness_does_not_depend_on_the_order_of_messages():
+    drive = drive_of(np.full(20 * HZ, 0.3))
+    rng, ordered, shuffled = np.random.default_rng(3), PoseFilter(), PoseFilter()
+    events = drive.events()
+    late_by = [rng.uniform(0.0, 2.0 if kind else 0.1) * 1e9 for _, kind, _ in events]
+    order = sorted(range(len(events)), key=lambda i: events[i][0] + late_by[i])
+    for fused, sequence in ((ordered, range(len(events))), (shuffled, order)):
+        # Both know from the start when their clock begins.
+        fused.set_pose(START_NS, drive.poses[0], np.diag([0.01, 0.01, 0.01]))
+        for i in sequence:
+            stamp_ns, kind, index = events[i]
+            content = round(index - 0.2 * max(index - 25, 0))
+            if kind == 0:
+                drive.give(fused, events[i])
+            else:
+                fused.add_measurement(stamp_ns, drive.seen[content], drive.covariance(True))
+    a, b = (fused._history.newest.lateness for fused in (ordered, shuffled))
+    assert a.suspected and b.suspected
+    np.testing.assert_allclose(a.odds, b.odds, atol=1e-9)
+    assert ordered.status == shuffled.status
+
+
+def path_of(omega, seconds):
+    """A trail at 1 m/s, by hand: knots each 50 ms on a line or a circle."""
+    t = np.arange(0.0, seconds, 0.05)
+    yaw = omega * t
+    if omega:
+        x, y = np.sin(yaw) / omega, (1 - np.cos(yaw)) / omega
+    else:
+        x, y = t, np.zeros_like(t)
+    stamps = START_NS + np.round(t * 1e9).astype(np.int64)
+    return [(int(s), *map(float, p)) for s, *p in zip(stamps, x, y, yaw, strict=True)]
+
+
+def test_images_before_any_motion_change_nothing():
+    knots = path_of(0.0, 1.0)
+    first = followed(None, (), knots[0], np.zeros(3), COVARIANCE, False)
+    again = followed(first, (knots[0],), knots[1], np.array([9.0, 9.0, 1.0]), COVARIANCE, False)
+    np.testing.assert_array_equal(first.odds, again.odds)
+    assert first.problem == '' and first.apart < 0.05
+
+
+def test_images_that_show_little_change_nothing():
+    knots = path_of(0.0, 3.0)
+    first = followed(None, (), knots[0], np.zeros(3), COVARIANCE, False)
+    vague = np.diag([100.0, 100.0, 0.1])
+    assert followed(first, tuple(knots), knots[-1], np.zeros(3), vague, False) is first
+    assert followed(None, (), knots[0], np.zeros(3), vague, False) is None
+    assert unrelated(None, (), knots[0], np.zeros(3), COVARIANCE) is None
+
+
+def test_odds_stay_probabilities_with_any_images():
+    rng, trail, late = np.random.default_rng(5), (), None
+    for k, knot in enumerate(path_of(0.2, 60.0)):
+        trail = extended(trail, knot)
+        if k % 4 == 0:
+            pose = rng.uniform(-20.0, 20.0, 3)
+            late = followed(
+                late, trail, knot, pose, COVARIANCE * 10 ** rng.uniform(-8, 3), k % 60 == 0
+            )
+            assert isinstance(late, Lateness)
+            assert late.odds.min() >= 0 and late.odds.sum() == pytest.approx(1.0)
+            assert np.isfinite(late.shift).all() and np.abs(late.turn) == pytest.approx(1.0)
+            assert (late.variance > 0).all() and (late.yaw_variance > 0).all()
+    assert late.suspected and late.problem == 'images and odometry show different motions'
+
+
+def test_the_trail_holds_the_last_seconds_in_steps():
+    trail = ()
+    for knot in path_of(0.0, 30.0):
+        trail = extended(trail, knot)
+        trail = extended(trail, (knot[0] + 1_000_000, *knot[1:]))
+    assert trail[-1][0] - trail[0][0] >= lateness.LATEST_S * 1e9
+    assert len(trail) <= lateness.LATEST_S / 0.05 + 3
+    assert all(b[0] - a[0] >= lateness.KNOT_NS for a, b in pairwise(trail))
+
+
+def test_a_first_image_that_contradicts_a_young_estimate_is_a_doubt():
+    drive, fused = drive_of(winding(5)), PoseFilter(FilterConfig())
+    for event in drive.events():
+        stamp_ns, kind, index = event
+        if kind == 1 and index == 2:
+            wrong = drive.seen[index] + [0.0, 0.0, 0.7]
+            assert not fused.add_measurement(stamp_ns, wrong, drive.covariance(True)).accepted
+            assert fused.status.level is Level.DEGRADED
+            return
+        drive.give(fused, event, heading=True)
