@@ -31,10 +31,15 @@ def winding(seconds):
     return 0.3 + 0.25 * np.sin(0.5 * t)
 
 
-def driven(drive, shown, turned=False):
-    """A filter, and per picture: its stamp s, level, error m, lateness; pictures show shown(t)."""
+def driven(drive, shown, turned=False, silent=(0.0, 0.0)):
+    """A filter, and per picture: its stamp s, level, error m, lateness; pictures show shown(t).
+
+    Between the times `silent` s there are no messages.
+    """
     fused, found = PoseFilter(FilterConfig()), []
     for stamp_ns, kind, index in drive.events():
+        if silent[0] < (stamp_ns - START_NS) * 1e-9 < silent[1]:
+            continue
         if kind == 0:
             drive.give(fused, (stamp_ns, kind, index))
             continue
@@ -99,6 +104,15 @@ def test_a_robot_that_was_carried_is_not_late_where_it_is_found_again():
     assert fused.status.level is Level.LOCALISED and found[-1][2] < 0.5
     assert any(late.odds[-1] > 0.5 for *_, late in found[75:85])
     assert found[-1][-1].apart < 0.1
+
+
+@pytest.mark.parametrize('seconds', [1.0, 4.0])
+def test_a_motion_that_no_message_shows_makes_no_images_late(seconds):
+    omega = winding(40)
+    omega[12 * HZ : round((12 + seconds) * HZ)] = 1.2
+    _, found = driven(drive_of(omega), lambda t: t, silent=(12.0, 12.0 + seconds))
+    assert not any(late.suspected for at_s, *_, late in found if at_s > 17.0)
+    assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 20.0)
 
 
 @pytest.mark.parametrize('scale', [0.94, 1.06])

@@ -80,7 +80,8 @@ class Lateness(NamedTuple):
     """The odds (K + 1,) of each delay and of elsewhere, and transforms from odometry to the map.
 
     A position p of the odometry's frame, x + iy, lies at turn p + shift, both (K,). `variance` (K,)
-    is that of the place along each axis, at the point of `path` that the newest image shows.
+    is that of the place along each axis, at the point of `path` that the newest image, of
+    `stamp_ns`, shows.
     """
 
     odds: Array
@@ -89,6 +90,7 @@ class Lateness(NamedTuple):
     variance: Array
     yaw_variance: Array
     path: Path
+    stamp_ns: int
     suspected: bool = False
 
     @property
@@ -133,18 +135,23 @@ def followed(
 ) -> Lateness | None:
     """The odds after an image of a pose (3,) with covariance (3, 3), at the pose by odometry `now`.
 
+    Where the trail has begun after the image before, the transforms begin anew.
     `restarted`: the filter has taken it for the robot's new place.
     """
     variance, yaw_variance = _noise(covariance)
     if variance > _USELESS_VARIANCE:
         return late
     path = _path(trail, now)
+    begun = _begun(path, now[0], pose, variance, yaw_variance)
     if late is None:
-        return _begun(path, pose, variance, yaw_variance)
+        return begun
+    if trail and trail[0][0] > late.stamp_ns:
+        return _judged(_anew(late, begun))
     if restarted or _moved(late.path, path):
         late = _corrected(_predicted(late, path), pose, variance, yaw_variance)
+        late = late._replace(stamp_ns=now[0])
     if restarted:
-        late = _replaced(late, _begun(path, pose, variance, yaw_variance))
+        late = _replaced(late, begun)
     return _judged(late)
 
 
@@ -157,14 +164,16 @@ def _path(trail: tuple[Knot, ...], now: Knot) -> Path:
     return Path(places, np.interp(-_DELAYS, seconds, np.unwrap(yaw)), known)
 
 
-def _begun(path: Path, pose: Array, variance: float, yaw_variance: float) -> Lateness:
+def _begun(
+    path: Path, stamp_ns: int, pose: Array, variance: float, yaw_variance: float
+) -> Lateness:
     """By each delay, the image shows where the robot was then."""
     odds = (1 - _SURPRISE) * _NEAR_SHARE + _SURPRISE / (_COUNT + 1)
     odds = np.append(odds, _SURPRISE / (_COUNT + 1))
     turn = np.exp(1j * (float(pose[2]) - path.yaws))
     shift = complex(pose[0], pose[1]) - turn * path.places
     stds = np.full(_COUNT, variance), np.full(_COUNT, yaw_variance)
-    return Lateness(odds / odds.sum(), turn, shift, *stds, path)
+    return Lateness(odds / odds.sum(), turn, shift, *stds, path, stamp_ns)
 
 
 def _moved(before: Path, path: Path) -> bool:
@@ -179,9 +188,14 @@ def unrelated(
     variance, yaw_variance = _noise(covariance)
     if late is None or variance > _USELESS_VARIANCE:
         return late
+    begun = _begun(_path(trail, now), now[0], pose, variance, yaw_variance)
+    return _judged(_anew(late, begun))
+
+
+def _anew(late: Lateness, begun: Lateness) -> Lateness:
+    """With the odds of before; what was elsewhere is perhaps in time."""
     odds = np.append(late.odds[:-1] + late.odds[-1] * _NEAR_SHARE, 0.0)
-    begun = _begun(_path(trail, now), pose, variance, yaw_variance)
-    return _judged(begun._replace(odds=odds, suspected=late.suspected))
+    return begun._replace(odds=odds, suspected=late.suspected)
 
 
 def _judged(late: Lateness) -> Lateness:
@@ -203,7 +217,9 @@ def _replaced(late: Lateness, begun: Lateness) -> Lateness:
         np.where(_NEAR, getattr(begun, name), getattr(late, name))
         for name in ('turn', 'shift', 'variance', 'yaw_variance')
     )
-    return Lateness(odds, turn, shift, variance, yaw_variance, begun.path, late.suspected)
+    return Lateness(
+        odds, turn, shift, variance, yaw_variance, begun.path, begun.stamp_ns, late.suspected
+    )
 
 
 def _predicted(late: Lateness, path: Path) -> Lateness:

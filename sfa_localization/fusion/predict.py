@@ -53,7 +53,11 @@ class Prediction:
         step = motion.drive(belief.mean, twist, dt, noise)
         if silence_s > COAST_S:
             motion.add_unknown_motion(step.noise, twist, min(dt, silence_s - COAST_S))
-        return self._moved(belief, event.stamp_ns, step, event)
+        driven = self._moved(belief, event.stamp_ns, step, event)
+        if silence_s > ODOMETRY_TIMEOUT_S:
+            # What the robot did meanwhile is unknown: its path begins anew.
+            driven = driven._replace(trail=((event.stamp_ns, *driven.dead_reckoned),))
+        return driven
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
         """The belief at a later stamp without new odometry: at the last speed, then unknown."""
