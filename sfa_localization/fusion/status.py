@@ -61,8 +61,8 @@ def status_of(
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
     if belief.memory.rejected >= (FEW_IMAGES if belief.memory.support >= FEW_IMAGES else 1):
         images = belief.memory.rejected
-        many = 'an image' if images == 1 else f'{images} images in a row'
-        degraded.append(f'{many} did not match')
+        one = 'an image did not match'
+        degraded.append(one if images == 1 else f'{images} images in a row did not match')
     # Only images confirm: what was driven since the last one, or before it came late, does not.
     degraded += doubts(belief.memory.trust, belief.memory.accepted_m)
     degraded += _silences(belief)
