@@ -27,7 +27,7 @@ from sfa_localization.commands.reproduction import (
     recorded,
     settings_of,
 )
-from sfa_localization.commands.trials import STRAIGHT, Features, slow_of
+from sfa_localization.commands.trials import STRAIGHT, features_of, slow_of
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory
@@ -132,12 +132,11 @@ class _Work:
         """Size of the simulated panoramas."""
         return PanoramaConfig(width=self.plan.panorama[0], height=self.plan.panorama[1])
 
-    def model(self, lights: Sequence[str]) -> PlaceModel:
-        """The model of the training drives in some lights."""
+    def model(self, lights: Sequence[str], bags: Sequence[Path]) -> PlaceModel:
+        """The model of the training drives in some lights, which are in bags."""
         path = self.out / f'{"_".join(lights)}.npz'
         if not path.exists():
             self.progress.say(f'train on {" + ".join(lights)}')
-            bags = [self.training(light) for light in lights]
             train(bags, path, progress=self.progress.shown, resume=True)
         return PlaceModel.load(path)
 
@@ -177,7 +176,7 @@ def _fill(work: _Work, training: Training, keep: Callable[[Cell], None]) -> None
     """Train once and test in some lights; every finished cell is handed to `keep`."""
     bags = [work.training(light) for light in training.lights]
     drives = [work.test(test) for test in training.tests]
-    model = work.model(training.lights)
+    model = work.model(training.lights, bags)
     recipe = as_live(Recipe(), work.panorama)
     with image_cache(work.out / 'images') as cache:
         runs = [_read(bag, cache / bag.name, recipe) for bag in bags]
@@ -250,7 +249,7 @@ def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
     and has no heading. Where these lines give no map, there is only the `problem`.
     """
     slow = slow_of(model.network)
-    features = _features(slow, training)
+    features = features_of(slow, training)
     try:
         segments = cut_odometry([training], [clock_of(training)], STRAIGHT)
         metric = learn_metric(features, segments, RECIPES['paper']).map
@@ -263,13 +262,8 @@ def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
 
     transform = fit_transform(_truth(training), located(training, features))
     return lambda drive: _summary(
-        score(_truth(drive), moved(located(drive, _features(slow, drive)), transform))
+        score(_truth(drive), moved(located(drive, features_of(slow, drive)), transform))
     )
-
-
-def _features(of: Features, run: Run) -> Array:
-    """Features (N, K) of all images of a drive."""
-    return np.concatenate([of(batch) for batch in run.panoramas.batches(BATCH)])
 
 
 def _retrieval(runs: Sequence[Run]) -> ImageRetrieval:

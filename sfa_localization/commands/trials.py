@@ -113,8 +113,13 @@ class Study:
 
     def features(self, of: Features) -> tuple[Array, Array]:
         """Features (N, K) of all training images, and (T, K) of the test drive's."""
-        training = np.concatenate([of(batch) for batch in self.batches()])
-        return training, np.concatenate([of(b) for b in self.test.panoramas.batches(BATCH)])
+        training = np.concatenate([features_of(of, run) for run in self.training])
+        return training, features_of(of, self.test)
+
+
+def features_of(of: Features, run: Run) -> Array:
+    """Features (N, K) of all images of a drive."""
+    return np.concatenate([of(batch) for batch in run.panoramas.batches(BATCH)])
 
 
 def _truth(run: Run, clock: CameraClock) -> Trajectory:

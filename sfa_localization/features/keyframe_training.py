@@ -59,8 +59,7 @@ def fit_keyframes(
 
 def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     """Some keyframes, each correlated with those of other stretches: index, (K,) correlations,
-    -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance
-    driven until each.
+    -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance driven until each.
     """
     count = len(keyframes.poses)
     sample = np.unique(np.linspace(0, count - 1, min(_TRIALS, count)).round().astype(np.int64))
@@ -78,7 +77,8 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
 class _Trial:
     """The match of a keyframe that is left out: `squared_error` m^2, `turn` rad, the error of its
     yaw, `unlike` and `score` of the match, and the variance m^2 by keyframes elsewhere at each
-    temperature."""
+    temperature.
+    """
 
     squared_error: float
     turn: float
@@ -96,10 +96,12 @@ class _Trial:
     ) -> _Trial:
         match = keyframes.located(keyframes.spectra[row], scores, shifts)
         error = match.pose - keyframes.poses[row]
-        scatters = []
-        for temperature in _TEMPERATURES.tolist():
-            weight, offset = keyframes.elsewhere(scores, match.pose[:2], temperature)
-            scatters.append(float(weight @ (offset**2).sum(1)) / 2)
+        reach = keyframes.reach(int(scores.argmax()))
+        squares = (keyframes.elsewhere(scores, match.pose[:2], reach) ** 2).sum(1)
+        scatters = [
+            float(keyframes.likelihood(scores, temperature) @ squares) / 2
+            for temperature in _TEMPERATURES.tolist()
+        ]
         squared, turn = float(error[:2] @ error[:2]), abs(float(wrap_angle(error[2])))
         return cls(squared, turn, match.unlike, match.score, tuple(scatters))
 

@@ -335,8 +335,10 @@ class Keyframes:
         best = int(scores.argmax())
         turn = (-2 if self.clockwise else 2) * np.pi / self._columns
         yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
-        place, yaw, unlike = self.regressed(spectrum, scores, yaws)
-        weight, offset = self.elsewhere(scores, place, self.noise.temperature)
+        reach = self.reach(best)
+        place, yaw, unlike = self._regressed(spectrum, scores, yaws, reach)
+        weight = self.likelihood(scores, self.noise.temperature)
+        offset = self.elsewhere(scores, place, reach)
         apart = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
         apart[(apart < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
         variance = self.noise.variance(unlike)
@@ -353,15 +355,15 @@ class Keyframes:
         pose = np.array([*place, wrap_angle(yaw)])
         return Match(pose, covariance, float(scores[best]), support, unlike)
 
-    def regressed(
-        self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array
+    def _regressed(
+        self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array, reach: float
     ) -> tuple[Array, float, float]:
         """Place (2,) m and yaw rad of the spectrum (rows, F) of an image, and how `unlike` the
         keyframes around the best one it is, of those whose correlations (K,) are known; `yaws`
-        (K,) rad are what each of them shows.
+        (K,) rad are what each of them shows, `reach` m how far the place may be from the best.
         """
         best, sign, columns = int(scores.argmax()), 1 if self.clockwise else -1, self._columns
-        start, reach = self.poses[best, :2], self._reach(best)
+        start = self.poses[best, :2]
         place, yaw, unlike = np.array(start), float(yaws[best]), _unlike(float(scores[best]))
         for _ in range(_REPEATED):
             near = self._around(place)
@@ -378,23 +380,27 @@ class Keyframes:
                 break
         return place, yaw, unlike
 
-    def elsewhere(
-        self, scores: NDArray[np.float32], place: Array, temperature: float
-    ) -> tuple[Array, Array]:
-        """Of the keyframes whose correlations (K,) are known, how likely each is the place, by
-        its correlation; and their offsets (M, 2) m from it, 0 for those that are near it.
+    def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
+        """How likely each of the keyframes (M,) whose correlations (K,) are known is the place, of
+        sum 1.
         """
-        known = np.isfinite(scores)
-        offset = self.poses[known, :2] - place
-        weight = np.exp((scores[known] - scores[known].max()) / temperature, dtype=np.float64)
-        near = np.hypot(*offset.T) <= 2 * self._reach(int(scores.argmax()))
-        return weight / weight.sum(), np.where(near[:, None], 0.0, offset)
+        known = scores[np.isfinite(scores)]
+        weight = np.exp((known - known.max()) / temperature, dtype=np.float64)
+        return np.asarray(weight / weight.sum())
+
+    def elsewhere(self, scores: NDArray[np.float32], place: Array, reach: float) -> Array:
+        """Offsets (M, 2) m from a place of the keyframes whose correlations (K,) are known; 0 for
+        those that are near it, by a `reach`.
+        """
+        offset = self.poses[np.isfinite(scores), :2] - place
+        near = np.hypot(*offset.T) <= 2 * reach
+        return np.where(near[:, None], 0.0, offset)
 
     @property
     def _columns(self) -> int:
         return int(self.textures.shape[2])
 
-    def _reach(self, best: int) -> float:
+    def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""
         start = self.poses[best, :2]
         farthest = self._alike(self._around(start), best)[:NEIGHBORS][-1]
