@@ -33,8 +33,8 @@ def turned(spectra: Spectra, angle: Array) -> Spectra:
     """Spectra (..., rows, F) of textures whose content is moved by `angle` (...) rad, to the left
     for positive ones.
     """
-    phase = np.exp(1j * np.multiply.outer(angle, np.arange(spectra.shape[-1])))
-    return np.asarray(spectra * phase[..., None, :], np.complex64)
+    phase = np.exp(1j * np.multiply.outer(angle, np.arange(spectra.shape[-1]))).astype(np.complex64)
+    return np.asarray(spectra * phase[..., None, :])
 
 
 @dataclass(frozen=True, slots=True)

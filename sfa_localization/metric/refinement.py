@@ -43,6 +43,9 @@ Vectors = NDArray[np.float32]
 
 DIMENSIONS = 32
 """Principal components that the finer map reads."""
+POINTS = 1000
+"""Inducing points of the finer map: with half as many more it is no better, and the model file and
+the time of an estimate are larger."""
 # Images that the components are found from, evenly along the drives: they are smooth statistics.
 _COMPONENT_IMAGES = 1500
 # Images turned at a time: memory.
@@ -114,9 +117,12 @@ class Refinement:
 
         Of spectra (T, H, J) at headings yaw (T,) rad, with the disagreement (T,) of the views.
         """
-        features = self.features(spectra, yaw)
-        places, covariances = self.metric.predict(features)
-        return places, covariances * self.agreement.factor(views)[:, None, None]
+        places, covariances = self.metric.predict(self.features(spectra, yaw))
+        return places, self._doubted(covariances, views)
+
+    def _doubted(self, covariances: Array, views: Array) -> Array:
+        """Covariances (T, 2, 2) with the factor for the disagreement (T,) of the views."""
+        return covariances * self.agreement.factor(views)[:, None, None]
 
     def refine(
         self,
@@ -133,9 +139,7 @@ class Refinement:
         covariance covers both.
         """
         known = np.isfinite(yaw) & (yaw_variance < _YAW_STD_MAX_RAD**2)
-        heading = np.where(known, yaw, 0.0)
-        places, covariances = self.predict(spectra, heading, views)
-        slope = self._slope(spectra, heading)
+        places, covariances, slope = self._with_slope(spectra, np.where(known, yaw, 0.0), views)
         covariances = covariances + _outer(slope) * yaw_variance[:, None, None]
         finer = known & (_size(covariances) < _SURER * _size(coarse[1]))
         apart = places - coarse[0]
@@ -151,14 +155,17 @@ class Refinement:
         squared = _squared(apart, joint)
         return np.maximum(1.0 - self.usual / np.maximum(squared, 1e-12), 0.0)[:, None, None]
 
-    def _slope(self, spectra: Spectrum, yaw: Array) -> Array:
-        """Change of the position with the heading (T, 2), m / rad."""
-        ahead, behind = (self._place(spectra, yaw + s * _YAW_STEP_RAD) for s in (1.0, -1.0))
-        return np.asarray((ahead - behind) / (2.0 * _YAW_STEP_RAD))
-
-    def _place(self, spectra: Spectrum, yaw: Array) -> Array:
-        """Positions (T, 2) without their covariances, for far less work."""
-        return self.metric.positions(self.features(spectra, yaw))
+    def _with_slope(
+        self, spectra: Spectrum, yaw: Array, views: Array
+    ) -> tuple[Array, Array, Array]:
+        """As `predict`, and the change of the positions with the heading, (T, 2) m / rad."""
+        count, steps = len(yaw), np.array([0.0, 1.0, -1.0]) * _YAW_STEP_RAD
+        yaws = np.add.outer(steps, yaw).ravel()
+        features = self.features(np.tile(spectra, (len(steps), 1, 1)), yaws)
+        places, covariances = self.metric.predict(features[:count])
+        ahead, behind = np.split(self.metric.positions(features[count:]), 2)
+        slope = (ahead - behind) / (2.0 * _YAW_STEP_RAD)
+        return places, self._doubted(covariances, views), np.asarray(slope)
 
     def features(self, spectra: Spectrum, yaw: Array) -> Array:
         """What the finer map reads, (T, K), of spectra (T, H, J) at headings yaw (T,) rad."""
@@ -216,7 +223,7 @@ def learn_refinement(
     # They count by their own size, as principal components do.
     scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
     process = replace(config, solver='certified', metric_map='gp', slow_features=0)
-    metric = learn_metric(features, segments, process, seed, scale=scale, onto=first)
+    metric = learn_metric(features, segments, process, seed, points=POINTS, scale=scale, onto=first)
     agreement = left_out_agreement(disagreement, metric)
     assert isinstance(metric.map.basis, Process)
     fast = FastProcess.of(metric.map, metric.map.basis)
