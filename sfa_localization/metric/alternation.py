@@ -6,6 +6,7 @@
     eliminate   the map's weights from equation 1                quadratic_form.py
     solve       directions, origins and biases, certified        quadratic_form.py, phases.py
     noise       variance and correlation of the residuals        here
+    links       variances of odometry's links                    link_noise.py
 
 The noise matters because odometry's links are weighted against the images.
 """
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.expansions import Basis
+from sfa_localization.metric.link_noise import learned
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import (
     Elimination,
@@ -44,9 +46,10 @@ YAW_BIAS_STD = 0.003
 _FIRST_VARIANCE = 0.04
 # Odometry's own paths are no better than this, however well a map fits them.
 _NOISE_MIN_M = 1e-3
-# The variance settles to _SETTLED, its relative change, in two or three rounds.
-_ROUNDS = 6
-_SETTLED = 0.01
+# The variance settles to _SETTLED, its relative change, in two or three rounds; those of noisy
+# links, which matter less, in some more.
+_ROUNDS = 8
+_SETTLED, _LINKS_SETTLED = 0.01, 0.05
 # Residuals further apart than this many images are taken as independent.
 _LAGS = 50
 
@@ -82,10 +85,13 @@ class MetricProblem:
         solution = start.solution if start else None
         variance = start.variance if start else _FIRST_VARIANCE
         correlation = start.correlation if start else LINK_WEIGHT
+        links = start.links if start else self.links
         for _ in range(max(rounds, 1)):
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
             loops = self.loops.form(self.stack, solution)
-            solution = self._solve(elimination, loops, variance * correlation, solution)
+            form = self._form(elimination, loops, links, variance * correlation)
+            solution = self._solve(form, solution)
+            links, links_before = learned(self.links, form, solution), links
             weights = elimination.weights(solution.coefficients(self.stack.period))
             predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
             residuals = solution.places(self.stack) - predicted
@@ -93,23 +99,22 @@ class MetricProblem:
             correlation = LINK_WEIGHT * _correlation(residuals, self.stack)
             freedom = _freedom(elimination, basis, self.stack)
             variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
-            if abs(variance - before) < _SETTLED * variance:
+            steady = links.alike(links_before, _LINKS_SETTLED)
+            if steady and abs(variance - before) < _SETTLED * variance:
                 break
         assert solution is not None
         return MapFit(
-            self, basis, expanded, noise_ratio, variance, correlation, loops,
+            self, basis, expanded, noise_ratio, variance, correlation, loops, links,
             elimination, solution, np.asarray(residuals), weights,
         )  # fmt: skip
 
-    def _solve(
-        self,
-        elimination: Elimination,
-        loops: Complex,
-        variance: float,
-        before: Solution | None,
-    ) -> Solution:
+    def _form(
+        self, elimination: Elimination, loops: Complex, links: Links, variance: float
+    ) -> QuadraticForm:
         gram = elimination.gram + variance * loops
-        form = QuadraticForm(gram, self.links, self.stack.period, variance, YAW_BIAS_STD)
+        return QuadraticForm(gram, links, self.stack.period, variance, YAW_BIAS_STD)
+
+    def _solve(self, form: QuadraticForm, before: Solution | None) -> Solution:
         if before is None:
             solution = form.solve(None, np.zeros(self.stack.period[-1] + 1))
         else:
@@ -145,6 +150,8 @@ class MapFit:
     correlated; times LINK_WEIGHT."""
     loops: Complex
     """(3N, 3N) form of the loop closures in [o, z, -b z], see loops.py."""
+    links: Links
+    """With the variances that the solution shows, see link_noise.py."""
     elimination: Elimination
     solution: Solution
     residuals: Complex
@@ -173,9 +180,8 @@ class MapFit:
 
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
-        links, period = self.problem.links, self.stack.period
         gram = elimination.gram + self.link_variance * self.loops
-        return QuadraticForm(gram, links, period, self.link_variance, 0.0)
+        return QuadraticForm(gram, self.links, self.stack.period, self.link_variance, 0.0)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:

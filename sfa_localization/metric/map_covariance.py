@@ -9,9 +9,9 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, RigidTransform
+from sfa_localization.metric import phases
 from sfa_localization.metric.alternation import MapFit
 from sfa_localization.metric.expansions import MetricMap
-from sfa_localization.metric.phases import angle_hessian, refine
 from sfa_localization.metric.quadratic_form import schur
 
 Complex = NDArray[np.complex128]
@@ -27,14 +27,7 @@ def plane(points: Complex) -> Array:
 
 def angle_covariance(fit: MapFit) -> Array:
     """Covariance (N, N) of the directions, rad^2, relative to the rotation of the whole map."""
-    hessian = angle_hessian(fit.solution.h, refine(fit.solution.h, fit.solution.z))
-    values, vectors = np.linalg.eigh(hessian)
-    n = len(values)
-    common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
-    inverse = np.where(common, 0.0, 1.0 / np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
-    centered = np.eye(n) - 1.0 / n
-    spread = centered @ vectors
-    return np.asarray(fit.link_variance * (spread * inverse) @ spread.T)
+    return np.asarray(fit.link_variance * phases.angle_covariance(fit.solution.h, fit.solution.z))
 
 
 def sway(fit: MapFit) -> Complex:

@@ -178,6 +178,6 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     solution = Solution(z, o, bias, certify(h, z), h, phase_cost(h, z))
     no_loops = np.zeros_like(elimination.gram)
     return MapFit(
-        problem, basis, expanded, ones, variance, 1.0, no_loops,
+        problem, basis, expanded, ones, variance, 1.0, no_loops, problem.links,
         elimination, solution, residuals, weights,
     )  # fmt: skip

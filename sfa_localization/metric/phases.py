@@ -162,6 +162,17 @@ def angle_hessian(h: Complex, z: Complex) -> Array:
     return _derivatives(h, z)[1]
 
 
+def angle_covariance(h: Complex, z: Complex) -> Array:
+    """Covariance (N, N) of the angles of z at a minimum, for a cost in units of the variance,
+    without a rotation of all together."""
+    values, vectors = np.linalg.eigh(angle_hessian(h, refine(h, z)))
+    n = len(values)
+    common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
+    inverse = np.where(common, 0.0, 1.0 / np.maximum(values, 1e-12 * max(values[-1], 1e-300)))
+    spread = (np.eye(n) - 1.0 / n) @ vectors
+    return np.asarray((spread * inverse) @ spread.T)
+
+
 def _step(hessian: Array, gradient: Array, damping: float) -> Array:
     """Newton step; where the Hessian is not positive, along its absolute value."""
     # Turning all together changes nothing: fix the mean.

@@ -107,6 +107,7 @@ class Links:
     """
 
     at: Indices
+    run: Indices
     period: Indices
     turn: Array
     turn_variance: Array
@@ -121,8 +122,16 @@ class Links:
         items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
         column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
         at = np.array([n for n, _ in items], np.int64)
-        period = np.array([s.period for _, s in items], np.int64)
-        return cls(at, period, *column)
+        run, period = (np.array([getattr(s, k) for _, s in items], np.int64) for k in _OWNERS)
+        return cls(at, run, period, *column)
+
+    def alike(self, other: Links, tolerance: float) -> bool:
+        """Whether the variances of the same links differ by no more than a relative tolerance."""
+        pairs = (
+            (self.turn_variance, other.turn_variance),
+            (self.displacement_variance, other.displacement_variance),
+        )
+        return all(np.allclose(own, its, tolerance, 0.0) for own, its in pairs)
 
     @property
     def used(self) -> bool:
@@ -131,6 +140,7 @@ class Links:
         return bool(np.isfinite(variances).any())
 
 
+_OWNERS = ('run', 'period')
 _MEASURED = (
     'turn_rad',
     'turn_variance',
@@ -258,7 +268,7 @@ class QuadraticForm:
     def system(self, bias: Array) -> Complex:
         """The quadratic form (2N, 2N) in [o, z] at the periods' biases (R,)."""
         form = self._biased_gram(bias)
-        for rows, weight in self._link_rows(bias):
+        for rows, weight in self.link_rows(bias):
             form = form + rows.conj().T @ (weight[:, None] * rows)
         return np.asarray(form)
 
@@ -272,7 +282,7 @@ class QuadraticForm:
         form[n:] += b[:, None] * product[2 * n :]
         return np.asarray(form)
 
-    def _link_rows(self, bias: Array) -> list[tuple[Complex, Array]]:
+    def link_rows(self, bias: Array) -> list[tuple[Complex, Array]]:
         """Rows (L, 2N) whose weighted squares are the turns' and the displacements' costs."""
         links, n, at = self.links, len(self.period), np.arange(len(self.links.at))
         turns, moves = np.zeros((2, len(at), 2 * n), complex)
@@ -292,7 +302,7 @@ class QuadraticForm:
         z = x[n:]
         right = self.gram[2 * n :] @ np.concatenate([x, -bias[self.period] * z])
         own = np.bincount(self.period, np.real(-np.conj(z) * right), len(bias))
-        (turns, turn_weight), (moves, move_weight) = self._link_rows(bias)
+        (turns, turn_weight), (moves, move_weight) = self.link_rows(bias)
         turned = -1j * links.turn_time * turns[np.arange(len(links.at)), n + links.at]
         for change, rows, weight in (
             (turned, turns, turn_weight),
@@ -361,7 +371,7 @@ class QuadraticForm:
         right = self.gram @ np.concatenate([x, b * x[n:]])
         pull = right[: 2 * n]
         pull[n:] += b * right[2 * n :]
-        for rows, weight in self._link_rows(bias):
+        for rows, weight in self.link_rows(bias):
             pull += rows.conj().T @ (weight * (rows @ x))
         return np.asarray(pull)
 

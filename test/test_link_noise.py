@@ -1,0 +1,116 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry that is worse than it says is noticed, and bends the map less."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from metric_worlds import drive, garden_features, meander
+
+from sfa_localization.data.geometry import align
+from sfa_localization.metric.alternation import MetricProblem
+from sfa_localization.metric.expansions import Process
+from sfa_localization.metric.segments import cut, join
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+
+
+def worse(segments, factor, seed=0):
+    """Displacements and turns with errors whose variances are a factor above the stated ones."""
+    rng = np.random.default_rng(seed)
+
+    def wrong(item):
+        if not item.linked:
+            return item
+        std = np.sqrt((factor - 1) * item.displacement_variance)
+        moved = item.displacement + std * complex(*rng.standard_normal(2))
+        turned = item.turn_rad + np.sqrt((factor - 1) * item.turn_variance) * rng.standard_normal()
+        return dataclasses.replace(item, displacement=moved, turn_rad=float(turned))
+
+    return dataclasses.replace(segments, items=tuple(wrong(item) for item in segments))
+
+
+def recorded(seed):
+    twists, start = meander(250.0, seed=seed)
+    return drive(twists, start=start, yaw_noise=0.01, speed_noise=0.03, seed=seed)
+
+
+def solved(segments, features):
+    problem = MetricProblem.of(features, segments, MetricConfig())
+    rows = problem.features
+    scale = np.full(rows.shape[1], 1.0 / np.sqrt(rows.var(0).sum()))
+    return problem.fit(Process.fit(rows, scale, 1e-2, 300))
+
+
+def factors(fit):
+    """How many times the stated variance each link of a fit has: of turns, of displacements."""
+    stated, learned = fit.problem.links, fit.links
+    return (
+        learned.turn_variance / stated.turn_variance,
+        learned.displacement_variance / stated.displacement_variance,
+    )
+
+
+def test_links_that_err_by_more_than_they_say_weigh_less():
+    run = recorded(seed=2)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    turn, move = factors(solved(worse(segments, 16.0), features))
+    assert np.ptp(move) < 1e-9 and np.ptp(turn) < 1e-9
+    assert 10.0 < move[0] < 25.0 and 10.0 < turn[0] < 25.0
+
+
+def test_links_that_err_as_they_say_keep_their_weight():
+    run = recorded(seed=2)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    turn, move = factors(solved(segments, garden_features(run.poses[:, :2], noise=0.05)))
+    assert 1.0 <= move.max() < 1.5 and 1.0 <= turn.max() < 1.5
+
+
+def test_the_map_is_better_for_it(monkeypatch):
+    run = recorded(seed=2)
+    segments = worse(cut(run.odometry, run.stamps_ns, SegmentConfig()), 16.0)
+    features = garden_features(run.poses[:, :2], noise=0.05)
+
+    def error(fit):
+        places = np.column_stack([fit.places.real, fit.places.imag])
+        truth = run.poses[fit.stack.images, :2]
+        return np.hypot(*(align(places, truth).apply(places) - truth).T).mean()
+
+    learned = error(solved(segments, features))
+    monkeypatch.setattr(
+        'sfa_localization.metric.alternation.learned', lambda stated, form, solution: stated
+    )
+    assert learned < 0.9 * error(solved(segments, features))
+
+
+def test_each_run_has_its_own():
+    good, bad = recorded(seed=2), recorded(seed=3)
+    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in (good, bad)]
+    parts[1] = worse(parts[1], 16.0)
+    places = np.concatenate([good.poses, bad.poses])
+    fit = solved(join(parts, [0, len(good.poses)]), garden_features(places[:, :2], noise=0.05))
+    _, move = factors(fit)
+    run = fit.links.run
+    assert move[run == 0].max() < 1.5 < 3.0 < move[run == 1].min()
+
+
+@pytest.mark.parametrize('name', ['turn', 'displacement'])
+def test_links_without_weight_stay_without(name):
+    run = recorded(seed=2)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    unused = tuple(dataclasses.replace(item, **{f'{name}_variance': np.inf}) for item in segments)
+    fit = solved(
+        dataclasses.replace(segments, items=unused), garden_features(run.poses[:, :2], noise=0.05)
+    )
+    assert np.isinf(getattr(fit.links, f'{name}_variance')).all()
+    other = {'turn': 'displacement', 'displacement': 'turn'}[name]
+    assert np.isfinite(getattr(fit.links, f'{other}_variance')).all()
+
+
+def test_a_few_links_change_little():
+    run = recorded(seed=2)
+    whole = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    short = worse(dataclasses.replace(whole, items=whole.items[:8]), 16.0)
+    _, move = factors(solved(short, garden_features(run.poses[:, :2], noise=0.05)))
+    assert 1.0 <= move[0] < 8.0
