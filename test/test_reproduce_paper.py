@@ -241,7 +241,10 @@ def test_bags_are_compared_too(work):
 @pytest.mark.slow
 def test_ablations_leave_out_what_they_name(work, monkeypatch):
     made, _ = work
-    chosen = ('everything', 'no keyframes', 'no simulated rotation', 'four layers', 'gray')
+    chosen = (
+        'everything', 'no keyframes', 'exact odometry in the training', 'no simulated rotation',
+        'four layers', 'gray',
+    )  # fmt: skip
     monkeypatch.setattr(comparisons, 'VARIANTS', {name: VARIANTS[name] for name in chosen})
     table = rows(made.reproduced('ablations'))
     cells = {cell['variant']: cell for cell in cells_of(made, 'ablations')}
@@ -249,6 +252,7 @@ def test_ablations_leave_out_what_they_name(work, monkeypatch):
     whole = cells['everything']
     assert cells['no keyframes']['slow'] == whole['slow'] == cells['no keyframes']['sfa']
     assert whole['sfa'] != whole['slow']
+    assert cells['exact odometry in the training']['ekf'] < whole['ekf']
     for name in ('no simulated rotation', 'gray'):
         assert cells[name]['slow'] != whole['slow']
     assert 'rows' in cells['four layers']['problem'], 'these images are too small for it'

@@ -26,6 +26,7 @@ from sfa_localization.commands.trials import (
     turned_of,
 )
 from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.run import Odometry, Run
 from sfa_localization.evaluation import evaluate
 from sfa_localization.features.network import (
     PAPER_LAYERS,
@@ -127,6 +128,8 @@ class Variant:
     one_drive: bool = False
     """The map is learned from the last training drive: the paper's descent starts from odometry,
     whose frame is another one in each drive."""
+    exact_odometry: bool = False
+    """In the training, not in the test: what the errors of odometry cost the map."""
 
     @property
     def same_network(self) -> bool:
@@ -134,10 +137,21 @@ class Variant:
         mine = self.normalization, self.layers, self.rotate, self.light_std
         return mine == (NetworkConfig().normalization, (), True, LIGHT_STD)
 
+    @property
+    def same_map(self) -> bool:
+        """Whether it learns the map of the whole package, from its network."""
+        mine = self.metric, self.segments, self.one_drive, self.exact_odometry
+        return mine == (MetricConfig(), SegmentConfig(), False, False)
+
     def recipe(self, base: Recipe) -> Recipe:
         """How it trains."""
         network = replace(base.network, normalization=self.normalization)
         return replace(base, network=network, metric=self.metric, segments=self.segments)
+
+    def drives(self, study: Study) -> tuple[Run, ...]:
+        """What its map is learned from."""
+        runs = study.training[-1:] if self.one_drive else study.training
+        return tuple(map(_exact, runs)) if self.exact_odometry else runs
 
     def reduced(self, model: PlaceModel) -> PlaceModel:
         """A model without the parts that it does without."""
@@ -171,6 +185,7 @@ VARIANTS = {
     "the same, paper's solver": Variant(
         metric=replace(MONOMIALS, solver='paper'), segments=STRAIGHT, one_drive=True
     ),
+    'exact odometry in the training': Variant(exact_odometry=True),
     'no simulated rotation': Variant(rotate=False),
     'no random light': Variant(light_std=0.0),
     'two layers; no second pass': Variant(layers=TWO_LAYERS),
@@ -203,10 +218,15 @@ def ablations(site: Site, results: Results, world: str) -> None:
             results.keep({'world': world, 'variant': name, **cell})
 
 
+def _exact(run: Run) -> Run:
+    """A drive whose odometry does not err."""
+    assert run.ground_truth is not None
+    return replace(run, odometry=Odometry.along(run.ground_truth), yaw_rate=None)
+
+
 def _ablated(site: Site, study: Study, whole: PlaceModel, variant: Variant) -> Cell:
     """Scores of a variant, aligned on the last training drive."""
     recipe, network = variant.recipe(site.recipe), whole.network
-    runs = study.training[-1:] if variant.one_drive else study.training
     if not variant.same_network:
         first = study.training[0]
         network = train_network(
@@ -216,10 +236,9 @@ def _ablated(site: Site, study: Study, whole: PlaceModel, variant: Variant) -> C
             light_std=variant.light_std,
             rotate=variant.rotate,
         )
-    same = variant.same_network and (variant.metric, variant.segments) == (
-        MetricConfig(), SegmentConfig(),
-    )  # fmt: skip
-    model = variant.reduced(whole if same else learned(network, runs, recipe))
+    same = variant.same_network and variant.same_map
+    model = whole if same else learned(network, variant.drives(study), recipe)
+    model = variant.reduced(model)
     judged = evaluate(model, site.test, align_bag=site.training[-1], recipe=site.recipe)
     alone = Variant(second_pass=False, keyframes=False).reduced(model)
     slow = evaluate(alone, site.test, align_bag=site.training[-1], recipe=site.recipe)
