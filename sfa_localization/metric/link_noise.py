@@ -10,7 +10,7 @@ surer of than they are.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -22,6 +22,10 @@ from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Solutio
 
 Indices = NDArray[np.int64]
 
+# Degrees of freedom of Student's distribution: wheels slip now and then, by far more than usual.
+_TAIL = 4.0
+# Of a run's factor and the doubts of its links in turn: far more than they need.
+_STEPS = 10
 # The variances that are stated or assumed count as so many links that miss by just as much: those
 # of a few say little.
 _PRIOR_LINKS = 10.0
@@ -43,12 +47,12 @@ def learned(stated: Links, form: QuadraticForm, solution: Solution) -> Links:
         form.variance * _between(unknown, stated.at) for unknown in (unknown_turn, unknown_place)
     )
     links, run = form.links, stated.run
+    missed_turn = _Missed(turned, left_turn, links.turn_variance, 1)
+    missed_move = _Missed(moved, left_move, links.displacement_variance, 2)
     return replace(
         stated,
-        turn_variance=_grown(stated.turn_variance, links.turn_variance, turned, left_turn, run),
-        displacement_variance=_grown(
-            stated.displacement_variance, links.displacement_variance, moved, left_move, run
-        ),
+        turn_variance=_grown(stated.turn_variance, missed_turn, run),
+        displacement_variance=_grown(stated.displacement_variance, missed_move, run),
     )
 
 
@@ -58,15 +62,39 @@ def _between(covariance: Array, at: Indices) -> Array:
     return np.asarray(variance[at] + variance[at + 1] - 2 * covariance[at, at + 1])
 
 
-def _grown(stated: Array, assumed: Array, missed: Array, left: Array, run: Indices) -> Array:
-    """Variances (L,), those of each run as many times the stated ones as the squares `missed` show.
+@dataclass(frozen=True, slots=True)
+class _Missed:
+    """By how much L links miss a solution, along each of so many `axes`: `squares` (L,), what the
+    solution leaves unknown of them, `left` (L,), and the variances (L,) `assumed` for it.
+    """
 
-    Under the variances that were `assumed`, the solution leaves `left` of them unknown; that share
-    of each link it follows. An infinite variance stays: such a link has no weight.
+    squares: Array
+    left: Array
+    assumed: Array
+    axes: int
+
+
+def _grown(stated: Array, missed: _Missed, run: Indices) -> Array:
+    """Variances (L,): those of each run as many times the `stated` ones as its links show, and
+    more for single links that miss by far more (Student's distribution).
+
+    The solution follows each link by the share of its variance that it leaves unknown. An infinite
+    variance stays: such a link has no weight.
     """
     known = np.isfinite(stated)
     of = np.where(known, stated, 1.0)
-    free = np.where(known, 1.0 - np.minimum(left / np.where(known, assumed, np.inf), 1.0), 0.0)
-    shown = np.bincount(run, known * missed / of) + _PRIOR_LINKS
-    factor = shown / (np.bincount(run, free) + _PRIOR_LINKS)
-    return np.asarray(stated * np.maximum(factor, 1.0)[run])
+    followed = np.minimum(missed.left / np.where(known, missed.assumed, np.inf), 1.0)
+    freedom = np.bincount(run, known * (1.0 - followed)) + _PRIOR_LINKS
+    error, miss = (missed.squares + missed.left) / of, known * missed.squares / of
+    factor = np.ones(len(freedom))
+    for _ in range(_STEPS):
+        doubt = _doubt(error / factor[run], missed.axes)
+        factor = (np.bincount(run, miss / doubt) + _PRIOR_LINKS) / freedom
+        factor = np.maximum(factor, 1.0)
+    return np.asarray(stated * factor[run] * _doubt(error / factor[run], missed.axes))
+
+
+def _doubt(ratio: Array, axes: int) -> Array:
+    """What the variance grows by of a link whose squared error along each axis is so many times it:
+    1 on average where it is right."""
+    return np.asarray((_TAIL + axes * ratio) / (_TAIL + axes))

@@ -126,18 +126,25 @@ class Links:
         return cls(at, run, period, *column)
 
     def alike(self, other: Links, tolerance: float) -> bool:
-        """Whether the variances of the same links differ by no more than a relative tolerance."""
+        """Whether the variances of the same links differ by less than a part, on average."""
         pairs = (
             (self.turn_variance, other.turn_variance),
             (self.displacement_variance, other.displacement_variance),
         )
-        return all(np.allclose(own, its, tolerance, 0.0) for own, its in pairs)
+        return all(_mean_change(own, its) < tolerance for own, its in pairs)
 
     @property
     def used(self) -> bool:
         """Whether any turn or displacement has a weight."""
         variances = np.concatenate([self.turn_variance, self.displacement_variance])
         return bool(np.isfinite(variances).any())
+
+
+def _mean_change(variances: Array, others: Array) -> float:
+    """Mean relative difference of two kinds of variances (L,) where they are finite."""
+    known = np.isfinite(others)
+    change = variances[known] / others[known] - 1.0
+    return float(np.abs(change).mean()) if known.any() else 0.0
 
 
 _OWNERS = ('run', 'period')
