@@ -56,15 +56,16 @@ def test_links_that_err_by_more_than_they_say_weigh_less():
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
     features = garden_features(run.poses[:, :2], noise=0.05)
     turn, move = factors(solved(worse(segments, 16.0), features))
-    assert np.ptp(move) < 1e-9 and np.ptp(turn) < 1e-9
-    assert 10.0 < move[0] < 25.0 and 10.0 < turn[0] < 25.0
+    for factor in (turn, move):
+        assert 5.0 < np.median(factor) < 25.0
 
 
 def test_links_that_err_as_they_say_keep_their_weight():
     run = recorded(seed=2)
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
     turn, move = factors(solved(segments, garden_features(run.poses[:, :2], noise=0.05)))
-    assert 1.0 <= move.max() < 1.5 and 1.0 <= turn.max() < 1.5
+    for factor in (turn, move):
+        assert 0.8 < np.median(factor) < 1.2 and factor.max() < 3.0
 
 
 def test_the_map_is_better_for_it(monkeypatch):
@@ -84,6 +85,21 @@ def test_the_map_is_better_for_it(monkeypatch):
     assert learned < 0.9 * error(solved(segments, features))
 
 
+def test_a_wheel_that_slips_once_costs_one_link():
+    run = recorded(seed=2)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    features = garden_features(run.poses[:, :2], noise=0.05)
+    slipped = list(segments)
+    for n in (10, 40, 70):
+        slipped[n] = dataclasses.replace(slipped[n], displacement=slipped[n].displacement + 0.7)
+    _, before = factors(solved(segments, features))
+    fit = solved(dataclasses.replace(segments, items=tuple(slipped)), features)
+    _, move = factors(fit)
+    wrong = np.isin(fit.links.at, (10, 40, 70))
+    assert move[wrong].min() > 10.0
+    assert np.median(move[~wrong]) < 1.5 * np.median(before)
+
+
 def test_each_run_has_its_own():
     good, bad = recorded(seed=2), recorded(seed=3)
     parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in (good, bad)]
@@ -92,7 +108,7 @@ def test_each_run_has_its_own():
     fit = solved(join(parts, [0, len(good.poses)]), garden_features(places[:, :2], noise=0.05))
     _, move = factors(fit)
     run = fit.links.run
-    assert move[run == 0].max() < 1.5 < 3.0 < move[run == 1].min()
+    assert np.median(move[run == 0]) < 1.5 < 3.0 < np.median(move[run == 1])
 
 
 @pytest.mark.parametrize('name', ['turn', 'displacement'])
@@ -113,4 +129,4 @@ def test_a_few_links_change_little():
     whole = cut(run.odometry, run.stamps_ns, SegmentConfig())
     short = worse(dataclasses.replace(whole, items=whole.items[:8]), 16.0)
     _, move = factors(solved(short, garden_features(run.poses[:, :2], noise=0.05)))
-    assert 1.0 <= move[0] < 8.0
+    assert np.median(move) < 8.0
