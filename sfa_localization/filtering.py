@@ -487,7 +487,8 @@ def _read_table(path: Path, known: dict[str, tuple[str, ...]], needed: tuple[str
         raise DataError(f'{path}: cannot be read: {error}') from None
     names, start = _header(rows, known)
     if not names:
-        raise DataError(f'{path}: holds no rows; the first line must be stamp_s,{",".join(needed)}')
+        wanted = ['stamp_s', *(known[name][0] for name in needed)]
+        raise DataError(f'{path}: holds no rows; the first line must be {",".join(wanted)}')
     at = _column_indices(path, names, known, needed)
     return _table(path, rows[start:], at, needed)
 
@@ -552,7 +553,8 @@ def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[
             stamps.append(stamp_ns)
             numbers.append(cells)
     if not stamps and skipped:
-        raise DataError(f'{path}: none of the {sum(skipped.values())} rows can be used')
+        why = ', '.join(f'{count} {reason}' for reason, count in skipped.items())
+        raise DataError(f'{path}: none of the {sum(skipped.values())} rows can be used ({why})')
     order = np.argsort(np.array(stamps, np.int64), kind='stable')
     if len(order) and np.any(np.diff(order) < 0):
         skipped['(rows out of order, sorted)'] = int(np.sum(np.diff(order) < 0))

@@ -46,7 +46,7 @@ from sfa_localization.camera.settings import (
 )
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.commands.options import destination
-from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
 from sfa_localization.features.network_training import ImageSequence, train_network
@@ -444,3 +444,15 @@ def test_the_tables_name_parameters_that_there_are():
     for table in (SPECIAL, OBSERVED_BY, BESIDE):
         for kind, entries in table.items():
             assert set(entries) <= {item.name for item in dataclasses.fields(kind)}, kind.__name__
+
+
+@pytest.mark.parametrize(
+    ('given', 'message'),
+    [
+        ({'blind_sectors': [0.0] * 10_000}, 'blind_sectors: 10000 entries are more than 100'),
+        ({'mask_file': 'x' * 10_000}, 'mask_file: a text of 10000 characters, more than 1000'),
+    ],
+)
+def test_values_that_would_block_a_node_are_rejected_at_once(given, message):
+    with pytest.raises(ConfigError, match=message):
+        CameraConfig.from_mapping(given, 'parameters')

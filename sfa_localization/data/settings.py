@@ -21,6 +21,8 @@ from sfa_localization.data.rejections import quoted
 S = TypeVar('S', bound='Settings')
 _LONGEST_NAME = 100
 """Characters of a wrong name that are compared with those of the parameters."""
+_MOST_ENTRIES, _LONGEST_TEXT = 100, 1000
+"""Of a value: lists of sectors and paths are shorter, and longer ones would block a node."""
 
 
 def setting(
@@ -90,6 +92,8 @@ def _checked(item: dataclasses.Field[Any], value: Any) -> Any:
 def _converted(where: str, default: Any, value: Any) -> Any:
     """Accept an int for a float and a list for a tuple; otherwise require the same type."""
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
+        if len(value) > _MOST_ENTRIES:
+            raise ConfigError(f'{where}: {len(value)} entries are more than {_MOST_ENTRIES}')
         kind = default[0] if default else 0.0
         return tuple(_converted(where, kind, entry) for entry in value)
     if isinstance(default, bool) or isinstance(value, bool):
@@ -98,6 +102,8 @@ def _converted(where: str, default: Any, value: Any) -> Any:
         return _float(where, value)
     else:
         matches = isinstance(value, type(default))
+    if isinstance(value, str) and len(value) > _LONGEST_TEXT:
+        raise ConfigError(f'{where}: a text of {len(value)} characters, more than {_LONGEST_TEXT}')
     if not matches:
         raise ConfigError(f'{where}: {quoted(value)} is not of type {type(default).__name__}')
     return value
