@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from filter_drives import Drive
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion import consistency
 from sfa_localization.fusion.belief import Evidence, Trust
@@ -21,6 +22,7 @@ from sfa_localization.fusion.consistency import (
     contradiction,
     doubts,
     moved,
+    pulled,
     watched,
 )
 from sfa_localization.fusion.pose_filter import PoseFilter
@@ -215,6 +217,50 @@ def test_driving_without_images_confirms_nothing():
         if found_ns is not None and stamp_ns < found_ns + 2_900_000_000:
             levels.append(fused.status.level)
     assert len(levels) > 100 and set(levels) == {Level.DEGRADED}
+
+
+OFFSETS = {
+    'to one side': (lambda k: (0.8, 0.4), True),
+    'to both sides': (lambda k: (0.8 * (-1) ** k, 0.4), False),
+    'near, if by many standard deviations': (lambda k: (0.1, 0.1), False),
+}
+
+
+@pytest.mark.parametrize('kind', OFFSETS)
+def test_images_on_one_side_of_the_estimate_are_noticed(kind):
+    offset, suspected = OFFSETS[kind]
+    variance = 0.01 if kind.startswith('near') else 0.64
+    pull = None
+    for k in range(80):
+        pull = pulled(pull, 0.25 * k, np.array(offset(k)), variance)
+    assert pull.suspected == suspected
+    shown = ['images lie 0.9 m to one side of the estimate'] if suspected else []
+    assert doubts(Trust(), 0.0, pull) == shown
+    assert pull.variance == pytest.approx(0.4 * suspected, rel=0.1)
+    standing = pulled(pull, 0.25 * 79, np.array([9.0, 9.0]), variance)
+    assert standing.mean == pull.mean, 'a place where the map errs says nothing while one stands'
+    for k in range(80, 160):
+        pull = pulled(pull, 0.25 * k, np.zeros(2), variance)
+    assert not pull.suspected
+
+
+class Poor(Drive):
+    """Images that err by less than they claim, as those of a covered camera in another light."""
+
+    def covariance(self, heading):
+        return np.diag([0.7**2, 0.7**2, 0.1**2][: 3 if heading else 2])
+
+
+@pytest.mark.parametrize('scale', [1 / 0.7, 1 / 0.6])
+def test_wheels_of_another_size_are_noticed_though_images_are_poor(scale, monkeypatch):
+    way = np.tile([1.0, 0.0], (50 * 40, 1))
+    drive = Poor(twists=way, scale=scale, position_std=0.2, yaw_std=0.03)
+    correlation = ErrorCorrelation(0.7, 0.6)
+    sure = wrong_and_sure(fed(drive, PoseFilter(FilterConfig(), correlation)))
+    monkeypatch.setattr(consistency, 'PULLED', np.inf)
+    without = wrong_and_sure(fed(drive, PoseFilter(FilterConfig(), correlation)))
+    assert without > 50
+    assert sure < 0.1 * without
 
 
 def test_constants_are_used(monkeypatch):

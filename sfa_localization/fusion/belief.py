@@ -109,6 +109,23 @@ class Trust(NamedTuple):
         return position, position, off_rad**2
 
 
+class Pull(NamedTuple):
+    """On which side of the estimate accepted images have lain over the last meters, until
+    `traveled_m`: the mean (2,) of their innovations, in standard deviations, and in m (`offset_m`).
+    `suspected`: it is no chance.
+    """
+
+    mean: tuple[float, float]
+    offset_m: tuple[float, float]
+    traveled_m: float
+    suspected: bool = False
+
+    @property
+    def variance(self) -> float:
+        """Of the position along each axis, on top, while the estimate is not trusted."""
+        return (self.offset_m[0] ** 2 + self.offset_m[1] ** 2) / 2 if self.suspected else 0.0
+
+
 class Memory(NamedTuple):
     """The record of measurements: accepted ones, those rejected in a row, and where they lay.
 
@@ -116,7 +133,7 @@ class Memory(NamedTuple):
     row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
     images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`,
     `scatter`, the usual squared distance of images over that expected, and `period_s`, the usual
-    time between images, outlive restarts.
+    time between images, outlive restarts; `pull` does not.
     """
 
     support: int = 0
@@ -131,6 +148,7 @@ class Memory(NamedTuple):
     trust: Trust = Trust()
     scatter: float = 1.0
     period_s: float = 1.0
+    pull: Pull | None = None
 
 
 class Belief(NamedTuple):
@@ -171,6 +189,8 @@ class Belief(NamedTuple):
         trust = self.memory.trust
         if trust.problem or trust.confirming_m:
             covariance[:3, :3] += np.diag(trust.variances(self.memory.accepted_m))
+        if self.memory.pull is not None:
+            covariance[:2, :2] += self.memory.pull.variance * np.eye(2)
         return State(self.stamp_ns, self.mean, covariance)
 
 

@@ -51,7 +51,7 @@ def status_of(
     belief: Belief, clock: CameraClock, config: FilterConfig, delay_limit_ns: int
 ) -> Status:
     """The status of a belief; a camera whose delay is beyond the limit makes it DEGRADED."""
-    state = belief.state
+    state, memory = belief.state, belief.memory
     if state is None:
         return Status(Level.UNINITIALISED, (_missing(belief),))
     lost = uncertainty(state, config) + _contradictions(belief)
@@ -59,12 +59,12 @@ def status_of(
     if config.degraded_std < state.position_std <= config.lost_std:
         degraded.append(f'position known to {state.position_std:.1f} m only')
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
-    if belief.memory.rejected >= (FEW_IMAGES if belief.memory.support >= FEW_IMAGES else 1):
-        images = belief.memory.rejected
+    if memory.rejected >= (FEW_IMAGES if memory.support >= FEW_IMAGES else 1):
+        images = memory.rejected
         one = 'an image did not match'
         degraded.append(one if images == 1 else f'{images} images in a row did not match')
     # Only images confirm: what was driven since the last one, or before it came late, does not.
-    degraded += doubts(belief.memory.trust, belief.memory.accepted_m)
+    degraded += doubts(memory.trust, memory.accepted_m, memory.pull)
     degraded += _silences(belief)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'

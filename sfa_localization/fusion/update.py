@@ -10,8 +10,15 @@ import numpy as np
 from scipy.stats import chi2
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.belief import Belief, Evidence, MeasurementEvent, Memory, Update
-from sfa_localization.fusion.consistency import watched
+from sfa_localization.fusion.belief import (
+    Belief,
+    Evidence,
+    MeasurementEvent,
+    Memory,
+    Pull,
+    Update,
+)
+from sfa_localization.fusion.consistency import pulled, watched
 from sfa_localization.fusion.evidence import (
     AGREEING_DISTANCE_M,
     FEW_IMAGES,
@@ -161,12 +168,20 @@ class Correction:
             trust=belief.memory.trust,
             scatter=_scatter(belief.memory.scatter, d2 / _MEDIANS[event.value.size]),
             period_s=belief.memory.period_s,
+            pull=_pull(belief, event),
         )
         outlying = d2 / (belief.memory.scatter * _OUTLYING[event.value.size])
         if outlying > 1 and self._recovery.share >= ALIKE_SHARE:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, belief.covariance, lighter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
+
+
+def _pull(belief: Belief, event: MeasurementEvent) -> Pull:
+    """With an image that was accepted."""
+    both = belief.covariance[:2, :2] + event.covariance[:2, :2]
+    offset, variance = event.value[:2] - belief.mean[:2], float(np.trace(both)) / 2
+    return pulled(belief.memory.pull, belief.traveled_m, offset, variance)
 
 
 def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lateness | None:
