@@ -152,7 +152,7 @@ def test_masks_that_cannot_be_used(kind, tmp_path):
 
 
 @pytest.mark.parametrize('source', [Device, Video, Folder])
-@pytest.mark.parametrize('path', [300 * 'x', 5000 * 'y'])
+@pytest.mark.parametrize('path', [300 * 'x', 4000 * 'y'])
 def test_sources_with_a_path_that_cannot_be(source, path):
     with pytest.raises(CameraError):
         source(CaptureConfig(source_path=path))

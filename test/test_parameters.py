@@ -450,7 +450,7 @@ def test_the_tables_name_parameters_that_there_are():
     ('given', 'message'),
     [
         ({'blind_sectors': [0.0] * 10_000}, 'blind_sectors: 10000 entries are more than 100'),
-        ({'mask_file': 'x' * 10_000}, 'mask_file: a text of 10000 characters, more than 1000'),
+        ({'mask_file': 'x' * 10_000}, 'mask_file: a text of 10000 characters, more than 4096'),
     ],
 )
 def test_values_that_would_block_a_node_are_rejected_at_once(given, message):

@@ -21,8 +21,8 @@ from sfa_localization.data.rejections import quoted
 S = TypeVar('S', bound='Settings')
 _LONGEST_NAME = 100
 """Characters of a wrong name that are compared with those of the parameters."""
-_MOST_ENTRIES, _LONGEST_TEXT = 100, 1000
-"""Of a value: lists of sectors and paths are shorter, and longer ones would block a node."""
+_MOST_ENTRIES, _LONGEST_TEXT = 100, 4096
+"""Of a value: no list of sectors and no path is longer, and longer ones would block a node."""
 
 
 def setting(
