@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
-from ros_bench import Bench, until  # noqa: E402
+from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
@@ -71,7 +71,7 @@ def test_a_signal_ends_the_node_with_exit_code_0(bench, start, number):
     process = start('ekf_node')
     assert running(bench)
     process.send_signal(number)
-    _, told = process.communicate(timeout=15)
+    _, told = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, told
     assert 'Traceback' not in told
 
@@ -80,7 +80,7 @@ def test_a_signal_while_unconfigured_too(bench, start):
     process = start('ekf_node', 'autostart:=false')
     assert until(lambda: 'ekf_node' in bench.node.get_node_names())
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=15)
+    _, told = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0 and 'Traceback' not in told
 
 
@@ -226,5 +226,5 @@ def test_an_impossible_transition_does_not_end_the_node(bench, start):
     assert until(answer.done) and answer.result().success
     assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=15)
+    process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0
