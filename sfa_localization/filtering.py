@@ -20,7 +20,7 @@ from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.progress import progress_over
-from sfa_localization.data.rejections import short_line
+from sfa_localization.data.rejections import listed, short_line
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD, read_twist
 from sfa_localization.fusion.log_noise import EXPECTED, NEARLY_WHITE, Learned, Log, Noise, learn
@@ -553,8 +553,8 @@ def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[
             stamps.append(stamp_ns)
             numbers.append(cells)
     if not stamps and skipped:
-        why = ', '.join(f'{count} {reason}' for reason, count in skipped.items())
-        raise DataError(f'{path}: none of the {sum(skipped.values())} rows can be used ({why})')
+        total = sum(skipped.values())
+        raise DataError(f'{path}: none of the {total} rows can be used ({listed(skipped)})')
     order = np.argsort(np.array(stamps, np.int64), kind='stable')
     if len(order) and np.any(np.diff(order) < 0):
         skipped['(rows out of order, sorted)'] = int(np.sum(np.diff(order) < 0))

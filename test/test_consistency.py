@@ -232,15 +232,15 @@ def test_images_on_one_side_of_the_estimate_are_noticed(kind):
     variance = 0.01 if kind.startswith('near') else 0.64
     pull = None
     for k in range(80):
-        pull = pulled(pull, 0.25 * k, np.array(offset(k)), variance)
+        pull = pulled(pull, 0.25 * k, complex(*offset(k)), variance)
     assert pull.suspected == suspected
     shown = ['images lie 0.9 m to one side of the estimate'] if suspected else []
     assert doubts(Trust(), 0.0, pull) == shown
     assert pull.variance == pytest.approx(0.4 * suspected, rel=0.1)
-    standing = pulled(pull, 0.25 * 79, np.array([9.0, 9.0]), variance)
+    standing = pulled(pull, 0.25 * 79, 9 + 9j, variance)
     assert standing.mean == pull.mean, 'a place where the map errs says nothing while one stands'
     for k in range(80, 160):
-        pull = pulled(pull, 0.25 * k, np.zeros(2), variance)
+        pull = pulled(pull, 0.25 * k, 0j, variance)
     assert not pull.suspected
 
 

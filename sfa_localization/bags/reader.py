@@ -30,6 +30,7 @@ from sfa_localization.bags.storage import Channel, Record, add_problem, inflate_
 from sfa_localization.bags.topic_stream import Stream, Tally
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
+from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
 
 SERIALIZATIONS = ('cdr', 'ros1')
@@ -330,6 +331,6 @@ def _plain_name(name: str) -> str:
 
 
 def _reasons(count: Count) -> str:
-    reasons = ', '.join(f'{number} {reason}' for reason, number in count.skipped.items())
+    reasons = listed(count.skipped)
     remedy = '; try the time of reception (stamp_source: receive)' if 'zero' in reasons else ''
     return f'no usable message ({reasons or "none recorded"}){remedy}'

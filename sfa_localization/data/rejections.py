@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 LONGEST = 240
 """Characters of a reason: two lines of a terminal."""
@@ -31,6 +32,11 @@ def short_line(text: str) -> str:
     line = ' '.join(text[: 2 * LONGEST].split())
     line = ''.join(letter if letter.isprintable() else '?' for letter in line)
     return line if len(line) <= LONGEST else line[: LONGEST - 3] + '...'
+
+
+def listed(skipped: Mapping[str, int]) -> str:
+    """Numbers with their reasons, '' for none."""
+    return ', '.join(f'{number} {reason}' for reason, number in skipped.items())
 
 
 def quoted(value: object) -> str:

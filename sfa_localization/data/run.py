@@ -88,12 +88,7 @@ class Odometry:
     @classmethod
     def along(cls, path: Trajectory) -> Odometry:
         """Exact odometry of a path, of unknown variances: mean twists from pose to pose."""
-        dt = np.maximum(np.diff(path.stamps_ns) * 1e-9, 1e-9)
-        steps, yaw = np.diff(path.poses[:, :2], axis=0), path.poses[:-1, 2]
-        turns = wrap_angle(np.diff(path.poses[:, 2]))
-        ahead = steps[:, 0] * np.cos(yaw + turns / 2) + steps[:, 1] * np.sin(yaw + turns / 2)
-        arcs = ahead / np.sinc(turns / (2 * np.pi))
-        twists = np.vstack([np.zeros(2), np.column_stack([arcs / dt, turns / dt])])
+        twists = differences(path.stamps_ns, path.poses)
         return cls(path.stamps_ns, path.poses, twists, np.zeros_like(twists))
 
     @property

@@ -111,19 +111,19 @@ class Trust(NamedTuple):
 
 class Pull(NamedTuple):
     """On which side of the estimate accepted images have lain over the last meters, until
-    `traveled_m`: the mean (2,) of their innovations, in standard deviations, and in m (`offset_m`).
-    `suspected`: it is no chance.
+    `traveled_m`: the mean x + i y of their innovations, in standard deviations, and in m
+    (`offset_m`). `suspected`: it is no chance.
     """
 
-    mean: tuple[float, float]
-    offset_m: tuple[float, float]
+    mean: complex
+    offset_m: complex
     traveled_m: float
     suspected: bool = False
 
     @property
     def variance(self) -> float:
         """Of the position along each axis, on top, while the estimate is not trusted."""
-        return (self.offset_m[0] ** 2 + self.offset_m[1] ** 2) / 2 if self.suspected else 0.0
+        return abs(self.offset_m) ** 2 / 2 if self.suspected else 0.0
 
 
 class Memory(NamedTuple):

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, align_complex, wrap_angle
+from sfa_localization.data.geometry import align_complex, wrap_angle
 from sfa_localization.fusion.belief import Evidence, Pull, Trust
 from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
 
@@ -72,22 +72,16 @@ def moved(trust: Trust, traveled_m: float, jump_m: float = 0.0) -> Trust:
     )
 
 
-def pulled(pull: Pull | None, traveled_m: float, offset: Array, variance: float) -> Pull:
-    """After another accepted image, at an `offset` (2,) m of this variance m^2 along each axis."""
+def pulled(pull: Pull | None, traveled_m: float, offset_m: complex, variance: float) -> Pull:
+    """After another accepted image, at an offset x + i y of this variance m^2 along each axis."""
     if pull is None:
-        return Pull((0.0, 0.0), (0.0, 0.0), traveled_m)
-    kept = math.exp(-abs(traveled_m - pull.traveled_m) / PULLED_OVER_M)
-    x, y = offset.tolist()
-    std = math.sqrt(max(variance, 1e-12))
-    mean = (_mixed(kept, pull.mean[0], x / std), _mixed(kept, pull.mean[1], y / std))
-    offset_m = (_mixed(kept, pull.offset_m[0], x), _mixed(kept, pull.offset_m[1], y))
+        return Pull(0j, 0j, traveled_m)
+    new = -math.expm1(-abs(traveled_m - pull.traveled_m) / PULLED_OVER_M)
+    mean = pull.mean + new * (offset_m / math.sqrt(max(variance, 1e-12)) - pull.mean)
+    offset_m = pull.offset_m + new * (offset_m - pull.offset_m)
     part = RELEASED if pull.suspected else 1.0
-    suspected = math.hypot(*mean) > part * PULLED and math.hypot(*offset_m) > part * PULLED_M
+    suspected = abs(mean) > part * PULLED and abs(offset_m) > part * PULLED_M
     return Pull(mean, offset_m, traveled_m, suspected)
-
-
-def _mixed(kept: float, before: float, new: float) -> float:
-    return kept * before + (1 - kept) * new
 
 
 def doubts(trust: Trust, accepted_m: float, pull: Pull | None = None) -> list[str]:
@@ -96,8 +90,7 @@ def doubts(trust: Trust, accepted_m: float, pull: Pull | None = None) -> list[st
     """
     found = [trust.problem] if trust.problem else []
     if pull is not None and pull.suspected:
-        offset_m = math.hypot(*pull.offset_m)
-        found.append(f'images lie {offset_m:.1f} m to one side of the estimate')
+        found.append(f'images lie {abs(pull.offset_m):.1f} m to one side of the estimate')
     if trust.moves and trust.unconfirmed(accepted_m):
         since_m = accepted_m - trust.moved_m
         times = f' {trust.moves} times in a row' if trust.moves > 1 else ''

@@ -180,8 +180,8 @@ class Correction:
 def _pull(belief: Belief, event: MeasurementEvent) -> Pull:
     """With an image that was accepted."""
     both = belief.covariance[:2, :2] + event.covariance[:2, :2]
-    offset, variance = event.value[:2] - belief.mean[:2], float(np.trace(both)) / 2
-    return pulled(belief.memory.pull, belief.traveled_m, offset, variance)
+    offset_m = complex(*(event.value[:2] - belief.mean[:2]))
+    return pulled(belief.memory.pull, belief.traveled_m, offset_m, float(np.trace(both)) / 2)
 
 
 def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lateness | None:

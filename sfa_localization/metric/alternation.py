@@ -89,7 +89,7 @@ class MetricProblem:
         for _ in range(max(rounds, 1)):
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
             loops = self.loops.form(self.stack, solution)
-            form = self._form(elimination, loops, links, variance * correlation)
+            form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
             solution = self._solve(form, solution)
             links, links_before = learned(self.links, form, solution), links
             weights = elimination.weights(solution.coefficients(self.stack.period))
@@ -108,11 +108,19 @@ class MetricProblem:
             elimination, solution, np.asarray(residuals), weights,
         )  # fmt: skip
 
-    def _form(
-        self, elimination: Elimination, loops: Complex, links: Links, variance: float
+    def form(
+        self,
+        elimination: Elimination,
+        loops: Complex,
+        links: Links,
+        variance: float,
+        bias_std: float,
     ) -> QuadraticForm:
+        """The quadratic form of the map, loop closures (3N, 3N) and links, for the variance m^2 of
+        a position; with a `bias_std` of 0 the biases stay what they are.
+        """
         gram = elimination.gram + variance * loops
-        return QuadraticForm(gram, links, self.stack.period, variance, YAW_BIAS_STD)
+        return QuadraticForm(gram, links, self.stack.period, variance, bias_std)
 
     def _solve(self, form: QuadraticForm, before: Solution | None) -> Solution:
         if before is None:
@@ -180,8 +188,8 @@ class MapFit:
 
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
-        gram = elimination.gram + self.link_variance * self.loops
-        return QuadraticForm(gram, self.links, self.stack.period, self.link_variance, 0.0)
+        noise = self.links, self.link_variance
+        return self.problem.form(elimination, self.loops, *noise, bias_std=0.0)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:

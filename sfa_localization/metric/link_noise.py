@@ -4,8 +4,8 @@
 
 What messages state of their noise, or data sheets, is of wheels on a good floor. Where the links of
 a drive miss the certified solution by more than that, their variances grow. They miss it by less
-than they err, because it follows them: as many degrees of freedom are left as the solution is
-surer of than they are.
+than they err, because it follows them: a link has as much of a degree of freedom left as the
+solution's own uncertainty of it is smaller than its variance.
 """
 
 from __future__ import annotations
