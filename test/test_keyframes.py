@@ -11,7 +11,14 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.features.keyframe_training import MOST, fit_keyframes, spread
-from sfa_localization.features.keyframes import Keyframes, Match, quantized, texture
+from sfa_localization.features.keyframes import (
+    Keyframes,
+    Match,
+    correlate,
+    quantized,
+    spectrum,
+    texture,
+)
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)
@@ -181,9 +188,53 @@ def test_too_few_images_are_rejected():
 def test_any_size_has_a_texture(shape):
     image = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
     small = texture(image)
-    assert small.shape == (min(shape[0], 20), min(shape[1], 100))
+    rows = min(shape[0], 16) + 2 * min(shape[0], 8)
+    assert small.shape == (rows, min(shape[1], 80))
     assert abs(small.mean()) < 1e-6 and np.linalg.norm(small) == pytest.approx(1, abs=1e-4)
     assert np.allclose(texture(cv2.convertScaleAbs(image, alpha=1.0)), small)
+
+
+def posts(sun: float) -> np.ndarray:
+    """A panorama of brown posts before a blue sky, each lit on one side."""
+    image = np.full((24, 120, 3), (220, 190, 170), np.float32)
+    for start in np.random.default_rng(2).permutation(15)[:9] * 8:
+        across = np.linspace(-1, 1, 6, dtype=np.float32)
+        shade = np.exp(0.7 * sun * across)[None, :, None]
+        image[6:, start : start + 6] = shade * np.array([40, 60, 90], np.float32)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def gray(image: np.ndarray) -> np.ndarray:
+    return np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[:, :, None], 3, axis=2)
+
+
+def moved(one: np.ndarray, other: np.ndarray) -> float:
+    """By how much of a column one image seems to be the other, shifted."""
+    spectra = [spectrum(texture(image))[None] for image in (one, other)]
+    columns = texture(one).shape[1]
+    shift = float(correlate(*spectra, columns)[1][0, 0])
+    return abs((shift + columns / 2) % columns - columns / 2)
+
+
+def test_colors_stay_where_the_sun_moves_the_lit_side():
+    morning, evening = posts(1.0), posts(-1.0)
+    assert moved(gray(morning), gray(evening)) > 0.5
+    assert moved(morning, evening) < 0.3 * moved(gray(morning), gray(evening))
+
+
+def test_color_weighs_as_much_as_brightness_and_a_gray_camera_has_none():
+    image, rows = posts(0.0), (16, 24)
+    parts = [np.linalg.norm(part) for part in np.split(texture(image), rows)]
+    assert max(parts) < 2.5 * min(parts)
+    assert all(np.ptp(part) < 1e-6 for part in np.split(texture(gray(image)), rows)[1:])
+    tinted = (image * np.array([0.8, 1.0, 0.9])).astype(np.uint8)
+    assert float((texture(image) * texture(tinted)).sum()) > 0.97, 'the white balance is no matter'
+
+
+def test_a_gray_image_finds_its_place_among_colored_keyframes():
+    world, poses = Spheres.about(0), unseen(30)
+    images = np.stack([gray(image) for image in world.panoramas(poses, CONFIG)])
+    assert np.median(errors(learnt(world), images, poses)[0]) < 0.1
 
 
 def test_a_long_drive_is_thinned_evenly():

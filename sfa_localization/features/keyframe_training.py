@@ -26,7 +26,7 @@ from sfa_localization.features.keyframes import (
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
 
 MOST = 2000
-"""Keyframes of a model: 4 MB."""
+"""Keyframes of a model: 5 MB."""
 # Keyframes that are left out in turn: enough for quantiles of 5 %.
 _TRIALS = 400
 # A keyframe is matched without those of the same stretch of driving: they are too alike.

@@ -6,7 +6,8 @@ Slow features are regressed to a pose, and a regression always has an answer. A 
 the training images says whether the place was seen at all: local contrast survives another light
 and season, and what matches nothing is unknown. The match is a pose of its own: the keyframes
 around the best one show how the image changes with the place, and the shift of the columns is the
-heading.
+heading. Brightness also shows the sunlit side of things, and seems to move them with the sun; their
+colors stay.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from sfa_localization.features.nearby import Spectra, place_among, turned
 
 Texture = NDArray[np.float32]
 
-_COLUMNS, _ROWS = 100, 20
+_COLUMNS, _ROWS, _COLOR_ROWS = 80, 16, 8
 # Standard deviation of the blur that takes light and its slow changes out, of the columns: 10 deg.
 _BLUR = 1 / 37.5
 # Keeps the noise of dark and of plain surfaces small beside texture: of the brightness (8 bit),
@@ -47,8 +48,8 @@ _REGRESSED, _REPEATED, _NEARER = 64, 2, 0.5
 _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
 _COARSE, _CANDIDATES = 15, 64
-# Correlations that unknown places do not reach (foreign and mirrored gardens: 0.40), and the same
-# as a share of what keyframes of other stretches of driving reach.
+# Correlations that unknown places do not reach (foreign gardens: 0.35, mirrored ones: 0.35, one
+# image 0.43), and the same as a share of what keyframes of other stretches of driving reach.
 LOWEST, LOWEST_SHARE = 0.42, 0.5
 # Keyframes near the place show headings that differ by no more than this because things are near.
 _PARALLAX_RAD = 0.3
@@ -162,22 +163,45 @@ def texture(panorama: Image) -> Texture:
     """Local contrast of a panorama (H, W, 3) uint8, small: (rows, columns), zero mean, unit norm.
 
     The logarithm of the brightness minus its surroundings, over their standard deviation: what is
-    left of an image after its light.
+    left of an image after its light. Below it, of fewer rows and the same weight, the same of red
+    over green and of blue over both; a gray camera has none.
     """
-    small = small_gray(panorama, _ROWS, _COLUMNS)
-    width = small.shape[1]
+    small = _small(panorama, _ROWS, _COLUMNS)
+    few = _small(small, _COLOR_ROWS, _COLUMNS)
+    light = _logarithm(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.float32))
+    blue, green, red = np.moveaxis(_logarithm(few), 2, 0)
+    colors = np.dstack([red - green, blue - (red + green) / 2])
+    weight = np.float32(np.sqrt(len(small) / len(few)))
+    parts = [_contrast(light[:, :, None]), weight * _contrast(colors)]
+    return normalized(np.concatenate([channel for part in parts for channel in part]))
+
+
+def _logarithm(image: Texture) -> Texture:
+    return np.asarray(np.log(image + np.float32(_DARKEST)), np.float32)
+
+
+def _contrast(values: Texture) -> Texture:
+    """Of channels (rows, columns, C): their values minus the surroundings, over their standard
+    deviation there, (C, rows, columns).
+    """
+    width = values.shape[1]
     margin = max(width // 6, 1)
-    light = np.log(np.pad(small, ((0, 0), (margin, margin)), 'wrap') + np.float32(_DARKEST))
-    detail = light - cv2.GaussianBlur(light, (0, 0), width * _BLUR)
-    contrast = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), width * _BLUR))
-    return normalized((detail / (contrast + np.float32(_FLATTEST)))[:, margin:-margin])
+    around = cv2.copyMakeBorder(values, 0, 0, margin, margin, cv2.BORDER_WRAP)
+    detail = around - cv2.GaussianBlur(around, (0, 0), width * _BLUR)
+    deviation = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), width * _BLUR))
+    contrast = (detail / (deviation + np.float32(_FLATTEST)))[:, margin:-margin]
+    return np.asarray(np.moveaxis(contrast.reshape(*values.shape), 2, 0), np.float32)
 
 
 def small_gray(panorama: Image, rows: int, columns: int) -> Texture:
     """A panorama (H, W, 3) uint8 in gray, of at most so many rows and columns."""
-    size = min(panorama.shape[1], columns), min(panorama.shape[0], rows)
-    gray = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
-    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.float32)
+    return _small(cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY), rows, columns)
+
+
+def _small(image: NDArray[Any], rows: int, columns: int) -> Texture:
+    """An image (H, W) or (H, W, C) of at most so many rows and columns."""
+    size = min(image.shape[1], columns), min(image.shape[0], rows)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def normalized(image: Texture) -> Texture:

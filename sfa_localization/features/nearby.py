@@ -93,7 +93,7 @@ def _regressed(
 
 def _vectors(spectra: Spectra, columns: int) -> Vectors:
     """Vectors (..., D) whose products are the correlations of the textures of spectra."""
-    weight = np.full(spectra.shape[-1], 2.0 / columns)
+    weight = np.full(spectra.shape[-1], 2.0 / columns, np.float32)
     weight[0] = 1 / columns
     if columns % 2 == 0:
         weight[-1] = 1 / columns
