@@ -48,6 +48,8 @@ VERSION = 7
 FARTHEST_M = 1e6
 """No place is farther from the origin of its map: there a pose's last digits are still micrometers.
 """
+SCALE_STD = 0.01
+"""Of the scale of a map: its meters are those of wheels, seldom known better."""
 _STEEPEST = 1e9
 """Weights of a map, m: a million times those of any training."""
 _MOST_DRIVES = 1e6
@@ -142,7 +144,8 @@ class Estimate:
 @dataclass(frozen=True, slots=True)
 class View:
     """What slow features say of an image, `position` (2,), `yaw` and `covariance` (3, 3) as in
-    `Estimate`, and the `match` of the keyframes, which have `noise`.
+    `Estimate`, and the `match` of the keyframes, which have `noise`. Of both together the scale
+    of the map is uncertain, about its `center` (2,).
     """
 
     slow_features: Array
@@ -151,6 +154,7 @@ class View:
     covariance: Array
     match: Match
     noise: MatchNoise
+    center: Array
 
     @property
     def distance(self) -> float:
@@ -174,6 +178,8 @@ class View:
             nothing = np.full(2, np.nan), np.full((3, 3), np.nan)
             return Estimate(self.slow_features, nothing[0], np.nan, nothing[1], novelty)
         covariance = covariance * max(novelty, 1.0) ** 2
+        by_scale = SCALE_STD * (position - self.center)
+        covariance[:2, :2] += np.outer(by_scale, by_scale)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
         return Estimate(self.slow_features, position, yaw, covariance, novelty)
 
@@ -236,8 +242,9 @@ class PlaceModel:
             )
         joined = _joined(covariances, yaw_variance)
         matches = map(self._matched, panoramas, positions)
+        noise, center = self.keyframes.noise, self.keyframes.poses[:, :2].mean(0)
         return [
-            View(slow[t], positions[t], float(yaw[t]), joined[t], match, self.keyframes.noise)
+            View(slow[t], positions[t], float(yaw[t]), joined[t], match, noise, center)
             for t, match in enumerate(matches)
         ]
 

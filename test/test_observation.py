@@ -126,7 +126,18 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
 def test_a_view_without_a_finite_estimate_is_no_error():
     """Two estimates that are certain beyond all numbers have no mean."""
     match = Match(np.zeros(3), np.zeros((3, 3)), score=0.9, support=0.0)
-    view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise())
+    view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise(), np.zeros(2))
     assert math.isnan(view.distance)
     estimate = view.estimate()
     assert np.isnan(estimate.position).all() and np.isnan(estimate.covariance).all()
+
+
+def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
+    center, place = np.array([1.0, 2.0]), np.array([11.0, 2.0])
+    own = np.diag([0.01, 0.01, 0.001])
+    match = Match(np.append(place, 0.0), own, score=0.9, support=0.0)
+    noise = MatchNoise()
+    at_border = View(np.zeros(2), place, 0.0, own, match, noise, center).estimate()
+    at_center = View(np.zeros(2), place, 0.0, own, match, noise, place).estimate()
+    more = at_border.covariance - at_center.covariance
+    assert np.allclose(more, np.diag([0.1**2, 0.0, 0.0]))
