@@ -81,3 +81,33 @@ def test_textures_that_are_all_the_same_give_a_finite_place(texture):
     found = place_among(keyframes[0], keyframes, places, 60)
     assert np.isfinite(found.place).all() and np.isfinite([found.angle, found.unlike]).all()
     assert np.abs(found.place).max() <= 0.5
+
+
+def doubled(spoil):
+    """Two channels of the same scene, the second of the image spoilt: its place and what is found
+    with and without a word about channels.
+    """
+    columns, place = 60, (0.3, -0.2)
+    seen, places, _ = scene(columns)
+    keyframes = np.stack([np.concatenate([seen(p), seen(p)]) for p in places])
+    image = np.concatenate([seen(place), spoil(seen(place))])
+    channels = slice(ROWS), slice(ROWS, 2 * ROWS)
+    plain = place_among(image, keyframes, places, columns)
+    return np.array(place), plain, place_among(image, keyframes, places, columns, channels)
+
+
+def test_channels_that_are_as_good_change_nothing():
+    place, plain, found = doubled(lambda spectra: spectra)
+    assert np.allclose(plain.place, place, atol=0.01) and np.allclose(found.place, place, atol=0.01)
+
+
+def noisy(spectra):
+    noise = smooth(np.random.default_rng(9), 60)
+    return spectra + spectrum(2 * noise)
+
+
+@pytest.mark.parametrize('spoil', [np.negative, np.zeros_like, noisy])
+def test_a_channel_that_shows_something_else_counts_little(spoil):
+    place, plain, found = doubled(spoil)
+    assert np.hypot(*(found.place - place)) < 0.03
+    assert found.unlike < 0.3 * plain.unlike

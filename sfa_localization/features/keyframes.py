@@ -393,7 +393,7 @@ class Keyframes:
             if len(near) < _FEWEST:
                 break
             around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
-            found = place_among(spectrum, around, self.poses[near, :2], columns)
+            found = place_among(spectrum, around, self.poses[near, :2], columns, self._channels)
             step, limit = found.place - start, 2 * np.pi / columns
             place = start + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9))
             yaw += sign * float(np.clip(found.angle, -limit, limit))
@@ -421,6 +421,14 @@ class Keyframes:
     @property
     def _columns(self) -> int:
         return int(self.textures.shape[2])
+
+    @property
+    def _channels(self) -> tuple[slice, ...]:
+        """Rows of brightness and of both color differences, see `texture`."""
+        rows = self.textures.shape[1]
+        few = min(rows // 3, _COLOR_ROWS)
+        light = rows - 2 * few
+        return slice(light), slice(light, light + few), slice(light + few, rows)
 
     def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""

@@ -10,6 +10,7 @@ little to do with them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,9 +50,18 @@ class Nearby:
     unlike: float
 
 
-def place_among(image: Spectra, keyframes: Spectra, places: Array, columns: int) -> Nearby:
+def place_among(
+    image: Spectra,
+    keyframes: Spectra,
+    places: Array,
+    columns: int,
+    channels: Sequence[slice] = (slice(None),),
+) -> Nearby:
     """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
     F) of keyframes at places (N, 2) m, all turned to the heading of the image.
+
+    `channels` are rows that may be unlike for reasons of their own: each counts by how well the
+    keyframes explain it.
     """
     near, own = _vectors(keyframes, columns), _vectors(image, columns)
     scores = near @ own
@@ -60,35 +70,60 @@ def place_among(image: Spectra, keyframes: Spectra, places: Array, columns: int)
     mean = weight @ near
     by_angle = 1j * np.arange(keyframes.shape[-1], dtype=np.float32)
     turning = (mean.view(np.complex64).reshape(keyframes.shape[1:]) * by_angle).view(np.float32)
-    others = np.stack([mean, turning.ravel(), own])
-    return _regressed(near @ near.T, near @ others.T, others @ others.T, weight, places)
+    vectors = np.concatenate([near, turning.reshape(1, -1), own[None]])
+    rows = vectors.reshape(len(vectors), len(image), -1)
+    parts = [rows[:, channel].reshape(len(rows), -1) for channel in channels]
+    gains, products = zip(*(_products(part, weight) for part in parts), strict=True)
+    found, rest = _regressed(np.tensordot(np.square(gains), products, 1), weight, places)
+    if len(channels) == 1:
+        return found
+    left = np.einsum('i,cij,j->c', rest, products, rest)
+    noise = left / [part.shape[1] for part in parts]
+    trust = 1 / (noise + noise.min() + 1e-12)
+    return _regressed(np.tensordot(trust / trust.max(), products, 1), weight, places)[0]
 
 
-def _regressed(
-    products: Vectors, with_others: Vectors, of_others: Vectors, weight: Vectors, places: Array
-) -> Nearby:
-    """The regression by the products of N keyframes (N, N), with their mean by weight (N,), its
-    derivative by the angle, and the image (N, 3), and of these (3, 3).
+def _products(part: Vectors, weight: Vectors) -> tuple[float, Array]:
+    """The share of its likeness to the mean by weight (N,) of N keyframes that a channel of the
+    image has kept; and the products (N + 2, N + 2) of the keyframes, of the derivative of their
+    mean by the angle, and of the image, which gets back what it lacks.
+    """
+    products = (part @ part.T).astype(np.float64)
+    means = products[:-2, :-2] @ weight
+    gain = max(float(products[-1, :-2] @ weight) / max(float(means @ weight), 1e-12), _LEAST_GAIN)
+    products[-1] /= gain
+    products[:, -1] /= gain
+    return gain, products
+
+
+def _regressed(products: Array, weight: Vectors, places: Array) -> tuple[Nearby, Array]:
+    """The regression by the products (N + 2, N + 2) of N keyframes, the derivative of their mean by
+    the angle, and the image; and what it leaves of the image, as a combination of these.
 
     Neither likeness to the mean nor a rest of angle is a matter of the place: the parts of all
     vectors along both, which are orthogonal, are taken out of the products.
     """
-    gram, (mean, turning, own) = products.astype(np.float64), with_others.T.astype(np.float64)
-    (square, _, likeness), (_, power, turned_by), (_, _, norm) = of_others.astype(np.float64)
-    square, power = max(square, 1e-12), max(power, 1e-12)
-    gain = max(likeness / square, _LEAST_GAIN)
-    along, around = mean - square, turning
+    means = weight.astype(np.float64)
+    gram, around, with_own = products[:-2, :-2].copy(), products[-2, :-2], products[-1, :-2]
+    mean, turned_by, norm = gram @ means, float(products[-2, -1]), float(products[-1, -1])
+    likeness = float(means @ with_own)
+    square, power = max(float(means @ mean), 1e-12), max(float(products[-2, -2]), 1e-12)
+    along = mean - square
     gram += square - mean[:, None] - mean - np.outer(along, along) / square
     gram -= np.outer(around, around) / power
-    shown = (own - likeness - along * likeness / square - around * turned_by / power) / gain
-    rest = (norm - likeness**2 / square - turned_by**2 / power) / gain**2
-    root, center = np.sqrt(weight), weight @ places
+    shown = with_own - likeness - along * likeness / square - around * turned_by / power
+    rest = norm - likeness**2 / square - turned_by**2 / power
+    root, center = np.sqrt(means), means @ places
     gram *= np.outer(root, root)
     ridge = max(_RIDGE * float(np.trace(gram)), 1e-12)
     explained = np.linalg.solve(gram + ridge * np.eye(len(gram)), root * shown)
     rest += float(explained @ (gram @ explained - 2 * root * shown))
-    place = center + (explained * root) @ (places - center)
-    return Nearby(place, -turned_by / (gain * power), max(rest, 0.0) / square)
+    by = explained * root
+    place = center + by @ (places - center)
+    of_mean = by @ (1 + along / square) - likeness / square
+    of_turning = (float(by @ around) - turned_by) / power
+    left = np.concatenate([of_mean * means - by, [of_turning, 1.0]])
+    return Nearby(place, -turned_by / power, max(rest, 0.0) / square), left
 
 
 def _vectors(spectra: Spectra, columns: int) -> Vectors:
