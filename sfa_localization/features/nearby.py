@@ -74,9 +74,7 @@ def place_among(
     rows = vectors.reshape(len(vectors), len(image), -1)
     parts = [rows[:, channel].reshape(len(rows), -1) for channel in channels]
     gains, products = zip(*(_products(part, weight) for part in parts), strict=True)
-    found, rest = _regressed(np.tensordot(np.square(gains), products, 1), weight, places)
-    if len(channels) == 1:
-        return found
+    rest = _regressed(np.tensordot(np.square(gains), products, 1), weight, places)[1]
     left = np.einsum('i,cij,j->c', rest, products, rest)
     noise = left / [part.shape[1] for part in parts]
     trust = 1 / (noise + noise.min() + 1e-12)
