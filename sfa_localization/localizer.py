@@ -22,6 +22,7 @@ from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
+from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
@@ -62,6 +63,7 @@ class Observer:
         self.watch = ImageWatch(config)
         self._gyro = VisualGyro(model.panorama.clockwise)
         self._apart = 1.0
+        self._light = OtherLight()
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""
@@ -92,6 +94,9 @@ class Observer:
         """Slow features and keyframes together. Where they have lately been farther apart than
         their covariances allow, the light is another one, and slow features lose their weight.
         """
+        if view.known:
+            self._light.add(view.match.nearby, view.noise)
+        view = view.in_light(self._light.unlike)
         estimate = view.estimate(max(self._apart, 1.0))
         if np.isfinite(view.distance):
             self._apart += _LATELY * (min(view.distance, _FARTHEST) - self._apart)

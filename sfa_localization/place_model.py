@@ -8,7 +8,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 7
+VERSION = 8
 FARTHEST_M = 1e6
 """No place is farther from the origin of its map: there a pose's last digits are still micrometers.
 """
@@ -82,7 +82,8 @@ _BASIS = {
 _KEYFRAMES = {
     'textures': ArrayRule('NRC', 'i'),
     'poses': ArrayRule('N3', largest=FARTHEST_M),
-    'noise': ArrayRule('9', positive=(0, 1, 2, 3, 4, 5, 6, 7)),
+    'noise': ArrayRule('9', all_positive=True),
+    'clockwise': ArrayRule('', 'b'),
 }
 SCHEMA: Schema = {
     'network/#/': [
@@ -157,9 +158,18 @@ class View:
     center: Array
 
     @property
+    def known(self) -> bool:
+        """Whether the keyframes know the place."""
+        return self.match.score >= self.noise.lowest
+
+    def in_light(self, light: float) -> View:
+        """The same where the light is known to make images so unlike, see `OtherLight`."""
+        return replace(self, match=self.match.in_light(light, self.noise))
+
+    @property
     def distance(self) -> float:
         """How far both are apart, see `Match.distance`; NaN where one of them is unknown."""
-        if self.match.score < self.noise.lowest:
+        if not self.known:
             return np.nan
         try:
             return self.match.distance(self.position, self.covariance[:2, :2])

@@ -59,6 +59,10 @@ class AsLocated:
 
     located: Estimate
     distance: float = math.nan
+    known: bool = False
+
+    def in_light(self, light):
+        return self
 
     def estimate(self, factor=1.0):
         return self.located

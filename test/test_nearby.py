@@ -111,3 +111,39 @@ def test_a_channel_that_shows_something_else_counts_little(spoil):
     place, plain, found = doubled(spoil)
     assert np.hypot(*(found.place - place)) < 0.03
     assert found.unlike < 0.3 * plain.unlike
+
+
+def lit(rng, columns, share):
+    """What a light adds to a texture: other things in each sector of 22.5 degrees."""
+    sectors = np.repeat(rng.normal(size=(ROWS, 16)), -(-columns // 16), axis=1)[:, :columns]
+    return share * normalized((sectors * rng.normal(1.0, 0.3, sectors.shape)).astype(np.float32))
+
+
+@SIZES
+@pytest.mark.parametrize('share', [0.1, 0.5])
+def test_the_noise_is_what_light_moves_the_place_by(columns, share):
+    seen, places, _ = scene(columns)
+    keyframes = np.stack([seen(p) for p in places])
+    rng, place = np.random.default_rng(7), np.array([0.1, -0.2])
+    found = [
+        place_among(seen(place, lit(rng, columns, share)), keyframes, places, columns)
+        for _ in range(300)
+    ]
+    errors = np.array([one.place - place for one in found])
+    noise = np.mean([one.noise for one in found], axis=0)
+    assert np.allclose(noise, noise.T) and np.linalg.eigvalsh(noise)[0] > 0
+    true = errors.T @ errors / len(errors)
+    assert 0.6 < np.trace(noise) / np.trace(true) < 1.7
+
+
+def test_keyframes_vary_more_where_none_is_near_and_not_in_another_light():
+    seen, places, strange = scene(60)
+    place = np.array([0.1, -0.2])
+    far = place + 4 * (places - place)
+
+    def variation(at, more=0.0):
+        keyframes = np.stack([seen(p) for p in at])
+        return place_among(seen(place, more), keyframes, at, 60).variation
+
+    assert variation(far) > 3 * variation(places)
+    assert variation(places, 0.7 * strange) == pytest.approx(variation(places), rel=0.5)

@@ -14,9 +14,12 @@ from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.features.keyframes import Match, MatchNoise
+from sfa_localization.features.nearby import Nearby
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Observer, unusable_covariance
 from sfa_localization.place_model import View
+
+NEARBY = Nearby(np.zeros(2), 0.0, 0.1, np.zeros((2, 2)), 0.1)
 
 
 def test_a_good_picture_is_believed():
@@ -125,7 +128,7 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
 
 def test_a_view_without_a_finite_estimate_is_no_error():
     """Two estimates that are certain beyond all numbers have no mean."""
-    match = Match(np.zeros(3), np.zeros((3, 3)), score=0.9, support=0.0)
+    match = Match(np.zeros(3), np.zeros((3, 3)), 0.9, 0.0, NEARBY)
     view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise(), np.zeros(2))
     assert math.isnan(view.distance)
     estimate = view.estimate()
@@ -135,7 +138,7 @@ def test_a_view_without_a_finite_estimate_is_no_error():
 def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
     center, place = np.array([1.0, 2.0]), np.array([11.0, 2.0])
     own = np.diag([0.01, 0.01, 0.001])
-    match = Match(np.append(place, 0.0), own, score=0.9, support=0.0)
+    match = Match(np.append(place, 0.0), own, 0.9, 0.0, NEARBY)
     noise = MatchNoise()
     at_border = View(np.zeros(2), place, 0.0, own, match, noise, center).estimate()
     at_center = View(np.zeros(2), place, 0.0, own, match, noise, place).estimate()

@@ -22,6 +22,7 @@ from sfa_localization.features.keyframes import (
     MatchNoise,
     correlate,
 )
+from sfa_localization.features.nearby import Nearby
 
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
 
@@ -37,6 +38,8 @@ _FLOORS_M = np.geomspace(0.01, 1.0, 15)
 _SLOPES_M = np.geomspace(0.03, 3.0, 13)
 _HEAVY_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
 _USUAL_SHARE = 0.05
+# Images between keyframes on both sides are more alike than most that are left out.
+_ALIKE_SHARE = 0.25
 _LEAST_YAW_STD = 1e-3
 # Keeps novelty's scale finite where all images look alike.
 _LEAST_RANGE = 0.05
@@ -76,14 +79,14 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
 @dataclass(frozen=True, slots=True)
 class _Trial:
     """The match of a keyframe that is left out: `squared_error` m^2, `turn` rad, the error of its
-    yaw, `unlike` and `score` of the match, and the variance m^2 by keyframes elsewhere at each
+    yaw, its `score`, what is `nearby`, and the variance m^2 by keyframes elsewhere at each
     temperature.
     """
 
     squared_error: float
     turn: float
-    unlike: float
     score: float
+    nearby: Nearby
     scatters: tuple[float, ...]
 
     @classmethod
@@ -103,7 +106,7 @@ class _Trial:
             for temperature in _TEMPERATURES.tolist()
         ]
         squared, turn = float(error[:2] @ error[:2]), abs(float(wrap_angle(error[2])))
-        return cls(squared, turn, match.unlike, match.score, tuple(scatters))
+        return cls(squared, turn, match.score, match.nearby, tuple(scatters))
 
 
 def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
@@ -114,13 +117,21 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
     noise, variance = _likeliest(trials)
     squared = np.array([trial.squared_error for trial in trials])
     best = np.array([trial.score for trial in trials])
+    unlike = np.array([trial.nearby.unlike for trial in trials])
+    variation = np.array([trial.nearby.variation for trial in trials])
     alike = np.ones(len(trials))
-    factor = max(needed_factor(squared / variance, 2, alike), 1.0)
     lowest = max(LOWEST, LOWEST_SHARE * float(np.median(best)))
-    usual = max(quantile(best, _USUAL_SHARE, alike), lowest + _LEAST_RANGE)
-    turns = [trial.turn / (1 + trial.unlike) for trial in trials]
-    yaw_std = max(MEDIAN_TO_STD * float(np.median(turns)), _LEAST_YAW_STD)
-    return dataclasses.replace(noise, factor=factor, yaw_std=yaw_std, lowest=lowest, usual=usual)
+    turns = [trial.turn / (1 + trial.nearby.unlike) for trial in trials]
+    return dataclasses.replace(
+        noise,
+        factor=max(needed_factor(squared / variance, 2, alike), 1.0),
+        yaw_std=max(MEDIAN_TO_STD * float(np.median(turns)), _LEAST_YAW_STD),
+        lowest=lowest,
+        usual=max(quantile(best, _USUAL_SHARE, alike), lowest + _LEAST_RANGE),
+        by_variation=max(
+            quantile(unlike / np.maximum(variation, 1e-6) ** 2, _ALIKE_SHARE, alike), 1e-3
+        ),
+    )
 
 
 def spread(poses: Array) -> NDArray[np.int64]:
@@ -146,8 +157,9 @@ def _likeliest(trials: Sequence[_Trial]) -> tuple[MatchNoise, Array]:
     it gives them.
     """
     squared = np.array([trial.squared_error for trial in trials])
-    unlike = np.array([trial.unlike for trial in trials])
-    scatters = np.array([trial.scatters for trial in trials]).T
+    unlike = np.array([trial.nearby.unlike for trial in trials])
+    nearby = np.array([np.trace(trial.nearby.noise) for trial in trials]) / 2
+    scatters = np.array([trial.scatters for trial in trials]).T + nearby
     best, found = np.inf, (MatchNoise(), squared)
     # Of equals the largest temperature, which doubts most.
     for temperature, scatter in reversed([*zip(_TEMPERATURES.tolist(), scatters, strict=True)]):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.nearby import Spectra, place_among, turned
+from sfa_localization.features.nearby import Nearby, Spectra, place_among, turned
 
 Texture = NDArray[np.float32]
 
@@ -68,7 +68,8 @@ class MatchNoise:
     variances of positions lack, `yaw_std` rad the least standard deviation of a heading, which
     grows by as much when `unlike` grows by 1. `lowest` is the correlation below which a place is
     unknown, `usual` the one that 19 of 20 images of known places reach. `joint_factor` is what
-    the variances lack of estimates that slow features and keyframes agree on.
+    the variances lack of estimates that slow features and keyframes agree on. `by_variation`
+    times the square of `Nearby.variation` is how unlike images in the light of the keyframes are.
     """
 
     temperature: float = 0.02
@@ -79,19 +80,26 @@ class MatchNoise:
     lowest: float = LOWEST
     usual: float = 0.6
     joint_factor: float = 1.0
+    by_variation: float = 10.0
 
     def with_map(self, common_m: float, turn_std: float) -> MatchNoise:
         """With the errors of a map, which keyframes that are left out share: standard deviations
         along each axis, m, and of its directions, rad.
         """
         floor, yaw_std = np.hypot(self.floor_m, common_m), np.hypot(self.yaw_std, turn_std)
-        return dataclasses.replace(self, floor_m=float(floor), yaw_std=float(yaw_std))
+        return replace(self, floor_m=float(floor), yaw_std=float(yaw_std))
 
-    def variance(self, unlike: float) -> float:
-        """Variance m^2 of a position along each axis, of an image that is so unlike; of one that
-        is less usual than the left-out ones `novelty` says the rest.
+    def variance(self, unlike: float, light: float = 0.0) -> float:
+        """Variance m^2 of a position along each axis, of an image that is so unlike, and the more
+        so because of its `light`; of one that is less usual than the left-out ones `novelty` says
+        the rest.
         """
-        return self.floor_m**2 + (self.slope_m * min(unlike, _unlike(self.usual))) ** 2
+        by_place = max((1 + unlike) / (1 + light) - 1, 0.0)
+        return self.floor_m**2 + (self.slope_m * min(by_place, _unlike(self.usual))) ** 2
+
+    def expected_unlike(self, variation: float) -> float:
+        """How unlike an image in the light of the keyframes is, among such that vary so much."""
+        return self.by_variation * variation**2
 
     def novelty(self, score: float) -> float:
         """1 for a correlation that is just usual, 3 for the lowest of a known place, more below."""
@@ -105,15 +113,25 @@ class Match:
 
     `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
     with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
-    near a guess minus `score`, in temperatures: 0 where the best is among them; `unlike` that of
-    `Nearby`.
+    near a guess minus `score`, in temperatures: 0 where the best is among them; `nearby` is what
+    the keyframes around the best one say.
     """
 
     pose: Array
     covariance: Array
     score: float
     support: float
-    unlike: float = 0.0
+    nearby: Nearby
+
+    def in_light(self, light: float, noise: MatchNoise) -> Match:
+        """The same where the image is known to be so unlike because of its light, by itself: that
+        moves places less than what is unlike because no keyframe is near.
+        """
+        unlike = self.nearby.unlike
+        less = noise.variance(unlike, light) - noise.variance(unlike)
+        covariance = self.covariance.copy()
+        covariance[:2, :2] += noise.factor * less * np.eye(2)
+        return replace(self, covariance=covariance)
 
     def distance(self, position: Array, covariance: Array) -> float:
         """Half the squared Mahalanobis distance from another estimate's position (2,) m, with its
@@ -358,49 +376,49 @@ class Keyframes:
         turn = (-2 if self.clockwise else 2) * np.pi / self._columns
         yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
         reach = self.reach(best)
-        place, yaw, unlike = self._regressed(spectrum, scores, yaws, reach)
+        found, yaw = self._regressed(spectrum, scores, yaws, reach)
         weight = self.likelihood(scores, self.noise.temperature)
-        offset = self.elsewhere(scores, place, reach)
+        offset = self.elsewhere(scores, found.place, reach)
         apart = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
         apart[(apart < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
-        variance = self.noise.variance(unlike)
+        variance = self.noise.variance(found.unlike)
         scatter = (offset * weight[:, None]).T @ offset
         covariance = np.zeros((3, 3))
-        covariance[:2, :2] = self.noise.factor * (variance * np.eye(2) + scatter)
-        covariance[2, 2] = (self.noise.yaw_std * (1 + unlike)) ** 2 + float(weight @ apart)
+        covariance[:2, :2] = self.noise.factor * (variance * np.eye(2) + found.noise + scatter)
+        covariance[2, 2] = (self.noise.yaw_std * (1 + found.unlike)) ** 2 + float(weight @ apart)
         support = 0.0
         if guess is not None:
             near = scores[self.nearest(guess)]
             near = near[np.isfinite(near)]
             if len(near):
                 support = float(near.max() - scores[best]) / self.noise.temperature
-        pose = np.array([*place, wrap_angle(yaw)])
-        return Match(pose, covariance, float(scores[best]), support, unlike)
+        pose = np.array([*found.place, wrap_angle(yaw)])
+        return Match(pose, covariance, float(scores[best]), support, found)
 
     def _regressed(
         self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array, reach: float
-    ) -> tuple[Array, float, float]:
-        """Place (2,) m and yaw rad of the spectrum (rows, F) of an image, and how `unlike` the
-        keyframes around the best one it is, of those whose correlations (K,) are known; `yaws`
-        (K,) rad are what each of them shows, `reach` m how far the place may be from the best.
+    ) -> tuple[Nearby, float]:
+        """Where the spectrum (rows, F) of an image is among the keyframes around the best one, of
+        those whose correlations (K,) are known, and its yaw rad; `yaws` (K,) rad are what each of
+        them shows, `reach` m how far the place may be from the best.
         """
         best, sign, columns = int(scores.argmax()), 1 if self.clockwise else -1, self._columns
-        start = self.poses[best, :2]
-        place, yaw, unlike = np.array(start), float(yaws[best]), _unlike(float(scores[best]))
+        start, yaw = self.poses[best, :2], float(yaws[best])
+        found = Nearby(np.array(start), 0.0, _unlike(float(scores[best])), np.zeros((2, 2)), 0.0)
         for _ in range(_REPEATED):
-            near = self._around(place)
+            near = self._around(found.place)
             near = self._alike(near[np.isfinite(scores[near])], best)
             if len(near) < _FEWEST:
                 break
             around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
             found = place_among(spectrum, around, self.poses[near, :2], columns, self._channels)
             step, limit = found.place - start, 2 * np.pi / columns
-            place = start + step * min(1.0, reach / max(float(np.hypot(*step)), 1e-9))
+            apart = float(np.hypot(*step))
+            found = replace(found, place=start + step * min(1.0, reach / max(apart, 1e-9)))
             yaw += sign * float(np.clip(found.angle, -limit, limit))
-            unlike = found.unlike
-            if np.hypot(*step) < _NEARER * reach:
+            if apart < _NEARER * reach:
                 break
-        return place, yaw, unlike
+        return found, yaw
 
     def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
         """How likely each of the keyframes (M,) whose correlations (K,) are known is the place, of
@@ -443,11 +461,12 @@ class Keyframes:
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle; `drives` where some were added."""
-        noise = np.array([*dataclasses.astuple(self.noise), float(self.clockwise)])
+        noise = np.array(dataclasses.astuple(self.noise))
         arrays: dict[str, NDArray[Any]] = {
             'textures': self.textures,
             'poses': self.poses,
             'noise': noise,
+            'clockwise': np.array(self.clockwise),
         }
         if self.drives.any():
             arrays['drives'] = self.drives
@@ -456,11 +475,11 @@ class Keyframes:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Keyframes:
         """Read the arrays of `to_arrays`."""
-        *noise, clockwise = (float(n) for n in np.asarray(arrays['noise'], float))
+        noise = MatchNoise(*np.asarray(arrays['noise'], float).tolist())
         textures = np.asarray(arrays['textures'], np.int8)
         poses = np.asarray(arrays['poses'], float)
         drives = np.asarray(arrays.get('drives', np.zeros(len(poses))), np.int32)
-        return cls.of(textures, poses, MatchNoise(*noise), bool(clockwise), drives)
+        return cls.of(textures, poses, noise, bool(arrays['clockwise']), drives)
 
 
 def _unlike(score: float) -> float:

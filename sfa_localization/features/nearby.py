@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from sfa_localization.data.geometry import Array
 
@@ -28,6 +29,8 @@ _LIKENESS = 0.05
 _RIDGE = 0.005
 # Share of its likeness that an image keeps in any light.
 _LEAST_GAIN = 0.2
+# Parts of the panorama in which light and what hides the view are one error each: 22.5 deg.
+_SECTORS = 16
 
 
 def turned(spectra: Spectra, angle: Array) -> Spectra:
@@ -43,11 +46,32 @@ class Nearby:
     """Where an image is among keyframes: `place` (2,) m, the `angle` rad by which `turned` would
     still turn it to them, and `unlike`, how much of it no place among them explains: 0 for an
     image between them in their light, 1 for as much as what they have in common.
+
+    `noise` (2, 2) m^2 is the covariance of the place by what is left of the image; `variation`
+    how much the keyframes that are like it differ, in the unit of `unlike`: much where none of
+    them is near, in any light.
     """
 
     place: Array
     angle: float
     unlike: float
+    noise: Array
+    variation: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Regression:
+    """A regression of an image, and what it is made of: `left` (N + 2,) combines the vectors of N
+    keyframes, of their mean's derivative and of the image to what is left of the image, `pull`
+    (2, N + 2) to the direction in which it moves the place.
+    """
+
+    place: Array
+    angle: float
+    unlike: float
+    variation: float
+    left: Array
+    pull: Array
 
 
 def place_among(
@@ -63,22 +87,46 @@ def place_among(
     `channels` are rows that may be unlike for reasons of their own: each counts by how well the
     keyframes explain it.
     """
-    near, own = _vectors(keyframes, columns), _vectors(image, columns)
-    scores = near @ own
+    parts = [
+        np.concatenate([_pixels(keyframes[:, rows], columns), _pixels(image[None, rows], columns)])
+        for rows in channels
+    ]
+    scores = sum(part[:-1] @ part[-1] for part in parts)
     weight = np.exp((scores - scores.max()) / _LIKENESS)
     weight /= weight.sum()
-    mean = weight @ near
-    by_angle = 1j * np.arange(keyframes.shape[-1], dtype=np.float32)
-    turning = (mean.view(np.complex64).reshape(keyframes.shape[1:]) * by_angle).view(np.float32)
-    vectors = np.concatenate([near, turning.reshape(1, -1), own[None]])
-    rows = vectors.reshape(len(vectors), len(image), -1)
-    parts = [rows[:, channel].reshape(len(rows), -1) for channel in channels]
+    parts = [_with_turning(part, weight, columns) for part in parts]
     gains, products = zip(*(_products(part, weight) for part in parts), strict=True)
-    rest = _regressed(np.tensordot(np.square(gains), products, 1), weight, places)[1]
-    left = np.einsum('i,cij,j->c', rest, products, rest)
-    noise = left / [part.shape[1] for part in parts]
+    left = _regressed(np.tensordot(np.square(gains), products, 1), weight, places).left
+    noise = np.einsum('i,cij,j->c', left, products, left) / [part.shape[1] for part in parts]
     trust = 1 / (noise + noise.min() + 1e-12)
-    return _regressed(np.tensordot(trust / trust.max(), products, 1), weight, places)[0]
+    trust /= trust.max()
+    found = _regressed(np.tensordot(trust, products, 1), weight, places)
+    moved = sum(
+        by * _moved(found, part, gain, columns)
+        for by, part, gain in zip(trust, parts, gains, strict=True)
+    )
+    return Nearby(found.place, found.angle, found.unlike, moved @ moved.T, found.variation)
+
+
+def _moved(found: _Regression, part: Vectors, gain: float, columns: int) -> Array:
+    """By how much, m, what is left of a channel moves the place in each sector of the panorama,
+    (2, sectors): light and what hides the view are alike within one, and not in all.
+    """
+    combine = np.vstack([found.left, found.pull]).astype(np.float32)
+    combine[:, -1] /= gain
+    left, *pull = (combine @ part).reshape(3, -1, columns)
+    sectors = min(_SECTORS, columns)
+    starts = np.arange(sectors) * columns // sectors
+    return np.add.reduceat((np.stack(pull) * left).sum(axis=1), starts, axis=1).astype(np.float64)
+
+
+def _with_turning(part: Vectors, weight: Vectors, columns: int) -> Vectors:
+    """Vectors (N + 2, D) from those of N keyframes and the image: between them the derivative by
+    the angle of the keyframes' mean.
+    """
+    mean = fft.rfft((weight @ part[:-1]).reshape(-1, columns))
+    turning = fft.irfft(mean * (1j * np.arange(mean.shape[-1], dtype=np.float32)), columns)
+    return np.concatenate([part[:-1], turning.reshape(1, -1).astype(np.float32), part[-1:]])
 
 
 def _products(part: Vectors, weight: Vectors) -> tuple[float, Array]:
@@ -94,9 +142,9 @@ def _products(part: Vectors, weight: Vectors) -> tuple[float, Array]:
     return gain, products
 
 
-def _regressed(products: Array, weight: Vectors, places: Array) -> tuple[Nearby, Array]:
+def _regressed(products: Array, weight: Vectors, places: Array) -> _Regression:
     """The regression by the products (N + 2, N + 2) of N keyframes, the derivative of their mean by
-    the angle, and the image; and what it leaves of the image, as a combination of these.
+    the angle, and the image.
 
     Neither likeness to the mean nor a rest of angle is a matter of the place: the parts of all
     vectors along both, which are orthogonal, are taken out of the products.
@@ -113,22 +161,29 @@ def _regressed(products: Array, weight: Vectors, places: Array) -> tuple[Nearby,
     rest = norm - likeness**2 / square - turned_by**2 / power
     root, center = np.sqrt(means), means @ places
     gram *= np.outer(root, root)
-    ridge = max(_RIDGE * float(np.trace(gram)), 1e-12)
-    explained = np.linalg.solve(gram + ridge * np.eye(len(gram)), root * shown)
+    variation = float(np.trace(gram))
+    ridge = max(_RIDGE * variation, 1e-12)
+    wanted = np.column_stack([shown, places - center]) * root[:, None]
+    solved = np.linalg.solve(gram + ridge * np.eye(len(gram)), wanted)
+    explained = solved[:, 0]
     rest += float(explained @ (gram @ explained - 2 * root * shown))
-    by = explained * root
-    place = center + by @ (places - center)
-    of_mean = by @ (1 + along / square) - likeness / square
-    of_turning = (float(by @ around) - turned_by) / power
-    left = np.concatenate([of_mean * means - by, [of_turning, 1.0]])
-    return Nearby(place, -turned_by / power, max(rest, 0.0) / square), left
+    by, *pull = (root[:, None] * solved).T
+
+    def combined(share: Array, likeness: float, turned_by: float, own: float) -> Array:
+        of_mean = share @ (1 + along / square) - likeness / square
+        of_turning = (float(share @ around) - turned_by) / power
+        return np.concatenate([of_mean * means - share, [of_turning, own]])
+
+    return _Regression(
+        center + by @ (places - center),
+        -turned_by / power,
+        max(rest, 0.0) / square,
+        variation / square,
+        combined(by, likeness, turned_by, 1.0),
+        np.stack([-combined(share, 0.0, 0.0, 0.0) for share in pull]),
+    )
 
 
-def _vectors(spectra: Spectra, columns: int) -> Vectors:
-    """Vectors (..., D) whose products are the correlations of the textures of spectra."""
-    weight = np.full(spectra.shape[-1], 2.0 / columns, np.float32)
-    weight[0] = 1 / columns
-    if columns % 2 == 0:
-        weight[-1] = 1 / columns
-    scaled = np.ascontiguousarray(spectra * np.sqrt(weight), np.complex64)
-    return scaled.reshape(*spectra.shape[:-2], -1).view(np.float32)
+def _pixels(spectra: Spectra, columns: int) -> Vectors:
+    """Vectors (N, D) of the textures of spectra (N, rows, F)."""
+    return np.asarray(fft.irfft(spectra, columns).reshape(len(spectra), -1), np.float32)

@@ -1,0 +1,46 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How unlike the keyframes all images of a drive are because their light is another one.
+
+An image may be unlike because no keyframe is near, and then its place is uncertain by as much; or
+because the light is another one, which is nearly the same for all images of some minutes, and
+moves places little. The keyframes around it say how unlike the first would make it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from sfa_localization.features.keyframes import MatchNoise
+from sfa_localization.features.nearby import Nearby
+
+# Standard deviations of the logarithm: at the start, of its change from image to image, and of what
+# one image shows of it, which those around it repeat.
+_START, _CHANGE, _SHOWN = 0.3, 0.01, 0.1
+_REPEATED = 10
+# No light makes images more unlike than this: 1, as much as what they have in common.
+_MOST = math.log(2.0)
+
+
+class OtherLight:
+    """A Kalman filter of the logarithm of 1 + `unlike`: unlikeness by place and by light multiply.
+
+    Images that vary with the place say less of the light. Without any, it is that of the keyframes.
+    """
+
+    def __init__(self) -> None:
+        self._logarithm, self._variance = 0.0, _START**2
+
+    @property
+    def unlike(self) -> float:
+        """How unlike, see `Nearby`, images at the places of keyframes are now; never negative."""
+        return math.expm1(max(self._logarithm, 0.0))
+
+    def add(self, nearby: Nearby, noise: MatchNoise) -> None:
+        """Learn from an image of a known place."""
+        by_place = math.log1p(noise.expected_unlike(nearby.variation))
+        shown = min(max(math.log1p(nearby.unlike) - by_place, -_MOST), _MOST)
+        self._variance += _CHANGE**2
+        gain = self._variance / (self._variance + _REPEATED * (_SHOWN**2 + by_place**2))
+        self._logarithm += gain * (shown - self._logarithm)
+        self._variance *= 1 - gain
