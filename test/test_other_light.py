@@ -32,8 +32,10 @@ def after(nearby) -> float:
 
 @pytest.mark.parametrize('unlike', [0.0, 0.3, 0.8])
 def test_the_light_of_a_drive_is_found_within_some_seconds(unlike):
-    assert after(images(unlike, 100)) == pytest.approx(unlike, rel=0.2, abs=0.05)
-    assert after(images(unlike, 1)) <= 0.5 * unlike + 0.05
+    """Or less, as long as it is not sure."""
+    found = after(images(unlike, 150))
+    assert 0.6 * unlike - 0.05 < found < unlike + 0.05
+    assert after(images(unlike, 1)) == 0.0
 
 
 def test_the_light_may_change():
@@ -62,16 +64,18 @@ def repainted(world: Spheres, share: float) -> Spheres:
 
 
 def test_in_another_light_ellipses_are_small_and_hold():
-    world, poses = Spheres.about(0), unseen(150)
+    world, poses = Spheres.about(1), unseen(150)
     keyframes, light = learnt(world), OtherLight()
     plain, known = [], []
-    for image in repainted(world, 0.7).panoramas(poses, CONFIG):
+    for image in repainted(world, 0.5).panoramas(poses, CONFIG):
         match = keyframes.match(image)
         light.add(match.nearby, keyframes.noise)
         plain.append(match)
         known.append(match.in_light(light.unlike, keyframes.noise))
-    sizes = [np.median([np.trace(m.covariance[:2, :2]) for m in found]) for found in (plain, known)]
+    late = slice(50, None)
+    sizes = [
+        np.median([np.trace(m.covariance[:2, :2]) for m in found[late]]) for found in (plain, known)
+    ]
     assert light.unlike > 0.1
     assert sizes[1] < 0.7 * sizes[0]
-    late = slice(50, None)
     assert np.mean([holds(m, p) for m, p in zip(known[late], poses[late], strict=True)]) > 0.9

@@ -40,6 +40,7 @@ _HEAVY_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tail
 _USUAL_SHARE = 0.05
 # Images between keyframes on both sides are more alike than most that are left out.
 _ALIKE_SHARE = 0.25
+_LEAST_BY_VARIATION = 1e-3
 _LEAST_YAW_STD = 1e-3
 # Keeps novelty's scale finite where all images look alike.
 _LEAST_RANGE = 0.05
@@ -79,13 +80,14 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
 @dataclass(frozen=True, slots=True)
 class _Trial:
     """The match of a keyframe that is left out: `squared_error` m^2, `turn` rad, the error of its
-    yaw, its `score`, what is `nearby`, and the variance m^2 by keyframes elsewhere at each
-    temperature.
+    yaw, its `score`, what is `nearby`, the variance m^2 by keyframes elsewhere at each temperature,
+    and whether another track was `crossed` there: else nothing is left of the place.
     """
 
     squared_error: float
     turn: float
     score: float
+    crossed: bool
     nearby: Nearby
     scatters: tuple[float, ...]
 
@@ -106,7 +108,9 @@ class _Trial:
             for temperature in _TEMPERATURES.tolist()
         ]
         squared, turn = float(error[:2] @ error[:2]), abs(float(wrap_angle(error[2])))
-        return cls(squared, turn, match.score, match.nearby, tuple(scatters))
+        others = keyframes.poses[np.isfinite(scores), :2] - keyframes.poses[row, :2]
+        crossed = bool(np.hypot(*others.T).min() < _STRETCH_M / 2)
+        return cls(squared, turn, match.score, crossed, match.nearby, tuple(scatters))
 
 
 def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
@@ -116,21 +120,28 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
         return MatchNoise()
     noise, variance = _likeliest(trials)
     squared = np.array([trial.squared_error for trial in trials])
-    best = np.array([trial.score for trial in trials])
-    unlike = np.array([trial.nearby.unlike for trial in trials])
-    variation = np.array([trial.nearby.variation for trial in trials])
     alike = np.ones(len(trials))
-    lowest = max(LOWEST, LOWEST_SHARE * float(np.median(best)))
+    lowest = max(LOWEST, LOWEST_SHARE * float(np.median([trial.score for trial in trials])))
     turns = [trial.turn / (1 + trial.nearby.unlike) for trial in trials]
+    crossings = [trial for trial in trials if trial.crossed]
     return dataclasses.replace(
-        noise,
+        _usual(crossings, noise, lowest) if crossings else noise,
         factor=max(needed_factor(squared / variance, 2, alike), 1.0),
         yaw_std=max(MEDIAN_TO_STD * float(np.median(turns)), _LEAST_YAW_STD),
         lowest=lowest,
-        usual=max(quantile(best, _USUAL_SHARE, alike), lowest + _LEAST_RANGE),
-        by_variation=max(
-            quantile(unlike / np.maximum(variation, 1e-6) ** 2, _ALIKE_SHARE, alike), 1e-3
-        ),
+    )
+
+
+def _usual(trials: Sequence[_Trial], noise: MatchNoise, lowest: float) -> MatchNoise:
+    """The noise with what is usual at places that were left out where tracks cross."""
+    alike = np.ones(len(trials))
+    variation = np.maximum([trial.nearby.variation for trial in trials], 1e-6)
+    ratio = np.array([trial.nearby.unlike for trial in trials]) / variation**2
+    usual = quantile(np.array([trial.score for trial in trials]), _USUAL_SHARE, alike)
+    return dataclasses.replace(
+        noise,
+        usual=max(usual, lowest + _LEAST_RANGE),
+        by_variation=max(quantile(ratio, _ALIKE_SHARE, alike), _LEAST_BY_VARIATION),
     )
 
 

@@ -16,7 +16,7 @@ from sfa_localization.features.nearby import Nearby
 
 # Standard deviations of the logarithm: at the start, of its change from image to image, and of what
 # one image shows of it, which those around it repeat.
-_START, _CHANGE, _SHOWN = 0.3, 0.01, 0.1
+_START, _CHANGE, _SHOWN = 0.3, 0.005, 0.1
 _REPEATED = 10
 # No light makes images more unlike than this: 1, as much as what they have in common.
 _MOST = math.log(2.0)
@@ -33,8 +33,10 @@ class OtherLight:
 
     @property
     def unlike(self) -> float:
-        """How unlike, see `Nearby`, images at the places of keyframes are now; never negative."""
-        return math.expm1(max(self._logarithm, 0.0))
+        """How unlike, see `Nearby`, images at the places of keyframes are now at least, to one
+        standard deviation; never negative.
+        """
+        return math.expm1(max(self._logarithm - math.sqrt(self._variance), 0.0))
 
     def add(self, nearby: Nearby, noise: MatchNoise) -> None:
         """Learn from an image of a known place."""
