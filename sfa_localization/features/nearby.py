@@ -87,14 +87,16 @@ def place_among(
     `channels` are rows that may be unlike for reasons of their own: each counts by how well the
     keyframes explain it.
     """
-    parts = [
-        np.concatenate([_pixels(keyframes[:, rows], columns), _pixels(image[None, rows], columns)])
-        for rows in channels
-    ]
-    scores = sum(part[:-1] @ part[-1] for part in parts)
+    scale = _scale(image.shape[-1], columns)
+    near = [_vectors(keyframes[:, rows], scale) for rows in channels]
+    own = [_vectors(image[None, rows], scale) for rows in channels]
+    scores = sum(one @ other[0] for one, other in zip(near, own, strict=True))
     weight = np.exp((scores - scores.max()) / _LIKENESS)
     weight /= weight.sum()
-    parts = [_with_turning(part, weight, columns) for part in parts]
+    parts = [
+        np.concatenate([one, _turning(weight @ one, len(scale)), other])
+        for one, other in zip(near, own, strict=True)
+    ]
     gains, products = zip(*(_products(part, weight) for part in parts), strict=True)
     left = _regressed(np.tensordot(np.square(gains), products, 1), weight, places).left
     noise = np.einsum('i,cij,j->c', left, products, left) / [part.shape[1] for part in parts]
@@ -102,31 +104,31 @@ def place_among(
     trust /= trust.max()
     found = _regressed(np.tensordot(trust, products, 1), weight, places)
     moved = sum(
-        by * _moved(found, part, gain, columns)
+        by * _moved(found, part, gain, scale, columns)
         for by, part, gain in zip(trust, parts, gains, strict=True)
     )
     return Nearby(found.place, found.angle, found.unlike, moved @ moved.T, found.variation)
 
 
-def _moved(found: _Regression, part: Vectors, gain: float, columns: int) -> Array:
+def _moved(found: _Regression, part: Vectors, gain: float, scale: Vectors, columns: int) -> Array:
     """By how much, m, what is left of a channel moves the place in each sector of the panorama,
     (2, sectors): light and what hides the view are alike within one, and not in all.
     """
     combine = np.vstack([found.left, found.pull]).astype(np.float32)
     combine[:, -1] /= gain
-    left, *pull = (combine @ part).reshape(3, -1, columns)
+    spectra = (combine @ part).view(np.complex64).reshape(3, -1, len(scale)) / scale
+    left, along_x, along_y = fft.irfft(spectra, columns)
+    pull = np.stack([(along_x * left).sum(axis=0), (along_y * left).sum(axis=0)])
     sectors = min(_SECTORS, columns)
     starts = np.arange(sectors) * columns // sectors
-    return np.add.reduceat((np.stack(pull) * left).sum(axis=1), starts, axis=1).astype(np.float64)
+    return np.add.reduceat(pull, starts, axis=1).astype(np.float64)
 
 
-def _with_turning(part: Vectors, weight: Vectors, columns: int) -> Vectors:
-    """Vectors (N + 2, D) from those of N keyframes and the image: between them the derivative by
-    the angle of the keyframes' mean.
-    """
-    mean = fft.rfft((weight @ part[:-1]).reshape(-1, columns))
-    turning = fft.irfft(mean * (1j * np.arange(mean.shape[-1], dtype=np.float32)), columns)
-    return np.concatenate([part[:-1], turning.reshape(1, -1).astype(np.float32), part[-1:]])
+def _turning(mean: Vectors, frequencies: int) -> Vectors:
+    """The derivative by the angle of a vector (D,), (1, D)."""
+    by_angle = 1j * np.arange(frequencies, dtype=np.float32)
+    spectra = mean.view(np.complex64).reshape(-1, frequencies) * by_angle
+    return spectra.astype(np.complex64).view(np.float32).reshape(1, -1)
 
 
 def _products(part: Vectors, weight: Vectors) -> tuple[float, Array]:
@@ -184,6 +186,16 @@ def _regressed(products: Array, weight: Vectors, places: Array) -> _Regression:
     )
 
 
-def _pixels(spectra: Spectra, columns: int) -> Vectors:
-    """Vectors (N, D) of the textures of spectra (N, rows, F)."""
-    return np.asarray(fft.irfft(spectra, columns).reshape(len(spectra), -1), np.float32)
+def _scale(frequencies: int, columns: int) -> Vectors:
+    """Of the spectra of so many columns, so that products are those of the textures."""
+    weight = np.full(frequencies, 2.0 / columns, np.float32)
+    weight[0] = 1 / columns
+    if columns % 2 == 0:
+        weight[-1] = 1 / columns
+    return np.asarray(np.sqrt(weight), np.float32)
+
+
+def _vectors(spectra: Spectra, scale: Vectors) -> Vectors:
+    """Vectors (N, D) whose products are the correlations of the textures of spectra."""
+    scaled = np.ascontiguousarray(spectra * scale, np.complex64)
+    return scaled.reshape(len(spectra), -1).view(np.float32)
