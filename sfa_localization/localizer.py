@@ -59,11 +59,20 @@ class Observer:
     """Judges and locates the panoramas of one camera, in the order in which they were taken."""
 
     def __init__(self, model: PlaceModel, config: WatchConfig | None = None) -> None:
-        self.model = model
         self.watch = ImageWatch(config)
         self._gyro = VisualGyro(model.panorama.clockwise)
+        self.use(model)
+
+    def use(self, model: PlaceModel) -> None:
+        """Go on with a model, which may know another light than the one before."""
+        self.model = model
         self._apart = 1.0
         self._light = OtherLight()
+
+    @property
+    def other_light(self) -> float:
+        """How unlike the light makes all images of late, see `OtherLight.unlike`."""
+        return self._light.unlike
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""

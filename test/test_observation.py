@@ -144,3 +144,35 @@ def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
     at_center = View(np.zeros(2), place, 0.0, own, match, noise, place).estimate()
     more = at_border.covariance - at_center.covariance
     assert np.allclose(more, np.diag([0.1**2, 0.0, 0.0]))
+
+
+class InOtherLight(PictureReader):
+    """Keyframes alone know the place; all images are unlike by their light."""
+
+    def views(self, images):
+        nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05)
+        noise = MatchNoise(floor_m=0.02, slope_m=0.4)
+        own = np.diag([noise.variance(0.6) + 1e-4] * 2 + [0.01])
+        match = Match(np.zeros(3), own, 0.7, 0.0, nearby)
+        unknown = np.diag([1e4, 1e4, 3.0])
+        return [View(np.zeros(2), np.zeros(2), 0.0, unknown, match, noise, np.zeros(2))] * len(
+            images
+        )
+
+
+def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
+    observer = Observer(InOtherLight())
+    seen = [observer.observe(k, panorama(seed=k)) for k in range(1, 200)]
+    std = np.array([np.sqrt(one.covariance[0, 0]) for one in seen])
+    assert std[0] == pytest.approx(np.hypot(0.24, 0.0224), rel=0.02)
+    assert np.all(np.diff(std) < 1e-6) and 0.02 < std[-1] < 0.3 * std[0]
+    assert 0.4 < observer.other_light < 0.6
+
+
+def test_another_model_may_know_the_light():
+    observer = Observer(InOtherLight())
+    for k in range(1, 100):
+        observer.observe(k, panorama(seed=k))
+    assert observer.other_light > 0.3
+    observer.use(PictureReader())
+    assert observer.other_light == 0.0

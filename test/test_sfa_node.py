@@ -392,6 +392,7 @@ def test_the_map_frame_is_a_parameter_and_novelty_is_warned_of(bench, models):
     assert features[0].header.frame_id == 'slow_feature_space'
     assert poses[0].header.frame_id == uncertain[0].header.frame_id == 'garden'
     assert until(lambda: 'unlike' in node.health()[1])
+    assert node.health()[2]['unlike by light'] == '0 %'
     models['a.npz'].novelty = NOVELTY_WARNING - 0.1
     bench.publish('panorama', message(seed=2))
     assert until(lambda: node.health()[1] == 'locating')

@@ -125,7 +125,7 @@ class SfaNode(LocalizationNode):
     def _use(self, model: PlaceModel) -> None:
         """Go on with another model; an unconfigured node reads its own when it is configured."""
         if self._observer is not None:
-            self._observer.model = model
+            self._observer.use(model)
             self._publish_correlation()
 
     def _reload(self, _: Any, response: Any) -> Any:
@@ -196,7 +196,9 @@ class SfaNode(LocalizationNode):
     def health(self) -> tuple[int, str, dict[str, str]]:
         problem = self._last.problem if self._last is not None else ''
         novelty = self._last.estimate.novelty if self._last is not None else 0.0
+        light = self._observer.other_light if self._observer is not None else 0.0
         values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
+        values['unlike by light'] = f'{100 * light:.0f} %'
         silent = self.monitor(self._topic).silent_for_s()
         if math.isinf(silent):
             return _WARN, f'waiting for images on {self.shown(self._topic)}', values
