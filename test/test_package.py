@@ -58,7 +58,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'lz4'}),
     'metric': ({'data', 'features'}, NUMERIC),
     'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
-    'localizer': ({'data', 'camera', 'fusion', 'metric', 'place_model'}, {'numpy'}),
+    'localizer': ({'data', 'camera', 'features', 'fusion', 'metric', 'place_model'}, {'numpy'}),
     'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
     'training': (CORE | {'place_model'}, {'numpy'}),
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
