@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from ros_domains import free_domain
 
 from sfa_localization import config as config_file
 from sfa_localization.camera.settings import PanoramaConfig
@@ -21,6 +22,8 @@ from sfa_localization.config import (
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes.settings import NodeConfig
+
+DOMAIN = free_domain()
 
 SHIPPED = Path(__file__).parents[1] / 'config' / 'localization.yaml'
 EVERY = [(section, kind) for section, kinds in SECTIONS.items() for kind in kinds]
@@ -159,7 +162,7 @@ def test_the_sections_that_ros_ignores_are_those_it_gives_no_node(tmp_path, text
 def test_ros_agrees_on_which_nodes_a_section_is_for(tmp_path, text):
     rclpy = pytest.importorskip('rclpy')
     path, context = saved(tmp_path, text), rclpy.Context()
-    rclpy.init(context=context, domain_id=70, args=['--ros-args', '--params-file', str(path)])
+    rclpy.init(context=context, domain_id=DOMAIN, args=['--ros-args', '--params-file', str(path)])
     taken = []
     for namespace in ('', 'robot1', 'a/robot1'):
         node = rclpy.create_node(

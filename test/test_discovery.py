@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from ros_domains import free_domain
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -17,11 +18,13 @@ from sfa_localization.nodes.conversions import to_image, to_odometry  # noqa: E4
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
 
+DOMAIN = free_domain()
+
 
 @pytest.fixture
 def bench(monkeypatch):
     monkeypatch.setattr(discovery, 'PATIENCE_S', 0.0)
-    made = Bench(63)
+    made = Bench(DOMAIN)
     yield made
     made.close()
 

@@ -8,6 +8,7 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 from filter_drives import START_NS, Drive
+from ros_domains import free_domain
 from transform_buffer import TransformBuffer
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
@@ -48,6 +49,8 @@ from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
 from sfa_localization.nodes.monitor import steady_s  # noqa: E402
 
+DOMAIN = free_domain()
+
 IMAGE_POSE = 'sfa/pose_with_covariance'
 AT_ORIGIN = [0.0, 0.0, 0.0]
 SPREAD = np.diag([0.04, 0.04, 0.0025])
@@ -56,7 +59,7 @@ NOISY = {'position_std': 0.1, 'yaw_std': 0.03, 'v_std': 0.02, 'omega_std': 0.01}
 
 @pytest.fixture
 def bench():
-    made = Bench(62)
+    made = Bench(DOMAIN)
     yield made
     made.close()
 

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from picture_readers import SIZE, PictureReader, panorama
+from ros_domains import free_domain
 
 from sfa_localization.place_model import PlaceModel
 
@@ -25,6 +26,8 @@ from sfa_localization.nodes.conversions import to_image, to_odometry  # noqa: E4
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
 from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
+
+DOMAIN = free_domain()
 
 START_NS = 1_700_000_000_000_000_000
 PLACES = {'robot1': (3.0, 4.0, 0.5), 'robot2': (20.0, 11.0, -1.0)}
@@ -53,7 +56,7 @@ class Broadcast(String):
 def bench(monkeypatch):
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
     monkeypatch.setattr(ekf_node, 'TFMessage', Broadcast)
-    made = Bench(71)
+    made = Bench(DOMAIN)
     yield made
     made.close()
 

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 import yaml
+from ros_domains import free_domain
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -20,7 +21,7 @@ from std_msgs.msg import String  # noqa: E402
 
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
 
-DOMAIN = 64
+DOMAIN = free_domain()
 
 
 @pytest.fixture

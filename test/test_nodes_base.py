@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from ros_domains import free_domain
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError
@@ -32,6 +33,8 @@ from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import LocalizationNode  # noqa: E402
 from sfa_localization.nodes.monitor import Monitor  # noqa: E402
 
+DOMAIN = free_domain()
+
 
 @dataclass(frozen=True, slots=True)
 class Knobs(Settings):
@@ -52,7 +55,7 @@ class Knobs(Settings):
 def context():
     made = rclpy.Context()
     rclpy.init(
-        context=made, domain_id=61, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO
+        context=made, domain_id=DOMAIN, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO
     )
     yield made
     rclpy.try_shutdown(context=made)
@@ -207,7 +210,7 @@ class Timed(LocalizationNode):
 
 
 def test_a_timer_goes_on_after_an_error_which_is_counted():
-    bench = Bench(61)
+    bench = Bench(DOMAIN)
     try:
         node = bench.run(Timed)
         told = bench.listen(DiagnosticArray, '/diagnostics')
@@ -227,7 +230,7 @@ def test_a_timer_goes_on_after_an_error_which_is_counted():
 
 
 def test_a_defect_in_a_service_is_its_answer_and_ends_nothing():
-    bench = Bench(61)
+    bench = Bench(DOMAIN)
     try:
         bench.run(Timed)
         for _ in range(2):

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from ros_domains import free_domain
 
 from sfa_localization.camera import watch
 from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
@@ -41,6 +42,8 @@ from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
 from sfa_localization.nodes.omnicam_node import _JPEG_QUALITY, OmnicamNode  # noqa: E402
 from sfa_localization.nodes.settings import OmnicamNodeConfig  # noqa: E402
 
+DOMAIN = free_domain()
+
 PANORAMA = PanoramaConfig(width=120, height=12)
 GROUPS = (OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig)
 
@@ -54,7 +57,7 @@ def raw_picture(seed=1):
 def bench(monkeypatch, tmp_path):
     monkeypatch.setenv('ROS_PYTHON_CHECK_FIELDS', '1')
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
-    context = new_context(63)
+    context = new_context(DOMAIN)
     made = []
 
     def build(**parameters):
@@ -248,7 +251,7 @@ def remapped():
     def build(*rules, **parameters):
         words = [word for rule in rules for word in ('-r', rule)]
         given = [Parameter(name, value=value) for name, value in parameters.items()]
-        context = new_context(63, ['--ros-args', *words])
+        context = new_context(DOMAIN, ['--ros-args', *words])
         made.append(OmnicamNode(context=context, parameter_overrides=given))
         return made[-1]
 
@@ -302,7 +305,7 @@ def test_a_node_that_would_hear_itself_is_not_configured(remapped, rules, transp
 @contextlib.contextmanager
 def from_file(path):
     """Run the node with a parameter file."""
-    context = new_context(63, ['--ros-args', '--params-file', str(path)])
+    context = new_context(DOMAIN, ['--ros-args', '--params-file', str(path)])
     node = OmnicamNode(context=context)
     yield node
     node.destroy_node()

@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from ros_domains import free_domain
 
 from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.lenses import make_camera
@@ -16,6 +17,8 @@ pytestmark = pytest.mark.ros
 from omnicam_bench import Bench, image_message, new_context, pixels, send_until  # noqa: E402
 
 from sfa_localization.simulation.garden import Garden  # noqa: E402
+
+DOMAIN = free_domain()
 
 OPEN = {'radius_min': 0.0, 'radius_max': 0.0}
 LEVEL = (0.0, 0.0, 0.0)
@@ -71,7 +74,7 @@ def test_the_node_undoes_the_camera(garden, name, monkeypatch, tmp_path):
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path))
     (size, mount_rpy, lens), panorama = CAMERAS[name], PanoramaConfig()
     (tmp_path / 'camera.yaml').write_text(calibration_text(lens, mount_rpy))
-    context = new_context(64)
+    context = new_context(DOMAIN)
     bench = Bench(
         context,
         calibration_file=str(tmp_path / 'camera.yaml'),

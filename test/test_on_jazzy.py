@@ -32,6 +32,7 @@ from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.time import Time
 from ros_bench import Bench, until
+from ros_domains import free_domain
 from std_msgs.msg import String
 
 from sfa_localization.data.geometry import compose
@@ -40,7 +41,7 @@ from sfa_localization.nodes.conversions import to_pose_with_covariance
 from sfa_localization.nodes.lifecycle import latched_qos
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-DOMAIN = 72
+DOMAIN = free_domain()
 ROOT = Path(__file__).parents[1]
 DRIVE, MODEL_DRIVE = ROOT / 'bags' / 'sample_test', ROOT / 'bags' / 'sample'
 COMMAND_S = 60

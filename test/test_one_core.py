@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from picture_readers import SIZE, PictureReader, Recording
+from ros_domains import free_domain
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.events import ODOMETRY
@@ -28,6 +29,8 @@ from sfa_localization.nodes.conversions import (  # noqa: E402
 )
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
+
+DOMAIN = free_domain()
 
 SEEN = 'sfa/pose_with_covariance'
 # Settings of sfa_node and ekf_node that are not the defaults, and matter here.
@@ -58,7 +61,7 @@ def trajectory(messages):
 def live(recording, monkeypatch):
     """Return what sfa_node and ekf_node publish: poses of pictures, and of the filter."""
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
-    bench = Bench(69)
+    bench = Bench(DOMAIN)
     try:
         sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
         ekf = bench.run(EkfNode, **FILTER)

@@ -29,6 +29,7 @@ from bag_formats import (
     write_rosbags,
     write_version,
 )
+from ros_domains import free_domain
 
 from sfa_localization.commands.pace import (
     FASTER,
@@ -44,7 +45,7 @@ from sfa_localization.data.errors import BagError
 ROOT = Path(__file__).parents[1]
 
 DEADLINE_S = 30.0
-DOMAIN = 67
+DOMAIN = free_domain()
 FAST = PlayConfig(rate=20.0, wait=20.0)
 
 

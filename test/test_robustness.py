@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 from picture_readers import AsLocated
 from robustness.readme import TABLE, robustness_table
+from ros_domains import free_domain
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.fusion.pose_filter import HISTORY_S
 from sfa_localization.place_model import Estimate, PlaceModel
+
+DOMAIN = free_domain()
 
 SIZE = PanoramaConfig(width=60, height=12)
 START_NS = 1_700_000_000_000_000_000
@@ -97,7 +100,7 @@ def model(monkeypatch):
 
 @pytest.fixture
 def bench():
-    made = Bench(68)
+    made = Bench(DOMAIN)
     yield made
     made.close()
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cylinder_worlds import place
 from picture_readers import AsLocated
+from ros_domains import free_domain
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import FROZEN_IMAGES
@@ -17,6 +18,8 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.localizer import UNKNOWN_VARIANCE
 from sfa_localization.place_model import FORMAT, VERSION, Estimate, PlaceModel
+
+DOMAIN = free_domain()
 
 SIZE = PanoramaConfig(width=60, height=12)
 KNOWN = ErrorCorrelation(0.25, 1.5)
@@ -89,7 +92,7 @@ def models(monkeypatch):
 
 @pytest.fixture
 def bench():
-    made = Bench(63)
+    made = Bench(DOMAIN)
     yield made
     made.close()
 

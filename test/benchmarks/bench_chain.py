@@ -42,7 +42,7 @@ from sfa_localization.nodes.conversions import (
 )
 from sfa_localization.place_model import PlaceModel
 
-DOMAIN = 65
+DOMAIN = 101  # no test uses it
 PICTURES_HZ, ODOMETRY_HZ = 30.0, 50.0
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -38,13 +38,14 @@ from std_msgs.msg import String
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe
+from ros_domains import free_domain
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.threads import one_core
 from sfa_localization.nodes.conversions import to_image, to_odometry
 from sfa_localization.nodes.lifecycle import latched_qos
 
-DOMAIN = 69
+DOMAIN = free_domain()
 START_NS = 1_700_000_000_000_000_000
 ODOMETRY_HZ, EVERY = 50, 10
 STEP_NS = 10**9 // ODOMETRY_HZ

@@ -24,11 +24,12 @@ from sfa_localization.place_model import PlaceModel
 
 from nav_msgs.msg import Odometry  # isort: skip
 from sensor_msgs.msg import CompressedImage  # isort: skip
+from ros_domains import free_domain
 
 SEEN, ODOM, PANORAMA = 'sfa/pose_with_covariance', 'odom', 'panorama'
 RAW = 'image_raw/compressed'
 KINDS = dict(zip(NODES, (OmnicamNode, SfaNode, EkfNode), strict=True))
-DOMAIN = 73
+DOMAIN = free_domain()
 """Of ROS, for these nodes alone."""
 PATIENCE_S = 3.0
 """What takes longer was lost on its way, or is not answered: no message needs a tenth of it."""
