@@ -389,7 +389,7 @@ def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
         raise CameraError(
             f'the image is {width} x {height} but the camera is calibrated for '
             f'{calibrated[0]} x {calibrated[1]}: name the calibration_file of this camera (see the '
-            'command calibrate)'
+            'command calibrate), or set camera_model to panorama where images are panoramas already'
         )
     return scale
 
