@@ -15,7 +15,7 @@ EXPLAINED = re.compile(r'\*\*Cause:\*\* \S.*\n\n\*\*Remedy:\*\* \S.*\n\n((?:- `.
 ROWS = [row.strip('|').split('|') for row in TEXT.splitlines() if row.startswith('| `')]
 
 
-KEYS = {'camera model', 'panorama visible [%]'}  # of values on /diagnostics
+KEYS = {'camera model', 'panorama visible [%]', 'unlike by light'}  # of values on /diagnostics
 
 
 def plain(text: str) -> str:
