@@ -46,7 +46,7 @@ class FilterConfig(Settings):
         1.0, 'factor on the variances in odometry messages', low=1e-3, high=1e4, live=True
     )
     slip_per_metre: float = setting(
-        0.04, 'position error by wheel slip', unit='m per sqrt(m)', low=0.0, high=10.0, live=True
+        0.03, 'position error by wheel slip', unit='m per sqrt(m)', low=0.0, high=10.0, live=True
     )
     yaw_per_radian: float = setting(
         0.02,
