@@ -94,6 +94,17 @@ def test_a_camera_that_was_turned_is_noticed(angle, noticed):
         assert f'look {angle} degrees off' in shown or f'look {-angle} degrees off' in shown
 
 
+@pytest.mark.parametrize(('scatter', 'noticed'), [(0.05, True), (1.5, False)])
+def test_images_that_claim_meters_show_a_turned_camera_where_they_lie_on_a_line(scatter, noticed):
+    found = []
+    for seed in range(40):
+        poses, places, yaws = bend(length_m=4.0)
+        drawn = wrap_angle(yaws + math.radians(25))
+        weak = seen(poses, places + noise(16, scatter, seed), drawn, std=1.5)
+        found.append('was the camera turned?' in contradiction(weak))
+    assert np.mean(found) > 0.95 if noticed else np.mean(found) < 0.1
+
+
 def test_without_headings_only_the_motion_counts():
     poses, places, _ = bend()
     assert contradiction(seen(poses, places, np.full(16, np.nan))) == ''

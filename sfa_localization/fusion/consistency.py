@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import align_complex, wrap_angle
+from sfa_localization.data.geometry import Array, align_complex, wrap_angle
 from sfa_localization.fusion.belief import Evidence, Pull, Trust
 from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
 
@@ -44,6 +44,8 @@ PULLED, PULLED_M, RELEASED = 0.6, 0.3, 0.5
 """Mean offset, in standard deviations and in m, from which the estimate is not trusted, and the
 part of both below which it is again. One that follows its images is nearer, in any light: after
 slip, offsets of 0.9 standard deviations were 0.1 m."""
+LEAST_APART_M = 0.1
+"""Standard deviation of images about the odometry's path of which none is sure to be less."""
 _HEADING_DRIFT_RAD = 0.05  # of odometry over the window
 _FIT_STEPS = 5  # of reweighting, from where the fit hardly changes
 
@@ -124,7 +126,19 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     lever = float(np.sum(agree * np.abs(along) ** 2 / variance))
     # Neighboring images err alike, over about a meter.
     dependence = max(1.0, len(recent) / (1 + span_m))
-    return _turned(recent, agree, float(np.angle(turn)), dependence / max(lever, 1e-9))
+    excess = _excess(apart[agree], variance[agree], len(recent) / dependence)
+    return _turned(recent, agree, float(np.angle(turn)), excess * dependence / max(lever, 1e-9))
+
+
+def _excess(apart: Array, variance: Array, independent: float) -> float:
+    """The variance of images about the odometry's path, of the one that they claim, at most 1.
+
+    Weak images may claim meters and lie on a line: then they show well where it leads. `apart` (N,)
+    m from the path, of `variance` (N,) m^2, so many of them `independent`.
+    """
+    free = max(independent - 1.5, 0.5)  # the path is turned, and shifted along both axes
+    measured = float(np.mean(apart**2)) / 2 * independent / free
+    return min(max(measured, LEAST_APART_M**2) / float(np.mean(variance)), 1.0)
 
 
 def _turned(
