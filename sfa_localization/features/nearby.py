@@ -61,17 +61,16 @@ class Nearby:
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """A regression of an image, and what it is made of: `left` (N + 2,) combines the vectors of N
-    keyframes, of their mean's derivative and of the image to what is left of the image, `pull`
-    (2, N + 2) to the direction in which it moves the place.
+    """A regression of an image. `combine` (3, N + 2) makes of the vectors of N keyframes, of their
+    mean's derivative and of the image what is left of the image, and the two vectors along which
+    that moves the place.
     """
 
     place: Array
     angle: float
     unlike: float
     variation: float
-    left: Array
-    pull: Array
+    combine: Array
 
 
 def place_among(
@@ -98,7 +97,7 @@ def place_among(
         for one, other in zip(near, own, strict=True)
     ]
     gains, products = zip(*(_products(part, weight) for part in parts), strict=True)
-    left = _regressed(np.tensordot(np.square(gains), products, 1), weight, places).left
+    left = _regressed(np.tensordot(np.square(gains), products, 1), weight, places).combine[0]
     noise = np.einsum('i,cij,j->c', left, products, left) / [part.shape[1] for part in parts]
     trust = 1 / (noise + noise.min() + 1e-12)
     trust /= trust.max()
@@ -114,7 +113,7 @@ def _moved(found: _Regression, part: Vectors, gain: float, scale: Vectors, colum
     """By how much, m, what is left of a channel moves the place in each sector of the panorama,
     (2, sectors): light and what hides the view are alike within one, and not in all.
     """
-    combine = np.vstack([found.left, found.pull]).astype(np.float32)
+    combine = found.combine.astype(np.float32)
     combine[:, -1] /= gain
     spectra = (combine @ part).view(np.complex64).reshape(3, -1, len(scale)) / scale
     left, along_x, along_y = fft.irfft(spectra, columns)
@@ -169,20 +168,16 @@ def _regressed(products: Array, weight: Vectors, places: Array) -> _Regression:
     solved = np.linalg.solve(gram + ridge * np.eye(len(gram)), wanted)
     explained = solved[:, 0]
     rest += float(explained @ (gram @ explained - 2 * root * shown))
-    by, *pull = (root[:, None] * solved).T
-
-    def combined(share: Array, likeness: float, turned_by: float, own: float) -> Array:
-        of_mean = share @ (1 + along / square) - likeness / square
-        of_turning = (float(share @ around) - turned_by) / power
-        return np.concatenate([of_mean * means - share, [of_turning, own]])
-
+    share = (root[:, None] * solved).T
+    of_image = np.array([1.0, 0.0, 0.0])
+    of_mean = share @ (1 + along / square) - of_image * likeness / square
+    of_turning = (share @ around - of_image * turned_by) / power
     return _Regression(
-        center + by @ (places - center),
+        center + share[0] @ (places - center),
         -turned_by / power,
         max(rest, 0.0) / square,
         variation / square,
-        combined(by, likeness, turned_by, 1.0),
-        np.stack([-combined(share, 0.0, 0.0, 0.0) for share in pull]),
+        np.column_stack([np.outer(of_mean, means) - share, of_turning, of_image]),
     )
 
 

@@ -33,6 +33,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from ros_domains import free_domain
+
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import (
     to_image,
@@ -42,7 +46,7 @@ from sfa_localization.nodes.conversions import (
 )
 from sfa_localization.place_model import PlaceModel
 
-DOMAIN = 101  # no test uses it
+DOMAIN = free_domain()
 PICTURES_HZ, ODOMETRY_HZ = 30.0, 50.0
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
