@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -54,6 +53,8 @@ _STEEPEST = 1e9
 """Weights of a map, m: a million times those of any training."""
 _MOST_DRIVES = 1e6
 """Drives that added keyframes: more than a robot ever makes."""
+_LONGEST_DELAY_S = 10.0
+"""Of a camera: training finds delays of up to half a second."""
 _AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
 _PROCESS = {
     'kind': ArrayRule('', 'U'),
@@ -284,9 +285,9 @@ class PlaceModel:
             model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
             model._prove()
         except LocalizationError as error:
-            raise _damaged(path, error) from None
-        except Exception as error:  # arrays that do not fit each other fail in many ways
-            raise _damaged(path, f'{type(error).__name__}: {error}') from None
+            raise _damaged(path, str(error)) from None
+        except Exception:  # header and arrays that do not fit each other fail in many ways
+            raise _damaged(path, 'its parts do not fit each other') from None
         return model
 
     def _prove(self) -> None:
@@ -311,8 +312,8 @@ class PlaceModel:
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
                 raise ModelError('its covariances are not positive')
-        if not math.isfinite(self.camera_delay_s):
-            raise ModelError('its camera delay is not finite')
+        if not abs(self.camera_delay_s) <= _LONGEST_DELAY_S:
+            raise ModelError('its camera delay is not that of a camera')
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
@@ -351,7 +352,7 @@ class PlaceModel:
         return cls(
             network_from(arrays, header),
             map_from_arrays(_under(arrays, 'metric/')),
-            PanoramaConfig(**header['panorama']),
+            PanoramaConfig.from_mapping(header['panorama'], 'panorama'),
             Keyframes.from_arrays(_under(arrays, 'keyframes/')),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
             Compass.from_arrays(compass) if compass else None,
@@ -363,8 +364,8 @@ class PlaceModel:
         )
 
 
-def _damaged(path: Path, reason: object) -> ModelError:
-    return ModelError(f'{path}: the model is damaged ({short_line(str(reason))}): train it again')
+def _damaged(path: Path, reason: str) -> ModelError:
+    return ModelError(f'{path}: the model is damaged ({short_line(reason)}): train it again')
 
 
 def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:

@@ -19,6 +19,7 @@ from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
 from sfa_localization.config import load_settings, write_config
+from sfa_localization.data.errors import ConfigError
 
 rclpy = pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -354,7 +355,6 @@ def test_impossible_changes_are_rejected_with_the_reason(bench, change, words):
     [
         ({'source': 'video'}, 'source_path'),
         ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
-        ({'elevation_min': 50.0}, 'elevation_min'),
         ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
     ],
 )
@@ -362,6 +362,11 @@ def test_an_impossible_camera_says_so_and_does_not_start(bench, parameters, word
     run = bench(**parameters)
     assert not run.node.start()
     assert words in run.node.failure
+
+
+def test_an_empty_range_of_elevations_is_a_wrong_parameter(bench):
+    with pytest.raises(ConfigError, match="'omnicam_node': elevation_min of the panorama"):
+        bench(elevation_min=50.0)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from sfa_localization.camera.panorama import (
     panorama_rays,
 )
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
-from sfa_localization.data.errors import CameraError
+from sfa_localization.data.errors import CameraError, ConfigError
 
 SIZE = (400, 400)
 SMALL = PanoramaConfig(width=180, height=24)
@@ -312,8 +312,8 @@ def test_wrong_pictures_are_refused(picture):
 
 
 def test_an_empty_range_of_elevations_is_refused():
-    with pytest.raises(CameraError, match='elevation_min'):
-        panorama_rays(PanoramaConfig(elevation_min=10.0, elevation_max=10.0))
+    with pytest.raises(ConfigError, match='elevation_min'):
+        PanoramaConfig(elevation_min=10.0, elevation_max=10.0)
 
 
 def test_images_of_several_sizes():

@@ -37,13 +37,8 @@ def looks_like_panorama(height: int, width: int) -> bool:
 
 
 def panorama_rays(panorama: PanoramaConfig) -> Array:
-    """Unit rays (H, W, 3) of the panorama's pixels in the robot's axes (x forward, y left, z up).
-
-    Raises CameraError for an empty range of elevations.
-    """
+    """Unit rays (H, W, 3) of the pixels, in the robot's axes (x forward, y left, z up)."""
     low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
-    if low >= high:
-        raise CameraError('elevation_min of the panorama must be below elevation_max')
     height, width = panorama.height, panorama.width
     clockwise = (np.arange(width) + 0.5 - width / 2) * 2 * np.pi / width
     azimuth = -clockwise if panorama.clockwise else clockwise

@@ -33,6 +33,11 @@ class PanoramaConfig(Settings):
     )
     clockwise: bool = setting(True, 'columns grow clockwise seen from above')
 
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        if self.elevation_min >= self.elevation_max:
+            raise ConfigError('elevation_min of the panorama must be below elevation_max')
+
     def differences(self, other: PanoramaConfig) -> str:
         """What differs in `other`, as 'height 30 instead of 60'; '' when they are equal."""
         names = [item.name for item in dataclasses.fields(self)]

@@ -32,8 +32,8 @@ LARGEST_FILE = 1 << 28
 """Bytes of a file: twenty times a model of a large garden. In use a model is ten times its file."""
 MOST_ARRAYS = 1000
 """Arrays in a file: a model has about ten for each of its parts."""
-LARGEST_NUMBER = 1e30
-"""Magnitude of a number: those of models stay below 1e9, and products of larger ones overflow."""
+LARGEST_NUMBER = 1e15
+"""Magnitude of a number: those of models stay below 1e9, and squares of larger ones overflow."""
 _HEADER, _CHECKSUM = 'header', 'sha256'
 _LONGEST_HEADER = 1 << 20
 """Characters of the header: a thousand times the usual."""
@@ -73,8 +73,8 @@ def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
         intact = header.get(_CHECKSUM) == checksum(arrays, header)
     except _Unusable as error:
         raise ModelError(f'{path}: not a {kind} ({error}): {remedy}') from None
-    except Exception as error:  # zip, numpy and json fail in many ways on foreign bytes
-        raise ModelError(f'{path}: not a {kind} ({type(error).__name__}): {remedy}') from None
+    except Exception:  # zip, numpy and json fail in many ways on foreign bytes
+        raise ModelError(f'{path}: not a {kind}: {remedy}') from None
     if found_kind != kind:
         raise ModelError(f'{path}: a {short_line(str(found_kind))}, not a {kind}: {remedy}')
     if found_version != version:

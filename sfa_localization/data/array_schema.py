@@ -62,7 +62,7 @@ def _prefix(name: str, schema: Schema) -> str:
     """The longest prefix of the schema that a name has."""
     fitting = [prefix for prefix in schema if _pattern(name).startswith(prefix)]
     if not fitting:
-        raise ModelError(f'the array {short_line(name)} is unknown: train it again')
+        raise ModelError(f'the array {short_line(name)} is unknown')
     longest = max(fitting, key=len)
     # A number may have more digits than the # that stands for it.
     return name[: len(name) - len(_pattern(name)) + len(longest)]
@@ -76,20 +76,20 @@ def _alternative(prefix: str, names: Mapping[str, Any], groups: Sequence[Group])
     nearest = min(groups, key=lambda group: len(set(group) ^ set(names)))
     wrong = min(set(nearest) ^ set(names))
     how = 'is missing' if wrong in nearest else 'is unknown'
-    raise ModelError(f'the array {short_line(prefix + wrong)} {how}: train it again')
+    raise ModelError(f'the array {short_line(prefix + wrong)} {how}')
 
 
 def _check(name: str, array: NDArray[Any], rule: ArrayRule, lengths: dict[str, int]) -> None:
     if array.dtype.kind != rule.kind:
-        raise ModelError(f'the array {name} is of type {array.dtype}: train it again')
+        raise ModelError(f'the array {name} is of type {array.dtype}')
     fits = array.ndim == len(rule.shape) and all(
         length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
         for axis, length in zip(rule.shape, array.shape, strict=False)
     )
     if not fits:
-        raise ModelError(f'the array {name} has the shape {array.shape}: train it again')
+        raise ModelError(f'the array {name} has the shape {array.shape}')
     numbers = array.ravel() if rule.all_positive else array.ravel()[list(rule.positive)]
     if rule.kind in 'fiu' and not np.all(numbers > 0):
-        raise ModelError(f'the array {name} holds a number that must be positive: train it again')
+        raise ModelError(f'the array {name} holds a number that must be positive')
     if rule.kind in 'fiuc' and array.size and np.abs(array).max() > rule.largest:
-        raise ModelError(f'the array {name} holds a number beyond {rule.largest:g}: train it again')
+        raise ModelError(f'the array {name} holds a number beyond {rule.largest:g}')

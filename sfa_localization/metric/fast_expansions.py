@@ -65,13 +65,13 @@ def fast_map(metric: MetricMap) -> Predictor:
 
 
 def map_from_arrays(arrays: Arrays) -> Predictor:
-    """The map of saved arrays. Raises ModelError when one is missing or of an unknown kind."""
+    """The map of saved arrays. Raises ModelError where they are not those of its kind."""
     kinds: dict[str, type[FastProcess] | type[MetricMap]]
     kinds = {'gp': FastProcess, 'monomials': MetricMap}
     try:
         return kinds[str(arrays['kind'])].from_arrays(arrays)
-    except KeyError as error:
-        raise ModelError(f'the metric map lacks {error}: train the model again') from None
+    except KeyError:
+        raise ModelError('the arrays of the metric map are not those of its kind') from None
 
 
 @dataclass(frozen=True, slots=True)
