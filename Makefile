@@ -29,9 +29,9 @@ reproduce: $(READY)  ## the tables and figures of test/EVALUATION.md: hours, whi
 test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(ARGS)
 
-robustness: $(READY)  ## run the tests of test/README.md; print what each fault of a drive did (15 minutes)
+robustness: $(READY)  ## run the tests of test/README.md; print what each fault of a drive did (20 minutes)
 	$(PY) -m pytest -m robustness $(ARGS)
-	PYTHONPATH=.:test $(PY) -m robustness --live
+	PYTHONPATH=.:test $(PY) -m robustness --live --lights
 
 animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp
 	PYTHONPATH=.:test $(PY) -m robustness.animation resource/kidnapped.webp

@@ -16,6 +16,11 @@ from robustness.plot import draw, summary
 from robustness.recorded import World, two_laps
 from robustness.replay import replayed
 
+DANGEROUS = (
+    'images half covered', 'images mirrored, from the start', 'camera turned by 30 degrees',
+    'two frames in turns', 'wheels slip', 'robot pushed', 'kidnapped', 'kidnapped in the dark',
+)  # fmt: skip
+"""Faults that were believed once, in the light of the training."""
 RIGHT_AGAIN_S = 20.0
 """Driving on confirms an estimate that was moved often; after so long all are LOCALISED again."""
 
@@ -161,3 +166,13 @@ def test_the_filter_is_never_sure_and_wrong(name):
     verdict = judge(replayed(fault.messages(drive), drive.times_ns[0]), fault.ends_s)
     assert fault.allows(verdict.false_s), verdict
     assert math.isnan(verdict.recovered_s) or verdict.recovered_s < RIGHT_AGAIN_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', DANGEROUS)
+def test_nor_in_another_light(name):
+    """`make robustness` plays all faults in four of them."""
+    pytest.importorskip('trimesh')
+    drive, fault = two_laps('evening'), FAULTS[name]
+    verdict = judge(replayed(fault.messages(drive), drive.times_ns[0]), fault.ends_s)
+    assert fault.allows(verdict.false_s), verdict

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print what each fault of a drive did, and draw what the filter claimed.
 
-PYTHONPATH=.:test python -m robustness --live 'wheels slip' kidnapped
+PYTHONPATH=.:test python -m robustness --live --lights 'wheels slip' kidnapped
 """
 
 import argparse
@@ -13,7 +13,7 @@ import tempfile
 from robustness.faults import FAULTS
 from robustness.judged import head, judge, row
 from robustness.plot import draw, summary
-from robustness.recorded import CACHE, two_laps
+from robustness.recorded import CACHE, OTHER_LIGHTS, two_laps
 from robustness.replay import replayed
 
 PLOT = CACHE / 'calibration.png'
@@ -32,10 +32,9 @@ def live():
     return played
 
 
-def run(names, play):
+def run(names, play, world):
     """Print a row for each fault; the names of those that are not allowed, and all outputs."""
-    world, width = two_laps(), max(map(len, names))
-    wrong, outputs = [], []
+    wrong, outputs, width = [], [], max(map(len, names))
     tell(head(width))
     for name in names:
         fault = FAULTS[name]
@@ -60,16 +59,18 @@ def main():
     )
     parser.add_argument('faults', nargs='*', metavar='FAULT', help='some of them, by name')
     parser.add_argument('--live', action='store_true', help='also through the three nodes')
+    parser.add_argument('--lights', action='store_true', help='also in other lights and seasons')
     options = parser.parse_args()
-    ways = {'Localizer': replayed}
-    if options.live:
-        ways['nodes'] = live()
+    ways = [('the Localizer', replayed, ())]
+    ways += [('the nodes', live(), ())] if options.live else []
+    for when in OTHER_LIGHTS if options.lights else ():
+        ways.append((f'the Localizer, {" in ".join(when)}', replayed, when))
     everything, wrong = [], []
-    for way, play in ways.items():
-        tell(f'\nThrough the {way}:\n')
-        refused, outputs = run(options.faults or list(FAULTS), play)
+    for way, play, when in ways:
+        tell(f'\nThrough {way}:\n')
+        refused, outputs = run(options.faults or list(FAULTS), play, two_laps(*when))
         everything += outputs
-        wrong += refused
+        wrong += [f'{name}, through {way}' for name in refused]
     draw(everything, PLOT)
     tell(f'\n{summary(everything)}\n\n{PLOT}: written')
     for name in wrong:

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two laps of bags/sample_test as messages, with the truth; a model of bags/sample to locate them.
 
-Model and foreign pictures are made once, and kept in build/ while the code that makes them stays.
+Model, other lights and foreign pictures are made once, and kept in build/ while the code that makes
+them stays.
 """
 
 import dataclasses
@@ -31,6 +32,11 @@ RENDERING = ('bags', 'camera', 'data', 'simulation')
 SENSOR_STD = 3.0
 """Gray levels by which two pictures from one place differ: the noise of the simulated camera."""
 FOREIGN_WORLD = 5
+RECORDED = 'day', 'summer'
+"""Light and season of the bags."""
+OTHER_LIGHTS = (
+    ('morning', 'summer'), ('evening', 'summer'), ('overcast', 'autumn'), ('day', 'winter'),
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -145,10 +151,32 @@ def to_truth():
     return fit_transform(run.ground_truth, Trajectory(np.array(stamps), np.array(poses)))
 
 
+def simulated(name, **settings):
+    """A bag of panoramas in a garden of 8 m; needs what simulates."""
+    from sfa_localization.simulation.drive import simulate
+    from sfa_localization.simulation.settings import SimulationConfig
+
+    bag = CACHE / f'{name}-{sources_key(RENDERING)}'
+    if not bag.exists():
+        config = SimulationConfig(
+            trajectory='test', area=(8.0, 8.0), images='panorama', compression='jpeg',
+            odometry_rate=25.0, **settings,
+        )  # fmt: skip
+        simulate(config, bag)
+    return bag
+
+
+def drive_in(light, season):
+    """bags/sample_test, or the same drive in another light or season."""
+    if (light, season) == RECORDED:
+        return BAGS / 'sample_test'
+    return simulated(f'{light}-{season}', seed=2, length=20.0, light=light, season=season)
+
+
 @functools.cache
-def two_laps():
+def two_laps(light=RECORDED[0], season=RECORDED[1]):
     """The closed drive, once around and once again."""
-    run, pictures = read(BAGS / 'sample_test')
+    run, pictures = read(drive_in(light, season))
     odometry = run.odometry
     true = run.ground_truth.at(odometry.stamps_ns)
     steps = np.zeros((len(true), 3))
@@ -172,16 +200,7 @@ def noisy(pictures, rng, std=SENSOR_STD):
 @functools.cache
 def foreign_pictures():
     """Panoramas (M, H, W, 3) of another garden; needs what simulates."""
-    from sfa_localization.simulation.drive import simulate
-    from sfa_localization.simulation.settings import SimulationConfig
-
-    bag = CACHE / f'foreign-{sources_key(RENDERING)}'
-    if not bag.exists():
-        config = SimulationConfig(
-            trajectory='test', world=FOREIGN_WORLD, seed=5, area=(8.0, 8.0), length=12.0,
-            images='panorama', compression='jpeg', odometry_rate=25.0,
-        )  # fmt: skip
-        simulate(config, bag)
+    bag = simulated('foreign', seed=5, world=FOREIGN_WORLD, length=12.0)
     return read(bag)[1]
 
 
