@@ -105,6 +105,40 @@ def test_images_that_claim_meters_show_a_turned_camera_where_they_lie_on_a_line(
     assert np.mean(found) > 0.95 if noticed else np.mean(found) < 0.1
 
 
+def stretched(factor, scatter, std, seeds=40):
+    """How often images that move so many times as far as the odometry contradict it."""
+    found = []
+    for seed in range(seeds):
+        poses, places, yaws = bend(length_m=4.0)
+        off = places[0] + factor * (places - places[0]) + noise(16, scatter, seed)
+        found.append('times as far as the odometry' in contradiction(seen(poses, off, yaws, std)))
+    return np.mean(found)
+
+
+@pytest.mark.parametrize(
+    ('factor', 'noticed'), [(0.0, True), (0.6, True), (0.9, False), (1.15, False), (1.5, True)]
+)
+def test_images_that_move_farther_or_less_far_contradict(factor, noticed):
+    """Whether they claim decimeters or meters, where they lie on a line."""
+    for std in (0.5, 1.5):
+        found = stretched(factor, 0.05, std)
+        assert found > 0.95 if noticed else found < 0.05
+
+
+def test_scattered_images_do_not_show_how_far_they_move():
+    assert stretched(1.0, 1.0, 1.0, seeds=200) < 0.05
+
+
+def test_by_how_much_images_move_otherwise_widens_what_is_published():
+    poses, places, yaws = bend(length_m=4.0)
+    near = 0.4 * places + noise(16, 0.02)
+    trust = Trust()
+    for item in seen(poses, near, yaws, std=1.0):
+        trust = watched(trust, item)
+    assert trust.problem.startswith('images move 0.4 times')
+    assert math.sqrt(trust.variances(0.0)[0]) > 0.5 * WINDOW_M
+
+
 def test_without_headings_only_the_motion_counts():
     poses, places, _ = bend()
     assert contradiction(seen(poses, places, np.full(16, np.nan))) == ''

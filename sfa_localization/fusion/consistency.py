@@ -4,10 +4,10 @@
 
 An image that repeats, a camera that was knocked or a clock that is seconds off gives poses that
 pass the gate now and then. Over some meters they show: laid on the odometry's path, which is
-turned and shifted as one piece, the images lie beside it, or look into another direction than the
-one in which they move. An estimate that was moved once has to be confirmed by driving, and one
-that is moved again and again by driving far. Images that all lie on one side of the estimate, each
-within what it claims, contradict it together.
+turned and shifted as one piece, the images lie beside it, move farther or less far, or look into
+another direction than the one in which they move. An estimate that was moved once has to be
+confirmed by driving, and one that is moved again and again by driving far. Images that all lie on
+one side of the estimate, each within what it claims, contradict it together.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ WINDOW_M, WINDOW_IMAGES = 1.5 * AGREEING_DISTANCE_M, 8
 """The newest images over both are compared; images of slow cameras are farther apart."""
 AGREEING_HALF = 0.5
 """Fewer than half of the images on the odometry's path are no outliers: motions differ."""
-TURNED_RAD, TURNED_STDS = math.radians(12.0), 3.5
-"""Headings that differ from the direction of motion by more than both were not drawn by chance;
-12 degrees is twice what maps of noisy odometry show in places."""
+TURNED_RAD, STRETCHED, CHANCE_STDS = math.radians(12.0), 0.25, 3.5
+"""Headings that differ from the direction of motion by more than both angle and standard deviations
+were not drawn by chance, nor were images that move farther or less far than odometry by this part:
+twice what maps of noisy odometry show in places."""
 FORGIVEN_M, LONGEST_M = 30.0, 16.0
 """Distance after which an estimate that stayed counts as never moved, and the longest distance
 that must confirm one."""
@@ -115,7 +116,6 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
     weight = 1 / variance
     for _ in range(_FIT_STEPS):
-        along = path - np.average(path, weights=weight)
         turn, shift = align_complex(path, places, weight)
         apart = np.abs(turn * path + shift - places)
         square = apart**2 / variance
@@ -123,22 +123,37 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     agree = square <= AGREEING_VARIANCES
     if agree.mean() < AGREEING_HALF:
         return 'images and odometry show different motions', (math.sqrt(np.mean(apart**2)), 0.0)
-    lever = float(np.sum(agree * np.abs(along) ** 2 / variance))
     # Neighboring images err alike, over about a meter.
     dependence = max(1.0, len(recent) / (1 + span_m))
-    excess = _excess(apart[agree], variance[agree], len(recent) / dependence)
-    return _turned(recent, agree, float(np.angle(turn)), excess * dependence / max(lever, 1e-9))
+    factor, spread = _stretch(path[agree], places[agree], variance[agree], dependence)
+    stretch, std = abs(factor) - 1, math.hypot(math.sqrt(spread), ODOMETRY_DRIFT)
+    if abs(stretch) > max(STRETCHED, CHANCE_STDS * std):
+        shown = f'images move {abs(factor):.1f} times as far as the odometry'
+        return shown, (abs(stretch) * span_m, 0.0)
+    return _turned(recent, agree, float(np.angle(turn)), spread)
 
 
-def _excess(apart: Array, variance: Array, independent: float) -> float:
-    """The variance of images about the odometry's path, of the one that they claim, at most 1.
+def _stretch(
+    path: NDArray[np.complex128],
+    places: NDArray[np.complex128],
+    variance: Array,
+    dependence: float,
+) -> tuple[complex, float]:
+    """The factor that turns and stretches the odometry's path (N,) m to the places (N,) m of
+    images, and the variance of its logarithm.
 
-    Weak images may claim meters and lie on a line: then they show well where it leads. `apart` (N,)
-    m from the path, of `variance` (N,) m^2, so many of them `independent`.
+    Weak images may claim meters, `variance` (N,) m^2, and lie on a line: then they show well where
+    it leads, as far as `dependence` images that err alike count as one.
     """
-    free = max(independent - 1.5, 0.5)  # the path is turned, and shifted along both axes
-    measured = float(np.mean(apart**2)) / 2 * independent / free
-    return min(max(measured, LEAST_APART_M**2) / float(np.mean(variance)), 1.0)
+    weight = 1 / variance
+    along, placed = (each - np.average(each, weights=weight) for each in (path, places))
+    lever = max(float(np.sum(weight * np.abs(along) ** 2)), 1e-9)
+    factor = complex(np.sum(weight * np.conj(along) * placed)) / lever
+    independent = len(path) / dependence
+    free = max(independent - 2.0, 0.5)  # the path is turned, stretched, and shifted along both axes
+    apart = float(np.mean(np.abs(placed - factor * along) ** 2)) / 2 * independent / free
+    excess = min(max(apart, LEAST_APART_M**2) / float(np.mean(variance)), 1.0)
+    return factor, excess * dependence / lever
 
 
 def _turned(
@@ -154,7 +169,7 @@ def _turned(
     angle = float(wrap_angle(mean + np.median(wrap_angle(np.array(off) - mean))))
     yaw_variance = float(np.mean([item.yaw_variance for item in items if math.isfinite(item.yaw)]))
     std = math.sqrt(variance + yaw_variance + _HEADING_DRIFT_RAD**2)
-    if abs(angle) < max(TURNED_RAD, TURNED_STDS * std):
+    if abs(angle) < max(TURNED_RAD, CHANCE_STDS * std):
         return '', (0.0, 0.0)
     degrees = f'{math.degrees(angle):.0f} degrees'
     return f'images look {degrees} off the motion: was the camera turned?', (0.0, abs(angle))
