@@ -300,12 +300,47 @@ class Poor(Drive):
 def test_wheels_of_another_size_are_noticed_though_images_are_poor(scale, monkeypatch):
     way = np.tile([1.0, 0.0], (50 * 40, 1))
     drive = Poor(twists=way, scale=scale, position_std=0.2, yaw_std=0.03)
-    correlation = ErrorCorrelation(0.7, 0.6)
-    sure = wrong_and_sure(fed(drive, PoseFilter(FilterConfig(), correlation)))
+
+    def times_wrong():
+        """With limits that let weak images pass."""
+        config = FilterConfig(degraded_std=1.0)
+        return wrong_and_sure(fed(drive, PoseFilter(config, ErrorCorrelation(0.7, 0.6))))
+
+    both = times_wrong()
+    monkeypatch.setattr(consistency, 'STRETCHED', np.inf)
+    by_side = times_wrong()
     monkeypatch.setattr(consistency, 'PULLED', np.inf)
-    without = wrong_and_sure(fed(drive, PoseFilter(FilterConfig(), correlation)))
+    without = times_wrong()
     assert without > 50
-    assert sure < 0.1 * without
+    assert both <= by_side < 0.1 * without
+
+
+@pytest.mark.parametrize('share', [0.0, 0.7])
+def test_many_weak_images_make_no_sure_estimate_where_they_err_alike(share):
+    """They may all be wrong for the same reason; sensors with white errors average out."""
+    drive = Poor(seconds=30, position_std=0.3, yaw_std=0.03)
+    correlation = ErrorCorrelation(share, 0.6)
+    found = fed(drive, PoseFilter(FilterConfig(), correlation))
+    statuses = [status for status, _, state in found if state.position_std < 0.4]
+    assert len(statuses) > 50
+    sure = np.mean([status.level is Level.LOCALISED for status in statuses])
+    if share == 0.0:
+        assert sure > 0.9
+        return
+    assert sure < 0.1
+    reason = 'single images show the position to no better than 0.5 m'
+    assert np.mean([reason in status.reasons for status in statuses]) > 0.9
+
+
+def test_one_good_image_among_weak_ones_is_enough_for_a_while():
+    drive = Poor(seconds=30, position_std=0.2, yaw_std=0.03)
+    fused = PoseFilter(FilterConfig(), ErrorCorrelation(0.7, 0.6))
+    fed(drive, fused)
+    assert fused.status.level is Level.DEGRADED
+    last_ns = int(drive.stamps_ns[-1])
+    covariance = np.diag([0.1**2, 0.1**2, 0.05**2])
+    fused.add_measurement(last_ns + 1, drive.poses[-1], covariance)
+    assert fused.status.level is Level.LOCALISED
 
 
 def test_constants_are_used(monkeypatch):

@@ -276,7 +276,18 @@ def test_contradictions_make_the_estimate_degraded_then_lost(memory, moved_m, le
 ])  # fmt: skip
 def test_silence_makes_the_estimate_degraded(silences_s, level):
     images_ns, odometry_ns = (round(5e9 - 1e9 * silence_s) for silence_s in silences_s)
-    belief = belief_at(accepted_ns=images_ns)._replace(stamp_ns=5 * SECOND, odometry_ns=odometry_ns)
+    belief = belief_at(accepted_ns=images_ns, precise_ns=images_ns)
+    belief = belief._replace(stamp_ns=5 * SECOND, odometry_ns=odometry_ns)
+    assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
+
+
+@pytest.mark.parametrize(
+    ('precise_ns', 'level'),
+    [(None, Level.DEGRADED), (round(1.9e9), Level.DEGRADED), (round(2.1e9), Level.LOCALISED)],
+)
+def test_weak_images_make_the_estimate_degraded_as_silence_does(precise_ns, level):
+    belief = belief_at(accepted_ns=5 * SECOND, precise_ns=precise_ns)
+    belief = belief._replace(stamp_ns=5 * SECOND, odometry_ns=5 * SECOND)
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
 
 

@@ -129,7 +129,8 @@ class Pull(NamedTuple):
 class Memory(NamedTuple):
     """The record of measurements: accepted ones, those rejected in a row, and where they lay.
 
-    `support` counts accepted images since the last start, `rejected` those outside the gate in a
+    `support` counts accepted images since the last start, and `precise_ns` is the stamp of the last
+    that shows the place well by itself; `rejected` those outside the gate in a
     row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
     images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`,
     `scatter`, the usual squared distance of images over that expected, and `period_s`, the usual
@@ -141,6 +142,7 @@ class Memory(NamedTuple):
     gate_excess: float = 0.0
     accepted_ns: int | None = None
     accepted_m: float = 0.0
+    precise_ns: int | None = None
     outage: bool = False
     doubt: tuple[float, float, float] = _NO_DOUBT
     evidence: tuple[Evidence, ...] = ()

@@ -97,13 +97,17 @@ class State:
     @property
     def position_std(self) -> float:
         """Standard deviation along the worst direction, m."""
-        a, b, c = self.covariance[0, 0], self.covariance[1, 1], self.covariance[0, 1]
-        largest = (a + b) / 2 + math.hypot((a - b) / 2, c)
-        return math.sqrt(max(float(largest), 0.0))
+        return largest_std(self.covariance)
 
     @property
     def yaw_std(self) -> float:
         return math.sqrt(max(float(self.covariance[YAW, YAW]), 0.0))
+
+
+def largest_std(covariance: Array) -> float:
+    """Standard deviation along the worst direction of x and y, the first rows of a covariance."""
+    a, b, c = covariance[0, 0], covariance[1, 1], covariance[0, 1]
+    return math.sqrt(max(float((a + b) / 2 + math.hypot((a - b) / 2, c)), 0.0))
 
 
 class Step(NamedTuple):

@@ -30,11 +30,22 @@ from sfa_localization.fusion.evidence import (
     relocate,
     remember,
 )
-from sfa_localization.fusion.motion import ERROR, SCALE, SIZE, YAW, Twist, V, wrap
+from sfa_localization.fusion.motion import (
+    ERROR,
+    SCALE,
+    SIZE,
+    YAW,
+    Twist,
+    V,
+    largest_std,
+    wrap,
+)
 from sfa_localization.fusion.settings import FilterConfig
 
 IMAGE_TIMEOUT_S = 3.0
 """Time without an accepted image that counts as an outage: many times any camera's period."""
+ALIKE_SHARE = 0.2
+"""Where neighbors share less of their errors, positions are those of a sensor with white errors."""
 BIAS_STD, SCALE_STD = 0.01, 0.03
 """Standard deviations of turn-rate bias (rad/s) and wheel scale before any is learned: data sheets
 of cheap gyroscopes, and the tolerance of a tire's diameter."""
@@ -67,7 +78,7 @@ class Recovery:
     def __init__(self, config: FilterConfig, correlation: ErrorCorrelation) -> None:
         self._config = config
         self._correlation = correlation
-        self.share, self.decorrelation_m = correlation.share, correlation.distance_m
+        self.alike, self.decorrelation_m = correlation.share >= ALIKE_SHARE, correlation.distance_m
 
     def blank(self, stamp_ns: int) -> Belief:
         """The belief before the first message, without a pose."""
@@ -83,6 +94,14 @@ class Recovery:
             odometry_ns=None,
             memory=Memory(),
         )
+
+    def precise_ns(self, belief: Belief, event: MeasurementEvent) -> int | None:
+        """When the last image came that shows the place well by itself, now that one is accepted.
+
+        Many weak ones together do not: what makes them weak is the same for all.
+        """
+        weak = self.alike and largest_std(event.covariance) > self._config.degraded_std
+        return belief.memory.precise_ns if weak else event.stamp_ns
 
     def placed(self, belief: Belief, event: PoseEvent) -> Belief:
         """The pose was set from outside: earlier images do not count any more."""
@@ -139,6 +158,7 @@ class Recovery:
             support=1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
+            precise_ns=self.precise_ns(belief, event),
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
             trust=moved(trust, belief.traveled_m, jump_m) if again else Trust(),
             scatter=belief.memory.scatter,

@@ -61,7 +61,8 @@ class FilterConfig(Settings):
     )
     degraded_std: float = setting(
         0.5,
-        'standard deviation of the position above which the state is DEGRADED',
+        'standard deviation of the position, or of all single images, above which the state is '
+        'DEGRADED',
         unit='m',
         low=1e-3,
         high=1e6,

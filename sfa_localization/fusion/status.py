@@ -65,7 +65,7 @@ def status_of(
         degraded.append(one if images == 1 else f'{images} images in a row did not match')
     # Only images confirm: what was driven since the last one, or before it came late, does not.
     degraded += doubts(memory.trust, memory.accepted_m, memory.pull)
-    degraded += _silences(belief)
+    degraded += _silences(belief, config)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'
         degraded.append(
@@ -107,14 +107,19 @@ def silence_limit_s(period_s: float) -> float:
     return min(max(SILENT_IMAGES * period_s, LEAST_SILENCE_S), IMAGE_TIMEOUT_S)
 
 
-def _silences(belief: Belief) -> list[str]:
+def _silences(belief: Belief, config: FilterConfig) -> list[str]:
     reasons = []
+    limit_s = silence_limit_s(belief.memory.period_s)
     if belief.memory.accepted_ns is None:
         reasons.append('no image has confirmed the start yet')
     else:
         silence_s = (belief.stamp_ns - belief.memory.accepted_ns) * 1e-9
-        if silence_s > silence_limit_s(belief.memory.period_s):
+        weak_s = (belief.stamp_ns - (belief.memory.precise_ns or 0)) * 1e-9
+        if silence_s > limit_s:
             reasons.append(f'no usable image for {silence_s:.0f} s')
+        elif weak_s > limit_s:
+            least_m = config.degraded_std
+            reasons.append(f'single images show the position to no better than {least_m:g} m')
     if belief.odometry_ns is None:
         reasons.append('no odometry')
     else:

@@ -46,9 +46,6 @@ OUTLYING_SHARE = 0.8
 """Images farther off than this share of the usual ones lose weight, with the fourth power of their
 distance: errors of images have heavy tails, and those of neighbors are alike. Of images that err as
 they claim, the fifth that loses weight loses little."""
-ALIKE_SHARE = 0.2
-"""Where neighbors share less of their errors, positions are those of a sensor with white errors:
-they keep their weight inside the gate."""
 SCATTER_STEP = 0.05
 """Relative change of the usual distance per image: it is learned over about twenty images."""
 LEAST_SCATTER = 0.05
@@ -144,7 +141,11 @@ class Correction:
         memory = belief.memory._replace(evidence=evidence, update=update)
         if not near:
             return belief._replace(memory=memory)
-        memory = memory._replace(accepted_ns=event.stamp_ns, accepted_m=belief.traveled_m)
+        memory = memory._replace(
+            accepted_ns=event.stamp_ns,
+            accepted_m=belief.traveled_m,
+            precise_ns=self._recovery.precise_ns(belief, event),
+        )
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
     def _gated(self, belief: Belief, event: MeasurementEvent) -> Belief:
@@ -163,6 +164,7 @@ class Correction:
             support=belief.memory.support + 1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
+            precise_ns=self._recovery.precise_ns(belief, event),
             evidence=remember(belief, event, accepted=True),
             update=update,
             trust=belief.memory.trust,
@@ -171,7 +173,7 @@ class Correction:
             pull=_pull(belief, event),
         )
         outlying = d2 / (belief.memory.scatter * _OUTLYING[event.value.size])
-        if outlying > 1 and self._recovery.share >= ALIKE_SHARE:
+        if outlying > 1 and self._recovery.alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, belief.covariance, lighter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
