@@ -3,6 +3,7 @@
 """Parameters from settings, message conversions, and the life cycle that all nodes share."""
 
 import dataclasses
+import gc
 import math
 from dataclasses import dataclass
 
@@ -250,6 +251,25 @@ def test_a_node_survives_its_whole_life_cycle_twice(make):
         assert node.start() and node.active
     node.trigger_shutdown()
     assert not node.active
+
+
+def test_a_node_that_ends_leaves_ros_without_waiting_for_the_garbage_collection():
+    """Else it is listed on, and the middleware ends it at any moment, while others start."""
+    domain = free_domain()
+    watching, running = Bench(domain), Bench(domain)
+    gc.disable()
+    try:
+        node = running.run(EkfNode)
+        assert until(lambda: 'ekf_node' in watching.node.get_node_names())
+        running.executor.remove_node(node)
+        running.nodes.remove(node)
+        node.destroy_node()
+        assert until(lambda: 'ekf_node' not in watching.node.get_node_names(), 10.0)
+        node.destroy_node()
+    finally:
+        gc.enable()
+        running.close()
+        watching.close()
 
 
 class Failing(LocalizationNode):

@@ -358,6 +358,15 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._drop()
         return super().on_error(state)
 
+    def destroy_node(self) -> None:
+        """End the node, and leave ROS at once.
+
+        rclpy's state machine would keep the node until the garbage collection; where that comes
+        while others start, the middleware may wait for itself.
+        """
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def _drop(self) -> None:
         self.teardown()
         for destroy, entity in reversed(self._entities):
