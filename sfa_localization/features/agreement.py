@@ -64,7 +64,6 @@ class Agreement:
         inside the 50 % region and 95 % inside the 95 % region, whichever needs more. `weight`
         (M,) is how much each image counts; without it, all count alike.
         """
-        weight = np.ones(len(disagreement)) if weight is None else weight
         typical = quantile(disagreement, 0.5, weight)
         relative = _relative(disagreement, typical)
         exponent = min(
@@ -88,7 +87,7 @@ def _relative(disagreement: Array, typical: float) -> Array:
     return np.asarray(np.clip(disagreement / max(typical, 1e-9), *_LIMITS))
 
 
-def _surprise(squared_error: Array, variance: Array, axes: int, weight: Array) -> float:
+def _surprise(squared_error: Array, variance: Array, axes: int, weight: Array | None) -> float:
     """Mean negative log-likelihood of heavy-tailed errors at their best common scale."""
     ratio = squared_error / variance
     scale = quantile(ratio, 0.5, weight) / stats.chi2.ppf(0.5, axes) + 1e-300
@@ -96,7 +95,7 @@ def _surprise(squared_error: Array, variance: Array, axes: int, weight: Array) -
     return float(np.average(tails + axes / 2 * np.log(variance * scale), weights=weight))
 
 
-def needed_factor(ratio: Array, axes: int, weight: Array) -> float:
+def needed_factor(ratio: Array, axes: int, weight: Array | None = None) -> float:
     """Factor on variances for which half of the errors fall inside the 50 % region, and 95 %
     inside the 95 % region, whichever needs more.
 
@@ -114,8 +113,12 @@ def share_within(ratio: Array, axes: int, share: float, weight: Array) -> float:
     return float(np.average(ratio <= stats.chi2.ppf(share, axes), weights=weight))
 
 
-def quantile(values: Array, share: float, weight: Array) -> float:
-    """Smallest of the values (M,) that at least this share, by weight (M,), does not exceed."""
+def quantile(values: Array, share: float, weight: Array | None = None) -> float:
+    """Smallest of the values (M,) that at least this share, by weight (M,), does not exceed.
+
+    Without `weight`, all count alike.
+    """
+    weight = np.ones(len(values)) if weight is None else weight
     order = np.argsort(values, kind='stable')
     below = np.cumsum(weight[order])
     at = int(np.searchsorted(below, share * below[-1]))

@@ -120,13 +120,12 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
         return MatchNoise()
     noise, variance = _likeliest(trials)
     squared = np.array([trial.squared_error for trial in trials])
-    alike = np.ones(len(trials))
     lowest = max(LOWEST, LOWEST_SHARE * float(np.median([trial.score for trial in trials])))
     turns = [trial.turn / (1 + trial.nearby.unlike) for trial in trials]
     crossings = [trial for trial in trials if trial.crossed]
     return dataclasses.replace(
         _usual(crossings, noise, lowest) if crossings else noise,
-        factor=max(needed_factor(squared / variance, 2, alike), 1.0),
+        factor=max(needed_factor(squared / variance, 2), 1.0),
         yaw_std=max(MEDIAN_TO_STD * float(np.median(turns)), _LEAST_YAW_STD),
         lowest=lowest,
     )
@@ -134,14 +133,13 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
 
 def _usual(trials: Sequence[_Trial], noise: MatchNoise, lowest: float) -> MatchNoise:
     """The noise with what is usual at places that were left out where tracks cross."""
-    alike = np.ones(len(trials))
     variation = np.maximum([trial.nearby.variation for trial in trials], 1e-6)
     ratio = np.array([trial.nearby.unlike for trial in trials]) / variation**2
-    usual = quantile(np.array([trial.score for trial in trials]), _USUAL_SHARE, alike)
+    usual = quantile(np.array([trial.score for trial in trials]), _USUAL_SHARE)
     return dataclasses.replace(
         noise,
         usual=max(usual, lowest + _LEAST_RANGE),
-        by_variation=max(quantile(ratio, _ALIKE_SHARE, alike), _LEAST_BY_VARIATION),
+        by_variation=max(quantile(ratio, _ALIKE_SHARE), _LEAST_BY_VARIATION),
     )
 
 
