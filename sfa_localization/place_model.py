@@ -172,15 +172,16 @@ class View:
         """How far both are apart, see `Match.distance`; NaN where one of them is unknown."""
         if not self.known:
             return np.nan
+        covariance = self.match.widened(self.covariance, self.noise)
         try:
-            return self.match.distance(self.position, self.covariance[:2, :2])
+            return self.match.distance(self.position, covariance[:2, :2])
         except np.linalg.LinAlgError:
             return np.nan
 
     def estimate(self, factor: float = 1.0) -> Estimate:
         """Both together, with a `factor` on the variances of slow features."""
         novelty = self.noise.novelty(self.match.score)
-        claimed = self.covariance * factor
+        claimed = self.match.widened(self.covariance * factor, self.noise)
         try:
             position, yaw, covariance = self.match.combined(
                 self.position, float(self.yaw), claimed, self.noise

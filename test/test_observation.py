@@ -128,7 +128,7 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
 
 def test_a_view_without_a_finite_estimate_is_no_error():
     """Two estimates that are certain beyond all numbers have no mean."""
-    match = Match(np.zeros(3), np.zeros((3, 3)), 0.9, 0.0, NEARBY)
+    match = Match(np.zeros(3), np.zeros((3, 3)), 0.9, 0.0, NEARBY, 0.0)
     view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise(), np.zeros(2))
     assert math.isnan(view.distance)
     estimate = view.estimate()
@@ -138,7 +138,7 @@ def test_a_view_without_a_finite_estimate_is_no_error():
 def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
     center, place = np.array([1.0, 2.0]), np.array([11.0, 2.0])
     own = np.diag([0.01, 0.01, 0.001])
-    match = Match(np.append(place, 0.0), own, 0.9, 0.0, NEARBY)
+    match = Match(np.append(place, 0.0), own, 0.9, 0.0, NEARBY, 0.0)
     noise = MatchNoise()
     at_border = View(np.zeros(2), place, 0.0, own, match, noise, center).estimate()
     at_center = View(np.zeros(2), place, 0.0, own, match, noise, place).estimate()
@@ -153,7 +153,7 @@ class InOtherLight(PictureReader):
         nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05)
         noise = MatchNoise(floor_m=0.02, slope_m=0.4)
         own = np.diag([noise.variance(0.6) + 1e-4] * 2 + [0.01])
-        match = Match(np.zeros(3), own, 0.7, 0.0, nearby)
+        match = Match(np.zeros(3), own, 0.7, 0.0, nearby, noise.by_place(0.6))
         unknown = np.diag([1e4, 1e4, 3.0])
         return [View(np.zeros(2), np.zeros(2), 0.0, unknown, match, noise, np.zeros(2))] * len(
             images
@@ -167,6 +167,21 @@ def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
     assert std[0] == pytest.approx(np.hypot(0.24, 0.0224), rel=0.02)
     assert np.all(np.diff(std) < 1e-6) and 0.02 < std[-1] < 0.3 * std[0]
     assert 0.4 < observer.other_light < 0.6
+
+
+def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
+    """Beside the trained area both extrapolate; in another light, where keyframes are near, not."""
+    noise = MatchNoise(floor_m=0.02, slope_m=1.4)
+    nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05)
+    own = np.diag([noise.variance(noise.by_place(0.6))] * 2 + [0.01])
+    match = Match(np.zeros(3), own, 0.75, 0.0, nearby, noise.by_place(0.6))
+    sure, beside = np.diag([0.1**2, 0.1**2, 0.01]), np.array([0.3, 0.0])
+    view = View(np.zeros(2), beside, 0.0, sure, match, noise, np.zeros(2))
+    outside, in_light = view.estimate(), view.in_light(0.58).estimate()
+    by_place_m = 1.4 * noise.by_place(0.6)
+    assert np.sqrt(outside.covariance[0, 0]) == pytest.approx(0.45 * by_place_m, rel=0.1)
+    assert np.sqrt(in_light.covariance[0, 0]) < 0.1
+    assert np.hypot(*outside.position) < 0.9 * np.hypot(*beside)
 
 
 def test_another_model_may_know_the_light():

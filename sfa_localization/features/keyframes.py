@@ -55,6 +55,9 @@ LOWEST, LOWEST_SHARE = 0.42, 0.5
 _PARALLAX_RAD = 0.3
 # Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
 _DOUBT = 4.0
+# Slow features extrapolate from the same image: they lack so much of what its place adds to the
+# standard deviation of a match. (Between keyframes, where it adds little, this changes little.)
+_SLOW_SHARE = 0.5
 # Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
 _APART = 6.0
 
@@ -89,13 +92,15 @@ class MatchNoise:
         floor, yaw_std = np.hypot(self.floor_m, common_m), np.hypot(self.yaw_std, turn_std)
         return replace(self, floor_m=float(floor), yaw_std=float(yaw_std))
 
-    def variance(self, unlike: float, light: float = 0.0) -> float:
-        """Variance m^2 of a position along each axis, of an image that is so unlike, and the more
-        so because of its `light`; of one that is less usual than the left-out ones `novelty` says
-        the rest.
+    def by_place(self, unlike: float, light: float = 0.0) -> float:
+        """How unlike the place makes an image that is so unlike, and the more so because of its
+        `light`; of one that is less usual than the left-out ones `novelty` says the rest.
         """
-        by_place = max((1 + unlike) / (1 + light) - 1, 0.0)
-        return self.floor_m**2 + (self.slope_m * min(by_place, _unlike(self.usual))) ** 2
+        return min(max((1 + unlike) / (1 + light) - 1, 0.0), _unlike(self.usual))
+
+    def variance(self, by_place: float) -> float:
+        """Variance m^2 of a position along each axis, where the place makes images so unlike."""
+        return self.floor_m**2 + (self.slope_m * by_place) ** 2
 
     def expected_unlike(self, variation: float) -> float:
         """How unlike an image in the light of the keyframes is, among such that vary so much."""
@@ -114,7 +119,7 @@ class Match:
     `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
     with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
     near a guess minus `score`, in temperatures: 0 where the best is among them; `nearby` is what
-    the keyframes around the best one say.
+    the keyframes around the best one say, and `by_place` how unlike the place makes the image.
     """
 
     pose: Array
@@ -122,16 +127,25 @@ class Match:
     score: float
     support: float
     nearby: Nearby
+    by_place: float
 
     def in_light(self, light: float, noise: MatchNoise) -> Match:
         """The same where the image is known to be so unlike because of its light, by itself: that
         moves places less than what is unlike because no keyframe is near.
         """
-        unlike = self.nearby.unlike
-        less = noise.variance(unlike, light) - noise.variance(unlike)
+        by_place = noise.by_place(self.nearby.unlike, light)
+        less = noise.variance(by_place) - noise.variance(self.by_place)
         covariance = self.covariance.copy()
         covariance[:2, :2] += noise.factor * less * np.eye(2)
-        return replace(self, covariance=covariance)
+        return replace(self, covariance=covariance, by_place=by_place)
+
+    def widened(self, covariance: Array, noise: MatchNoise) -> Array:
+        """The covariance (3, 3) of slow features, with what they lack where the place makes the
+        image unlike.
+        """
+        wider = covariance.copy()
+        wider[:2, :2] += (_SLOW_SHARE * noise.slope_m * self.by_place) ** 2 * np.eye(2)
+        return wider
 
     def distance(self, position: Array, covariance: Array) -> float:
         """Half the squared Mahalanobis distance from another estimate's position (2,) m, with its
@@ -381,7 +395,8 @@ class Keyframes:
         offset = self.elsewhere(scores, found.place, reach)
         apart = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
         apart[(apart < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
-        variance = self.noise.variance(found.unlike)
+        by_place = self.noise.by_place(found.unlike)
+        variance = self.noise.variance(by_place)
         scatter = (offset * weight[:, None]).T @ offset
         covariance = np.zeros((3, 3))
         covariance[:2, :2] = self.noise.factor * (variance * np.eye(2) + found.noise + scatter)
@@ -393,7 +408,7 @@ class Keyframes:
             if len(near):
                 support = float(near.max() - scores[best]) / self.noise.temperature
         pose = np.array([*found.place, wrap_angle(yaw)])
-        return Match(pose, covariance, float(scores[best]), support, found)
+        return Match(pose, covariance, float(scores[best]), support, found, by_place)
 
     def _regressed(
         self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array, reach: float

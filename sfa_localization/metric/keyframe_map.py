@@ -82,7 +82,7 @@ def _judged(
         row, place = rows[k], keyframes.poses[k, :2]
         guess = place + result.left_out[row]
         match = keyframes.located(keyframes.spectra[k], scores, shifts, guess)
-        claimed = np.diag([variance[row], variance[row], 1.0])
+        claimed = match.widened(np.diag([variance[row], variance[row], 1.0]), keyframes.noise)
         found, _, covariance = match.combined(guess, np.nan, claimed, keyframes.noise)
         errors.append(found - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)
