@@ -26,7 +26,7 @@ from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
-from sfa_localization.place_model import Estimate, PlaceModel, View
+from sfa_localization.place_model import Estimate, PlaceModel, View, require_panorama
 
 UNKNOWN_VARIANCE = 1e6
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
@@ -118,6 +118,7 @@ class Observer:
 
     def _require_size(self, panorama: Image) -> None:
         size = self.model.panorama
+        require_panorama(panorama)
         if panorama.shape[:2] != (size.height, size.width):
             height, width = panorama.shape[:2]
             raise ModelError(

@@ -226,12 +226,9 @@ class PlaceModel:
     def locate(self, panorama: Image) -> Estimate:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
 
-        Raises ModelError when its size is not `self.panorama`'s.
+        Raises ModelError when it is none, or its size is not `self.panorama`'s.
         """
-        if panorama.ndim != 3 or panorama.dtype != np.uint8:
-            raise ModelError(
-                f'a panorama is (H, W, 3) uint8, not {panorama.shape} {panorama.dtype}'
-            )
+        require_panorama(panorama)
         return self.locate_all(panorama[None])[0]
 
     def locate_all(self, panoramas: Image) -> list[Estimate]:
@@ -363,6 +360,16 @@ class PlaceModel:
             ErrorCorrelation(**header['error_correlation']),
             Refinement.from_arrays(refinement) if refinement else None,
         )
+
+
+def require_panorama(image: object) -> None:
+    """Raise ModelError for anything but an array (H, W, 3) uint8."""
+    found = type(image).__name__
+    if isinstance(image, np.ndarray):
+        found = f'{image.shape} {image.dtype}'
+        if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+            return
+    raise ModelError(f'a panorama is (H, W, 3) uint8, not {found}')
 
 
 def _damaged(path: Path, reason: str) -> ModelError:

@@ -219,6 +219,36 @@ def test_while_images_repeat_the_filter_is_never_sure_and_wrong(kind):
     assert found[95][0].level is Level.LOCALISED and found[-1][1] < 0.5
 
 
+def test_a_start_from_images_alone_is_confirmed_by_driving():
+    drive = Drive(seconds=10, **NOISY)
+    levels = [status.level for status, *_ in fed(drive)]
+    steps = np.diff(drive.poses[:, :2], axis=0, prepend=drive.poses[:1, :2])
+    driven = np.cumsum(np.hypot(*steps.T))
+    confirmed = driven[drive.pictures] > AGREEING_DISTANCE_M + 0.5
+    assert set(levels[: np.argmax(confirmed) - 8]) == {Level.DEGRADED}
+    assert {level for level, sure in zip(levels, confirmed, strict=True) if sure} == {
+        Level.LOCALISED
+    }
+
+
+def test_a_start_that_was_given_needs_images_only():
+    drive = Drive(seconds=2, **NOISY)
+    levels = [status.level for status, *_ in fed(drive, PoseFilter(FilterConfig(
+        initial_pose=(0.0, 0.0, 0.0))))]  # fmt: skip
+    assert levels[-1] is Level.LOCALISED and levels.count(Level.LOCALISED) > 0.9 * len(levels)
+
+
+@pytest.mark.parametrize('standing_s', [0, 8])
+@pytest.mark.parametrize(('degrees', 'at_most_s'), [(25, 1.0), (40, 0.0)])
+def test_a_camera_that_was_turned_before_the_start_shows_by_driving(standing_s, degrees, at_most_s):
+    twists = np.zeros((50 * (standing_s + 20), 2))
+    twists[50 * standing_s :] = [0.7, 0.1]
+    drive = Drive(twists=twists, **NOISY)
+    drive.seen[:, 2] += math.radians(degrees)
+    sure = [status.level is Level.LOCALISED for status, *_ in fed(drive)]
+    assert 0.1 * sum(sure) <= at_most_s
+
+
 def test_after_a_knock_of_the_camera_the_filter_is_not_sure():
     drive = Drive(seconds=40, **NOISY)
     drive.seen[100:, 2] = wrap_angle(drive.seen[100:, 2] + math.radians(35))

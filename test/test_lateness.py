@@ -16,6 +16,8 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level
 
 HZ, EVERY = 25, 5
+CONFIRMED_S = 3.0
+"""By then driving has confirmed where an image put the robot."""
 NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.08, 'yaw_std': 0.02, 'rate_hz': HZ}
 COVARIANCE = np.diag([0.05**2, 0.05**2, 0.01**2])
 
@@ -64,7 +66,7 @@ def sure_and_wrong_s(found):
 def test_images_in_time_are_never_suspected(omega, seed):
     _, found = driven(drive_of(omega, seed=seed), lambda t: t)
     assert max(late.apart for *_, late in found) < 0.3
-    assert all(level is Level.LOCALISED for _, level, *_ in found)
+    assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > CONFIRMED_S)
 
 
 @pytest.mark.parametrize('rate', [0.1, 0.15, 0.2])

@@ -16,7 +16,7 @@ from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.features.keyframes import Match, MatchNoise
 from sfa_localization.features.nearby import Nearby
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.localizer import Observer, unusable_covariance
+from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import View
 
 NEARBY = Nearby(np.zeros(2), 0.0, 0.1, np.zeros((2, 2)), 0.1)
@@ -115,6 +115,16 @@ def test_in_batches_and_one_by_one_images_are_judged_alike():
     assert {text.split()[2].rstrip(':') for text in found} == {
         'dark', 'covered', 'frozen', 'unlike'
     }  # fmt: skip
+
+
+@pytest.mark.parametrize('image', [
+    None, 'image', b'bytes', [[1, 2, 3]], np.zeros((4, 8)), np.zeros((4, 8, 4), np.uint8),
+    np.zeros((4, 8, 3), np.float32), np.zeros((4, 8, 3), np.uint16), np.array([None]),
+])  # fmt: skip
+def test_what_is_no_panorama_is_one_error(image):
+    localizer = Localizer(PictureReader())
+    with pytest.raises(ModelError, match=r'a panorama is \(H, W, 3\) uint8, not '):
+        localizer.add_panorama(1, image)
 
 
 def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp():

@@ -281,6 +281,15 @@ def test_silence_makes_the_estimate_degraded(silences_s, level):
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
 
 
+@pytest.mark.parametrize(('waited_s', 'level'), [(0.9, Level.LOCALISED), (1.1, Level.DEGRADED)])
+def test_of_a_slow_camera_the_first_image_that_contradicts_counts(waited_s, level):
+    """NOTICED_S after the last one that fitted; sooner it may be an outlier."""
+    images_ns = round(5e9 - 1e9 * waited_s)
+    belief = belief_at(accepted_ns=images_ns, precise_ns=images_ns, support=9, rejected=1)
+    belief = belief._replace(stamp_ns=5 * SECOND, odometry_ns=5 * SECOND)
+    assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
+
+
 @pytest.mark.parametrize(
     ('precise_ns', 'level'),
     [(None, Level.DEGRADED), (round(1.9e9), Level.DEGRADED), (round(2.1e9), Level.LOCALISED)],

@@ -75,6 +75,11 @@ def moved(trust: Trust, traveled_m: float, jump_m: float = 0.0) -> Trust:
     )
 
 
+def begun(traveled_m: float) -> Trust:
+    """The trust in a start from an image alone: it may be of another place, or look elsewhere."""
+    return Trust(moved_m=traveled_m, confirming_m=AGREEING_DISTANCE_M)
+
+
 def pulled(pull: Pull | None, traveled_m: float, offset_m: complex, variance: float) -> Pull:
     """After another accepted image, at an offset x + i y of this variance m^2 along each axis."""
     if pull is None:
@@ -94,10 +99,11 @@ def doubts(trust: Trust, accepted_m: float, pull: Pull | None = None) -> list[st
     found = [trust.problem] if trust.problem else []
     if pull is not None and pull.suspected:
         found.append(f'images lie {abs(pull.offset_m):.1f} m to one side of the estimate')
-    if trust.moves and trust.unconfirmed(accepted_m):
+    if trust.unconfirmed(accepted_m):
         since_m = accepted_m - trust.moved_m
         times = f' {trust.moves} times in a row' if trust.moves > 1 else ''
-        found.append(f'placed anew{times}, confirmed over {since_m:.1f} m: driving on confirms it')
+        again = f' anew{times}' if trust.moves else ''
+        found.append(f'placed{again}, confirmed over {since_m:.1f} m: driving on confirms it')
     return found
 
 

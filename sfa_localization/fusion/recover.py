@@ -20,7 +20,7 @@ from sfa_localization.fusion.belief import (
     Update,
     capped,
 )
-from sfa_localization.fusion.consistency import moved
+from sfa_localization.fusion.consistency import begun, moved
 from sfa_localization.fusion.evidence import (
     AGREEING_DISTANCE_M,
     ENOUGH_IMAGES,
@@ -150,22 +150,28 @@ class Recovery:
         found: MeasurementEvent | Relocation,
         reason: str,
     ) -> Belief:
-        pose = found.pose if isinstance(found, Relocation) else found.value
-        trust = belief.memory.trust
-        jump_m = math.hypot(*(pose[:2] - belief.mean[:2])) if belief.located else 0.0
-        again = belief.located or trust.moves > 0
+        pose = _pose_of(found)
         memory = Memory(
             support=1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
             precise_ns=self.precise_ns(belief, event),
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
-            trust=moved(trust, belief.traveled_m, jump_m) if again else Trust(),
+            trust=self._trust(belief, found),
             scatter=belief.memory.scatter,
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
         return placed._replace(memory=memory)
+
+    @staticmethod
+    def _trust(belief: Belief, found: MeasurementEvent | Relocation) -> Trust:
+        """The trust in a pose that images alone give."""
+        trust, pose = belief.memory.trust, _pose_of(found)
+        if belief.located or trust.moves > 0:
+            jump_m = math.hypot(*(pose[:2] - belief.mean[:2])) if belief.located else 0.0
+            return moved(trust, belief.traveled_m, jump_m)
+        return Trust() if isinstance(found, Relocation) else begun(belief.traveled_m)
 
     def _widened(self, belief: Belief) -> Belief:
         """In doubt, the pose becomes less certain with every new place that contradicts it."""
@@ -209,6 +215,11 @@ def displaced(found: Relocation, mean: Array) -> bool:
     turn = abs(wrap(float(found.pose[YAW] - mean[YAW])))
     elsewhere = jump_m >= max(OBVIOUS_JUMP_M, OBVIOUS_STDS * found.position_std)
     return elsewhere or turn >= max(OBVIOUS_TURN_RAD, OBVIOUS_STDS * found.yaw_std)
+
+
+def _pose_of(found: MeasurementEvent | Relocation) -> Array:
+    """The pose (2 or 3,) of an image, or where agreeing ones put the robot."""
+    return found.pose if isinstance(found, Relocation) else found.value
 
 
 def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Belief:

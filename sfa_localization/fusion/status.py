@@ -23,6 +23,8 @@ SILENT_IMAGES, LEAST_SILENCE_S = 6.0, 1.5
 """Images that stay away for so many of their usual periods are missed, but not before 1.5 s, in
 which a robot goes about as many meters, and after IMAGE_TIMEOUT_S at the latest: meanwhile the
 robot may be towed, held or carried away, and nothing shows it."""
+NOTICED_S = 1.0
+"""Images that contradict for so long are no outliers, however few: a jump is noticed by then."""
 LOST_M, LOST_RAD = 1.0, 0.3
 """Images that contradict by less leave the estimate near enough to find a way by."""
 LOST_EXCESS, LOST_DISTANCE_M = 4.0, 0.5
@@ -59,7 +61,7 @@ def status_of(
     if config.degraded_std < state.position_std <= config.lost_std:
         degraded.append(f'position known to {state.position_std:.1f} m only')
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
-    if memory.rejected >= (FEW_IMAGES if memory.support >= FEW_IMAGES else 1):
+    if memory.rejected >= _few(belief):
         images = memory.rejected
         one = 'an image did not match'
         degraded.append(one if images == 1 else f'{images} images in a row did not match')
@@ -73,6 +75,13 @@ def status_of(
         )
     level = Level.LOST if lost else Level.DEGRADED if degraded else Level.LOCALISED
     return Status(level, (*lost, *degraded))
+
+
+def _few(belief: Belief) -> int:
+    """How many rejected images in a row are no outliers; of slow cameras the first counts."""
+    memory = belief.memory
+    waited_s = (belief.stamp_ns - (memory.accepted_ns or 0)) * 1e-9
+    return FEW_IMAGES if memory.support >= FEW_IMAGES and waited_s < NOTICED_S else 1
 
 
 def uncertainty(state: State, config: FilterConfig) -> list[str]:
