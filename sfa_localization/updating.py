@@ -119,6 +119,9 @@ def new_views(
 
     Raises DataError where the robot is never LOCALISED, and ModelError for images of another size.
     """
+    config = config or FilterConfig()
+    # Images that are weak are those to learn; whether their places are certain shows afterwards.
+    config = replace(config, degraded_std=config.lost_std)
     localizer = Localizer(model, config, watch, Smoother)
     seen, sure = [], []
     with progress_bar(f'replay {run.name}', len(run.panoramas), shown=progress) as bar:

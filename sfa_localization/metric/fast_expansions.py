@@ -70,8 +70,8 @@ def map_from_arrays(arrays: Arrays) -> Predictor:
     kinds = {'gp': FastProcess, 'monomials': MetricMap}
     try:
         return kinds[str(arrays['kind'])].from_arrays(arrays)
-    except KeyError:
-        raise ModelError('the arrays of the metric map are not those of its kind') from None
+    except KeyError as error:
+        raise ModelError(f'the metric map lacks {error}, or is of another kind') from None
 
 
 @dataclass(frozen=True, slots=True)
