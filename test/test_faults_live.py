@@ -24,9 +24,11 @@ def verdicts(name, *ways):
 
 @pytest.mark.parametrize('node', NODES)
 def test_a_node_that_ends_and_comes_back_is_no_harm(node):
-    """The others go on; only the filter's own end is one of the estimate."""
+    """The others go on; only the filter's own end is one of the estimate, and driving two meters
+    confirms where images put it then."""
     (verdict,) = verdicts(f'{node} restarted', played)
-    assert verdict.false_s == 0.0 and verdict.recovered_s < 1.0
+    assert verdict.false_s == 0.0
+    assert verdict.recovered_s < (3.0 if node == 'ekf_node' else 1.0)
     assert verdict.max_m < 0.5
 
 
