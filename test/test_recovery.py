@@ -266,7 +266,7 @@ def test_the_memory_is_bounded_and_its_newer_half_complete():
 def test_contradictions_make_the_estimate_degraded_then_lost(memory, moved_m, level):
     if memory['rejected'] >= 5:
         memory = {'doubt': (1.0, 1.0, 0.0), **memory}
-    belief = belief_at(accepted_ns=SECOND, **memory)
+    belief = belief_at(accepted_ns=SECOND, precise_ns=SECOND, **memory)
     belief = belief._replace(traveled_m=moved_m, odometry_ns=SECOND)
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
 

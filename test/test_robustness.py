@@ -140,12 +140,12 @@ def test_the_nodes_start_in_any_order(bench, model, order):
         kind, parameters = NODES[name]
         bench.run(kind, **parameters)
 
-    def localised():
+    def placed():
         send()
         # The robot stands: driving would confirm where the images put it.
         return poses and states and states[-1].data.startswith('DEGRADED: placed, confirmed')
 
-    assert until(localised), states
+    assert until(placed), states
     position = poses[-1].pose.pose.position
     assert (position.x, position.y) == pytest.approx((7, 3), abs=0.05)
 

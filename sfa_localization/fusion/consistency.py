@@ -132,7 +132,7 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     # Neighboring images err alike, over about a meter.
     dependence = max(1.0, len(recent) / (1 + span_m))
     factor, spread = _stretch(path[agree], places[agree], variance[agree], dependence)
-    stretch, std = abs(factor) - 1, math.hypot(math.sqrt(spread), ODOMETRY_DRIFT)
+    stretch, std = abs(factor) - 1, math.sqrt(spread + ODOMETRY_DRIFT**2)
     if abs(stretch) > max(STRETCHED, CHANCE_STDS * std):
         shown = f'images move {abs(factor):.1f} times as far as the odometry'
         return shown, (abs(stretch) * span_m, 0.0)

@@ -150,28 +150,19 @@ class Recovery:
         found: MeasurementEvent | Relocation,
         reason: str,
     ) -> Belief:
-        pose = _pose_of(found)
+        pose = found.pose if isinstance(found, Relocation) else found.value
         memory = Memory(
             support=1,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
             precise_ns=self.precise_ns(belief, event),
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
-            trust=self._trust(belief, found),
+            trust=_trust(belief, pose, relocated=isinstance(found, Relocation)),
             scatter=belief.memory.scatter,
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
         return placed._replace(memory=memory)
-
-    @staticmethod
-    def _trust(belief: Belief, found: MeasurementEvent | Relocation) -> Trust:
-        """The trust in a pose that images alone give."""
-        trust, pose = belief.memory.trust, _pose_of(found)
-        if belief.located or trust.moves > 0:
-            jump_m = math.hypot(*(pose[:2] - belief.mean[:2])) if belief.located else 0.0
-            return moved(trust, belief.traveled_m, jump_m)
-        return Trust() if isinstance(found, Relocation) else begun(belief.traveled_m)
 
     def _widened(self, belief: Belief) -> Belief:
         """In doubt, the pose becomes less certain with every new place that contradicts it."""
@@ -217,9 +208,13 @@ def displaced(found: Relocation, mean: Array) -> bool:
     return elsewhere or turn >= max(OBVIOUS_TURN_RAD, OBVIOUS_STDS * found.yaw_std)
 
 
-def _pose_of(found: MeasurementEvent | Relocation) -> Array:
-    """The pose (2 or 3,) of an image, or where agreeing ones put the robot."""
-    return found.pose if isinstance(found, Relocation) else found.value
+def _trust(belief: Belief, pose: Array, *, relocated: bool) -> Trust:
+    """The trust in a pose (3,) of an image alone, or where agreeing ones `relocated` the robot."""
+    trust = belief.memory.trust
+    if belief.located or trust.moves > 0:
+        jump_m = math.hypot(*(pose[:2] - belief.mean[:2])) if belief.located else 0.0
+        return moved(trust, belief.traveled_m, jump_m)
+    return Trust() if relocated else begun(belief.traveled_m)
 
 
 def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Belief:

@@ -80,8 +80,8 @@ def status_of(
 def _few(belief: Belief) -> int:
     """How many rejected images in a row are no outliers; of slow cameras the first counts."""
     memory = belief.memory
-    waited_s = (belief.stamp_ns - (memory.accepted_ns or 0)) * 1e-9
-    return FEW_IMAGES if memory.support >= FEW_IMAGES and waited_s < NOTICED_S else 1
+    lately = _silent_s(belief, memory.accepted_ns) < NOTICED_S
+    return FEW_IMAGES if memory.support >= FEW_IMAGES and lately else 1
 
 
 def uncertainty(state: State, config: FilterConfig) -> list[str]:
@@ -116,23 +116,25 @@ def silence_limit_s(period_s: float) -> float:
     return min(max(SILENT_IMAGES * period_s, LEAST_SILENCE_S), IMAGE_TIMEOUT_S)
 
 
+def _silent_s(belief: Belief, last_ns: int | None) -> float:
+    """Time since the last of something; infinite where there was none."""
+    return math.inf if last_ns is None else (belief.stamp_ns - last_ns) * 1e-9
+
+
 def _silences(belief: Belief, config: FilterConfig) -> list[str]:
-    reasons = []
-    limit_s = silence_limit_s(belief.memory.period_s)
-    if belief.memory.accepted_ns is None:
+    reasons, memory = [], belief.memory
+    limit_s, least_m = silence_limit_s(memory.period_s), config.degraded_std
+    images_s, odometry_s = (
+        _silent_s(belief, last_ns) for last_ns in (memory.accepted_ns, belief.odometry_ns)
+    )
+    if memory.accepted_ns is None:
         reasons.append('no image has confirmed the start yet')
-    else:
-        silence_s = (belief.stamp_ns - belief.memory.accepted_ns) * 1e-9
-        weak_s = (belief.stamp_ns - (belief.memory.precise_ns or 0)) * 1e-9
-        if silence_s > limit_s:
-            reasons.append(f'no usable image for {silence_s:.0f} s')
-        elif weak_s > limit_s:
-            least_m = config.degraded_std
-            reasons.append(f'single images show the position to no better than {least_m:g} m')
+    elif images_s > limit_s:
+        reasons.append(f'no usable image for {images_s:.0f} s')
+    elif _silent_s(belief, memory.precise_ns) > limit_s:
+        reasons.append(f'single images show the position to no better than {least_m:g} m')
     if belief.odometry_ns is None:
         reasons.append('no odometry')
-    else:
-        silence_s = (belief.stamp_ns - belief.odometry_ns) * 1e-9
-        if silence_s > ODOMETRY_TIMEOUT_S:
-            reasons.append(f'no odometry for {silence_s:.1f} s')
+    elif odometry_s > ODOMETRY_TIMEOUT_S:
+        reasons.append(f'no odometry for {odometry_s:.1f} s')
     return reasons
