@@ -92,14 +92,14 @@ def _expit(logit: Array) -> Array:
 EXPECTED = Noise(*map(np.array, (1.0, 1.0, 1.0, NEARLY_WHITE, 1.0, 0.0)))
 """The noise that the parameters suppose, with white errors of positions."""
 # Odometry may be several times better or worse than the parameters suppose; stated variances of
-# positions are mostly right; what lags by more than half a second would be noticed.
+# positions are mostly right; real wheels lag behind their readings by up to half a second.
 _SCALES = {
     'turn': _Scale(np.log, np.exp, 1.5),
     'speed': _Scale(np.log, np.exp, 1.5),
     'position': _Scale(np.log, np.exp, 0.5),
     'share': _Scale(_logit, _expit, 1.5),
     'distance_m': _Scale(np.log, np.exp, 0.5),
-    'lag_s': _Scale(np.asarray, np.asarray, 0.15),
+    'lag_s': _Scale(np.asarray, np.asarray, 0.25),
 }
 _NAMES = Noise._fields
 _CORRELATED = ('share', 'distance_m')
