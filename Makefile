@@ -5,6 +5,8 @@ VENV ?= .venv
 # More requirements or version limits for pip, such as PINS='numpy==1.26.4'.
 PINS ?=
 ARGS ?=
+# Files of tests run side by side, but not many: each may hold a training in memory.
+PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile
 
 PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
@@ -26,8 +28,8 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 reproduce: $(READY)  ## the tables and figures of test/EVALUATION.md: hours, which go on where they ended (ARGS=--quick)
 	$(PY) -m sfa_localization reproduce all $(ARGS)
 
-test: $(READY)  ## run all tests (ARGS='-k bag' for some of them)
-	$(PY) -m pytest $(ARGS)
+test: $(READY)  ## run all tests, several files at once (ARGS='-k bag' for some of them)
+	$(PY) -m pytest $(PARALLEL) $(ARGS)
 
 robustness: $(READY)  ## run the tests of test/README.md; print what each fault of a drive did (20 minutes)
 	$(PY) -m pytest -m robustness $(ARGS)

@@ -76,7 +76,7 @@ setup(
         'distributed': ['distributed>=2024.1'],
         # colcon finds the test runner by this name.
         'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9'],
-        'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'types-PyYAML', 'pytest-cov>=4'],
+        'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'types-PyYAML', 'pytest-xdist>=3.3'],
     },
     entry_points={
         'console_scripts': [
