@@ -12,7 +12,16 @@ from sfa_localization.data import errors
 PACKAGE = Path(errors.__file__).parents[1]
 ERRORS = {name for name in vars(errors) if name.endswith('Error')}
 REASONS = {
-    'fusion/status.py': ('status_of', 'uncertainty', '_missing', '_contradictions', '_silences'),
+    'fusion/status.py': (
+        'status_of',
+        'uncertainty',
+        '_heading',
+        '_weakness',
+        '_rejections',
+        '_missing',
+        '_contradictions',
+        '_silences',
+    ),
     'fusion/consistency.py': ('doubts', 'compared', '_turned'),
     'fusion/turn_watch.py': ('problem',),
     'fusion/pose_filter.py': ('_apart_in_time', '_require_place', '_require_others_ahead'),

@@ -269,6 +269,7 @@ def test_standing_still_neither_drifts_nor_becomes_overconfident():
     before = fused.state
     stamp, wrong = int(drive.stamps_ns[-1]), drive.seen[-1] + [0.15, -0.15, 0.02]
     rng = np.random.default_rng(0)
+    fused.add_odometry(stamp + SECOND // 10, 0.0, 0.0, (4e-4, 1e-4))
     for k in range(1, 3600):
         fused.add_odometry(stamp + k * SECOND, 0.0, 0.0, (4e-4, 1e-4))
         seen = wrong + 0.02 * rng.standard_normal(3)
@@ -633,6 +634,44 @@ def test_dropouts_of_the_odometry_are_bridged(gap):
         if event[1] or t % 5.0 > gap:
             drive.give(fused, event, True)
     assert drive.error(fused, len(drive.stamps_ns) - 1)[0] < 0.6
+
+
+def through_a_gap(pose=None):
+    """Straight on at 0.5 m/s; unseen for 1 s, after which the odometry is at a pose; the state."""
+    fused = PoseFilter()
+    fused.set_pose(START_NS, (0.0, 0.0, 0.0), np.diag(np.square([0.05, 0.05, 0.02])))
+    for k in range(11):
+        at = None if pose is None else (0.05 * k, 0.0, 0.0)
+        fused.add_odometry(START_NS + k * SECOND // 10, 0.5, 0.0, (1e-4, 1e-4), at)
+    fused.add_odometry(START_NS + 2 * SECOND, 0.5, 0.0, (1e-4, 1e-4), pose)
+    return fused.state
+
+
+def test_what_the_robot_did_in_a_gap_of_the_odometry_is_uncertain():
+    state = through_a_gap()
+    assert state.pose == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert 0.25 < state.yaw_std < 0.5 and 0.25 < state.position_std < 0.5
+
+
+def test_a_heading_that_is_hardly_known_is_degraded():
+    for std, reasons in ((0.15, ()), (0.25, ('heading known to 14 deg only',))):
+        fused = PoseFilter()
+        fused.set_pose(START_NS, (0.0, 0.0, 0.0), np.diag(np.square([0.05, 0.05, std])))
+        fused.add_odometry(START_NS + 1, 0.0, 0.0)
+        fused.add_measurement(START_NS + 2, [0.0, 0.0], 0.09 * np.eye(2))
+        assert fused.status.reasons == reasons
+        assert fused.status.level is (Level.DEGRADED if reasons else Level.LOCALISED)
+
+
+def test_the_odometrys_own_pose_bridges_a_gap():
+    straight = through_a_gap((1.0, 0.0, 0.0))
+    assert straight.pose == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert straight.yaw_std < 0.05 and straight.position_std < 0.08
+    turned = through_a_gap((0.9, 0.2, 0.8))
+    assert turned.pose == pytest.approx([0.9, 0.2, 0.8], abs=0.05)
+    assert 0.3 < turned.yaw_std < 0.5  # readings do not expect it
+    reset = through_a_gap((0.0, 0.0, 2.5))
+    assert reset.pose == pytest.approx([1.0, 0.0, 0.0], abs=1e-6) and reset.yaw_std > 0.25
 
 
 def test_the_state_machine_reports_why():

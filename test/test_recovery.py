@@ -310,6 +310,9 @@ def test_a_wide_gate_needs_confirmation(prior_std, reason):
     # 0.45 m: inside the gate of the prior, beyond that of the image alone (0.37 m).
     after = CORRECTION.fuse(belief_at(std=prior_std, support=5), image([0.45, 0.0]))
     assert after.memory.update.reason == reason
+    reasons = status_of(after, CameraClock(), FilterConfig(), SECOND).reasons
+    waits = 'images lie far from the estimate: others must confirm them' in reasons
+    assert waits is (reason != 'accepted')
 
 
 @pytest.mark.parametrize(('count', 'way', 'confirmed'), [

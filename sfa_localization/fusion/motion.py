@@ -146,23 +146,24 @@ def twist_from_poses(
     before: tuple[float, float, float],
     after: tuple[float, float, float],
     seconds: float,
-    twist: Twist,
-) -> Twist:
-    """The reading with the mean twist by which the odometry's own pose moved since the last one.
+    fastest: Twist,
+) -> Twist | None:
+    """The mean twist by which the odometry's own pose moved, with the variances of `fastest`.
 
     Publishers differ in the time over which they average their twist; their pose is unambiguous.
-    The twist stays where the pose disagrees with it: then the pose was reset, or is not filled.
+    None where it moved beyond `fastest`, or not at all: then it was reset, or is not filled.
     """
     dx, dy = after[0] - before[0], after[1] - before[1]
     turn, distance = wrap(after[2] - before[2]), math.hypot(dx, dy)
-    expected, turned = abs(twist.v) * seconds, abs(twist.omega) * seconds
-    reset = distance > expected + _JUMP_M or abs(turn) > turned + _JUMP_RAD
-    if seconds <= 0 or reset or (distance == 0.0 and turn == 0.0):
-        return twist
+    reach_m = abs(fastest.v) * seconds + _JUMP_M
+    reach_rad = abs(fastest.omega) * seconds + _JUMP_RAD
+    reset = distance > reach_m or abs(turn) > reach_rad
+    if seconds <= 0 or reset or reach_rad > math.pi or (distance == 0.0 and turn == 0.0):
+        return None
     half = turn / 2
     chord = dx * math.cos(before[2] + turn / 2) + dy * math.sin(before[2] + turn / 2)
     arc = chord * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
-    return twist._replace(v=arc / seconds, omega=turn / seconds)
+    return fastest._replace(v=arc / seconds, omega=turn / seconds)
 
 
 class _Arc(NamedTuple):

@@ -39,11 +39,11 @@ class Prediction:
         silence_s = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
         if silence_s > _BRIDGED_S:
             belief = self.coast(belief, event.stamp_ns)
-        twist = event.twist
-        if belief.odometry_ns is not None and silence_s > ODOMETRY_TIMEOUT_S:
-            twist = _mean_twist(belief.twist, event.twist)
-        elif belief.odometry_pose is not None and event.pose is not None:
-            twist = motion.twist_from_poses(belief.odometry_pose, event.pose, silence_s, twist)
+        gap = belief.odometry_ns is not None and silence_s > ODOMETRY_TIMEOUT_S
+        if gap:
+            twist, shown = _bridged(belief, event, silence_s)
+        else:
+            twist, shown = _shown(belief, event, silence_s, event.twist) or event.twist, True
             event = event._replace(twist=twist)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         factor, noise = belief.turn_factor, self._noise
@@ -51,7 +51,7 @@ class Prediction:
             twist = twist._replace(omega_variance=twist.omega_variance * factor**2)
             noise = noise._replace(yaw_per_radian=noise.yaw_per_radian * factor)
         step = motion.drive(belief.mean, twist, dt, noise)
-        if silence_s > COAST_S:
+        if silence_s > COAST_S and not shown:
             motion.add_unknown_motion(step.noise, twist, min(dt, silence_s - COAST_S))
         driven = self._moved(belief, event.stamp_ns, step, event)
         if silence_s > ODOMETRY_TIMEOUT_S:
@@ -118,13 +118,35 @@ class Prediction:
         return yaw + turned / belief.turn_factor**2, variance + (x + y) / 2
 
 
-def _mean_twist(a: Twist, b: Twist) -> Twist:
-    """The mean motion over a gap, as uncertain as its ends differ."""
-    # The variance of a uniform distribution between the two is their difference squared over 12.
-    v_variance, omega_variance = (a.v - b.v) ** 2 / 12, (a.omega - b.omega) ** 2 / 12
-    return Twist(
-        (a.v + b.v) / 2,
-        (a.omega + b.omega) / 2,
-        max(a.v_variance, b.v_variance) + v_variance,
-        max(a.omega_variance, b.omega_variance) + omega_variance,
-    )
+def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist) -> Twist | None:
+    """The mean twist since the last reading by the odometry's own poses, where it is possible."""
+    if belief.odometry_pose is None or event.pose is None:
+        return None
+    return motion.twist_from_poses(belief.odometry_pose, event.pose, seconds, fastest)
+
+
+def _bridged(belief: Belief, event: OdometryEvent, seconds: float) -> tuple[Twist, bool]:
+    """The mean motion over a gap, and whether the odometry's own poses show it.
+
+    Else nothing but both ends of it is known. The variance of a uniform distribution between them
+    is their difference squared over 12; that of the mean of the random walk that joins them,
+    CTRV's, is a twelfth of the walk's.
+    """
+    a, b = belief.twist, event.twist
+    variances = max(a.v_variance, b.v_variance), max(a.omega_variance, b.omega_variance)
+    mean = Twist((a.v + b.v) / 2, (a.omega + b.omega) / 2, *variances)
+    v = max(abs(a.v), abs(b.v), motion.UNKNOWN_SPEED)
+    omega = max(abs(a.omega), abs(b.omega), motion.UNKNOWN_RATE)
+    shown = _shown(belief, event, seconds, Twist(v, omega, *variances))
+    if shown is not None:
+        # What the readings do not expect may be a reset of the pose.
+        surprise = (shown.v - mean.v) / 2, (shown.omega - mean.omega) / 2
+        return _wider(shown, surprise[0] ** 2, surprise[1] ** 2), True
+    v_variance = (a.v - b.v) ** 2 + motion.ACCELERATION**2 * seconds
+    omega_variance = (a.omega - b.omega) ** 2 + motion.ANGULAR_ACCELERATION**2 * seconds
+    return _wider(mean, v_variance / 12, omega_variance / 12), False
+
+
+def _wider(twist: Twist, v_variance: float, omega_variance: float) -> Twist:
+    return twist._replace(v_variance=twist.v_variance + v_variance,
+                          omega_variance=twist.omega_variance + omega_variance)  # fmt: skip

@@ -25,6 +25,8 @@ which a robot goes about as many meters, and after IMAGE_TIMEOUT_S at the latest
 robot may be towed, held or carried away, and nothing shows it."""
 NOTICED_S = 1.0
 """Images that contradict for so long are no outliers, however few: a jump is noticed by then."""
+DEGRADED_YAW_RAD = 0.2
+"""A heading with a larger standard deviation leads the robot a meter astray within a few."""
 LOST_M, LOST_RAD = 1.0, 0.3
 """Images that contradict by less leave the estimate near enough to find a way by."""
 LOST_EXCESS, LOST_DISTANCE_M = 4.0, 0.5
@@ -57,14 +59,7 @@ def status_of(
     if state is None:
         return Status(Level.UNINITIALISED, (_missing(belief),))
     lost = uncertainty(state, config) + _contradictions(belief)
-    degraded = []
-    if config.degraded_std < state.position_std <= config.lost_std:
-        degraded.append(f'position known to {state.position_std:.1f} m only')
-    # An estimate that rests on one or two images is doubted by the first that contradicts it.
-    if memory.rejected >= _few(belief):
-        images = memory.rejected
-        one = 'an image did not match'
-        degraded.append(one if images == 1 else f'{images} images in a row did not match')
+    degraded = _weakness(state, config) + _rejections(belief)
     # Only images confirm: what was driven since the last one, or before it came late, does not.
     degraded += doubts(memory.trust, memory.accepted_m, memory.pull)
     degraded += _silences(belief, config)
@@ -90,7 +85,33 @@ def uncertainty(state: State, config: FilterConfig) -> list[str]:
     if state.position_std > config.lost_std:
         reasons.append(f'position known to {state.position_std:.1f} m only')
     if state.yaw_std > config.lost_yaw_std:
-        reasons.append(f'heading known to {math.degrees(state.yaw_std):.0f} deg only')
+        reasons.append(_heading(state))
+    return reasons
+
+
+def _heading(state: State) -> str:
+    return f'heading known to {math.degrees(state.yaw_std):.0f} deg only'
+
+
+def _weakness(state: State, config: FilterConfig) -> list[str]:
+    """Why a state is DEGRADED by its standard deviations alone."""
+    reasons = []
+    if config.degraded_std < state.position_std <= config.lost_std:
+        reasons.append(f'position known to {state.position_std:.1f} m only')
+    if DEGRADED_YAW_RAD < state.yaw_std <= config.lost_yaw_std:
+        reasons.append(_heading(state))
+    return reasons
+
+
+def _rejections(belief: Belief) -> list[str]:
+    """What the last images say, where they were not fused."""
+    reasons, images, update = [], belief.memory.rejected, belief.memory.update
+    # An estimate that rests on one or two images is doubted by the first that contradicts it.
+    if images >= _few(belief):
+        one = 'an image did not match'
+        reasons.append(one if images == 1 else f'{images} images in a row did not match')
+    if update is not None and not update.accepted and update.d2 <= update.threshold:
+        reasons.append('images lie far from the estimate: others must confirm them')
     return reasons
 
 
