@@ -10,8 +10,9 @@ import pytest
 from cylinder_worlds import Spheres, panorama_config, recipe, run_in, wander
 
 from sfa_localization import training
-from sfa_localization.bags.drives import read_drive
+from sfa_localization.bags.drives import read_drive, read_drives
 from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run
 from sfa_localization.features import checkpoint as checkpoints
@@ -99,6 +100,16 @@ def test_it_says_what_error_to_expect_and_where_it_is_worst(bag, tmp_path):
     assert f'expect {quality["expected_yaw_error_deg"]:.1f} degrees' in summary(trained)
     _, places = positions(trained.metric, trained.segments)
     assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
+
+
+@pytest.mark.parametrize(('panorama', 'said'), [
+    (PanoramaConfig(), False), (PanoramaConfig(width=600, height=30), True),
+])  # fmt: skip
+def test_a_size_that_recorded_panoramas_do_not_have_is_named(bag, tmp_path, caplog, panorama, said):
+    recipe = replace(RECIPE, panorama=panorama)
+    runs = read_drives([bag], tmp_path, recipe)
+    assert ('width and height (600x30) are for images of a camera' in caplog.text) is said
+    assert runs[0].panoramas.shape[:2] != (30, 600)
 
 
 def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeypatch, caplog):

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import fcntl
 import glob
+import logging
 import os
 import shutil
 import tempfile
@@ -30,6 +31,7 @@ from sfa_localization.data.run import Image, Run
 SAME_IMAGE_NS = 1_000_000
 """Stamps this near to each other are those of one image: no camera takes a thousand a second."""
 _LOCK = 'lock'
+logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
 
@@ -110,7 +112,19 @@ def read_drives(
     if len({run.panoramas.shape for run in runs}) > 1:
         sizes = ', '.join(f'{r.name}: {r.panoramas.shape[1]}x{r.panoramas.shape[0]}' for r in runs)
         raise DataError(f'the bags hold panoramas of different sizes ({sizes}): train on one size')
+    _compare_size(runs[0], recipe.panorama)
     return runs
+
+
+def _compare_size(run: Run, asked: PanoramaConfig) -> None:
+    """Say where panoramas were recorded, so that a size that was asked for has no effect."""
+    height, width, _ = run.panoramas.shape
+    usual = PanoramaConfig()
+    if (asked.width, asked.height) not in {(width, height), (usual.width, usual.height)}:
+        logger.warning(
+            '%s: its panoramas are %dx%d and stay so: width and height (%dx%d) are for images of '
+            'a camera', run.name, width, height, asked.width, asked.height,
+        )  # fmt: skip
 
 
 def _same_recording(run: Run, other: Run) -> bool:
