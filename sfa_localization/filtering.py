@@ -44,6 +44,7 @@ _MEDIAN_OF_RAYLEIGH = 1.1774
 _USERS = (
     ('measurement_factor', 'position'),
     ('speed_std', 'speed'),
+    ('slip_per_metre', 'slip'),
     ('rate_std', 'turn'),
     ('yaw_per_radian', 'turn'),
     ('odometry_factor', 'speed'),
@@ -284,6 +285,7 @@ def _scaled(config: FilterConfig, noise: Noise) -> FilterConfig:
         'rate_std': config.rate_std * noise.turn,
         'yaw_per_radian': config.yaw_per_radian * noise.turn,
         'speed_std': config.speed_std * noise.speed,
+        'slip_per_metre': config.slip_per_metre * noise.slip,
         'measurement_factor': noise.position**2,
     }
     for name, value in values.items():
@@ -309,7 +311,8 @@ def _remarks(found: Learned, position_std: float) -> tuple[str, ...]:
     said = [
         f'learned from the log: positions err by {position_std:.2f} m'
         + (share if float(noise.share) > 2 * NEARLY_WHITE else ''),
-        f'noise of the odometry: speed {noise.speed:.2g}, turn {noise.turn:.2g} of the expected',
+        f'noise of the odometry: speed {noise.speed:.2g}, slip {noise.slip:.2g}, '
+        f'turn {noise.turn:.2g} of the expected',
     ]
     if found.forward:
         said.append('readings of the odometry hold until the next one')

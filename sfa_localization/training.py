@@ -50,21 +50,24 @@ from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
-from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
+from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
 from sfa_localization.metric.fast_expansions import fast_map
 from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
+    headings,
     learn_metric,
     left_out_agreement,
+    positions,
 )
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
 from sfa_localization.metric.retracing import with_closures
 from sfa_localization.metric.seen_turns import Headings, corrections
-from sfa_localization.metric.segments import Segments, cut, join
+from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.sufficiency import ROUTE
+from sfa_localization.metric.turn_loss import Shown, way_of
 from sfa_localization.metric.turn_noise import against_images, expected_noise
 from sfa_localization.place_model import PlaceModel
 
@@ -263,21 +266,76 @@ def _learn_map(
     progress: bool,
 ) -> tuple[Segments, MetricResult, LearnedHeading | None]:
     """Steps 5 to 7; where no map can be learned with the noise of turns that is stated or assumed,
-    once more with the one that the shifts of the images, `seen` in each run (N,) rad, show.
+    once more with the one that the shifts of the images, `seen` in each run (N,) rad, show; and
+    where the map shows that wheels lose way in turns, once more without it.
     """
     turns = _seen_turns(runs, clocks, seen, closures, recipe.segments)
-    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, turns=turns), closures)
-    try:
+
+    def learned(
+        noise: float | None = None, ways: Sequence[Way | None] | None = None
+    ) -> tuple[Segments, MetricResult, LearnedHeading | None]:
+        cuts = cut_odometry(runs, clocks, recipe.segments, noise, turns, ways)
+        segments = with_closures(cuts, closures)
         return segments, *_map_and_compass(images, segments, recipe, points, progress)
+
+    noise = None
+    try:
+        found = learned()
     except DataError:
-        found = _bound(runs, clocks, seen, recipe.segments)
-        assumed = SegmentConfig().yaw_noise
-        known = turns is not None or recipe.segments.yaw_noise != assumed
-        least = _NOISE_FACTOR * max(assumed, expected_noise(segments))
-        if known or found is None or found < least:
+        noise = None if turns else _needed_noise(runs, clocks, seen, recipe.segments)
+        if noise is None:
             raise
-    segments = with_closures(cut_odometry(runs, clocks, recipe.segments, found), closures)
-    return segments, *_map_and_compass(images, segments, recipe, points, progress)
+        found = learned(noise)
+    ways = _driven(runs, clocks, turns, found[0], found[1], recipe)
+    try:
+        return learned(noise, ways) if any(ways) else found
+    except DataError as error:
+        logger.warning('the way that wheels lose in turns stays in the map: %s', error)
+        return found
+
+
+def _needed_noise(
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    seen: Sequence[Sequence[float]],
+    config: SegmentConfig,
+) -> float | None:
+    """The noise of turns that the images show; None where it is known, or hardly differs."""
+    assumed, noise = SegmentConfig().yaw_noise, _bound(runs, clocks, seen, config)
+    if noise is None or config.yaw_noise != assumed:
+        return None
+    stated = expected_noise(cut_odometry(runs, clocks, config))
+    return noise if noise >= _NOISE_FACTOR * max(assumed, stated) else None
+
+
+def _driven(
+    runs: Sequence[Run],
+    clocks: Sequence[CameraClock],
+    turns: Sequence[TurnCorrection] | None,
+    segments: Segments,
+    result: MetricResult,
+    recipe: Recipe,
+) -> list[Way | None]:
+    """The way of each run by the map, where its wheels lose some in turns.
+
+    All have the same scale: it is that of the map, and the runs are not better known by themselves.
+    """
+    if recipe.metric.solver == 'paper':
+        return []
+    images, places = positions(result, segments)
+    places, yaw = places - result.residuals, headings(result, segments)[1]
+    shown = places[:, 0] + 1j * places[:, 1]
+    found, start = [], 0
+    for k, (run, clock) in enumerate(zip(runs, clocks, strict=True)):
+        correction = turns[k] if turns else None
+        track = tracked(run.odometry, recipe.segments, run.yaw_rate, turns=correction)
+        stamps_ns = run.panoramas.stamps_ns - clock.delay_ns - track.stamps_ns[0]
+        own = (images >= start) & (images < start + len(stamps_ns))
+        time_s = stamps_ns[images[own] - start] * 1e-9
+        found.append(way_of(track, Shown(time_s, shown[own], yaw[own])))
+        start += len(stamps_ns)
+    scales = [way.scale for way in found if way]
+    return [way and way._replace(scale=float(np.mean(scales))) for way in found]
 
 
 def _map_and_compass(
@@ -336,6 +394,7 @@ def cut_odometry(
     config: SegmentConfig,
     noise: float | None = None,
     turns: Sequence[TurnCorrection] | None = None,
+    ways: Sequence[Way | None] | None = None,
 ) -> Segments:
     """Step 5: segments of all runs, at the stamps of the images by the clock of the odometry."""
     parts = [
@@ -346,6 +405,7 @@ def cut_odometry(
             run.yaw_rate,
             noise,
             turns[k] if turns else None,
+            ways[k] if ways else None,
         )
         for k, (run, clock) in enumerate(zip(runs, clocks, strict=True))
     ]
@@ -404,6 +464,7 @@ def _assemble(
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
     quality = _quality(network, images, segments, result, known)
     quality |= {'features_used': first.map.features, 'refined': finer is not None}
+    quality['turn_loss'] = [way.loss if way else 0.0 for way in segments.ways]
     return PlaceModel(
         network,
         fast_map(first.map),

@@ -82,7 +82,7 @@ def test_the_straight_line_limit_is_continuous():
     assert np.allclose(poses[0].mean[:3], [1.0, 0.0, 0.0], atol=0)
     for before, after in itertools.pairwise(poses):
         assert np.allclose(before.mean[:3], after.mean[:3], atol=3e-4)
-        assert np.allclose(before.jacobian, after.jacobian, atol=3e-4)
+        assert np.allclose(before.jacobian, after.jacobian, atol=4e-4)
     # Either side of the switch between series and closed form, the difference is the turn's own.
     assert abs(poses[2].mean[1] - poses[1].mean[1] - 2e-5 * 0.25) < 1e-9
 

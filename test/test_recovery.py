@@ -13,6 +13,7 @@ from sfa_localization.fusion.belief import LARGEST_STD_M, Evidence, PoseEvent, U
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.evidence import Relocation, consistent, relocate, remember
 from sfa_localization.fusion.kalman import Kalman
+from sfa_localization.fusion.motion import SIZE
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.recover import Recovery, displaced, outweighs, shows_heading
 from sfa_localization.fusion.settings import FilterConfig
@@ -190,10 +191,10 @@ def test_images_after_a_silence_follow_an_outage(silence_s, outage):
 
 
 def test_the_standard_deviation_is_capped():
-    huge = np.diag([1e8, 4e4, 100.0, *[1.0] * 7])
+    huge = np.diag([1e8, 4e4, 100.0, *[1.0] * (SIZE - 3)])
     limits = [LARGEST_STD_M, LARGEST_STD_M, math.pi]
     assert np.sqrt(np.diag(capped(huge))[:3]) == pytest.approx(limits)
-    assert np.array_equal(capped(np.eye(10)), np.eye(10))
+    assert np.array_equal(capped(np.eye(SIZE)), np.eye(SIZE))
 
 
 # Agreement of measurements.

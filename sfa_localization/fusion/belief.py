@@ -197,7 +197,7 @@ class Belief(NamedTuple):
 
 
 def capped(covariance: Array) -> Array:
-    """A covariance (10, 10) with the pose's standard deviations held at LARGEST_STD_M and pi.
+    """A covariance (11, 11) with the pose's standard deviations held at LARGEST_STD_M and pi.
 
     The correlations stay what they are.
     """

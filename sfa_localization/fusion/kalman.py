@@ -21,7 +21,7 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self._next_mean: Array = np.zeros(SIZE)
 
     def predicted(self, belief: Belief, step: Step) -> Array:
-        """Covariance (10, 10) after a prediction: F P F^T + Q."""
+        """Covariance (11, 11) after a prediction: F P F^T + Q."""
         self.x, self.P, self._next_mean = belief.mean, belief.covariance, step.mean
         self.F, self.Q = step.jacobian, step.noise
         self.predict()
@@ -34,9 +34,9 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
     def corrected(
         self, belief: Belief, covariance: Array, event: MeasurementEvent
     ) -> tuple[Array, Array, float]:
-        """Mean (10,), covariance (Joseph form) and squared Mahalanobis distance of the innovation.
+        """Mean (11,), covariance (Joseph form) and squared Mahalanobis distance of the innovation.
 
-        `covariance` (10, 10) is the prior one. The innovation stays in `y`, its covariance in `S`.
+        `covariance` (11, 11) is the prior one. The innovation stays in `y`, its covariance in `S`.
         """
         self.x, self.P = belief.mean, covariance
         # Array.dot throughout: on arrays this small, @ takes twice as long.

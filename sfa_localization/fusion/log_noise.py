@@ -22,6 +22,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Stamps, integrate
 from sfa_localization.fusion.motion import (
     BIAS_WALK,
+    LOSS_WALK,
     ODOMETRY_CORRELATION_S,
     SCALE_WALK,
     STANDSTILL_RATE,
@@ -32,7 +33,7 @@ from sfa_localization.fusion.motion import (
     YAW_PER_METER,
 )
 from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
-from sfa_localization.fusion.recover import BIAS_STD, SCALE_STD
+from sfa_localization.fusion.recover import BIAS_STD, LOSS_STD, SCALE_STD
 from sfa_localization.fusion.settings import FilterConfig
 
 MOST_POSITIONS = 2000
@@ -53,20 +54,21 @@ _SETTLE = 10
 """Positions after which the start's heading, and so the likelihood, is settled."""
 _FORWARD_GAIN = 1.0
 """By so much in log-likelihood, holding readings forward has to be better than backward."""
-_X, _Y, _YAW, _BIAS, _SCALE, _ERROR = range(6)
-_SIZE = 7
+_X, _Y, _YAW, _BIAS, _SCALE, _LOSS, _ERROR = range(7)
+_SIZE = 8
 
 
 class Noise(NamedTuple):
     """What a log suffers from; numbers, or arrays (C,) of trials.
 
-    `turn` and `speed` are factors on the standard deviations of the odometry, `position` that on
-    those of the positions. Of their errors, `share` is common to positions close together, and
-    fades over `distance_m`. The motion is `lag_s` behind the odometry's stamps.
+    `turn`, `speed` and `slip` are factors on the standard deviations of the odometry, `position`
+    that on those of the positions. Of their errors, `share` is common to positions close together,
+    and fades over `distance_m`. The motion is `lag_s` behind the odometry's stamps.
     """
 
     turn: Array
     speed: Array
+    slip: Array
     position: Array
     share: Array
     distance_m: Array
@@ -89,13 +91,14 @@ def _expit(logit: Array) -> Array:
     return np.asarray(1 / (1 + np.exp(-logit)))
 
 
-EXPECTED = Noise(*map(np.array, (1.0, 1.0, 1.0, NEARLY_WHITE, 1.0, 0.0)))
+EXPECTED = Noise(*map(np.array, (1.0, 1.0, 1.0, 1.0, NEARLY_WHITE, 1.0, 0.0)))
 """The noise that the parameters suppose, with white errors of positions."""
 # Odometry may be several times better or worse than the parameters suppose; stated variances of
 # positions are mostly right; real wheels lag behind their readings by up to half a second.
 _SCALES = {
     'turn': _Scale(np.log, np.exp, 1.5),
     'speed': _Scale(np.log, np.exp, 1.5),
+    'slip': _Scale(np.log, np.exp, 1.0),
     'position': _Scale(np.log, np.exp, 0.5),
     'share': _Scale(_logit, _expit, 1.5),
     'distance_m': _Scale(np.log, np.exp, 0.5),
@@ -121,13 +124,16 @@ _GRID = [(turn, position) for turn in (-1.0, 0.0, 1.0, 2.0) for position in (-1.
 class Steps(NamedTuple):
     """The odometry between positions, for each of LAGS_S: arrays (M, L), the first row zero.
 
-    `forward` and `left` m and `turn` rad of the motion, the `meters` and `radians` driven, the
-    seconds `moving`, and the variances that readings as good as they claim add to the heading,
+    `forward` and `left` m and `turn` rad of the motion, how much less both are for each meter lost
+    per radian (`lost_forward`, `lost_left`), the `meters` and `radians` driven, the seconds
+    `moving`, and the variances that readings as good as they claim add to the heading,
     `turn_variance`, and along the way, `way_variance`.
     """
 
     forward: Array
     left: Array
+    lost_forward: Array
+    lost_left: Array
     turn: Array
     meters: Array
     radians: Array
@@ -217,8 +223,8 @@ def _correlated(drive: _Drive, found: _Found, start: Noise, held: frozenset[str]
     Two numbers more have to raise the log-likelihood by the logarithm of the positions' number
     (Bayesian information criterion).
     """
-    near = start._replace(lag_s=found.noise.lag_s, turn=found.noise.turn, speed=found.noise.speed,
-                          position=found.noise.position)  # fmt: skip
+    known = {name: getattr(found.noise, name) for name in _NAMES if name not in _CORRELATED}
+    near = start._replace(**known)
     starts = [near._replace(share=np.array(s), distance_m=np.array(d)) for s, d in _SHARED_STARTS]
     trials = Noise(*(np.array([getattr(one, name) for one in starts]) for name in _NAMES))
     costs = drive.costs(trials, found.heads)[:, 0]
@@ -268,7 +274,7 @@ class _Search:
         moved = np.tile(self._origin, (len(units), 1))
         moved[:, self._free] += units * self._sigma
         moved[:, -1] = np.clip(moved[:, -1], LAGS_S[0], LAGS_S[-1])
-        moved[:, :2] = np.clip(moved[:, :2], -math.log(_LARGEST), math.log(_LARGEST))
+        moved[:, :3] = np.clip(moved[:, :3], -math.log(_LARGEST), math.log(_LARGEST))
         return Noise(*(s.back(moved[:, i]) for i, s in enumerate(_SCALES.values())))
 
     def costs(self, units: Array) -> Array:
@@ -334,27 +340,34 @@ class _Drive:
         self.steps = self._between(clock, self._sums(seconds, config))
 
     def _sums(self, seconds: Array, config: FilterConfig) -> Array:
-        """Running sums (8, N) along the odometry: x, y, and those of which Steps has parts."""
+        """Running sums (10, N) along the odometry: x, y, the same that turns take, and those of
+        which Steps has parts.
+        """
         twists = self.log.twists.copy()
         # As Prediction.drive does.
         gaps = np.flatnonzero(seconds > ODOMETRY_TIMEOUT_S)
         twists[gaps] = (self.log.twists[gaps - 1] + self.log.twists[gaps]) / 2
         path = integrate(self.log.stamps_ns, twists)
+        # As motion.drive does.
+        slowed = np.sign(twists[:, 0]) * np.abs(twists[:, 1])
+        lost = integrate(self.log.stamps_ns, np.column_stack([slowed, twists[:, 1]]))
         meters, radians = (np.abs(twists) * seconds[:, None]).T
         moves = (np.abs(twists) >= [STANDSTILL_SPEED, STANDSTILL_RATE]).any(1) * seconds
         added = self.log.variances * (moves * (seconds + ODOMETRY_CORRELATION_S))[:, None]
         turning = config.yaw_per_radian**2 * radians + YAW_PER_METER**2 * meters + added[:, 1]
         rates = [twists[:, 1] * seconds, meters, radians, moves, turning, added[:, 0]]
-        return np.asarray([path[:, 0], path[:, 1], *np.cumsum(rates, axis=1)])
+        return np.asarray([*path[:, :2].T, *lost[:, :2].T, *np.cumsum(rates, axis=1)])
 
     def _between(self, clock: Array, sums: Array) -> Steps:
         """Interpolated at the positions' stamps, for every lag."""
         table = np.array([[np.interp(self._when - lag, clock, one) for lag in LAGS_S]
                           for one in sums])  # fmt: skip
-        x, y, *rest = np.diff(table, axis=2, prepend=table[:, :, :1])
-        heading = np.concatenate([table[2, :, :1], table[2, :, :-1]], axis=1)
+        x, y, lost_x, lost_y, *rest = np.diff(table, axis=2, prepend=table[:, :, :1])
+        heading = np.concatenate([table[4, :, :1], table[4, :, :-1]], axis=1)
         c, s = np.cos(heading), np.sin(heading)
-        return Steps(*(part.T for part in (c * x + s * y, c * y - s * x, *rest)))
+        moved = c * x + s * y, c * y - s * x
+        lost = c * lost_x + s * lost_y, c * lost_y - s * lost_x
+        return Steps(*(part.T for part in (*moved, *lost, *rest)))
 
     def lagging(self, lag_s: Array) -> list[Steps]:
         """The steps, arrays (C,), by lags (C,): interpolated between those of LAGS_S."""
@@ -387,7 +400,8 @@ class _Drive:
         log_bad = math.log(_OUTLIERS) + log.log_background
         total = np.zeros(len(spread.turn))
         for i, step in enumerate(self.lagging(spread.lag_s)[1:], 1):
-            bank.predict(step, self.slip**2 * step.meters, float(self.silent[i]))
+            slip = (self.slip * spread.slip) ** 2 * step.meters
+            bank.predict(step, slip, float(self.silent[i]))
             log_likelihood = bank.correct(log.places[i], log.spreads[i], log_bad)
             if i > _SETTLE:
                 total -= log_likelihood
@@ -395,15 +409,16 @@ class _Drive:
 
 
 class _Bank:
-    """A filter for each trial (C,): x m, y m, yaw rad, turn-rate bias, scale, and the error that
-    positions share, in standard deviations (x, y); the motion is that of `motion`, in one step.
+    """A filter for each trial (C,): x m, y m, yaw rad, turn-rate bias, scale, way lost in turns,
+    and the error that positions share, in standard deviations (x, y); the motion is that of
+    `motion`, in one step.
     """
 
     def __init__(self, noise: Noise, yaw: Array, place: Array, spread: Array) -> None:
         self._noise = noise
         self._mean = np.zeros((len(yaw), _SIZE))
         self._mean[:, :2], self._mean[:, _YAW] = place, yaw
-        stds = np.array([0, 0, np.pi / len(_HEADS), BIAS_STD, SCALE_STD, 1, 1])
+        stds = np.array([0, 0, np.pi / len(_HEADS), BIAS_STD, SCALE_STD, LOSS_STD, 1, 1])
         self._covariance = np.tile(np.diag(stds**2), (len(yaw), 1, 1))
         variance = noise.position[:, None] ** 2 * spread
         for axis in (_X, _Y):
@@ -416,15 +431,18 @@ class _Bank:
         mean, noise = self._mean, self._noise
         # Along the chord, which a bias turns by half.
         yaw = mean[:, _YAW] - mean[:, _BIAS] * step.moving / 2
-        gain, c, s = 1 + mean[:, _SCALE], np.cos(yaw), np.sin(yaw)
-        dx = gain * (c * step.forward - s * step.left)
-        dy = gain * (s * step.forward + c * step.left)
+        gain, loss, c, s = 1 + mean[:, _SCALE], mean[:, _LOSS], np.cos(yaw), np.sin(yaw)
+        by_scale = c * step.forward - s * step.left, s * step.forward + c * step.left
+        less, left = step.lost_forward, step.lost_left
+        by_loss = s * left - c * less, -s * less - c * left
+        dx, dy = (gain * a + loss * b for a, b in zip(by_scale, by_loss, strict=True))
         fade = np.exp(-(step.meters + TURN_RADIUS_M * step.radians) / noise.distance_m)
         jacobian = np.tile(np.eye(_SIZE), (len(yaw), 1, 1))
         jacobian[:, _X, _YAW], jacobian[:, _Y, _YAW] = -dy, dx
         jacobian[:, _X, _BIAS], jacobian[:, _Y, _BIAS] = dy * step.moving / 2, -dx * step.moving / 2
         jacobian[:, _YAW, _BIAS] = -step.moving
-        jacobian[:, _X, _SCALE], jacobian[:, _Y, _SCALE] = dx / gain, dy / gain
+        jacobian[:, _X, _SCALE], jacobian[:, _Y, _SCALE] = by_scale
+        jacobian[:, _X, _LOSS], jacobian[:, _Y, _LOSS] = by_loss
         jacobian[:, _ERROR, _ERROR] = jacobian[:, _ERROR + 1, _ERROR + 1] = fade
         covariance = jacobian @ self._covariance @ jacobian.transpose(0, 2, 1)
         turning = noise.turn**2 * step.turn_variance + UNKNOWN_RATE**2 * silent
@@ -433,8 +451,9 @@ class _Bank:
         covariance[:, :2, :2] += along[:, :, None] * along[:, None, :]
         anywhere = slip + 2 * UNKNOWN_SPEED**2 * silent
         fresh = [anywhere, anywhere, BIAS_WALK**2 * step.moving, SCALE_WALK**2 * step.meters,
-                 1 - fade**2, 1 - fade**2]  # fmt: skip
-        for i, variance in zip((_X, _Y, _BIAS, _SCALE, _ERROR, _ERROR + 1), fresh, strict=True):
+                 LOSS_WALK**2 * step.radians, 1 - fade**2, 1 - fade**2]  # fmt: skip
+        rows = (_X, _Y, _BIAS, _SCALE, _LOSS, _ERROR, _ERROR + 1)
+        for i, variance in zip(rows, fresh, strict=True):
             covariance[:, i, i] += variance
         mean[:, :3] += np.stack([dx, dy, step.turn - mean[:, _BIAS] * step.moving], 1)
         mean[:, _ERROR:] *= fade[:, None]

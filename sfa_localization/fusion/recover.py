@@ -32,7 +32,6 @@ from sfa_localization.fusion.evidence import (
 )
 from sfa_localization.fusion.motion import (
     ERROR,
-    SCALE,
     SIZE,
     YAW,
     Twist,
@@ -46,9 +45,10 @@ IMAGE_TIMEOUT_S = 3.0
 """Time without an accepted image that counts as an outage: many times any camera's period."""
 ALIKE_SHARE = 0.2
 """Where neighbors share less of their errors, positions are those of a sensor with white errors."""
-BIAS_STD, SCALE_STD = 0.01, 0.03
-"""Standard deviations of turn-rate bias (rad/s) and wheel scale before any is learned: data sheets
-of cheap gyroscopes, and the tolerance of a tire's diameter."""
+BIAS_STD, SCALE_STD, LOSS_STD = 0.01, 0.03, 0.05
+"""Standard deviations of turn-rate bias (rad/s), wheel scale and way lost in turns (m/rad) before
+any is learned: data sheets of cheap gyroscopes, the tolerance of a tire's diameter, and a third of
+the half track of a small robot."""
 START_YAW_STD = 0.3
 """rad: what positions alone must determine the heading to; up to there the EKF is linear enough."""
 AGREEING_SHARE = 0.6
@@ -83,10 +83,11 @@ class Recovery:
     def blank(self, stamp_ns: int) -> Belief:
         """The belief before the first message, without a pose."""
         speed_std, rate_std = self._config.speed_std, self._config.rate_std
+        stds = [1, 1, 1, speed_std, rate_std, BIAS_STD, SCALE_STD, LOSS_STD, 1, 1, 1]
         return Belief(
             stamp_ns,
             np.zeros(SIZE),
-            np.diag(np.square([1, 1, 1, speed_std, rate_std, BIAS_STD, SCALE_STD, 1, 1, 1])),
+            np.diag(np.square(stds)),
             located=False,
             dead_reckoned=(0.0, 0.0, 0.0),
             traveled_m=0.0,
@@ -218,14 +219,14 @@ def _trust(belief: Belief, pose: Array, *, relocated: bool) -> Trust:
 
 
 def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Belief:
-    """The belief at another pose (3,), with what is known of twist, bias and scale.
+    """The belief at another pose (3,), with what is known of twist, bias, scale and loss.
 
     `share` of the pose's variance is the error that the next images will repeat.
     """
     mean = belief.mean.copy()
     mean[:3], mean[ERROR:] = pose, 0.0
     mean[YAW] = wrap(float(mean[YAW]))
-    full, kept = np.eye(SIZE), slice(V, SCALE + 1)
+    full, kept = np.eye(SIZE), slice(V, ERROR)
     full[:3, :3], full[kept, kept] = covariance, belief.covariance[kept, kept]
     shared = -math.sqrt(share) * np.linalg.cholesky(covariance)
     full[:3, ERROR:], full[ERROR:, :3] = shared, shared.T

@@ -62,7 +62,7 @@ class TurnNoise(NamedTuple):
 
 
 def begun(driven: Driven, mean: Array, covariance: Array, before: TurnNoise | None) -> TurnNoise:
-    """All filters at the state of the large one, mean (10,) and covariance (10, 10), with the
+    """All filters at the state of the large one, mean (11,) and covariance (11, 11), with the
     evidence from `before`.
     """
     count = len(FACTORS)
@@ -77,7 +77,7 @@ def begun(driven: Driven, mean: Array, covariance: Array, before: TurnNoise | No
 def weighed(
     noise: TurnNoise, driven: Driven, value: Array, jacobian: Array, white: Array
 ) -> TurnNoise:
-    """The filters after a measurement (2,) or (3,), with the `jacobian` (10 columns) and `white`
+    """The filters after a measurement (2,) or (3,), with the `jacobian` (11 columns) and `white`
     noise of its event.
     """
     mean, covariance = _predicted(noise, driven)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from sfa_localization.metric.settings import SegmentConfig
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+Complex = NDArray[np.complex128]
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +59,15 @@ class TurnCorrection:
     stamps_ns: Stamps
     yaw: Array
     noise: float
+
+
+class Way(NamedTuple):
+    """The way of a drive by that which its wheels counted: `scale` times it, less a `loss`, m per
+    radian, in turns.
+    """
+
+    scale: float = 1.0
+    loss: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +132,29 @@ class OdometryTrack:
         sums = _running_sums(self.stamps_ns, poses, yaw, np.zeros(len(yaw)), turns.noise)
         rate = _smoothed(seconds, np.gradient(yaw, seconds))
         return replace(self, poses=poses, yaw=yaw, turn_rate=rate, sums=sums, slide=SEEN_TURN_SLIDE)
+
+    def driven(self, way: Way) -> OdometryTrack:
+        """The same turns with the way that was driven, not that which wheels counted."""
+        step, lost = self.steps(), way.loss * self.way_per_loss()
+        step = way.scale * step - np.where(np.abs(lost) < np.abs(step), lost, 0.0)
+        place = self.poses[0, 0] + 1j * self.poses[0, 1] + np.concatenate([[0.0], np.cumsum(step)])
+        poses = np.column_stack([place.real, place.imag, self.poses[:, 2]])
+        sums, t = self.sums.copy(), seconds_since_start(self.stamps_ns)
+        moment = step * (t[1:] + t[:-1]) / 2
+        added = np.column_stack([np.abs(step), moment.real, moment.imag])
+        sums[1:, [LENGTH, MOMENT.start, MOMENT.start + 1]] = np.cumsum(added, axis=0)
+        return replace(self, poses=poses, sums=sums)
+
+    def steps(self) -> Complex:
+        """Displacements (N - 1,) m between the stamps."""
+        return np.diff(self.poses[:, 0] + 1j * self.poses[:, 1])
+
+    def way_per_loss(self) -> Complex:
+        """Displacements (N - 1,) m that a loss of 1 m per radian takes from them."""
+        step = self.steps()
+        length = np.abs(step)
+        heading = np.divide(step, length, out=np.zeros_like(step), where=length > 0)
+        return np.asarray(heading * np.abs(np.diff(self.yaw)))
 
 
 def seconds_since_start(stamps_ns: Stamps) -> Array:

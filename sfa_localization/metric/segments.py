@@ -28,6 +28,7 @@ from sfa_localization.metric.dead_reckoning import (
     YAW_VARIANCE,
     OdometryTrack,
     TurnCorrection,
+    Way,
     seconds_since_start,
     tally,
 )
@@ -118,13 +119,14 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """Segments in driving order, how many images and odometry messages were used, and the loop
-    closures between their images."""
+    """Segments in driving order, how many images and odometry messages were used, the loop closures
+    between their images, and how the way of each run was corrected."""
 
     items: tuple[Segment, ...]
     images: Count = field(default_factory=Count)
     odometry: Count = field(default_factory=Count)
     closures: Closures = field(default_factory=Closures.none)
+    ways: tuple[Way | None, ...] = (None,)
 
     def __len__(self) -> int:
         return len(self.items)
@@ -143,6 +145,7 @@ def cut(
     yaw_rate: YawRate | None = None,
     turn_noise: float | None = None,
     turns: TurnCorrection | None = None,
+    way: Way | None = None,
 ) -> Segments:
     """Cut a drive into segments at the stamps of its images (N,).
 
@@ -151,12 +154,12 @@ def cut(
     bounded by length and by accumulated odometry error. Images without odometry, of a standing
     robot, or in too short a piece are left out and counted in `Segments.images`. A known
     `turn_noise` (rad per square root of s) replaces what the messages state; `turns` correct those
-    of the odometry, and state their noise.
+    of the odometry, and state their noise; `way` corrects what its wheels counted.
 
     Raises DataError when no segment is left.
     """
-    track = OdometryTrack.of(odometry, config, yaw_rate, turn_noise)
-    track = track if turns is None else track.corrected(turns)
+    track = tracked(odometry, config, yaw_rate, turn_noise, turns)
+    track = track if way is None else track.driven(way)
     skipped: dict[str, int] = {}
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
@@ -169,7 +172,19 @@ def cut(
     for n in range(len(items) - 1):
         items[n] = _linked(poses, items[n], items[n + 1], firsts[n], firsts[n + 1])
     used = sum(len(item.images) for item in items)
-    return Segments(tuple(items), Count(used, skipped), track.count)
+    return Segments(tuple(items), Count(used, skipped), track.count, ways=(way,))
+
+
+def tracked(
+    odometry: Odometry,
+    config: SegmentConfig,
+    yaw_rate: YawRate | None = None,
+    turn_noise: float | None = None,
+    turns: TurnCorrection | None = None,
+) -> OdometryTrack:
+    """The dead reckoning that `cut` cuts, with its arguments."""
+    track = OdometryTrack.of(odometry, config, yaw_rate, turn_noise)
+    return track if turns is None else track.corrected(turns)
 
 
 def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
@@ -187,7 +202,10 @@ def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
             for s, period in zip(part, periods, strict=True)
         ]
     return Segments(
-        tuple(items), _sum(part.images for part in parts), _sum(part.odometry for part in parts)
+        tuple(items),
+        _sum(part.images for part in parts),
+        _sum(part.odometry for part in parts),
+        ways=tuple(way for part in parts for way in part.ways),
     )
 
 

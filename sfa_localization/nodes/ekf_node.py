@@ -391,6 +391,7 @@ class EkfNode(LocalizationNode):
             values['heading std [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
+            values['way lost in turns [m/rad]'] = f'{state.turn_loss:.3f}'
         clock = self._filter.camera_clock
         if clock.known:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'

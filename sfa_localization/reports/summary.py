@@ -37,6 +37,11 @@ def summary(trained: Trained) -> str:
             lines.append(
                 f'{run.name}: images are stamped {abs(delay):.2f} s {late}: taken into account'
             )
+    for run, loss in zip(trained.runs, quality['turn_loss'], strict=True):
+        if loss:
+            lines.append(
+                f'{run.name}: wheels lose {loss:.2f} m per radian in turns: taken into account'
+            )
     for name, count in _skipped(trained).items():
         lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
     return '\n'.join(lines)
