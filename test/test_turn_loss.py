@@ -41,12 +41,13 @@ def shown(poses, every, std=0.03, turn=0.7):
     return places, chosen[:, 2] + turn
 
 
-def found(loss, every=4, **how):
+def found(loss, every=4, before=None, larger=1.0, **how):
     poses, odometry = losing(loss, **how)
     places, yaw = shown(poses, every)
+    places = larger * places
     track = OdometryTrack.of(odometry, SegmentConfig(), None)
     times = (odometry.stamps_ns[::every] - odometry.stamps_ns[0]) * 1e-9
-    return track, way_of(track, Shown(times, places, yaw))
+    return track, way_of(track, Shown(times, places, yaw), before)
 
 
 @pytest.mark.parametrize('loss', [0.08, 0.15, 0.25, -0.1])
@@ -55,6 +56,14 @@ def test_the_loss_is_found_forward_and_backward(loss, v):
     _, way = found(np.sign(v) * loss, v=v)
     assert way.loss == pytest.approx(loss, abs=0.02)
     assert way.scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_map_that_grew_or_shrank_shows_another_loss_but_no_other_scale():
+    for larger in (0.95, 1.0, 1.05):
+        _, way = found(0.15, larger=larger, before=Way(1.0, 0.1))
+        assert way.loss / way.scale == pytest.approx(0.15, abs=0.02)
+        # A smaller loss with the same scale as the larger one with more way.
+        assert 1.0 < way.scale == pytest.approx(found(0.15, before=Way(1.0, 0.1))[1].scale)
 
 
 def test_where_images_show_none_nothing_is_corrected():

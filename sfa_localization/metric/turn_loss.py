@@ -46,8 +46,11 @@ class Shown:
     yaw: Array
 
 
-def way_of(track: OdometryTrack, shown: Shown) -> Way | None:
-    """The way of a drive by its images; None where they do not clearly show a loss in turns."""
+def way_of(track: OdometryTrack, shown: Shown, before: Way | None = None) -> Way | None:
+    """The way of a drive by its images; None where they do not clearly show a loss in turns.
+
+    Images of a map that was learned with the way `before` show another loss, but no other scale.
+    """
     seconds = seconds_since_start(track.stamps_ns)
     driven = np.interp(shown.time_s, seconds, track.sums[:, LENGTH])
     part = track.part[np.searchsorted(seconds, shown.time_s, 'right') - 1]
@@ -66,6 +69,11 @@ def way_of(track: OdometryTrack, shown: Shown) -> Way | None:
     )
     moved = shown.places[last] - shown.places[first]
     way, std = _fitted(moved, by_odometry, -by_loss)
+    if before is not None:
+        shape = by_odometry - way.loss / way.scale * by_loss
+        whole = before.scale * by_odometry - before.loss * by_loss
+        scale = float(np.real(np.vdot(shape, whole)) / np.real(np.vdot(shape, shape)))
+        way, std = Way(scale, way.loss / way.scale * scale), std * scale / way.scale
     clear = CHANCE_STDS * std < abs(way.loss) < LARGEST_LOSS
     return way if clear else None
 
