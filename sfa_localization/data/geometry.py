@@ -17,6 +17,9 @@ from sfa_localization.data.errors import DataError
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
+SPOT_RADIUS_M = 0.1
+"""A robot that turns more tightly than this turns on the spot: it has no way to lose there."""
+
 
 def wrap_angle(angle_rad: Array | float) -> Array:
     """Wrap to [-pi, pi)."""

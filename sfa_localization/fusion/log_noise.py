@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array
 from sfa_localization.data.run import Stamps, integrate
 from sfa_localization.fusion.motion import (
     BIAS_WALK,
@@ -349,7 +349,8 @@ class _Drive:
         twists[gaps] = (self.log.twists[gaps - 1] + self.log.twists[gaps]) / 2
         path = integrate(self.log.stamps_ns, twists)
         # As motion.drive does.
-        slowed = np.sign(twists[:, 0]) * np.abs(twists[:, 1])
+        speed, rate = np.abs(twists).T
+        slowed = np.where(speed > SPOT_RADIUS_M * rate, np.sign(twists[:, 0]) * rate, 0.0)
         lost = integrate(self.log.stamps_ns, np.column_stack([slowed, twists[:, 1]]))
         meters, radians = (np.abs(twists) * seconds[:, None]).T
         moves = (np.abs(twists) >= [STANDSTILL_SPEED, STANDSTILL_RATE]).any(1) * seconds

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array
 
 X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, ERROR = range(9)
 SIZE = 11
@@ -217,7 +217,7 @@ def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
 def drive(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
     """Move by odometry: `twist`, held over the last `dt` seconds, becomes the state's v and omega.
 
-    v' = (1 + scale) v_odometry - loss |omega_odometry| (with the sign of v, and not beyond 0) and
+    v' = (1 + scale) v_odometry - loss |omega_odometry| (with the sign of v; none on the spot) and
     omega' = omega_odometry - bias: the columns of the old v and omega in the Jacobian vanish; those
     of scale, loss and bias are v_odometry, -|omega_odometry| and -1 times those of v' and omega'.
     Each reading adds noise of its own variance through the same columns.
@@ -225,11 +225,10 @@ def drive(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
     if twist.stands:
         return _stand(mean)
     v, omega = (1.0 + float(mean[SCALE])) * twist.v, twist.omega - float(mean[BIAS])
-    by_loss = -math.copysign(abs(twist.omega), twist.v)
-    lost = by_loss * float(mean[LOSS])
-    if abs(lost) >= abs(v):  # which robots do not do that turn on the spot
-        lost, by_loss = 0.0, 0.0
-    step = _advance(mean, v + lost, omega, twist, dt, noise)
+    by_loss = 0.0
+    if abs(twist.v) > SPOT_RADIUS_M * abs(twist.omega):
+        by_loss = -math.copysign(abs(twist.omega), twist.v)
+    step = _advance(mean, v + by_loss * float(mean[LOSS]), omega, twist, dt, noise)
     gain = step.jacobian[:, V : OMEGA + 1].copy()
     step.jacobian[:, V] = step.jacobian[:, OMEGA] = 0.0
     step.jacobian[:, SCALE] += twist.v * gain[:, 0]

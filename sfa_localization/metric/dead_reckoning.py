@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, relative, wrap_angle
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, relative, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
 from sfa_localization.metric.settings import SegmentConfig
 
@@ -135,8 +135,7 @@ class OdometryTrack:
 
     def driven(self, way: Way) -> OdometryTrack:
         """The same turns with the way that was driven, not that which wheels counted."""
-        step, lost = self.steps(), way.loss * self.way_per_loss()
-        step = way.scale * step - np.where(np.abs(lost) < np.abs(step), lost, 0.0)
+        step = way.scale * self.steps() - way.loss * self.way_per_loss()
         place = self.poses[0, 0] + 1j * self.poses[0, 1] + np.concatenate([[0.0], np.cumsum(step)])
         poses = np.column_stack([place.real, place.imag, self.poses[:, 2]])
         sums, t = self.sums.copy(), seconds_since_start(self.stamps_ns)
@@ -151,10 +150,10 @@ class OdometryTrack:
 
     def way_per_loss(self) -> Complex:
         """Displacements (N - 1,) m that a loss of 1 m per radian takes from them."""
-        step = self.steps()
+        step, turned = self.steps(), np.abs(np.diff(self.yaw))
         length = np.abs(step)
-        heading = np.divide(step, length, out=np.zeros_like(step), where=length > 0)
-        return np.asarray(heading * np.abs(np.diff(self.yaw)))
+        moves = length > SPOT_RADIUS_M * turned
+        return np.asarray(np.divide(step * turned, length, out=np.zeros_like(step), where=moves))
 
 
 def seconds_since_start(stamps_ns: Stamps) -> Array:
