@@ -27,8 +27,9 @@ STEP_M = 0.3
 """Images this far apart are compared: nearer ones hide a loss in their own errors."""
 CHANCE_STDS = 4.0
 """A loss below so many standard deviations may be chance."""
-LARGEST_LOSS = 0.3
-"""m per radian: half the track of a large robot; more is no loss in turns."""
+LARGEST_LOSS, LARGEST_SCALE = 0.3, 1.5
+"""m per radian, half the track of a large robot, and the scale of its way: beyond them the images
+show something else than a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
 _ROUNDS = 10  # of reweighting, from where the fit hardly changes
@@ -69,6 +70,8 @@ def way_of(track: OdometryTrack, shown: Shown, before: Way | None = None) -> Way
     )
     moved = shown.places[last] - shown.places[first]
     way, std = _fitted(moved, by_odometry, -by_loss)
+    if not 1 / LARGEST_SCALE < way.scale < LARGEST_SCALE:
+        return None
     if before is not None:
         shape = by_odometry - way.loss / way.scale * by_loss
         whole = before.scale * by_odometry - before.loss * by_loss
