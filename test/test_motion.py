@@ -170,3 +170,17 @@ def test_a_state_names_its_parts():
     assert list(state.pose) == [0, 1, 2] and list(state.twist) == [3, 4]
     assert (state.yaw_rate_bias, state.wheel_scale, state.yaw_std) == (5.0, 7.0, 0.5)
     assert state.position_std == pytest.approx(math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
+
+
+@pytest.mark.parametrize(('loss', 'v', 'omega', 'speed'), [
+    (0.1, 0.5, 1.0, 0.4), (0.1, -0.5, -1.0, -0.4), (-0.1, 0.5, 1.0, 0.6),
+    (0.1, 0.05, 1.0, 0.05),  # on the spot
+    (0.4, 0.5, 1.0, 0.5),  # it would stop the robot
+])  # fmt: skip
+def test_a_loss_in_turns_slows_the_robot_and_never_turns_it_around(loss, v, omega, speed):
+    mean = np.zeros(SIZE)
+    mean[motion.LOSS] = loss
+    step = motion.drive(mean, Twist(v, omega, 0.0, 0.0), 0.1, NOISE)
+    assert step.mean[motion.V] == pytest.approx(speed)
+    by_loss = 0.0 if speed == v else -math.copysign(abs(omega), v)
+    assert step.jacobian[motion.V, motion.LOSS] == pytest.approx(by_loss)

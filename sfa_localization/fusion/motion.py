@@ -11,7 +11,7 @@ constant v and omega leads from (x, y, yaw) to (`_arc`)
 and its derivatives fill the Jacobian (`_advance`). The state has eight components more than a pose:
 
 - V, OMEGA: speed m/s and turn rate rad/s of the robot, as in CTRV. Odometry replaces them:
-  v = (1 + scale) v_odometry - loss |omega_odometry| and omega = omega_odometry - bias (`drive`).
+  v = (1 + scale) v_odometry - loss |omega_odometry|, omega = omega_odometry - bias (`drive`).
 - BIAS: what the odometry's turn rate reads too much, rad/s; a random walk in time.
 - SCALE: true speed over wheel speed, minus 1; a random walk over the distance. Both calibrate the
   odometry while driving (augmented Kalman filter: Larsen et al., ICRA 1998).
@@ -225,10 +225,11 @@ def drive(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
     if twist.stands:
         return _stand(mean)
     v, omega = (1.0 + float(mean[SCALE])) * twist.v, twist.omega - float(mean[BIAS])
-    by_loss = 0.0
-    if abs(twist.v) > SPOT_RADIUS_M * abs(twist.omega):
+    loss, by_loss = float(mean[LOSS]), 0.0
+    # A loss slows a robot down, but turns no motion around.
+    if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(loss)) * abs(twist.omega):
         by_loss = -math.copysign(abs(twist.omega), twist.v)
-    step = _advance(mean, v + by_loss * float(mean[LOSS]), omega, twist, dt, noise)
+    step = _advance(mean, v + by_loss * loss, omega, twist, dt, noise)
     gain = step.jacobian[:, V : OMEGA + 1].copy()
     step.jacobian[:, V] = step.jacobian[:, OMEGA] = 0.0
     step.jacobian[:, SCALE] += twist.v * gain[:, 0]
