@@ -57,7 +57,7 @@ format: $(READY)  ## sort imports and format the code with ruff
 	$(VENV)/bin/ruff format .
 
 colcon:  ## colcon build and colcon test in a clean environment
-	PYTHON='$(PYTHON)' sh .ci/colcon $(ARGS)
+	PYTHON='$(PYTHON)' sh .ci/colcon $(PARALLEL) $(ARGS)
 
 matrix:  ## the tests on NumPy 1.26 with Python 3.12, and on the newest NumPy and Python
 	sh .ci/matrix $(ARGS)

@@ -306,8 +306,9 @@ def _needed_noise(
     config: SegmentConfig,
 ) -> float | None:
     """The noise of turns that the images show; None where it is known, or hardly differs."""
-    assumed, noise = SegmentConfig().yaw_noise, _bound(runs, clocks, seen, config)
-    if noise is None or config.yaw_noise != assumed:
+    assumed = SegmentConfig().yaw_noise
+    noise = _bound(runs, clocks, seen, config) if config.yaw_noise == assumed else None
+    if noise is None:
         return None
     stated = expected_noise(cut_odometry(runs, clocks, config))
     return noise if noise >= _NOISE_FACTOR * max(assumed, stated) else None
@@ -468,8 +469,9 @@ def _assemble(
     # Of each run, s; None where the drive does not show it.
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
     quality = _quality(network, images, segments, result, known)
+    losses = [way.loss if way else 0.0 for way in segments.ways]
     quality |= {'features_used': first.map.features, 'refined': finer is not None}
-    quality['turn_loss'] = [way.loss if way else 0.0 for way in segments.ways]
+    quality |= {'turn_loss': losses}
     return PlaceModel(
         network,
         fast_map(first.map),

@@ -653,6 +653,17 @@ def test_what_the_robot_did_in_a_gap_of_the_odometry_is_uncertain():
     assert 0.25 < state.yaw_std < 0.5 and 0.25 < state.position_std < 0.5
 
 
+def test_what_the_robot_did_before_its_first_odometry_is_uncertain():
+    stds = []
+    for silence_s in (1, 5):
+        fused = PoseFilter()
+        fused.set_pose(START_NS, (0.0, 0.0, 0.0), np.diag(np.square([0.05, 0.05, 0.02])))
+        fused.add_measurement(START_NS + 1, [0.0, 0.0, 0.0], np.diag([0.01, 0.01, 0.001]))
+        fused.add_odometry(START_NS + silence_s * SECOND, 0.5, 0.0, (1e-4, 1e-4))
+        stds.append(fused.state.position_std)
+    assert stds[0] < 0.2 and stds[1] > 1.0
+
+
 def test_a_heading_that_is_hardly_known_is_degraded():
     for std, reasons in ((0.15, ()), (0.25, ('heading known to 14 deg only',))):
         fused = PoseFilter()

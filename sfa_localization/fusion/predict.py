@@ -43,7 +43,7 @@ class Prediction:
         if gap:
             twist, shown = _bridged(belief, event, silence_s)
         else:
-            twist, shown = _shown(belief, event, silence_s, event.twist) or event.twist, True
+            twist, shown = _shown(belief, event, silence_s, event.twist) or event.twist, False
             event = event._replace(twist=twist)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         factor, noise = belief.turn_factor, self._noise

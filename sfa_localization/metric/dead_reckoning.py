@@ -136,17 +136,14 @@ class OdometryTrack:
     def driven(self, way: Way) -> OdometryTrack:
         """The same turns with the way that was driven, not that which wheels counted."""
         step = way.scale * self.steps() - way.loss * self.way_per_loss()
-        place = self.poses[0, 0] + 1j * self.poses[0, 1] + np.concatenate([[0.0], np.cumsum(step)])
-        poses = np.column_stack([place.real, place.imag, self.poses[:, 2]])
-        sums, t = self.sums.copy(), seconds_since_start(self.stamps_ns)
-        moment = step * (t[1:] + t[:-1]) / 2
-        added = np.column_stack([np.abs(step), moment.real, moment.imag])
-        sums[1:, [LENGTH, MOMENT.start, MOMENT.start + 1]] = np.cumsum(added, axis=0)
+        poses = _along(self.poses[0], step, self.poses[:, 2])
+        sums, of_way = self.sums.copy(), _sums_of_way(self.stamps_ns, step)
+        sums[1:, LENGTH], sums[1:, MOMENT] = of_way[:, 0], of_way[:, 1:]
         return replace(self, poses=poses, sums=sums)
 
     def steps(self) -> Complex:
         """Displacements (N - 1,) m between the stamps."""
-        return np.diff(self.poses[:, 0] + 1j * self.poses[:, 1])
+        return _steps(self.poses)
 
     def way_per_loss(self) -> Complex:
         """Displacements (N - 1,) m that a loss of 1 m per radian takes from them."""
@@ -279,25 +276,40 @@ def _gyro_sign(turns: Array, wheels: Array, at_s: Array, config: SegmentConfig) 
 
 def _with_yaw(poses: Array, yaw: Array, measured: Array) -> Array:
     """The same wheel steps driven with another yaw (N,)."""
-    step = np.diff(poses[:, 0] + 1j * poses[:, 1])
     middle = (yaw[:-1] + yaw[1:]) / 2
-    step = step * np.exp(1j * ((measured[:-1] + measured[1:]) / 2 - middle))
-    place = poses[0, 0] + 1j * poses[0, 1] + np.concatenate([[0.0], np.cumsum(step)])
-    return np.column_stack([place.real, place.imag, wrap_angle(measured)])
+    step = _steps(poses) * np.exp(1j * ((measured[:-1] + measured[1:]) / 2 - middle))
+    return _along(poses[0], step, wrap_angle(measured))
+
+
+def _steps(poses: Array) -> Complex:
+    """Displacements (N - 1,) m between poses (N, 3)."""
+    return np.diff(poses[:, 0] + 1j * poses[:, 1])
+
+
+def _along(start: Array, step: Complex, yaw: Array) -> Array:
+    """Poses (N, 3) from the place of a `start` (3,) by displacements (N - 1,) m, with yaw (N,)."""
+    place = start[0] + 1j * start[1] + np.concatenate([[0.0], np.cumsum(step)])
+    return np.column_stack([place.real, place.imag, yaw])
+
+
+def _sums_of_way(stamps: Stamps, step: Complex) -> Array:
+    """Running sums (N - 1, 3) of displacements (N - 1,) m: LENGTH and the two parts of MOMENT."""
+    t = seconds_since_start(stamps)
+    moment = step * (t[1:] + t[:-1]) / 2
+    return np.cumsum(np.column_stack([np.abs(step), moment.real, moment.imag]), axis=0)
 
 
 def _running_sums(
     stamps: Stamps, poses: Array, yaw: Array, variances: Array, yaw_noise: float
 ) -> Array:
     """Running sums (N, 5); `yaw_noise` (rad per square root of s) where variances (N,) are 0."""
-    t = seconds_since_start(stamps)
-    step = np.diff(poses[:, 0] + 1j * poses[:, 1])
-    moment = step * (t[1:] + t[:-1]) / 2
-    dt = np.diff(t)
+    dt = np.diff(seconds_since_start(stamps))
     stated = variances[:-1] * dt**2
     noise = np.where(stated > 0, stated, yaw_noise**2 * dt)
-    columns = [np.abs(step), np.abs(np.diff(yaw)), noise, moment.real, moment.imag]
-    return np.vstack([np.zeros(5), np.cumsum(np.column_stack(columns), axis=0)])
+    sums, of_way = np.zeros((len(stamps), 5)), _sums_of_way(stamps, _steps(poses))
+    sums[1:, LENGTH], sums[1:, MOMENT] = of_way[:, 0], of_way[:, 1:]
+    sums[1:, TURNED], sums[1:, YAW_VARIANCE] = np.cumsum(np.abs(np.diff(yaw))), np.cumsum(noise)
+    return sums
 
 
 def _smoothed(seconds: Array, rates: Array) -> Array:

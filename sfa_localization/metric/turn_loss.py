@@ -3,7 +3,7 @@
 """How much way the wheels of a drive lose in turns, by a map of its images.
 
 Odometry of real robots counts more way in a turn than they drive: wheels slide, and controllers
-slow down. Four small robots lost 0.07 to 0.1 m per radian, and half of what their odometry misses.
+slow down. Four small robots lost 0.07 to 0.1 m per radian, half of all that their odometry missed.
 A map averages over that where tracks cross, so that its images show it: between images some
 decimeters apart they move by D - loss L, with the odometry's displacement D turned into the map,
 and what one m/rad takes from it, L.
