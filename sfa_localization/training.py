@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -227,10 +227,9 @@ def learn_place(
     if points is not None and finer is None:
         first = learn_metric(images.slow, segments, recipe.metric, seed, onto=first)
     announce(f'choose keyframes, and check the map (step 9 of {STEPS})', shown=progress)
-    model = _assemble(
+    model, result = _assemble(
         network, runs, clocks, recipe, images, known.views, segments, first, heading, finer
     )
-    result = finer.metric if finer else first
     return Trained(model, tuple(runs), images.slow, segments, result, heading)
 
 
@@ -457,8 +456,8 @@ def _assemble(
     first: MetricResult,
     heading: LearnedHeading | None,
     finer: LearnedRefinement | None,
-) -> PlaceModel:
-    """Step 9: the model, with its figures of merit."""
+) -> tuple[PlaceModel, MetricResult]:
+    """Step 9: the model, with its figures of merit, and its map with what keyframes improve."""
     height, width, _ = runs[0].panoramas.shape
     agreement = left_out_agreement(images.disagreement, first)
     result = finer.metric if finer else first
@@ -468,11 +467,12 @@ def _assemble(
     )
     # Of each run, s; None where the drive does not show it.
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
+    result = replace(result, forecast=result.forecast.improved(known.improvement))
     quality = _quality(network, images, segments, result, known)
     losses = [way.loss if way else 0.0 for way in segments.ways]
     quality |= {'features_used': first.map.features, 'refined': finer is not None}
     quality |= {'turn_loss': losses}
-    return PlaceModel(
+    model = PlaceModel(
         network,
         fast_map(first.map),
         PanoramaConfig(**{**asdict(recipe.panorama), 'height': height, 'width': width}),
@@ -485,6 +485,7 @@ def _assemble(
         correlation_along_drive(result, segments, TURN_RADIUS_M),
         finer.refinement if finer else None,
     )
+    return model, result
 
 
 def _quality(
@@ -506,8 +507,8 @@ def _quality(
         'certificate': float(result.certificate.eigenvalue),
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
         'keyframes': len(known.keyframes.poses),
-        'expected_error_m': result.forecast.expected_m * known.improvement,
-        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error * known.improvement},
+        'expected_error_m': result.forecast.expected_m,
+        'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
         'left_out_error_m': result.left_out_error_m,
         'left_out_within_95': known.within_95,
         'coverage': result.diagnostics.as_dict(),

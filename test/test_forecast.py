@@ -36,7 +36,7 @@ DRIVES = {
     'wandering more': meander(400.0, seed=4),
     'lanes along and across': (grid(10.0, 1.0, 9), (-5.0, -5.0, 0.0)),
 }
-EVERYWHERE = Forecast(np.zeros((4, 2)), np.array([0.1, 0.2, 0.3, 0.4]), np.ones(4))
+EVERYWHERE = Forecast(np.zeros((4, 2)), np.array([0.1, 0.2, 0.3, 0.4]), np.ones(4), np.zeros(4))
 
 
 def trained(name, noise=0.05):
@@ -169,12 +169,18 @@ def test_distances_to_another_part():
 def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points():
     rng = np.random.default_rng(2)
     wanted, have = rng.uniform(0, 0.5, 4000), rng.uniform(0, 2.0, 4000) ** 1.5
-    weight = Forecast(np.zeros((4000, 2)), wanted, np.ones(4000)).importance(have)
+    weight = Forecast(np.zeros((4000, 2)), wanted, np.ones(4000), np.zeros(4000)).importance(have)
     assert weight.sum() == pytest.approx(1.0)
     assert np.all(weight[have > 0.5] == 0.0)
     assert weight @ have == pytest.approx(0.25, abs=0.01)
     far = EVERYWHERE.importance(np.array([5.0, 6.0]))
     assert far == pytest.approx([0.5, 0.5]), 'where none is near enough, all count'
+
+
+def test_keyframes_improve_what_is_left_out_but_not_the_drive():
+    known = Forecast(np.zeros((2, 2)), np.ones(2), np.array([0.3, 0.0]), np.array([0.4, 0.1]))
+    assert known.errors == pytest.approx([0.5, 0.1])
+    assert known.improved(0.5).errors == pytest.approx([np.hypot(0.15, 0.4), 0.1])
 
 
 def test_a_forecast_moves_with_its_map():

@@ -49,8 +49,15 @@ class Forecast:
     """(K, 2) m, in the map frame."""
     distances: Array
     """(K,) m to the nearest image of the drive."""
-    errors: Array
-    """(K,) m: of the map without the images as near as that, and of the drive's own positions."""
+    left_out: Array
+    """(K,) m: errors of the map without the images as near as that."""
+    drive_std: Array
+    """(K,) m: of the drive's own positions there, which a map repeats."""
+
+    @property
+    def errors(self) -> Array:
+        """(K,) m: of left-out images and of the drive together."""
+        return np.hypot(self.left_out, self.drive_std)
 
     @property
     def expected_m(self) -> float:
@@ -86,6 +93,10 @@ class Forecast:
         weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)
         return np.asarray(weights / weights.sum())
 
+    def improved(self, share: float) -> Forecast:
+        """With this share of the left-out errors; nothing learned from a drive improves its own."""
+        return replace(self, left_out=share * self.left_out)
+
     def moved(self, frame: RigidTransform) -> Forecast:
         """The same forecast in another frame."""
         return replace(self, points=frame.apply(self.points))
@@ -108,7 +119,7 @@ def forecast(fit: MapFit, sway_variance: Array, rng: np.random.Generator) -> For
         gap = _gap(complex_places, fit.stack, int(image), near[k], far[k], rng)
         left_out = _left_out_errors(white[gap], weights[gap], fit.residuals[gap])
         errors[k] = abs(complex(left_out[gap == image][0]))
-    return Forecast(points, near, np.hypot(errors, np.sqrt(sway_variance[nearest])))
+    return Forecast(points, near, errors, np.sqrt(sway_variance[nearest]))
 
 
 def nearest_used(places: Array, part: Indices) -> Array:

@@ -106,11 +106,9 @@ def weak_places(forecast: Forecast) -> Iterator[tuple[float, float, float]]:
 def weak_lines(trained: Trained) -> list[str]:
     """Where the expected error is large."""
     forecast = trained.metric.forecast
-    scale = trained.model.quality['expected_error_m'] / forecast.expected_m
     share = float((forecast.local > _WEAK * forecast.expected_m).mean())
     lines = [
-        f'near x {x:.1f} m, y {y:.1f} m: {scale * error:.2f} m'
-        for x, y, error in weak_places(forecast)
+        f'near x {x:.1f} m, y {y:.1f} m: {error:.2f} m' for x, y, error in weak_places(forecast)
     ]
     even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
     uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
