@@ -147,3 +147,13 @@ def test_keyframes_vary_more_where_none_is_near_and_not_in_another_light():
 
     assert variation(far) > 3 * variation(places)
     assert variation(places, 0.7 * strange) == pytest.approx(variation(places), rel=0.5)
+
+
+def test_a_place_beside_all_keyframes_is_seen_to_be():
+    seen, places, _ = scene(60)
+    keyframes = np.stack([seen(p) for p in places])
+    inside, border, outside = (
+        place_among(seen(at), keyframes, places, 60).aside
+        for at in ((0.0, 0.0), (0.5, 0.0), (1.5, 0.0))
+    )
+    assert inside < 0.2 and 0.5 < border < 0.9 and outside > 0.9

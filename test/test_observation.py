@@ -19,7 +19,7 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import View
 
-NEARBY = Nearby(np.zeros(2), 0.0, 0.1, np.zeros((2, 2)), 0.1)
+NEARBY = Nearby(np.zeros(2), 0.0, 0.1, np.zeros((2, 2)), 0.1, 0.0)
 
 
 def test_a_good_picture_is_believed():
@@ -160,7 +160,7 @@ class InOtherLight(PictureReader):
     """Keyframes alone know the place; all images are unlike by their light."""
 
     def views(self, images):
-        nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05)
+        nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05, 0.0)
         noise = MatchNoise(floor_m=0.02, slope_m=0.4)
         own = np.diag([noise.variance(0.6) + 1e-4] * 2 + [0.01])
         match = Match(np.zeros(3), own, 0.7, 0.0, nearby, noise.by_place(0.6))
@@ -182,7 +182,7 @@ def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
 def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
     """Beside the trained area both extrapolate; in another light, where keyframes are near, not."""
     noise = MatchNoise(floor_m=0.02, slope_m=1.4)
-    nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05)
+    nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05, 0.0)
     own = np.diag([noise.variance(noise.by_place(0.6))] * 2 + [0.01])
     match = Match(np.zeros(3), own, 0.75, 0.0, nearby, noise.by_place(0.6))
     sure, beside = np.diag([0.1**2, 0.1**2, 0.01]), np.array([0.3, 0.0])

@@ -20,7 +20,11 @@ def images(light: float, number: int, seed: int = 0, scatter: float = 0.3):
     for variation in rng.uniform(0.05, 0.4, number):
         place = NOISE.expected_unlike(variation) * np.exp(scatter * rng.normal())
         unlike = (1 + place) * (1 + light) - 1
-        yield Nearby(np.zeros(2), 0.0, float(unlike), np.zeros((2, 2)), float(variation))
+        yield seen(float(unlike), float(variation))
+
+
+def seen(unlike: float, variation: float, aside: float = 0.2) -> Nearby:
+    return Nearby(np.zeros(2), 0.0, unlike, np.zeros((2, 2)), variation, aside)
 
 
 def after(nearby) -> float:
@@ -44,16 +48,26 @@ def test_the_light_may_change():
 
 def test_keyframes_that_are_far_are_no_other_light():
     """A drive beside all tracks: images are unlike, and keyframes vary."""
-    far = [Nearby(np.zeros(2), 0.0, 0.8, np.zeros((2, 2)), 0.4)] * 100
+    far = [seen(0.8, 0.4)] * 100
     assert after(far) < 0.05
 
 
+def test_beside_all_keyframes_nothing_is_learned_of_the_light():
+    assert after([seen(1.5, 0.05, aside=0.7)] * 100) == 0.0
+
+
+def test_an_excursion_beyond_the_keyframes_is_no_other_light():
+    """The place seems to be among those at the border, which cannot show how far it is."""
+    away = [seen(unlike, 0.05) for unlike in (0.2, 0.5, 0.9, *[1.4] * 60)]
+    assert after([*images(0.0, 150), *away]) < 0.15
+
+
 def test_images_that_are_more_alike_than_usual_are_no_negative_light():
-    assert after([Nearby(np.zeros(2), 0.0, 0.0, np.zeros((2, 2)), 0.3)] * 50) == 0.0
+    assert after([seen(0.0, 0.3)] * 50) == 0.0
 
 
 def test_no_light_hides_the_place():
-    assert after([Nearby(np.zeros(2), 0.0, 1e6, np.zeros((2, 2)), 0.05)] * 500) <= 1.0
+    assert after([seen(1e6, 0.05)] * 500) <= 1.0
 
 
 def repainted(world: Spheres, share: float) -> Spheres:

@@ -419,7 +419,8 @@ class Keyframes:
         """
         best, sign, columns = int(scores.argmax()), 1 if self.clockwise else -1, self._columns
         start, yaw = self.poses[best, :2], float(yaws[best])
-        found = Nearby(np.array(start), 0.0, _unlike(float(scores[best])), np.zeros((2, 2)), 0.0)
+        unlike = _unlike(float(scores[best]))
+        found = Nearby(np.array(start), 0.0, unlike, np.zeros((2, 2)), 0.0, 1.0)
         for _ in range(_REPEATED):
             near = self._around(found.place)
             near = self._alike(near[np.isfinite(scores[near])], best)

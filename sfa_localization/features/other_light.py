@@ -4,7 +4,9 @@
 
 An image may be unlike because no keyframe is near, and then its place is uncertain by as much; or
 because the light is another one, which is nearly the same for all images of some minutes, and
-moves places little. The keyframes around it say how unlike the first would make it.
+moves places little. The keyframes around it say how unlike the first would make it; beside all of
+them they cannot, and nothing is learned there. Nor do they know of places that are farther than
+they seem: what is suddenly much more unlike than the light of before is rather that.
 """
 
 from __future__ import annotations
@@ -18,6 +20,10 @@ from sfa_localization.features.nearby import Nearby
 # one image shows of it, which those around it repeat.
 _START, _CHANGE, _SHOWN = 0.3, 0.005, 0.1
 _REPEATED = 10
+# An image that is so many standard deviations more unlike than expected counts half.
+_SUDDEN = 2.0
+# Beyond this `Nearby.aside` a place is at the border of the keyframes, or outside.
+_BORDER = 0.5
 # No light makes images more unlike than this: 1, as much as what they have in common.
 _MOST = math.log(2.0)
 
@@ -40,9 +46,13 @@ class OtherLight:
 
     def add(self, nearby: Nearby, noise: MatchNoise) -> None:
         """Learn from an image of a known place."""
+        if nearby.aside > _BORDER:
+            return
         by_place = math.log1p(noise.expected_unlike(nearby.variation))
         shown = min(max(math.log1p(nearby.unlike) - by_place, -_MOST), _MOST)
         self._variance += _CHANGE**2
-        gain = self._variance / (self._variance + _REPEATED * (_SHOWN**2 + by_place**2))
-        self._logarithm += gain * (shown - self._logarithm)
+        error, scatter = shown - self._logarithm, _SHOWN**2 + by_place**2
+        doubt = 1 + max(error, 0.0) ** 2 / (_SUDDEN**2 * (self._variance + scatter))
+        gain = self._variance / (self._variance + _REPEATED * scatter * doubt)
+        self._logarithm += gain * error
         self._variance *= 1 - gain
