@@ -51,7 +51,8 @@ def learn_keyframes(
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
     path = _along_tracks(views, segments)[seen]
     own = fit_keyframes(views.textures[seen], poses, path, clockwise)
-    turn_std = float(np.sqrt(np.diag(result.angle_covariance).mean()))
+    # A stretch that hardly anything ties to the others is no matter of the map as a whole.
+    turn_std = float(np.sqrt(np.median(np.diag(result.angle_covariance))))
     keyframes = replace(own, noise=own.noise.with_map(result.common_m, turn_std))
     kept = spread(poses)
     variance = result.left_out_variance * agreement.factor(disagreement[labeled])
