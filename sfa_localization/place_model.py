@@ -43,7 +43,7 @@ from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
 
 FORMAT = 'sfa_localization place model'
-VERSION = 8
+VERSION = 9
 FARTHEST_M = 1e6
 """No place is farther from the origin of its map: there a pose's last digits are still micrometers.
 """
@@ -83,7 +83,7 @@ _BASIS = {
 _KEYFRAMES = {
     'textures': ArrayRule('NRC', 'i'),
     'poses': ArrayRule('N3', largest=FARTHEST_M),
-    'noise': ArrayRule('9', all_positive=True),
+    'noise': ArrayRule('10', all_positive=True),
     'clockwise': ArrayRule('', 'b'),
 }
 SCHEMA: Schema = {
@@ -147,7 +147,7 @@ class Estimate:
 class View:
     """What slow features say of an image, `position` (2,), `yaw` and `covariance` (3, 3) as in
     `Estimate`, and the `match` of the keyframes, which have `noise`. Of both together the scale
-    of the map is uncertain, about its `center` (2,).
+    of the map is uncertain, about its `center` (2,), and how far beyond the keyframes they are.
     """
 
     slow_features: Array
@@ -191,7 +191,7 @@ class View:
             return Estimate(self.slow_features, nothing[0], np.nan, nothing[1], novelty)
         covariance = covariance * max(novelty, 1.0) ** 2
         by_scale = SCALE_STD * (position - self.center)
-        covariance[:2, :2] += np.outer(by_scale, by_scale)
+        covariance[:2, :2] += np.outer(by_scale, by_scale) + self.match.beyond**2 * np.eye(2)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
         return Estimate(self.slow_features, position, yaw, covariance, novelty)
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframes: found in any light, from any heading; unknown places are known to be unknown."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -246,3 +248,22 @@ def test_a_long_drive_is_thinned_evenly():
     shares = np.histogram(kept, bins=10, range=(0, 3000))[0] / MOST
     assert shares.min() > 0.07
     assert np.array_equal(kept, spread(poses))
+
+
+@pytest.mark.parametrize('east', [(2.6, 3.2), (3.2, 4.0)])
+def test_images_beyond_the_keyframes_say_how_uncertain_their_place_is(east):
+    world, rng = Spheres.about(0), np.random.default_rng(1)
+    keyframes = learnt(world)
+    columns = rng.uniform(*east, 40), rng.uniform(-1.5, 1.5, 40), rng.uniform(-3.0, 3.0, 40)
+    poses = np.column_stack(columns)
+    _, _, found = errors(keyframes, world.panoramas(poses, CONFIG), poses)
+    known = [(m, p) for m, p in zip(found, poses, strict=True) if m.score > keyframes.noise.lowest]
+    wider = [(replace(m, covariance=m.covariance + m.beyond**2 * np.eye(3)), p) for m, p in known]
+    assert np.mean([holds(m, p) for m, p in known]) < 0.5, 'they seem to be at the border'
+    assert np.mean([holds(m, p) for m, p in wider]) > 0.9
+
+
+def test_images_among_the_keyframes_are_not_beyond_them():
+    world, poses = Spheres.about(0), unseen(60)
+    _, _, found = errors(learnt(world), world.panoramas(poses, CONFIG), poses)
+    assert np.mean([match.beyond == 0.0 for match in found]) > 0.9

@@ -4,6 +4,7 @@
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
 
 def test_a_view_without_a_finite_estimate_is_no_error():
     """Two estimates that are certain beyond all numbers have no mean."""
-    match = Match(np.zeros(3), np.zeros((3, 3)), 0.9, 0.0, NEARBY, 0.0)
+    match = Match(np.zeros(3), np.zeros((3, 3)), 0.9, 0.0, NEARBY, 0.0, 0.0)
     view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise(), np.zeros(2))
     assert math.isnan(view.distance)
     estimate = view.estimate()
@@ -148,12 +149,29 @@ def test_a_view_without_a_finite_estimate_is_no_error():
 def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
     center, place = np.array([1.0, 2.0]), np.array([11.0, 2.0])
     own = np.diag([0.01, 0.01, 0.001])
-    match = Match(np.append(place, 0.0), own, 0.9, 0.0, NEARBY, 0.0)
+    match = Match(np.append(place, 0.0), own, 0.9, 0.0, NEARBY, 0.0, 0.0)
     noise = MatchNoise()
     at_border = View(np.zeros(2), place, 0.0, own, match, noise, center).estimate()
     at_center = View(np.zeros(2), place, 0.0, own, match, noise, place).estimate()
     more = at_border.covariance - at_center.covariance
     assert np.allclose(more, np.diag([0.1**2, 0.0, 0.0]))
+
+
+def test_beyond_the_keyframes_both_estimates_are_wrong_together_and_light_is_no_distance():
+    noise = MatchNoise(away_m=0.8)
+    nearby = Nearby(np.zeros(2), 0.0, 1.0, 1e-4 * np.eye(2), 0.05, 0.7)
+    own = np.diag([0.1**2, 0.1**2, 0.01])
+    match = Match(np.zeros(3), own, 0.7, 0.0, nearby, 0.0, noise.beyond(nearby))
+    view = View(np.zeros(2), np.zeros(2), 0.0, own, match, noise, np.zeros(2))
+    assert noise.beyond(replace(nearby, aside=0.2)) == 0.0
+    expected = (0.8 * np.log(2.0)) ** 2
+    more = (
+        view.estimate().covariance
+        - replace(view, match=replace(match, beyond=0.0)).estimate().covariance
+    )
+    assert np.diag(more)[:2] == pytest.approx(expected)
+    assert view.in_light(1.0).match.beyond == 0.0
+    assert 0 < view.in_light(0.5).match.beyond < view.match.beyond
 
 
 class InOtherLight(PictureReader):
@@ -163,7 +181,7 @@ class InOtherLight(PictureReader):
         nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05, 0.0)
         noise = MatchNoise(floor_m=0.02, slope_m=0.4)
         own = np.diag([noise.variance(0.6) + 1e-4] * 2 + [0.01])
-        match = Match(np.zeros(3), own, 0.7, 0.0, nearby, noise.by_place(0.6))
+        match = Match(np.zeros(3), own, 0.7, 0.0, nearby, noise.by_place(0.6), 0.0)
         unknown = np.diag([1e4, 1e4, 3.0])
         return [View(np.zeros(2), np.zeros(2), 0.0, unknown, match, noise, np.zeros(2))] * len(
             images
@@ -184,7 +202,7 @@ def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
     noise = MatchNoise(floor_m=0.02, slope_m=1.4)
     nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05, 0.0)
     own = np.diag([noise.variance(noise.by_place(0.6))] * 2 + [0.01])
-    match = Match(np.zeros(3), own, 0.75, 0.0, nearby, noise.by_place(0.6))
+    match = Match(np.zeros(3), own, 0.75, 0.0, nearby, noise.by_place(0.6), 0.0)
     sure, beside = np.diag([0.1**2, 0.1**2, 0.01]), np.array([0.3, 0.0])
     view = View(np.zeros(2), beside, 0.0, sure, match, noise, np.zeros(2))
     outside, in_light = view.estimate(), view.in_light(0.58).estimate()

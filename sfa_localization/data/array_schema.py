@@ -19,8 +19,8 @@ from sfa_localization.data.rejections import short_line
 class ArrayRule(NamedTuple):
     """What one array must be.
 
-    `shape` has a character for each axis: a digit is its length, a letter any length, the same
-    everywhere in the group. `kind` is that of its dtype: f real, c complex, i integer, u unsigned,
+    `shape` has a number or a letter for each axis: its length, or any length, the same everywhere
+    in the group. `kind` is that of its dtype: f real, c complex, i integer, u unsigned,
     b boolean, U text. The numbers at the places `positive`, in order, must be > 0;
     `all_positive`: all. None is larger than `largest`, either way.
     """
@@ -82,9 +82,10 @@ def _alternative(prefix: str, names: Mapping[str, Any], groups: Sequence[Group])
 def _check(name: str, array: NDArray[Any], rule: ArrayRule, lengths: dict[str, int]) -> None:
     if array.dtype.kind != rule.kind:
         raise ModelError(f'the array {name} is of type {array.dtype}')
-    fits = array.ndim == len(rule.shape) and all(
+    axes = re.findall(r'\d+|\D', rule.shape)
+    fits = array.ndim == len(axes) and all(
         length == (int(axis) if axis.isdigit() else lengths.setdefault(axis, length))
-        for axis, length in zip(rule.shape, array.shape, strict=False)
+        for axis, length in zip(axes, array.shape, strict=False)
     )
     if not fits:
         raise ModelError(f'the array {name} has the shape {array.shape}')

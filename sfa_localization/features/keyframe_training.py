@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ from sfa_localization.features.keyframes import (
     MatchNoise,
     correlate,
 )
-from sfa_localization.features.nearby import Nearby
+from sfa_localization.features.nearby import BORDER, Nearby
 
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
 
@@ -42,6 +43,9 @@ _USUAL_SHARE = 0.05
 _ALIKE_SHARE = 0.25
 _LEAST_BY_VARIATION = 1e-3
 _LEAST_YAW_STD = 1e-3
+# Keyframes that are matched as if they were so far outside, m: about as far as any are known.
+_BEYOND_TRIALS, _BEYOND_M = 200, (0.2, 3.0)
+_LEAST_UNLIKE = 1e-3
 # Keeps novelty's scale finite where all images look alike.
 _LEAST_RANGE = 0.05
 
@@ -128,7 +132,37 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
         factor=max(needed_factor(squared / variance, 2), 1.0),
         yaw_std=max(MEDIAN_TO_STD * float(np.median(turns)), _LEAST_YAW_STD),
         lowest=lowest,
+        away_m=_away(keyframes, lowest),
     )
+
+
+def _away(keyframes: Keyframes, lowest: float) -> float:
+    """`MatchNoise.away_m`: what keyframes show that are matched with those alone that lie on one
+    side of them, and not near, as if they had been taken outside.
+    """
+    rng = np.random.default_rng(0)
+    places, columns = keyframes.poses[:, :2], keyframes.textures.shape[2]
+    nearest, farthest = map(math.log, _BEYOND_M)
+    far = np.exp(rng.uniform(nearest, farthest, _BEYOND_TRIALS))
+    direction = rng.uniform(-np.pi, np.pi, _BEYOND_TRIALS)
+    outward = np.column_stack([np.cos(direction), np.sin(direction)])
+    sample = rng.integers(len(places), size=_BEYOND_TRIALS)
+    shown = []
+    for row, towards, distance in zip(sample.tolist(), outward, far, strict=True):
+        rows = np.flatnonzero((places - places[row]) @ towards < -distance)
+        if len(rows) < NEIGHBORS:
+            continue
+        scores = np.full(len(places), -np.inf, np.float32)
+        shifts = np.zeros(len(places), np.float32)
+        own = keyframes.spectra[row]
+        (scores[rows],), (shifts[rows],) = correlate(own[None], keyframes.spectra[rows], columns)
+        match = keyframes.located(own, scores, shifts)
+        if match.score >= lowest and match.nearby.aside > BORDER:
+            unlike = max(math.log1p(match.nearby.unlike), _LEAST_UNLIKE)
+            shown.append(math.dist(match.pose[:2], places[row]) / unlike)
+    # Of the length of a vector whose components have a standard deviation of 1.
+    median = math.sqrt(2 * math.log(2))
+    return float(np.median(shown)) / median if len(shown) >= NEIGHBORS else MatchNoise().away_m
 
 
 def _usual(trials: Sequence[_Trial], noise: MatchNoise, lowest: float) -> MatchNoise:

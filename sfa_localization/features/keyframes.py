@@ -13,6 +13,7 @@ colors stay.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,7 +27,7 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.nearby import Nearby, Spectra, place_among, turned
+from sfa_localization.features.nearby import BORDER, Nearby, Spectra, place_among, turned
 
 Texture = NDArray[np.float32]
 
@@ -73,6 +74,8 @@ class MatchNoise:
     unknown, `usual` the one that 19 of 20 images of known places reach. `joint_factor` is what
     the variances lack of estimates that slow features and keyframes agree on. `by_variation`
     times the square of `Nearby.variation` is how unlike images in the light of the keyframes are.
+    `away_m` times the logarithm of 1 + `unlike` is how far out along each axis an image is that
+    seems to be at the border of the keyframes: likeness decays exponentially with the distance.
     """
 
     temperature: float = 0.02
@@ -84,6 +87,7 @@ class MatchNoise:
     usual: float = 0.6
     joint_factor: float = 1.0
     by_variation: float = 10.0
+    away_m: float = 0.8
 
     def with_map(self, common_m: float, turn_std: float) -> MatchNoise:
         """With the errors of a map, which keyframes that are left out share: standard deviations
@@ -102,6 +106,14 @@ class MatchNoise:
         """Variance m^2 of a position along each axis, where the place makes images so unlike."""
         return self.floor_m**2 + (self.slope_m * by_place) ** 2
 
+    def beyond(self, nearby: Nearby, light: float = 0.0) -> float:
+        """Standard deviation m along each axis of how far an image, in such a light, is beyond
+        the keyframes; 0 among them.
+        """
+        if nearby.aside <= BORDER:
+            return 0.0
+        return self.away_m * max(math.log1p(nearby.unlike) - math.log1p(light), 0.0)
+
     def expected_unlike(self, variation: float) -> float:
         """How unlike an image in the light of the keyframes is, among such that vary so much."""
         return self.by_variation * variation**2
@@ -119,7 +131,8 @@ class Match:
     `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
     with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
     near a guess minus `score`, in temperatures: 0 where the best is among them; `nearby` is what
-    the keyframes around the best one say, and `by_place` how unlike the place makes the image.
+    the keyframes around the best one say, `by_place` how unlike the place makes the image, and
+    `beyond` the standard deviation m of what all estimates from it miss outside the keyframes.
     """
 
     pose: Array
@@ -128,6 +141,7 @@ class Match:
     support: float
     nearby: Nearby
     by_place: float
+    beyond: float
 
     def in_light(self, light: float, noise: MatchNoise) -> Match:
         """The same where the image is known to be so unlike because of its light, by itself: that
@@ -137,7 +151,8 @@ class Match:
         less = noise.variance(by_place) - noise.variance(self.by_place)
         covariance = self.covariance.copy()
         covariance[:2, :2] += noise.factor * less * np.eye(2)
-        return replace(self, covariance=covariance, by_place=by_place)
+        beyond = noise.beyond(self.nearby, light)
+        return replace(self, covariance=covariance, by_place=by_place, beyond=beyond)
 
     def widened(self, covariance: Array, noise: MatchNoise) -> Array:
         """The covariance (3, 3) of slow features, with what they lack where the place makes the
@@ -408,7 +423,8 @@ class Keyframes:
             if len(near):
                 support = float(near.max() - scores[best]) / self.noise.temperature
         pose = np.array([*found.place, wrap_angle(yaw)])
-        return Match(pose, covariance, float(scores[best]), support, found, by_place)
+        beyond = self.noise.beyond(found)
+        return Match(pose, covariance, float(scores[best]), support, found, by_place, beyond)
 
     def _regressed(
         self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array, reach: float

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from sfa_localization.features.keyframes import MatchNoise
-from sfa_localization.features.nearby import Nearby
+from sfa_localization.features.nearby import BORDER, Nearby
 
 # Standard deviations of the logarithm: at the start, of its change from image to image, and of what
 # one image shows of it, which those around it repeat.
@@ -22,8 +22,6 @@ _START, _CHANGE, _SHOWN = 0.3, 0.005, 0.1
 _REPEATED = 10
 # An image that is so many standard deviations more unlike than expected counts half.
 _SUDDEN = 2.0
-# Beyond this `Nearby.aside` a place is at the border of the keyframes, or outside.
-_BORDER = 0.5
 # No light makes images more unlike than this: 1, as much as what they have in common.
 _MOST = math.log(2.0)
 
@@ -46,7 +44,7 @@ class OtherLight:
 
     def add(self, nearby: Nearby, noise: MatchNoise) -> None:
         """Learn from an image of a known place."""
-        if nearby.aside > _BORDER:
+        if nearby.aside > BORDER:
             return
         by_place = math.log1p(noise.expected_unlike(nearby.variation))
         shown = min(max(math.log1p(nearby.unlike) - by_place, -_MOST), _MOST)
