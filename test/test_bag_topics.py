@@ -382,6 +382,16 @@ def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
         np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
 
 
+def test_other_faults_do_not_name_the_remedy_of_stamps(tmp_path: Path) -> None:
+    entries = poses_of(pose_stamped, '/p')
+    for _, _, message in entries:
+        message.pose.orientation.z = message.pose.orientation.w = 0.0
+    path = record(tmp_path / 'bag', entries)
+    with Bag(path) as bag, pytest.raises(BagError, match='6 quaternion is zero') as raised:
+        bag.trajectory()
+    assert 'stamp_source' not in str(raised.value)
+
+
 def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

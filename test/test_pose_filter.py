@@ -146,6 +146,18 @@ def test_one_stamp_far_ahead_does_no_harm():
     assert all(update.accepted for _, update, _, _ in drive.feed(fused, start=2))
 
 
+def test_stamps_far_ahead_are_believed_only_in_a_row():
+    """A driver that spoils one stamp in a second must not start the filter anew."""
+    drive = Drive(seconds=8)
+    fused = known()
+    for number, event in enumerate(drive.events()):
+        drive.give(fused, event)
+        if number % 20 == 19:
+            assert fused.add_odometry(START_NS + 7200 * SECOND, 1.0, 0.0) == 'stamp far ahead'
+    assert fused.counts['gap in time'] == fused.counts['reset'] == 0
+    assert fused.status.level is Level.LOCALISED
+
+
 def test_a_long_pause_of_the_recording_is_survived_and_reported():
     drive = Drive(seconds=10)
     fused = known()

@@ -29,7 +29,7 @@ from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.storage import Channel, Record, add_problem, inflate_message, room_for
 from sfa_localization.bags.topic_stream import Stream, Tally
 from sfa_localization.data.errors import BagError, MessageError
-from sfa_localization.data.messages import read_yaw_rate
+from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
 from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
 
@@ -332,5 +332,5 @@ def _plain_name(name: str) -> str:
 
 def _reasons(count: Count) -> str:
     reasons = listed(count.skipped)
-    remedy = '; try the time of reception (stamp_source: receive)' if 'zero' in reasons else ''
+    remedy = '; try the time of reception (stamp_source: receive)' if NO_STAMP in reasons else ''
     return f'no usable message ({reasons or "none recorded"}){remedy}'

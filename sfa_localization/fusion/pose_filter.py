@@ -320,6 +320,8 @@ class PoseFilter:
             return
         if stamp_ns > newest + TIME_JUMP_S * 1e9:
             self._require_others_ahead(stamp_ns)
+        elif self._keeps_time(rank):
+            self._ahead = (0, 0)
         if rank == _MEASUREMENT and self._history.newest.odometry_ns is not None:
             self._require_same_clock(stamp_ns, newest)
         if stamp_ns <= newest and not self._history.reaches(stamp_ns):
@@ -343,7 +345,7 @@ class PoseFilter:
         self._waiting = None
 
     def _require_others_ahead(self, stamp_ns: int) -> None:
-        """One stamp far ahead is an error; several that agree are a pause of the recording."""
+        """One stamp far ahead is an error; several in a row that agree are a pause."""
         last, count = self._ahead
         near = abs(stamp_ns - last) <= TIME_JUMP_S * 1e9
         self._ahead = (stamp_ns, count + 1 if near else 1)
