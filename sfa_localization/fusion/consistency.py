@@ -32,6 +32,9 @@ TURNED_RAD, STRETCHED, CHANCE_STDS = math.radians(12.0), 0.25, 3.5
 """Headings that differ from the direction of motion by more than both angle and standard deviations
 were not drawn by chance, nor were images that move farther or less far than odometry by this part:
 twice what maps of noisy odometry show in places."""
+DOUBTED_STDS, YOUNG_M = 2.0, 4.0
+"""The bar is lower once they did, and over this distance after a place has been confirmed: what
+images alone have shown so far may be wrong from the start."""
 FORGIVEN_M, LONGEST_M = 30.0, 16.0
 """Distance after which an estimate that stayed counts as never moved, and the longest distance
 that must confirm one."""
@@ -59,8 +62,10 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
     recent = (*recent, newest)
     while len(recent) > WINDOW_IMAGES and newest.traveled_m - recent[1].traveled_m >= WINDOW_M:
         recent = recent[1:]
-    problem, misfit = compared(recent)
-    settled = newest.traveled_m - trust.moved_m > trust.confirming_m + FORGIVEN_M
+    since_m = newest.traveled_m - trust.moved_m - trust.confirming_m
+    doubted = trust.problem or since_m < YOUNG_M
+    problem, misfit = compared(recent, DOUBTED_STDS if doubted else CHANCE_STDS)
+    settled = since_m > FORGIVEN_M
     moves = 0 if settled and not problem else trust.moves
     return trust._replace(recent=recent, problem=problem, misfit=misfit, moves=moves)
 
@@ -112,8 +117,12 @@ def contradiction(recent: Sequence[Evidence]) -> str:
     return compared(recent)[0]
 
 
-def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
-    """The contradiction, and by how much (m, rad) the images differ; see `contradiction`."""
+def compared(
+    recent: Sequence[Evidence], stds: float = CHANCE_STDS
+) -> tuple[str, tuple[float, float]]:
+    """The contradiction, and by how much (m, rad) the images differ; see `contradiction`. Within
+    so many `stds` headings differ by chance.
+    """
     span_m = recent[-1].traveled_m - recent[0].traveled_m
     if len(recent) < WINDOW_IMAGES or span_m < AGREEING_DISTANCE_M:
         return '', (0.0, 0.0)
@@ -136,7 +145,7 @@ def compared(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
     if abs(stretch) > max(STRETCHED, CHANCE_STDS * std):
         shown = f'images move {abs(factor):.1f} times as far as the odometry'
         return shown, (abs(stretch) * span_m, 0.0)
-    return _turned(recent, agree, float(np.angle(turn)), spread)
+    return _turned(recent, agree, float(np.angle(turn)), spread, stds)
 
 
 def _stretch(
@@ -163,7 +172,11 @@ def _stretch(
 
 
 def _turned(
-    recent: Sequence[Evidence], agree: NDArray[np.bool_], turn: float, variance: float
+    recent: Sequence[Evidence],
+    agree: NDArray[np.bool_],
+    turn: float,
+    variance: float,
+    stds: float,
 ) -> tuple[str, tuple[float, float]]:
     """Whether headings of images differ from the direction in which their positions move."""
     items = [item for item, fits in zip(recent, agree, strict=True) if fits]
@@ -175,7 +188,7 @@ def _turned(
     angle = float(wrap_angle(mean + np.median(wrap_angle(np.array(off) - mean))))
     yaw_variance = float(np.mean([item.yaw_variance for item in items if math.isfinite(item.yaw)]))
     std = math.sqrt(variance + yaw_variance + _HEADING_DRIFT_RAD**2)
-    if abs(angle) < max(TURNED_RAD, CHANCE_STDS * std):
+    if abs(angle) < max(TURNED_RAD, stds * std):
         return '', (0.0, 0.0)
     degrees = f'{math.degrees(angle):.0f} degrees'
     return f'images look {degrees} off the motion: was the camera turned?', (0.0, abs(angle))
