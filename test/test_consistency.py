@@ -11,13 +11,12 @@ from filter_drives import Drive
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion import consistency
-from sfa_localization.fusion.belief import Evidence, Trust
+from sfa_localization.fusion.belief import COMPARED_IMAGES, Evidence, Trust
 from sfa_localization.fusion.consistency import (
     AGREEING_DISTANCE_M,
     FORGIVEN_M,
     LONGEST_M,
     SPACING_M,
-    WINDOW_IMAGES,
     WINDOW_M,
     contradiction,
     doubts,
@@ -147,7 +146,7 @@ def test_without_headings_only_the_motion_counts():
 def test_too_few_images_or_too_short_a_path_contradict_nothing():
     poses, places, yaws = bend()
     repeated = np.full(len(places), places[0])
-    few = slice(0, WINDOW_IMAGES - 1)
+    few = slice(0, COMPARED_IMAGES - 1)
     assert contradiction(seen(3 * poses[few], repeated[few], yaws[few])) == ''
     assert contradiction(seen(0.5 * poses, repeated, yaws)) == ''
     assert contradiction(seen(poses, repeated, yaws)) != ''
@@ -165,21 +164,27 @@ def test_the_window_holds_the_newest_images_over_both_distance_and_number():
     poses, places, yaws = bend(length_m=40.0, count=41)
     for item in seen(poses, places, yaws):
         trust = watched(trust, item)
-    assert len(trust.recent) == WINDOW_IMAGES
+    assert len(trust.recent) == COMPARED_IMAGES
+
+
+def compared(trust):
+    """The trust after as many images as a comparison needs."""
+    item = Evidence((0.0, 0.0, 0.0), 0.0, (0.0, 0.0), 0.0, 0.01, 0.001, True)
+    return trust._replace(recent=(item,) * COMPARED_IMAGES)
 
 
 def test_every_move_doubles_the_distance_that_confirms():
     trust = Trust()
     assert doubts(trust, 0.0) == []
-    trust = moved(trust, 10.0)
+    trust = compared(moved(trust, 10.0))
     assert doubts(trust, 10.5) == ['placed anew, confirmed over 0.5 m: driving on confirms it']
     assert doubts(trust, 10.0 + AGREEING_DISTANCE_M) == []
-    trust = moved(trust, 20.0)
+    trust = compared(moved(trust, 20.0))
     shown = 'placed anew 2 times in a row, confirmed over 3.0 m: driving on confirms it'
     assert shown in doubts(trust, 23.0)
     assert doubts(trust, 20.0 + 2 * AGREEING_DISTANCE_M) == []
     for _ in range(10):
-        trust = moved(trust, 30.0)
+        trust = compared(moved(trust, 30.0))
     assert doubts(trust, 30.0 + LONGEST_M - 0.1) != [] and doubts(trust, 30.0 + LONGEST_M) == []
 
 
@@ -247,6 +252,21 @@ def test_a_camera_that_was_turned_before_the_start_shows_by_driving(standing_s, 
     drive.seen[:, 2] += math.radians(degrees)
     sure = [status.level is Level.LOCALISED for status, *_ in fed(drive)]
     assert 0.1 * sum(sure) <= at_most_s
+
+
+@pytest.mark.parametrize(('every', 'at_most_s'), [(10, 1.5), (50, 0.0), (100, 0.0)])
+@pytest.mark.parametrize('degrees', [-22, -18, 18, 22])
+def test_a_camera_mounted_askew_is_not_trusted_at_any_rate(degrees, every, at_most_s):
+    drive = Drive(twists=np.tile([0.9, 0.08], (2500, 1)), every=every, **NOISY)
+    drive.seen[:, 2] = wrap_angle(drive.seen[:, 2] + math.radians(degrees))
+    sure = [status.level is Level.LOCALISED for status, *_ in fed(drive)]
+    assert every / 50 * sum(sure) <= at_most_s
+
+
+def test_of_a_slow_camera_too_few_images_confirm_nothing():
+    trust = moved(Trust(), 10.0)
+    few = compared(trust).recent[1:]
+    assert doubts(trust._replace(recent=few), 20.0) and not doubts(compared(trust), 20.0)
 
 
 def test_after_a_knock_of_the_camera_the_filter_is_not_sure():

@@ -81,6 +81,10 @@ class Evidence(NamedTuple):
     accepted: bool
 
 
+COMPARED_IMAGES = 5
+"""Images that show whether they move as the odometry does, and look in that direction."""
+
+
 class Trust(NamedTuple):
     """Images over the last meters, and how they contradict the odometry's motion, '' if not.
 
@@ -99,8 +103,11 @@ class Trust(NamedTuple):
     jump_m: float = 0.0
 
     def unconfirmed(self, accepted_m: float) -> bool:
-        """Whether no image has fitted yet that far from where images moved the estimate."""
-        return accepted_m - self.moved_m < self.confirming_m
+        """Whether no image has fitted yet that far from where images moved the estimate, or too
+        few came since to be compared with the odometry's motion.
+        """
+        few = len(self.recent) < COMPARED_IMAGES and self.confirming_m > 0.0
+        return few or accepted_m - self.moved_m < self.confirming_m
 
     def variances(self, accepted_m: float) -> tuple[float, float, float]:
         """Of x, y and yaw, on top, while the estimate is not trusted."""

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, align_complex, wrap_angle
-from sfa_localization.fusion.belief import Evidence, Pull, Trust
+from sfa_localization.fusion.belief import COMPARED_IMAGES, Evidence, Pull, Trust
 from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
 
 SPACING_M = 0.1
 """Images nearer than this to the last one kept show no motion of their own."""
-WINDOW_M, WINDOW_IMAGES = 1.5 * AGREEING_DISTANCE_M, 8
-"""The newest images over both are compared; images of slow cameras are farther apart."""
+WINDOW_M = 1.5 * AGREEING_DISTANCE_M
+"""The newest images over this distance are compared, or more where a slow camera took too few."""
 AGREEING_HALF = 0.5
 """Fewer than half of the images on the odometry's path are no outliers: motions differ."""
 TURNED_RAD, STRETCHED, CHANCE_STDS = math.radians(12.0), 0.25, 3.5
@@ -60,7 +60,7 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
     if recent and abs(newest.traveled_m - recent[-1].traveled_m) < SPACING_M:
         return trust
     recent = (*recent, newest)
-    while len(recent) > WINDOW_IMAGES and newest.traveled_m - recent[1].traveled_m >= WINDOW_M:
+    while len(recent) > COMPARED_IMAGES and newest.traveled_m - recent[1].traveled_m >= WINDOW_M:
         recent = recent[1:]
     since_m = newest.traveled_m - trust.moved_m - trust.confirming_m
     doubted = trust.problem or since_m < YOUNG_M
@@ -124,7 +124,7 @@ def compared(
     so many `stds` headings differ by chance.
     """
     span_m = recent[-1].traveled_m - recent[0].traveled_m
-    if len(recent) < WINDOW_IMAGES or span_m < AGREEING_DISTANCE_M:
+    if len(recent) < COMPARED_IMAGES or span_m < AGREEING_DISTANCE_M:
         return '', (0.0, 0.0)
     path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
     places = np.array([complex(*item.position) for item in recent])

@@ -59,9 +59,9 @@ _ACCELERATION = 0.3
 # Shares of the drift by one step between neighbors, either way.
 _LATER = np.where(_IN_TIME[:-1] & ~_IN_TIME[1:], _LEAVE, 1.0)
 _SOONER = np.where(_IN_TIME[1:] & ~_IN_TIME[:-1], _LEAVE, 1.0)
-_NEAR_NS, _APART_NS = 150_000_000, 950_000_000
-"""Closer images turn too little. Farther ones, a meter apart at walking speed, show other sides of
-near things, which shifts them as a turn does."""
+_NEAR_NS, _APART_NS = 150_000_000, 750_000_000
+"""Closer images turn too little. Farther ones, most of a meter at walking speed, show other sides
+of near things, which shifts them as a turn does."""
 _SOON_NS, _FINALLY_NS = 300_000_000, round(-EARLIEST_S * 1e9)
 """A pair counts after so long, with odometry that goes on as before where images may be early; and
 for good when all of the odometry is there."""
