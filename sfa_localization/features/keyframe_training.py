@@ -144,12 +144,12 @@ def _away(keyframes: Keyframes, lowest: float) -> float:
     places, columns = keyframes.poses[:, :2], keyframes.textures.shape[2]
     nearest, farthest = map(math.log, _BEYOND_M)
     far = np.exp(rng.uniform(nearest, farthest, _BEYOND_TRIALS))
-    direction = rng.uniform(-np.pi, np.pi, _BEYOND_TRIALS)
-    outward = np.column_stack([np.cos(direction), np.sin(direction)])
+    angle = rng.uniform(-np.pi, np.pi, _BEYOND_TRIALS)
+    directions = np.column_stack([np.cos(angle), np.sin(angle)])
     sample = rng.integers(len(places), size=_BEYOND_TRIALS)
     shown = []
-    for row, towards, distance in zip(sample.tolist(), outward, far, strict=True):
-        rows = np.flatnonzero((places - places[row]) @ towards < -distance)
+    for row, outward, distance in zip(sample.tolist(), directions, far, strict=True):
+        rows = np.flatnonzero((places - places[row]) @ outward < -distance)
         if len(rows) < NEIGHBORS:
             continue
         scores = np.full(len(places), -np.inf, np.float32)
