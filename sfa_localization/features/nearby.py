@@ -19,8 +19,8 @@ from scipy import fft
 
 from sfa_localization.data.geometry import Array
 
-BORDER = 0.5
-"""Above this `Nearby.aside` the keyframes lie on one side of the place: it may be farther out."""
+BORDER = 0.6
+"""Above this `Nearby.aside` a place is at the border of the keyframes: it may be farther out."""
 
 Spectra = NDArray[np.complex64]
 Vectors = NDArray[np.float32]
