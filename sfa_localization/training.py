@@ -469,9 +469,7 @@ def _assemble(
     delays = [clock.delay_ns * 1e-9 if clock.known else None for clock in clocks]
     result = replace(result, forecast=result.forecast.improved(known.improvement))
     quality = _quality(network, images, segments, result, known)
-    losses = [way.loss if way else 0.0 for way in segments.ways]
     quality |= {'features_used': first.map.features, 'refined': finer is not None}
-    quality |= {'turn_loss': losses}
     model = PlaceModel(
         network,
         fast_map(first.map),
@@ -503,6 +501,7 @@ def _quality(
         **images.variance_shares,
         'pictures': len(images.slow),
         'segments': len(segments),
+        'turn_loss': [way.loss if way else 0.0 for way in segments.ways],
         'certified': bool(result.certificate.certified),
         'certificate': float(result.certificate.eigenvalue),
         'residual_m': float(np.hypot(*result.residuals.T).mean()),
