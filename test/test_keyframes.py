@@ -21,6 +21,7 @@ from sfa_localization.features.keyframes import (
     spectrum,
     texture,
 )
+from sfa_localization.metric.keyframe_map import usual_turn_std
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)
@@ -267,3 +268,8 @@ def test_images_among_the_keyframes_are_not_beyond_them():
     world, poses = Spheres.about(0), unseen(60)
     _, _, found = errors(learnt(world), world.panoramas(poses, CONFIG), poses)
     assert np.mean([match.beyond == 0.0 for match in found]) > 0.9
+
+
+def test_one_loose_stretch_does_not_make_all_headings_uncertain():
+    stds = np.array([0.01] * 9 + [0.5])
+    assert usual_turn_std(np.diag(stds**2)) == pytest.approx(0.01)

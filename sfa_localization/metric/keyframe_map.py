@@ -51,12 +51,18 @@ def learn_keyframes(
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
     path = _along_tracks(views, segments)[seen]
     own = fit_keyframes(views.textures[seen], poses, path, clockwise)
-    # A stretch that hardly anything ties to the others is no matter of the map as a whole.
-    turn_std = float(np.sqrt(np.median(np.diag(result.angle_covariance))))
+    turn_std = usual_turn_std(result.angle_covariance)
     keyframes = replace(own, noise=own.noise.with_map(result.common_m, turn_std))
     kept = spread(poses)
     variance = result.left_out_variance * agreement.factor(disagreement[labeled])
     return _judged(keyframes, path[kept], row[kept], result, variance)
+
+
+def usual_turn_std(covariance: Array) -> float:
+    """Standard deviation rad of a map's directions, by those of its N segments, (N, N) rad^2: one
+    that hardly anything ties to the others is no matter of the map as a whole.
+    """
+    return float(np.sqrt(np.median(np.diag(covariance))))
 
 
 def _along_tracks(views: Views, segments: Segments) -> Array:
