@@ -22,6 +22,8 @@ from sfa_localization.features.rotation import Map
 
 MEDIAN_TO_STD = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
+LENGTH_TO_STD = float(1.0 / np.sqrt(2.0 * np.log(2.0)))
+"""The same of a vector in the plane: along each axis, over the median of its length."""
 _EXPONENTS = np.linspace(0.0, 6.0, 25)
 # Degrees of freedom of Student's t, for the few images with large errors.
 _HEAVY_TAIL = 4.0

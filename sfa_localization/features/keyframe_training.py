@@ -14,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.agreement import MEDIAN_TO_STD, needed_factor, quantile
+from sfa_localization.features.agreement import (
+    LENGTH_TO_STD,
+    MEDIAN_TO_STD,
+    needed_factor,
+    quantile,
+)
 from sfa_localization.features.keyframes import (
     LOWEST,
     LOWEST_SHARE,
@@ -23,7 +28,7 @@ from sfa_localization.features.keyframes import (
     MatchNoise,
     correlate,
 )
-from sfa_localization.features.nearby import BORDER, Nearby
+from sfa_localization.features.nearby import Nearby
 
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
 
@@ -141,7 +146,7 @@ def _away(keyframes: Keyframes, lowest: float) -> float:
     side of them, and not near, as if they had been taken outside.
     """
     rng = np.random.default_rng(0)
-    places, columns = keyframes.poses[:, :2], keyframes.textures.shape[2]
+    places = keyframes.poses[:, :2]
     nearest, farthest = map(math.log, _BEYOND_M)
     far = np.exp(rng.uniform(nearest, farthest, _BEYOND_TRIALS))
     angle = rng.uniform(-np.pi, np.pi, _BEYOND_TRIALS)
@@ -152,17 +157,13 @@ def _away(keyframes: Keyframes, lowest: float) -> float:
         rows = np.flatnonzero((places - places[row]) @ outward < -distance)
         if len(rows) < NEIGHBORS:
             continue
-        scores = np.full(len(places), -np.inf, np.float32)
-        shifts = np.zeros(len(places), np.float32)
-        own = keyframes.spectra[row]
-        (scores[rows],), (shifts[rows],) = correlate(own[None], keyframes.spectra[rows], columns)
-        match = keyframes.located(own, scores, shifts)
-        if match.score >= lowest and match.nearby.aside > BORDER:
+        match = keyframes.match_among(keyframes.spectra[row], rows)
+        if match.score >= lowest and match.nearby.at_border:
             unlike = max(math.log1p(match.nearby.unlike), _LEAST_UNLIKE)
             shown.append(math.dist(match.pose[:2], places[row]) / unlike)
-    # Of the length of a vector whose components have a standard deviation of 1.
-    median = math.sqrt(2 * math.log(2))
-    return float(np.median(shown)) / median if len(shown) >= NEIGHBORS else MatchNoise().away_m
+    if len(shown) < NEIGHBORS:
+        return keyframes.noise.away_m
+    return LENGTH_TO_STD * float(np.median(shown))
 
 
 def _usual(trials: Sequence[_Trial], noise: MatchNoise, lowest: float) -> MatchNoise:

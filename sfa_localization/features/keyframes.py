@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.nearby import BORDER, Nearby, Spectra, place_among, turned
+from sfa_localization.features.nearby import Nearby, Spectra, place_among, turned
 
 Texture = NDArray[np.float32]
 
@@ -110,7 +110,7 @@ class MatchNoise:
         """Standard deviation m along each axis of how far an image, in such a light, is beyond
         the keyframes; 0 among them.
         """
-        if nearby.aside <= BORDER:
+        if not nearby.at_border:
             return 0.0
         return self.away_m * max(math.log1p(nearby.unlike) - math.log1p(light), 0.0)
 
@@ -352,8 +352,7 @@ class Keyframes:
         correlated in full.
         """
         image = spectrum(texture(panorama))[None]
-        scores = np.full(len(self.poses), -np.inf, np.float32)
-        shifts = np.zeros(len(self.poses), np.float32)
+        scores, shifts = self._unmatched()
         wanted = [self._candidates(image)]
         if guess is not None:
             wanted.append(self.nearest(guess))
@@ -361,6 +360,17 @@ class Keyframes:
         best = self.poses[int(scores.argmax()), :2]
         self._add(image, self._around(best), scores, shifts)
         return self.located(image[0], scores, shifts, guess)
+
+    def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
+        """Find the spectrum (rows, F) of an image with some keyframes alone."""
+        scores, shifts = self._unmatched()
+        self._add(spectrum[None], rows, scores, shifts)
+        return self.located(spectrum, scores, shifts)
+
+    def _unmatched(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Correlations (K,) that are all unknown, and shifts (K,)."""
+        count = len(self.poses)
+        return np.full(count, -np.inf, np.float32), np.zeros(count, np.float32)
 
     def _add(
         self,

@@ -19,9 +19,6 @@ from scipy import fft
 
 from sfa_localization.data.geometry import Array
 
-BORDER = 0.6
-"""Above this `Nearby.aside` a place is at the border of the keyframes: it may be farther out."""
-
 Spectra = NDArray[np.complex64]
 Vectors = NDArray[np.float32]
 
@@ -32,6 +29,8 @@ _LIKENESS = 0.05
 _RIDGE = 0.005
 # Share of its likeness that an image keeps in any light.
 _LEAST_GAIN = 0.2
+# Above this `Nearby.aside` a place is at the border of the keyframes: a straight one has 0.64.
+_BORDER = 0.6
 # Parts of the panorama in which light and what hides the view are one error each: 22.5 deg.
 _SECTORS = 16
 
@@ -62,6 +61,11 @@ class Nearby:
     noise: Array
     variation: float
     aside: float
+
+    @property
+    def at_border(self) -> bool:
+        """Whether the place is at the border of the keyframes: it may be farther out."""
+        return self.aside > _BORDER
 
 
 @dataclass(frozen=True, slots=True)

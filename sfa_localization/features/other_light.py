@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from sfa_localization.features.keyframes import MatchNoise
-from sfa_localization.features.nearby import BORDER, Nearby
+from sfa_localization.features.nearby import Nearby
 
 # Standard deviations of the logarithm: at the start, of its change from image to image, and of what
 # one image shows of it, which those around it repeat.
@@ -44,7 +44,7 @@ class OtherLight:
 
     def add(self, nearby: Nearby, noise: MatchNoise) -> None:
         """Learn from an image of a known place."""
-        if nearby.aside > BORDER:
+        if nearby.at_border:
             return
         by_place = math.log1p(noise.expected_unlike(nearby.variation))
         shown = min(max(math.log1p(nearby.unlike) - by_place, -_MOST), _MOST)

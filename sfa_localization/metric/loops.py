@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.agreement import MEDIAN_TO_STD
+from sfa_localization.features.agreement import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.quadratic_form import Solution, Stack
 
@@ -96,8 +96,7 @@ class Loops:
         x = before.coefficients(stack.period)
         turned, apart = np.abs(turns @ x), np.abs(moves @ x)
         turn_std = max(MEDIAN_TO_STD * _median(turned), _LEAST_TURN_STD)
-        # Of two axes.
-        place_std = max(_median(apart) / np.sqrt(2.0 * np.log(2.0)), _LEAST_PLACE_STD_M)
+        place_std = max(LENGTH_TO_STD * _median(apart), _LEAST_PLACE_STD_M)
         doubt = 1.0 + (turned / (_HALF * turn_std)) ** 2 + (apart / (_HALF * place_std)) ** 2 / 2
         return self.share / doubt / turn_std**2, self.share / doubt / place_std**2
 
