@@ -74,6 +74,19 @@ def test_keyframes_in_another_light_have_little_weight():
     assert np.allclose(found.place, (0.2, 0.1), atol=0.03)
 
 
+def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
+    seen, places, strange = scene(60)
+    strange = strange / 2
+    line = np.column_stack([np.linspace(-0.5, 0.5, 12), np.zeros(12)])
+    keyframes = np.stack([*(seen(p) for p in places), *(seen(p, strange) for p in line)])
+    everywhere, place = np.concatenate([places, line]), (0.2, 0.3)
+    drives = np.repeat([0, 1], [64, 12]).astype(np.int32)
+    alone = place_among(seen(place, strange), keyframes[64:], line, 60)
+    assert abs(alone.place[1]) < 0.01
+    found = place_among(seen(place, strange), keyframes, everywhere, 60, drives=drives)
+    assert np.hypot(*(found.place - place)) < 0.1
+
+
 @pytest.mark.parametrize('texture', [np.zeros((ROWS, 60)), np.ones((ROWS, 60))])
 def test_textures_that_are_all_the_same_give_a_finite_place(texture):
     _, places, _ = scene(60)

@@ -26,6 +26,7 @@ from sfa_localization.commands.reproduction import (
     Results,
     recorded,
     settings_of,
+    usual_drift,
 )
 from sfa_localization.commands.trials import STRAIGHT, features_of, slow_of
 from sfa_localization.data.errors import DataError
@@ -120,6 +121,7 @@ class _Work:
             world=self.config.world,
             seed=self.config.seed + drive,
             area=self.plan.area,
+            test_drift=usual_drift(self.plan.area),
             light=condition[0],
             season=condition[1],
             images='panorama',

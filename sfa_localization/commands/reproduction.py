@@ -9,6 +9,7 @@ the command is repeated.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -80,6 +81,14 @@ def _found(file: Path, beside: Sequence[str], settings: Mapping[str, Any]) -> di
     source = kin[0] if kin and not file.exists() else file
     found = dict(json.loads(source.read_text(encoding='utf-8')))
     return found if source == file else {**found, 'cells': []}
+
+
+def usual_drift(area: Sequence[float]) -> float:
+    """Mean odometry error, m, of a test drive in a garden: in a smaller one, drives are shorter and
+    drift less with the same wheels.
+    """
+    usual = SimulationConfig()
+    return usual.test_drift * math.sqrt(math.prod(area) / math.prod(usual.area))
 
 
 def settings_of(

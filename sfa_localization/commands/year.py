@@ -19,6 +19,7 @@ from sfa_localization.commands.reproduction import (
     Results,
     recorded,
     settings_of,
+    usual_drift,
 )
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform
@@ -88,6 +89,7 @@ class _Work:
             world=self.config.world,
             seed=self.config.seed + number,
             area=self.plan.area,
+            test_drift=usual_drift(self.plan.area),
             light=light,
             season=season,
             images='panorama',

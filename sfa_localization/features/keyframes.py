@@ -396,10 +396,14 @@ class Keyframes:
         return np.asarray(self.tree.query(place, min(number, len(self.poses)))[1], np.int64)
 
     def _around(self, place: Array) -> NDArray[np.int64]:
-        """The keyframes of the regression about a place (2,) m; where later drives added some,
-        so many more that those of the training are still among them.
+        """The keyframes of the regression about a place (2,) m: the nearest of the training, in
+        that order, and as many of those that later drives added.
         """
-        return self.nearest(place, _REGRESSED * (2 if self.drives.any() else 1))
+        if not self.drives.any():
+            return self.nearest(place, _REGRESSED)
+        apart = np.hypot(*(self.poses[:, :2] - place).T)
+        kinds = np.flatnonzero(self.drives == 0), np.flatnonzero(self.drives)
+        return np.concatenate([rows[np.argsort(apart[rows])[:_REGRESSED]] for rows in kinds])
 
     def located(
         self,
@@ -449,11 +453,13 @@ class Keyframes:
         found = Nearby(np.array(start), 0.0, unlike, np.zeros((2, 2)), 0.0, 1.0)
         for _ in range(_REPEATED):
             near = self._around(found.place)
-            near = self._alike(near[np.isfinite(scores[near])], best)
+            near = near[np.isfinite(scores[near])]
             if len(near) < _FEWEST:
                 break
             around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
-            found = place_among(spectrum, around, self.poses[near, :2], columns, self._channels)
+            found = place_among(
+                spectrum, around, self.poses[near, :2], columns, self._channels, self.drives[near]
+            )
             step, limit = found.place - start, 2 * np.pi / columns
             apart = float(np.hypot(*step))
             found = replace(found, place=start + step * min(1.0, reach / max(apart, 1e-9)))
@@ -493,13 +499,8 @@ class Keyframes:
     def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""
         start = self.poses[best, :2]
-        farthest = self._alike(self._around(start), best)[:NEIGHBORS][-1]
+        farthest = self._around(start)[:NEIGHBORS][-1]
         return _REACH_SHARE * max(float(np.hypot(*(self.poses[farthest, :2] - start))), 1e-6)
-
-    def _alike(self, rows: NDArray[np.int64], best: int) -> NDArray[np.int64]:
-        """Of keyframes (N,) those of the training, or the added ones, as the best is, if enough."""
-        alike = rows[(self.drives[rows] > 0) == (self.drives[best] > 0)]
-        return alike if len(alike) >= NEIGHBORS else rows
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle; `drives` where some were added."""

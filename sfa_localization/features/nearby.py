@@ -82,35 +82,65 @@ class _Regression:
     combine: Array
 
 
+@dataclass(frozen=True, slots=True)
+class _Basis:
+    """What N keyframes are compared with: shares `mean` (N,) of the mean that is most like the
+    image, and `means` (N, N), row by row, of that of each one's drive; the `center` (2,) m of the
+    first, `offsets` (N, 2) m of their places from the second, and their weights in the regression
+    (N,), of sum 1.
+    """
+
+    mean: Array
+    means: Array
+    weight: Array
+    center: Array
+    offsets: Array
+
+    @classmethod
+    def of(cls, scores: Vectors, drives: NDArray[np.int32], places: Array) -> _Basis:
+        """By the correlations (N,) of the keyframes with the image, which say how near they are
+        among those of one drive.
+        """
+        means = np.where(drives[:, None] == drives, np.asarray(scores, float), -np.inf)
+        means = np.exp((means - means.max(axis=1, keepdims=True)) / _LIKENESS)
+        means /= means.sum(axis=1, keepdims=True)
+        mean = np.exp((scores - scores.max()) / _LIKENESS, dtype=np.float64)
+        mean /= mean.sum()
+        weight = np.diag(means) / np.trace(means)
+        return cls(mean, means, weight, mean @ places, places - means @ places)
+
+
 def place_among(
     image: Spectra,
     keyframes: Spectra,
     places: Array,
     columns: int,
     channels: Sequence[slice] = (slice(None),),
+    drives: NDArray[np.int32] | None = None,
 ) -> Nearby:
     """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
     F) of keyframes at places (N, 2) m, all turned to the heading of the image.
 
     `channels` are rows that may be unlike for reasons of their own: each counts by how well the
-    keyframes explain it.
+    keyframes explain it. Keyframes of different `drives` (N,) may differ by their light, so that
+    only differences within one show the place; all of one drive by default.
     """
     scale = _scale(image.shape[-1], columns)
     near = [_vectors(keyframes[:, rows], scale) for rows in channels]
     own = [_vectors(image[None, rows], scale) for rows in channels]
     scores = sum(one @ other[0] for one, other in zip(near, own, strict=True))
-    weight = np.exp((scores - scores.max()) / _LIKENESS)
-    weight /= weight.sum()
+    drives = np.zeros(len(places), np.int32) if drives is None else drives
+    basis = _Basis.of(scores, drives, places)
     parts = [
-        np.concatenate([one, _turning(weight @ one, len(scale)), other])
+        np.concatenate([one, _turning(basis.mean.astype(np.float32) @ one, len(scale)), other])
         for one, other in zip(near, own, strict=True)
     ]
-    gains, products = zip(*(_products(part, weight) for part in parts), strict=True)
-    left = _regressed(np.tensordot(np.square(gains), products, 1), weight, places).combine[0]
+    gains, products = zip(*(_products(part, basis.mean) for part in parts), strict=True)
+    left = _regressed(np.tensordot(np.square(gains), products, 1), basis).combine[0]
     errors = np.einsum('i,cij,j->c', left, products, left) / [part.shape[1] for part in parts]
     trust = 1 / (errors + errors.min() + 1e-12)
     trust /= trust.max()
-    found = _regressed(np.tensordot(trust, products, 1), weight, places)
+    found = _regressed(np.tensordot(trust, products, 1), basis)
     moved = sum(
         by * _moved(found, part, gain, scale, columns)
         for by, part, gain in zip(trust, parts, gains, strict=True)
@@ -142,54 +172,50 @@ def _turning(mean: Vectors, frequencies: int) -> Vectors:
     return spectra.astype(np.complex64).view(np.float32).reshape(1, -1)
 
 
-def _products(part: Vectors, weight: Vectors) -> tuple[float, Array]:
-    """The share of its likeness to the mean by weight (N,) of N keyframes that a channel of the
+def _products(part: Vectors, mean: Array) -> tuple[float, Array]:
+    """The share of its likeness to the mean, by shares (N,) of N keyframes, that a channel of the
     image has kept; and the products (N + 2, N + 2) of the keyframes, of the derivative of their
     mean by the angle, and of the image, which gets back what it lacks.
     """
     products = (part @ part.T).astype(np.float64)
-    means = products[:-2, :-2] @ weight
-    gain = max(float(products[-1, :-2] @ weight) / max(float(means @ weight), 1e-12), _LEAST_GAIN)
+    likeness = products[:-2, :-2] @ mean
+    gain = max(float(products[-1, :-2] @ mean) / max(float(likeness @ mean), 1e-12), _LEAST_GAIN)
     products[-1] /= gain
     products[:, -1] /= gain
     return gain, products
 
 
-def _regressed(products: Array, weight: Vectors, places: Array) -> _Regression:
+def _regressed(products: Array, basis: _Basis) -> _Regression:
     """The regression by the products (N + 2, N + 2) of N keyframes, the derivative of their mean by
     the angle, and the image.
 
     Neither likeness to the mean nor a rest of angle is a matter of the place: the parts of all
-    vectors along both, which are orthogonal, are taken out of the products.
+    vectors along both, which are orthogonal, are taken out.
     """
-    means = weight.astype(np.float64)
-    gram, around, with_own = products[:-2, :-2].copy(), products[-2, :-2], products[-1, :-2]
-    mean, turned_by, norm = gram @ means, float(products[-2, -1]), float(products[-1, -1])
-    likeness = float(means @ with_own)
-    square, power = max(float(means @ mean), 1e-12), max(float(products[-2, -2]), 1e-12)
-    along = mean - square
-    gram += square - mean[:, None] - mean - np.outer(along, along) / square
-    gram -= np.outer(around, around) / power
-    shown = with_own - likeness - along * likeness / square - around * turned_by / power
-    rest = norm - likeness**2 / square - turned_by**2 / power
-    root, center = np.sqrt(means), means @ places
-    gram *= np.outer(root, root)
+    count = len(basis.mean)
+    common = np.zeros((2, count + 2))
+    common[0, :-2], common[1, -2] = basis.mean, 1.0
+    rows = np.eye(count + 1, count + 2)
+    rows[:, -2:], rows[-1] = 0.0, np.eye(count + 2)[-1]
+    rows[:-1, :-2] -= basis.means
+    along = products @ common.T
+    norms = np.maximum((common * along.T).sum(1), 1e-12)
+    turned_by = float(along[-1, 1])
+    rows -= (rows @ along / norms) @ common
+    both = rows @ products @ rows.T
+    square, root = float(norms[0]), np.sqrt(basis.weight)
+    gram, shown = both[:-1, :-1] * np.outer(root, root), both[:-1, -1]
     variation = float(np.trace(gram))
     ridge = max(_RIDGE * variation, 1e-12)
-    wanted = np.column_stack([shown, places - center]) * root[:, None]
-    solved = np.linalg.solve(gram + ridge * np.eye(len(gram)), wanted)
-    explained = solved[:, 0]
-    rest += float(explained @ (gram @ explained - 2 * root * shown))
-    share = (root[:, None] * solved).T
-    of_image = np.array([1.0, 0.0, 0.0])
-    of_mean = share @ (1 + along / square) - of_image * likeness / square
-    of_turning = (share @ around - of_image * turned_by) / power
+    wanted = np.column_stack([shown, basis.offsets]) * root[:, None]
+    share = (np.linalg.solve(gram + ridge * np.eye(count), wanted) * root[:, None]).T
+    explained = np.append(-share[0], 1.0)
     return _Regression(
-        center + share[0] @ (places - center),
-        -turned_by / power,
-        max(rest, 0.0) / square,
+        basis.center + share[0] @ basis.offsets,
+        -turned_by / float(norms[1]),
+        max(float(explained @ both @ explained), 0.0) / square,
         variation / square,
-        np.column_stack([np.outer(of_mean, means) - share, of_turning, of_image]),
+        np.vstack([explained @ rows, share[1:] @ rows[:-1]]),
     )
 
 
