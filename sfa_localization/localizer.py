@@ -34,6 +34,8 @@ UNKNOWN_VARIANCE = 1e6
 
 # The distance of slow features from keyframes is averaged over about ten images, outliers cut.
 _LATELY, _FARTHEST = 0.1, 100.0
+# Farther apart than this on average, one of them is wrong, and not only less sure than it claims.
+_CONTRADICTORY = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +103,15 @@ class Observer:
 
     def _estimate(self, view: View) -> Estimate:
         """Slow features and keyframes together. Where they have lately been farther apart than
-        their covariances allow, the light is another one, and slow features lose their weight.
+        their covariances allow, the light is another one, and slow features lose their weight,
+        all of it where they contradict keyframes that know the place.
         """
         if view.known:
             self._light.add(view.match.nearby, view.noise)
         view = view.in_light(self._light.unlike)
-        estimate = view.estimate(max(self._apart, 1.0))
+        contradicted = view.known and self._apart > _CONTRADICTORY
+        trusted = view.by_keyframes if contradicted else view
+        estimate = trusted.estimate(max(self._apart, 1.0))
         if np.isfinite(view.distance):
             self._apart += _LATELY * (min(view.distance, _FARTHEST) - self._apart)
         return estimate

@@ -86,6 +86,10 @@ _KEYFRAMES = {
     'noise': ArrayRule('10', all_positive=True),
     'clockwise': ArrayRule('', 'b'),
 }
+_DRIVES = {
+    'drives': ArrayRule('N', 'i', largest=_MOST_DRIVES),
+    'trained': ArrayRule('', 'i', all_positive=True, largest=_MOST_DRIVES),
+}
 SCHEMA: Schema = {
     'network/#/': [
         {
@@ -98,7 +102,7 @@ SCHEMA: Schema = {
     ],
     'metric/': [_PROCESS, _MONOMIALS],
     'metric/basis_': [_BASIS],
-    'keyframes/': [_KEYFRAMES, {**_KEYFRAMES, 'drives': ArrayRule('N', 'i', largest=_MOST_DRIVES)}],
+    'keyframes/': [_KEYFRAMES, {**_KEYFRAMES, **_DRIVES}],
     'agreement/': _AGREEMENT,
     'yaw_agreement/': _AGREEMENT,
     'compass/': [
@@ -166,6 +170,11 @@ class View:
     def in_light(self, light: float) -> View:
         """The same where the light is known to make images so unlike, see `OtherLight`."""
         return replace(self, match=self.match.in_light(light, self.noise))
+
+    @property
+    def by_keyframes(self) -> View:
+        """The same without what slow features say of the pose."""
+        return replace(self, position=np.full(2, np.nan))
 
     @property
     def distance(self) -> float:

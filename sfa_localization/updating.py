@@ -153,7 +153,7 @@ def _replayed(localizer: Localizer, run: Run) -> Iterator[tuple[Observation, boo
 
 def familiar_score(model: PlaceModel) -> float:
     """The correlation with its likest neighbor that 19 of 20 keyframes of the training reach."""
-    first = np.flatnonzero(model.keyframes.drives == 0)
+    first = np.flatnonzero(model.keyframes.first)
     spectra, columns = model.keyframes.spectra[first], model.keyframes.textures.shape[2]
     best = list[float]()
     for row in np.unique(np.linspace(0, len(first) - 1, _SAMPLE).round()).astype(int).tolist():
@@ -222,6 +222,7 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
         old.noise,
         old.clockwise,
         np.append(old.drives[rows], np.full(count, old.drives.max() + 1, np.int32)),
+        old.trained,
     )
     updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': count}]
     quality = {**model.quality, 'updates': updates[-_REMEMBERED:]}
@@ -233,7 +234,7 @@ def _kept(old: Keyframes, new: Array) -> NDArray[np.int64]:
 
     Of twice as many as have to go, the oldest added ones, the nearest to new ones go.
     """
-    added = np.flatnonzero(old.drives)
+    added = np.flatnonzero(~old.first)
     surplus = max(len(added) + len(new) - MOST_ADDED, 0)
     oldest = added[np.argsort(old.drives[added], kind='stable')][: 2 * surplus]
     apart = cKDTree(new[:, :2]).query(old.poses[oldest, :2])[0]

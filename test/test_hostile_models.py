@@ -33,6 +33,16 @@ def arrays(whole: Path) -> dict:
     return read_arrays(whole, FORMAT, VERSION, '')
 
 
+def driven(arrays: dict, drive: int = 0, trained: int = 1) -> dict:
+    """With keyframes that are all of one drive."""
+    count = len(arrays['keyframes/poses'])
+    return {
+        **arrays,
+        'keyframes/drives': np.full(count, drive),
+        'keyframes/trained': np.array(trained),
+    }
+
+
 def rejected(path: Path, reason: str) -> None:
     with pytest.raises(ModelError, match=reason) as raised:
         PlaceModel.load(path)
@@ -93,13 +103,18 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: {**a, 'keyframes/textures': a['keyframes/textures'][:, 1:]},
         'damaged',
     ),
-    'no keyframes of the training': (
-        lambda a: {**a, 'keyframes/drives': np.ones(len(a['keyframes/poses']), np.int32)},
-        'too few for keyframes',
-    ),
+    'no keyframes of the training': (lambda a: driven(a, drive=1), 'too few for keyframes'),
     'keyframes of more drives than there are': (
-        lambda a: {**a, 'keyframes/drives': np.full(len(a['keyframes/poses']), 2**40)},
+        lambda a: driven(a, drive=2**40),
         'keyframes/drives holds a number beyond 1e',
+    ),
+    'no drive of the training': (
+        lambda a: driven(a, trained=0),
+        'keyframes/trained.*must be positive',
+    ),
+    'drives without their number in the training': (
+        lambda a: {k: v for k, v in driven(a).items() if k != 'keyframes/trained'},
+        'keyframes/',
     ),
     'too few keyframes': (
         lambda a: {

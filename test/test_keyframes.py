@@ -163,13 +163,29 @@ def test_a_symmetric_world_is_ambiguous():
     assert np.mean(wide) > 0.7
 
 
-def test_they_are_saved_and_read():
+@pytest.mark.parametrize('several', [False, True])
+def test_they_are_saved_and_read(several):
     world = Spheres.about(0)
     keyframes = learnt(world)
+    if several:
+        drives = np.arange(len(keyframes.poses), dtype=np.int32) % 3
+        keyframes = replace(keyframes, drives=drives, trained=2)
     again = Keyframes.from_arrays(keyframes.to_arrays())
+    assert np.array_equal(again.first, keyframes.first)
     for image in world.panoramas(unseen(5), CONFIG):
         a, b = keyframes.match(image), again.match(image)
         assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
+
+
+def test_drives_of_the_training_are_kept_apart_and_none_is_added():
+    poses = drive()
+    images = Spheres.about(0).panoramas(poses, CONFIG)
+    textures = quantized(np.stack([texture(image) for image in images]))
+    halves = (np.arange(len(poses)) >= len(poses) // 2).astype(np.int32)
+    keyframes = fit_keyframes(textures, poses, path(poses), drives=halves)
+    assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
+    off, turned, _ = errors(keyframes, Spheres.about(0).panoramas(unseen(), CONFIG), unseen())
+    assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
 
 
 def test_many_images_are_thinned_evenly():

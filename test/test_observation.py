@@ -212,6 +212,29 @@ def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
     assert np.hypot(*outside.position) < 0.9 * np.hypot(*beside)
 
 
+class Contradicted(PictureReader):
+    """Slow features are sure of a place 0.4 m from that of keyframes, which are as sure of it."""
+
+    def __init__(self, score: float) -> None:
+        super().__init__()
+        self.score = score
+
+    def views(self, images):
+        own = np.diag([0.1**2, 0.1**2, 0.01])
+        match = Match(np.zeros(3), own, self.score, 0.0, NEARBY, 0.0, 0.0)
+        apart = np.array([0.4, 0.0])
+        view = View(np.zeros(2), apart, 0.0, own, match, MatchNoise(), np.zeros(2))
+        return [view] * len(images)
+
+
+@pytest.mark.parametrize('known', [True, False])
+def test_slow_features_that_contradict_known_places_for_long_do_not_count(known):
+    observer = Observer(Contradicted(0.7 if known else 0.3))
+    seen = [observer.observe(k, panorama(seed=k)).estimate.position[0] for k in range(1, 50)]
+    assert seen[0] == pytest.approx(0.2 if known else 0.4, abs=0.02)
+    assert seen[-1] == (0.0 if known else 0.4)
+
+
 def test_another_model_may_know_the_light():
     observer = Observer(InOtherLight())
     for k in range(1, 100):

@@ -98,6 +98,7 @@ def test_network_maps_and_first_keyframes_stay():
     first = len(model.keyframes.poses)
     np.testing.assert_array_equal(newer.keyframes.textures[:first], model.keyframes.textures)
     np.testing.assert_array_equal(newer.keyframes.poses[first:], new.poses)
+    assert newer.keyframes.first.sum() == first
     assert newer.quality['updates'] == [{'bag': 'later', 'images': len(new)}]
     assert 'updates' not in model.quality
 
@@ -117,6 +118,7 @@ def test_an_updated_model_survives_its_file(tmp_path):
     newer.save(tmp_path / 'model.npz')
     read = PlaceModel.load(tmp_path / 'model.npz')
     np.testing.assert_array_equal(read.keyframes.drives, newer.keyframes.drives)
+    assert read.keyframes.trained == newer.keyframes.trained == 1
     assert read.quality['updates'] == newer.quality['updates']
     assert familiar_score(read) == pytest.approx(familiar_score(place().model))
     image = drive().panoramas.read(30, 31)[0]

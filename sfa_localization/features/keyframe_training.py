@@ -56,16 +56,22 @@ _LEAST_RANGE = 0.05
 
 
 def fit_keyframes(
-    textures: NDArray[np.int8], poses: Array, path_m: Array, clockwise: bool = True
+    textures: NDArray[np.int8],
+    poses: Array,
+    path_m: Array,
+    clockwise: bool = True,
+    drives: NDArray[np.int32] | None = None,
 ) -> Keyframes:
-    """From textures (N, rows, columns) of training images, their poses (N, 3) in the map, and the
-    distance (N,) m driven until each, which must jump between drives.
+    """From textures (N, rows, columns) of training images, their poses (N, 3) in the map, the
+    distance (N,) m driven until each, which must jump between drives, and the numbers (N,) of
+    these; one drive by default.
 
     Raises DataError for too few images.
     """
     kept = spread(poses)
+    drives = np.zeros(len(poses), np.int32) if drives is None else drives
     keyframes = Keyframes.of(
-        textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise
+        textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise, drives[kept]
     )
     return dataclasses.replace(keyframes, noise=_noise(keyframes, path_m[kept]))
 

@@ -311,7 +311,8 @@ def _low(spectra: Spectra) -> Spectra:
 class Keyframes:
     """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
-    `drives` (K,) is 0 for those of the training, then the number of the drive that added them.
+    `drives` (K,) are the numbers of their drives, of which the first `trained` were those of the
+    training.
     """
 
     textures: NDArray[np.int8]
@@ -319,6 +320,7 @@ class Keyframes:
     noise: MatchNoise
     clockwise: bool
     drives: NDArray[np.int32]
+    trained: int
     spectra: Spectra
     coarse: Spectra
     tree: cKDTree
@@ -331,18 +333,24 @@ class Keyframes:
         noise: MatchNoise,
         clockwise: bool,
         drives: NDArray[np.int32] | None = None,
+        trained: int | None = None,
     ) -> Keyframes:
-        """Keyframes ready to be matched, of the training without `drives`. Raises DataError for
-        too few.
+        """Keyframes ready to be matched, by default of one drive, and all of the training. Raises
+        DataError for too few.
         """
-        if drives is None:
-            drives = np.zeros(len(poses), np.int32)
-        first = np.count_nonzero(drives == 0)
+        drives = np.zeros(len(poses), np.int32) if drives is None else drives
+        trained = int(drives.max(initial=0)) + 1 if trained is None else trained
+        first = np.count_nonzero(drives < trained)
         if first < _FEWEST:
             raise DataError(f'{first} images are too few for keyframes')
-        spectra = spectra_of(textures)
-        tree = cKDTree(poses[:, :2])
-        return cls(textures, poses, noise, clockwise, drives, spectra, coarse(spectra), tree)
+        spectra, tree = spectra_of(textures), cKDTree(poses[:, :2])
+        matched = spectra, coarse(spectra), tree
+        return cls(textures, poses, noise, clockwise, drives, trained, *matched)
+
+    @property
+    def first(self) -> NDArray[np.bool_]:
+        """Which keyframes are of the training (K,)."""
+        return self.drives < self.trained
 
     def match(self, panorama: Image, guess: Array | None = None) -> Match:
         """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
@@ -399,10 +407,11 @@ class Keyframes:
         """The keyframes of the regression about a place (2,) m: the nearest of the training, in
         that order, and as many of those that later drives added.
         """
-        if not self.drives.any():
+        first = self.first
+        if first.all():
             return self.nearest(place, _REGRESSED)
         apart = np.hypot(*(self.poses[:, :2] - place).T)
-        kinds = np.flatnonzero(self.drives == 0), np.flatnonzero(self.drives)
+        kinds = np.flatnonzero(first), np.flatnonzero(~first)
         return np.concatenate([rows[np.argsort(apart[rows])[:_REGRESSED]] for rows in kinds])
 
     def located(
@@ -503,7 +512,7 @@ class Keyframes:
         return _REACH_SHARE * max(float(np.hypot(*(self.poses[farthest, :2] - start))), 1e-6)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Arrays to save, without pickle; `drives` where some were added."""
+        """Arrays to save, without pickle; drives where there are several."""
         noise = np.array(dataclasses.astuple(self.noise))
         arrays: dict[str, NDArray[Any]] = {
             'textures': self.textures,
@@ -513,6 +522,7 @@ class Keyframes:
         }
         if self.drives.any():
             arrays['drives'] = self.drives
+            arrays['trained'] = np.array(self.trained)
         return arrays
 
     @classmethod
@@ -521,8 +531,11 @@ class Keyframes:
         noise = MatchNoise(*np.asarray(arrays['noise'], float).tolist())
         textures = np.asarray(arrays['textures'], np.int8)
         poses = np.asarray(arrays['poses'], float)
-        drives = np.asarray(arrays.get('drives', np.zeros(len(poses))), np.int32)
-        return cls.of(textures, poses, noise, bool(arrays['clockwise']), drives)
+        clockwise = bool(arrays['clockwise'])
+        if 'drives' not in arrays:
+            return cls.of(textures, poses, noise, clockwise)
+        drives, trained = np.asarray(arrays['drives'], np.int32), int(arrays['trained'])
+        return cls.of(textures, poses, noise, clockwise, drives, trained)
 
 
 def _unlike(score: float) -> float:

@@ -50,7 +50,8 @@ def learn_keyframes(
     _, seen, row = np.intersect1d(views.images, labeled, return_indices=True)
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
     path = _along_tracks(views, segments)[seen]
-    own = fit_keyframes(views.textures[seen], poses, path, clockwise)
+    drives = views.run[seen].astype(np.int32)
+    own = fit_keyframes(views.textures[seen], poses, path, clockwise, drives)
     turn_std = usual_turn_std(result.angle_covariance)
     keyframes = replace(own, noise=own.noise.with_map(result.common_m, turn_std))
     kept = spread(poses)
