@@ -34,8 +34,8 @@ UNKNOWN_VARIANCE = 1e6
 
 # The distance of slow features from keyframes is averaged over about ten images, outliers cut.
 _LATELY, _FARTHEST = 0.1, 100.0
-# Farther apart than this on average, one of them is wrong, and not only less sure than it claims.
-_CONTRADICTORY = 2.0
+# Where both variances are right, this is 1 on average; above it, one of both is wrong.
+_CONTRADICTORY = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,6 +188,23 @@ def test_drives_of_the_training_are_kept_apart_and_none_is_added():
     assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
 
 
+def test_keyframes_that_a_drive_added_elsewhere_change_nothing_here():
+    world, other = Spheres.about(0), Spheres.about(1)
+    keyframes = learnt(world)
+    poses = np.column_stack([np.linspace(6.0, 12.0, 40), np.zeros((40, 2))])
+    textures = quantized(np.stack([texture(image) for image in other.panoramas(poses, CONFIG)]))
+    more = Keyframes.of(
+        np.concatenate([keyframes.textures, textures]),
+        np.concatenate([keyframes.poses, poses]),
+        keyframes.noise,
+        keyframes.clockwise,
+        np.repeat([0, 1], [len(keyframes.poses), 40]).astype(np.int32),
+        keyframes.trained,
+    )
+    for image in world.panoramas(unseen(20), CONFIG):
+        assert np.allclose(more.match(image).pose, keyframes.match(image).pose, atol=2e-3)
+
+
 def test_many_images_are_thinned_evenly():
     rng = np.random.default_rng(0)
     poses = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.zeros(4000)])

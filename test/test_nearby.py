@@ -84,7 +84,7 @@ def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
     alone = place_among(seen(place, strange), keyframes[64:], line, 60)
     assert abs(alone.place[1]) < 0.01
     found = place_among(seen(place, strange), keyframes, everywhere, 60, drives=drives)
-    assert np.hypot(*(found.place - place)) < 0.1
+    assert np.hypot(*(found.place - place)) < 0.15
 
 
 @pytest.mark.parametrize('texture', [np.zeros((ROWS, 60)), np.ones((ROWS, 60))])

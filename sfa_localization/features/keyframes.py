@@ -405,14 +405,16 @@ class Keyframes:
 
     def _around(self, place: Array) -> NDArray[np.int64]:
         """The keyframes of the regression about a place (2,) m: the nearest of the training, in
-        that order, and as many of those that later drives added.
+        that order, and of those that later drives added as many that are no farther.
         """
         first = self.first
         if first.all():
             return self.nearest(place, _REGRESSED)
         apart = np.hypot(*(self.poses[:, :2] - place).T)
-        kinds = np.flatnonzero(first), np.flatnonzero(~first)
-        return np.concatenate([rows[np.argsort(apart[rows])[:_REGRESSED]] for rows in kinds])
+        trained, added = np.flatnonzero(first), np.flatnonzero(~first)
+        trained = trained[np.argsort(apart[trained])[:_REGRESSED]]
+        added = added[apart[added] <= apart[trained[-1]]]
+        return np.concatenate([trained, added[np.argsort(apart[added])[:_REGRESSED]]])
 
     def located(
         self,

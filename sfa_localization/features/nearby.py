@@ -11,7 +11,7 @@ little to do with them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,12 @@ _RIDGE = 0.005
 _LEAST_GAIN = 0.2
 # Above this `Nearby.aside` a place is at the border of the keyframes: a straight one has 0.64.
 _BORDER = 0.6
+# Standard deviation of a place by keyframes in another light, m, for an image that has as much of
+# its own as in common with them; and what it grows by with the distance from them: another light
+# takes part of the differences away that show it.
+_BY_LIGHT, _BY_DISTANCE = 0.1, 0.4
+# How often the drives are weighed by the distance of the place from their keyframes.
+_WEIGHED = 2
 # Parts of the panorama in which light and what hides the view are one error each: 22.5 deg.
 _SECTORS = 16
 
@@ -86,15 +92,17 @@ class _Regression:
 class _Basis:
     """What N keyframes are compared with: shares `mean` (N,) of the mean that is most like the
     image, and `means` (N, N), row by row, of that of each one's drive; the `center` (2,) m of the
-    first, `offsets` (N, 2) m of their places from the second, and their weights in the regression
-    (N,), of sum 1.
+    first, `centers` (N, 2) m of the second, `offsets` (N, 2) m of their places from it, their
+    weights in the regression (N,), of sum 1, and the largest correlation of each one's drive (N,).
     """
 
     mean: Array
     means: Array
     weight: Array
     center: Array
+    centers: Array
     offsets: Array
+    likest: Array
 
     @classmethod
     def of(cls, scores: Vectors, drives: NDArray[np.int32], places: Array) -> _Basis:
@@ -102,12 +110,24 @@ class _Basis:
         among those of one drive.
         """
         means = np.where(drives[:, None] == drives, np.asarray(scores, float), -np.inf)
-        means = np.exp((means - means.max(axis=1, keepdims=True)) / _LIKENESS)
+        likest = means.max(axis=1)
+        means = np.exp((means - likest[:, None]) / _LIKENESS)
         means /= means.sum(axis=1, keepdims=True)
         mean = np.exp((scores - scores.max()) / _LIKENESS, dtype=np.float64)
         mean /= mean.sum()
-        weight = np.diag(means) / np.trace(means)
-        return cls(mean, means, weight, mean @ places, places - means @ places)
+        weight, centers = np.diag(means) / np.trace(means), means @ places
+        return cls(mean, means, weight, mean @ places, centers, places - centers, likest)
+
+    def about(self, place: Array) -> _Basis:
+        """With a mean that counts each drive by how certain a place (2,) m is by it: a light that
+        is more like that of the image is no use far away.
+        """
+        apart = self.centers - place
+        by_light = _BY_LIGHT**2 * (np.maximum(self.likest, 0.1) ** -2 - 1)
+        variance = by_light + _BY_DISTANCE**2 * (apart**2).sum(1)
+        mean = np.diag(self.means) / np.maximum(variance, 1e-6)
+        mean /= mean.sum()
+        return replace(self, mean=mean, weight=mean, center=mean @ (self.centers + self.offsets))
 
 
 def place_among(
@@ -131,8 +151,24 @@ def place_among(
     scores = sum(one @ other[0] for one, other in zip(near, own, strict=True))
     drives = np.zeros(len(places), np.int32) if drives is None else drives
     basis = _Basis.of(scores, drives, places)
+    found, moved = _found(near, own, basis, scale, columns)
+    for _ in range(_WEIGHED if (drives != drives[0]).any() else 0):
+        found, moved = _found(near, own, basis.about(found.place), scale, columns)
+    offset = places - found.place
+    aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
+    noise = moved @ moved.T
+    return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside)
+
+
+def _found(
+    near: Sequence[Vectors], own: Sequence[Vectors], basis: _Basis, scale: Vectors, columns: int
+) -> tuple[_Regression, Array]:
+    """The regression of an image by the vectors of each channel of it and of keyframes, and what
+    `_moved` says of all channels together.
+    """
+    mean = basis.mean.astype(np.float32)
     parts = [
-        np.concatenate([one, _turning(basis.mean.astype(np.float32) @ one, len(scale)), other])
+        np.concatenate([one, _turning(mean @ one, len(scale)), other])
         for one, other in zip(near, own, strict=True)
     ]
     gains, products = zip(*(_products(part, basis.mean) for part in parts), strict=True)
@@ -145,10 +181,7 @@ def place_among(
         by * _moved(found, part, gain, scale, columns)
         for by, part, gain in zip(trust, parts, gains, strict=True)
     )
-    offset = places - found.place
-    aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
-    noise = moved @ moved.T
-    return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside)
+    return found, np.asarray(moved)
 
 
 def _moved(found: _Regression, part: Vectors, gain: float, scale: Vectors, columns: int) -> Array:
