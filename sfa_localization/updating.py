@@ -75,7 +75,10 @@ class Updated:
     def sentence(self) -> str:
         """What was added, in one line."""
         if not any(count for _, count in self.added):
-            return 'nothing is new on these drives: the model stays as it is'
+            return (
+                'no image of these drives is both new and certain of its place: '
+                'the model stays as it is'
+            )
         counts = ', '.join(f'{count} images of {name}' for name, count in self.added)
         total = len(self.model.keyframes.poses)
         return f'added as keyframes: {counts}; the model has {total} keyframes now'

@@ -220,7 +220,7 @@ def test_a_long_drive_is_spread_over_the_ground():
 def test_a_sentence_says_what_was_added():
     model, new, newer = updated()
     assert Updated(model, (('a', 0), ('b', 0))).sentence() == (
-        'nothing is new on these drives: the model stays as it is'
+        'no image of these drives is both new and certain of its place: the model stays as it is'
     )
     text = Updated(newer, (('a', 0), ('b', len(new)))).sentence()
     total = len(newer.keyframes.poses)
