@@ -89,45 +89,102 @@ class _Regression:
 
 
 @dataclass(frozen=True, slots=True)
+class _Compared:
+    """A channel and a mean of its N keyframes: the derivative of the mean by the angle, `turning`
+    (1, D), the share of its likeness to the mean that the image has kept, `gain`, and the products
+    (N + 2, N + 2) of keyframes, derivative and image, which gets back what it lacks.
+    """
+
+    turning: Vectors
+    gain: float
+    products: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Channel:
+    """Some rows of N keyframes and an image: their vectors (N + 1, D), the image's last, and the
+    products (N + 1, N + 1) of these, which are correlations; and the `scale` of the vectors.
+    """
+
+    vectors: Vectors
+    products: Array
+    scale: Vectors
+
+    @classmethod
+    def of(cls, keyframes: Spectra, image: Spectra, scale: Vectors) -> _Channel:
+        """Of spectra (N, rows, F) and (1, rows, F)."""
+        vectors = _vectors(np.concatenate([keyframes, image]), scale)
+        return cls(vectors, (vectors @ vectors.T).astype(np.float64), scale)
+
+    def about(self, mean: Array) -> _Compared:
+        """With a mean by shares (N,) of the keyframes."""
+        turning = _turning(mean.astype(np.float32) @ self.vectors[:-1], len(self.scale))
+        rows = np.append(np.arange(len(mean)), len(mean) + 1)
+        products = np.empty((len(mean) + 2, len(mean) + 2))
+        products[np.ix_(rows, rows)] = self.products
+        products[-2, rows] = products[rows, -2] = self.vectors @ turning[0]
+        products[-2, -2] = turning[0] @ turning[0]
+        kept = float(self.products[-1, :-1] @ mean)
+        whole = float(mean @ self.products[:-1, :-1] @ mean)
+        gain = max(kept / max(whole, 1e-12), _LEAST_GAIN)
+        products[-1] /= gain
+        products[:, -1] /= gain
+        return _Compared(turning, gain, products)
+
+    def moved(self, found: _Regression, compared: _Compared, columns: int) -> Array:
+        """By how much, m, what is left of the channel moves the place in each sector of the
+        panorama, (2, sectors): light and what hides the view are alike within one, not in all.
+        """
+        combine = found.combine.astype(np.float32)
+        own = combine[:, -1:] / np.float32(compared.gain) * self.vectors[-1]
+        vectors = combine[:, :-2] @ self.vectors[:-1] + combine[:, -2:-1] * compared.turning + own
+        spectra = vectors.view(np.complex64).reshape(3, -1, len(self.scale)) / self.scale
+        left, along_x, along_y = fft.irfft(spectra, columns)
+        pull = np.stack([(along_x * left).sum(axis=0), (along_y * left).sum(axis=0)])
+        sectors = min(_SECTORS, columns)
+        starts = np.arange(sectors) * columns // sectors
+        return np.add.reduceat(pull, starts, axis=1).astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True)
 class _Basis:
     """What N keyframes are compared with: shares `mean` (N,) of the mean that is most like the
-    image, and `means` (N, N), row by row, of that of each one's drive; the `center` (2,) m of the
-    first, `centers` (N, 2) m of the second, `offsets` (N, 2) m of their places from it, their
-    weights in the regression (N,), of sum 1, and the largest correlation of each one's drive (N,).
+    image, `means` (D, N) of that of each drive's, whose number is `drive` (N,), and the `likest`
+    (D,), the largest correlation of each; `places` (N, 2) m, and their weights in the regression
+    (N,), of sum 1.
     """
 
     mean: Array
     means: Array
-    weight: Array
-    center: Array
-    centers: Array
-    offsets: Array
+    drive: NDArray[np.intp]
     likest: Array
+    places: Array
+    weight: Array
 
     @classmethod
-    def of(cls, scores: Vectors, drives: NDArray[np.int32], places: Array) -> _Basis:
+    def of(cls, scores: Array, drives: NDArray[np.int32], places: Array) -> _Basis:
         """By the correlations (N,) of the keyframes with the image, which say how near they are
         among those of one drive.
         """
-        means = np.where(drives[:, None] == drives, np.asarray(scores, float), -np.inf)
-        likest = means.max(axis=1)
-        means = np.exp((means - likest[:, None]) / _LIKENESS)
+        numbers, drive = np.unique(drives, return_inverse=True)
+        own = np.where(numbers[:, None] == drives, scores, -np.inf)
+        likest = own.max(axis=1)
+        means = np.exp((own - likest[:, None]) / _LIKENESS)
         means /= means.sum(axis=1, keepdims=True)
-        mean = np.exp((scores - scores.max()) / _LIKENESS, dtype=np.float64)
-        mean /= mean.sum()
-        weight, centers = np.diag(means) / np.trace(means), means @ places
-        return cls(mean, means, weight, mean @ places, centers, places - centers, likest)
+        mean = np.exp((scores - scores.max()) / _LIKENESS)
+        weight = means.sum(axis=0) / len(numbers)
+        return cls(mean / mean.sum(), means, drive, likest, places, weight)
 
     def about(self, place: Array) -> _Basis:
         """With a mean that counts each drive by how certain a place (2,) m is by it: a light that
         is more like that of the image is no use far away.
         """
-        apart = self.centers - place
+        apart = self.means @ self.places - place
         by_light = _BY_LIGHT**2 * (np.maximum(self.likest, 0.1) ** -2 - 1)
         variance = by_light + _BY_DISTANCE**2 * (apart**2).sum(1)
-        mean = np.diag(self.means) / np.maximum(variance, 1e-6)
+        mean = (1 / np.maximum(variance, 1e-6)) @ self.means
         mean /= mean.sum()
-        return replace(self, mean=mean, weight=mean, center=mean @ (self.centers + self.offsets))
+        return replace(self, mean=mean, weight=mean)
 
 
 def place_among(
@@ -146,56 +203,42 @@ def place_among(
     only differences within one show the place; all of one drive by default.
     """
     scale = _scale(image.shape[-1], columns)
-    near = [_vectors(keyframes[:, rows], scale) for rows in channels]
-    own = [_vectors(image[None, rows], scale) for rows in channels]
-    scores = sum(one @ other[0] for one, other in zip(near, own, strict=True))
+    parts = [_Channel.of(keyframes[:, rows], image[None, rows], scale) for rows in channels]
+    scores = np.sum([part.products[-1, :-1] for part in parts], axis=0)
     drives = np.zeros(len(places), np.int32) if drives is None else drives
     basis = _Basis.of(scores, drives, places)
-    found, moved = _found(near, own, basis, scale, columns)
-    for _ in range(_WEIGHED if (drives != drives[0]).any() else 0):
-        found, moved = _found(near, own, basis.about(found.place), scale, columns)
+    compared = [part.about(basis.mean) for part in parts]
+    trust = _trust(compared, basis)
+    found = _found(compared, trust, basis)
+    for _ in range(_WEIGHED if len(basis.means) > 1 else 0):
+        basis = basis.about(found.place)
+        compared = [part.about(basis.mean) for part in parts]
+        found = _found(compared, trust, basis)
+    moved = sum(
+        by * part.moved(found, one, columns)
+        for by, part, one in zip(trust, parts, compared, strict=True)
+    )
     offset = places - found.place
     aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
     noise = moved @ moved.T
     return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside)
 
 
-def _found(
-    near: Sequence[Vectors], own: Sequence[Vectors], basis: _Basis, scale: Vectors, columns: int
-) -> tuple[_Regression, Array]:
-    """The regression of an image by the vectors of each channel of it and of keyframes, and what
-    `_moved` says of all channels together.
-    """
-    mean = basis.mean.astype(np.float32)
-    parts = [
-        np.concatenate([one, _turning(mean @ one, len(scale)), other])
-        for one, other in zip(near, own, strict=True)
-    ]
-    gains, products = zip(*(_products(part, basis.mean) for part in parts), strict=True)
+def _trust(compared: Sequence[_Compared], basis: _Basis) -> Array:
+    """How much each channel counts, 1 at most: by how well the keyframes explain it there."""
+    products = np.array([one.products for one in compared])
+    gains = np.array([one.gain for one in compared])
     left = _regressed(np.tensordot(np.square(gains), products, 1), basis).combine[0]
-    errors = np.einsum('i,cij,j->c', left, products, left) / [part.shape[1] for part in parts]
+    sizes = [one.turning.shape[1] for one in compared]
+    errors = np.einsum('i,cij,j->c', left, products, left) / sizes
     trust = 1 / (errors + errors.min() + 1e-12)
-    trust /= trust.max()
-    found = _regressed(np.tensordot(trust, products, 1), basis)
-    moved = sum(
-        by * _moved(found, part, gain, scale, columns)
-        for by, part, gain in zip(trust, parts, gains, strict=True)
-    )
-    return found, np.asarray(moved)
+    return np.asarray(trust / trust.max())
 
 
-def _moved(found: _Regression, part: Vectors, gain: float, scale: Vectors, columns: int) -> Array:
-    """By how much, m, what is left of a channel moves the place in each sector of the panorama,
-    (2, sectors): light and what hides the view are alike within one, and not in all.
-    """
-    combine = found.combine.astype(np.float32)
-    combine[:, -1] /= gain
-    spectra = (combine @ part).view(np.complex64).reshape(3, -1, len(scale)) / scale
-    left, along_x, along_y = fft.irfft(spectra, columns)
-    pull = np.stack([(along_x * left).sum(axis=0), (along_y * left).sum(axis=0)])
-    sectors = min(_SECTORS, columns)
-    starts = np.arange(sectors) * columns // sectors
-    return np.add.reduceat(pull, starts, axis=1).astype(np.float64)
+def _found(compared: Sequence[_Compared], trust: Array, basis: _Basis) -> _Regression:
+    """The regression of the image by all channels."""
+    products = np.array([one.products for one in compared])
+    return _regressed(np.tensordot(trust, products, 1), basis)
 
 
 def _turning(mean: Vectors, frequencies: int) -> Vectors:
@@ -205,19 +248,6 @@ def _turning(mean: Vectors, frequencies: int) -> Vectors:
     return spectra.astype(np.complex64).view(np.float32).reshape(1, -1)
 
 
-def _products(part: Vectors, mean: Array) -> tuple[float, Array]:
-    """The share of its likeness to the mean, by shares (N,) of N keyframes, that a channel of the
-    image has kept; and the products (N + 2, N + 2) of the keyframes, of the derivative of their
-    mean by the angle, and of the image, which gets back what it lacks.
-    """
-    products = (part @ part.T).astype(np.float64)
-    likeness = products[:-2, :-2] @ mean
-    gain = max(float(products[-1, :-2] @ mean) / max(float(likeness @ mean), 1e-12), _LEAST_GAIN)
-    products[-1] /= gain
-    products[:, -1] /= gain
-    return gain, products
-
-
 def _regressed(products: Array, basis: _Basis) -> _Regression:
     """The regression by the products (N + 2, N + 2) of N keyframes, the derivative of their mean by
     the angle, and the image.
@@ -225,30 +255,35 @@ def _regressed(products: Array, basis: _Basis) -> _Regression:
     Neither likeness to the mean nor a rest of angle is a matter of the place: the parts of all
     vectors along both, which are orthogonal, are taken out.
     """
-    count = len(basis.mean)
+    count, means, drive = len(basis.mean), basis.means, basis.drive
     common = np.zeros((2, count + 2))
     common[0, :-2], common[1, -2] = basis.mean, 1.0
-    rows = np.eye(count + 1, count + 2)
-    rows[:, -2:], rows[-1] = 0.0, np.eye(count + 2)[-1]
-    rows[:-1, :-2] -= basis.means
-    along = products @ common.T
-    norms = np.maximum((common * along.T).sum(1), 1e-12)
-    turned_by = float(along[-1, 1])
-    rows -= (rows @ along / norms) @ common
-    both = rows @ products @ rows.T
+    apart = np.delete(products, -2, axis=1)
+    apart[:, :-1] -= (apart[:, :-1] @ means.T)[:, drive]
+    both = np.delete(apart, -2, axis=0)
+    both[:-1] -= (means @ both[:-1])[drive]
+    along = common @ apart
+    norms = np.maximum(((common @ products) * common).sum(1), 1e-12)
+    both -= along.T @ (along / norms[:, None])
+    turned_by = float(products[-2, -1])
     square, root = float(norms[0]), np.sqrt(basis.weight)
     gram, shown = both[:-1, :-1] * np.outer(root, root), both[:-1, -1]
     variation = float(np.trace(gram))
     ridge = max(_RIDGE * variation, 1e-12)
-    wanted = np.column_stack([shown, basis.offsets]) * root[:, None]
+    offsets = basis.places - (means @ basis.places)[drive]
+    wanted = np.column_stack([shown, offsets]) * root[:, None]
     share = (np.linalg.solve(gram + ridge * np.eye(count), wanted) * root[:, None]).T
-    explained = np.append(-share[0], 1.0)
+    share[0] *= -1
+    sums = np.stack([np.bincount(drive, one, len(means)) for one in share])
+    combine = np.column_stack([share - sums @ means, np.zeros(3), [1.0, 0.0, 0.0]])
+    explained = np.append(share[0], 1.0)
+    combine -= (np.column_stack([share, [1.0, 0.0, 0.0]]) @ along.T / norms) @ common
     return _Regression(
-        basis.center + share[0] @ basis.offsets,
+        basis.mean @ basis.places - share[0] @ offsets,
         -turned_by / float(norms[1]),
         max(float(explained @ both @ explained), 0.0) / square,
         variation / square,
-        np.vstack([explained @ rows, share[1:] @ rows[:-1]]),
+        combine,
     )
 
 
