@@ -69,9 +69,9 @@ def fit_keyframes(
     Raises DataError for too few images.
     """
     kept = spread(poses)
-    drives = np.zeros(len(poses), np.int32) if drives is None else drives
+    own = None if drives is None else drives[kept]
     keyframes = Keyframes.of(
-        textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise, drives[kept]
+        textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise, own
     )
     return dataclasses.replace(keyframes, noise=_noise(keyframes, path_m[kept]))
 

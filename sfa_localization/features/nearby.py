@@ -275,13 +275,14 @@ def _regressed(products: Array, basis: _Basis) -> _Regression:
     share = (np.linalg.solve(gram + ridge * np.eye(count), wanted) * root[:, None]).T
     share[0] *= -1
     sums = np.stack([np.bincount(drive, one, len(means)) for one in share])
-    combine = np.column_stack([share - sums @ means, np.zeros(3), [1.0, 0.0, 0.0]])
-    explained = np.append(share[0], 1.0)
-    combine -= (np.column_stack([share, [1.0, 0.0, 0.0]]) @ along.T / norms) @ common
+    of_image = np.array([1.0, 0.0, 0.0])
+    centered = np.column_stack([share, of_image])
+    combine = np.column_stack([share - sums @ means, np.zeros(3), of_image])
+    combine -= (centered @ along.T / norms) @ common
     return _Regression(
         basis.mean @ basis.places - share[0] @ offsets,
         -turned_by / float(norms[1]),
-        max(float(explained @ both @ explained), 0.0) / square,
+        max(float(centered[0] @ both @ centered[0]), 0.0) / square,
         variation / square,
         combine,
     )
