@@ -23,6 +23,7 @@ REASONS = {
         '_silences',
     ),
     'fusion/consistency.py': ('doubts', 'compared', '_turned'),
+    'fusion/mounting.py': ('problem',),
     'fusion/turn_watch.py': ('problem',),
     'fusion/pose_filter.py': ('_apart_in_time', '_require_place', '_require_others_ahead'),
     'fusion/update.py': ('_fused', '_followed', '_gated'),

@@ -13,6 +13,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.lateness import Knot, Lateness
 from sfa_localization.fusion.motion import SIZE, State, Twist
+from sfa_localization.fusion.mounting import Mounting
 from sfa_localization.fusion.turn_noise import TurnNoise
 
 LARGEST_STD_M = 100.0
@@ -165,7 +166,8 @@ class Belief(NamedTuple):
 
     `added` are the variances that driving has added so far, to the heading (as expected, without
     the factor of `turns`) and to the position along each axis. `trail` is the dead-reckoned path of
-    the last seconds, and `lateness` what images beside it show about their time.
+    the last seconds, `lateness` what images beside it show about their time, and `mounting` where
+    they show the camera on the robot.
     """
 
     stamp_ns: int
@@ -183,6 +185,7 @@ class Belief(NamedTuple):
     turn_factor: float = 1.0
     trail: tuple[Knot, ...] = ()
     lateness: Lateness | None = None
+    mounting: Mounting | None = None
 
     @property
     def state(self) -> State | None:
@@ -200,6 +203,8 @@ class Belief(NamedTuple):
             covariance[:3, :3] += np.diag(trust.variances(self.memory.accepted_m))
         if self.memory.pull is not None:
             covariance[:2, :2] += self.memory.pull.variance * np.eye(2)
+        if self.mounting is not None and self.mounting.suspected:
+            covariance[:2, :2] += self.mounting.variance * np.eye(2)
         return State(self.stamp_ns, self.mean, covariance)
 
 

@@ -107,6 +107,7 @@ class Prediction:
             belief.turn_factor,
             extended(belief.trail, (stamp_ns, *reckoned)),
             belief.lateness,
+            belief.mounting,
         )
 
     @staticmethod

@@ -62,6 +62,8 @@ def status_of(
     degraded = _weakness(state, config) + _rejections(belief)
     # Only images confirm: what was driven since the last one, or before it came late, does not.
     degraded += doubts(memory.trust, memory.accepted_m, memory.pull)
+    if belief.mounting is not None and belief.mounting.suspected:
+        degraded.append(belief.mounting.problem)
     degraded += _silences(belief, config)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'

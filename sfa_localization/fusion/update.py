@@ -31,6 +31,7 @@ from sfa_localization.fusion.inputs import lower_root
 from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.lateness import Lateness, followed, unrelated
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, X, Y
+from sfa_localization.fusion.mounting import Mounting, elsewhere, mounted
 from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.recover import Recovery
 from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, begun, weighed
@@ -84,7 +85,9 @@ class Correction:
         """The belief, predicted to the event's stamp before, after a measurement."""
         belief = self._fused(self._weighed(belief, event), event)
         update = belief.memory.update
-        belief = belief._replace(lateness=_late(belief, event, update))
+        belief = belief._replace(
+            lateness=_late(belief, event, update), mounting=_mounting(belief, event, update)
+        )
         if belief.located and update is not None and update.reason in STARTS:
             return belief._replace(turns=self._begun(belief))
         return belief
@@ -197,6 +200,16 @@ def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lat
         return unrelated(belief.lateness, trail, now, event.value, event.covariance)
     restarted = update is not None and update.reason == ELSEWHERE
     return followed(belief.lateness, trail, now, event.value, event.covariance, restarted)
+
+
+def _mounting(belief: Belief, event: MeasurementEvent, update: Update | None) -> Mounting | None:
+    """Where images show the camera on the robot after another one; positions alone show nothing."""
+    if event.value.size == 2:
+        return belief.mounting
+    image, driven_variance = evidence_of(belief, event, accepted=False), belief.added[1]
+    if update is not None and update.reason == ELSEWHERE:
+        return elsewhere(belief.mounting, image, driven_variance)
+    return mounted(belief.mounting, image, driven_variance)
 
 
 def _scatter(usual: float, distance: float) -> float:

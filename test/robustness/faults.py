@@ -243,6 +243,21 @@ def rolled(degrees):
     )
 
 
+def off_center(degrees):
+    """As by a mirror, or a whole camera, that sits beside where it was: things close up ahead."""
+
+    def change(pictures, i, _):
+        height, width = pictures[i].shape[:2]
+        angle = 2 * np.pi * np.arange(width) / width
+        columns = np.arange(width) + degrees / 360 * width * np.sin(angle)
+        x = np.tile(columns % width, (height, 1)).astype(np.float32)
+        y = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
+        closed = np.hstack([pictures[i], pictures[i][:, :1]])  # remap interpolates over the seam
+        return cv2.remap(closed, x, y, cv2.INTER_LINEAR)
+
+    return change
+
+
 def gray(pictures, i, _):
     return cv2.cvtColor(cv2.cvtColor(pictures[i], cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
 
@@ -261,9 +276,11 @@ PICTURES = {
     'gray': gray,
     'brighter by half': lambda pictures, i, _: np.minimum(pictures[i] * 1.5, 255),
     'from anywhere': lambda pictures, _, rng: pictures[rng.integers(len(pictures))],
+    'of a slipped mirror': off_center(8),
 }
 ALSO_FROM_START = (
     'a quarter black', 'half black', 'a quarter covered', 'mirrored', 'of a foreign garden',
+    'of a slipped mirror',
 )  # fmt: skip
 enter_all({f'images {name}': pictures_changed(change) for name, change in PICTURES.items()})
 enter_all({
