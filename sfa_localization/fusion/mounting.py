@@ -3,10 +3,10 @@
 """Whether images show the robot's place, or one beside it that turns with the robot.
 
 A camera that was mounted elsewhere after the training, or whose mirror has slipped, shows places
-that lie ahead of the robot, or to one side of it, by a constant lever. On a straight line that looks
-like another position; with the first turn the odometry shows it. A Kalman filter of two points
-in the plane holds the robot's place and the lever; the place moves with the odometry, and images
-show the sum: z = place + exp(i yaw) lever.
+that lie ahead of the robot, or to one side of it, by a constant lever. On a straight line that is
+like another position; with the first turn the odometry shows it. A Kalman filter of two points in
+the plane holds the robot's place and the lever; the place moves with the odometry, and images show
+the sum: z = place + exp(i yaw) lever.
 """
 
 from __future__ import annotations
