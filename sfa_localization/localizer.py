@@ -26,7 +26,7 @@ from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
-from sfa_localization.place_model import Estimate, PlaceModel, View, require_panorama
+from sfa_localization.place_model import Estimate, PlaceModel, SlowPose, require_panorama
 
 UNKNOWN_VARIANCE = 1e6
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
@@ -80,15 +80,15 @@ class Observer:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""
         self._require_size(panorama)
         problem, turned = self._judge(panorama)
-        (view,) = self.model.views(panorama[None])
-        return self._observation(stamp_ns, self._estimate(view), problem, turned)
+        (slow,) = self.model.slow_poses(panorama[None])
+        return self._observation(stamp_ns, self._estimate(panorama, slow), problem, turned)
 
     def observe_all(self, stamps_ns: Stamps, panoramas: Image) -> list[Observation]:
         """The same for panoramas (T, H, W, 3) with stamps (T,), quicker."""
         for panorama in panoramas[:1]:
             self._require_size(panorama)
         judged = [self._judge(panorama) for panorama in panoramas]
-        estimates = [self._estimate(view) for view in self.model.views(panoramas)]
+        estimates = list(map(self._estimate, panoramas, self.model.slow_poses(panoramas)))
         return [
             self._observation(int(stamp_ns), estimate, *verdict)
             for stamp_ns, estimate, verdict in zip(stamps_ns, estimates, judged, strict=True)
@@ -101,13 +101,14 @@ class Observer:
             yield from self.observe_all(run.panoramas.stamps_ns[at : at + len(batch)], batch)
             at += len(batch)
 
-    def _estimate(self, view: View) -> Estimate:
+    def _estimate(self, panorama: Image, slow: SlowPose) -> Estimate:
         """Slow features and keyframes together. Where they have lately been farther apart than
         their covariances allow, the light is another one, and slow features lose their weight,
         all of it where they contradict keyframes that know the place.
         """
+        view = self.model.view(panorama, slow, self._light.pattern)
         if view.known:
-            self._light.add(view.match.nearby, view.noise)
+            self._light.add(view.match, view.noise)
         view = view.in_light(self._light.unlike)
         contradicted = view.known and self._apart > _CONTRADICTORY
         trusted = view.by_keyframes if contradicted else view

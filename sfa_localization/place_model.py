@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from sfa_localization.features.image_features import (
     spectrum,
 )
 from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
+from sfa_localization.features.nearby import Spectra
 from sfa_localization.features.network import (
     Architecture,
     Layer,
@@ -147,6 +148,17 @@ class Estimate:
     novelty: float
 
 
+class SlowPose(NamedTuple):
+    """What slow features say of an image: themselves (K,), `position` (2,) m, `yaw` rad, NaN
+    without a compass, and `covariance` (3, 3).
+    """
+
+    slow_features: Array
+    position: Array
+    yaw: float
+    covariance: Array
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """What slow features say of an image, `position` (2,), `yaw` and `covariance` (3, 3) as in
@@ -246,6 +258,18 @@ class PlaceModel:
 
     def views(self, panoramas: Image) -> list[View]:
         """The estimates from panoramas (T, H, W, 3) by slow features and by keyframes."""
+        return list(map(self.view, panoramas, self.slow_poses(panoramas)))
+
+    def view(self, panorama: Image, slow: SlowPose, pattern: Spectra | None = None) -> View:
+        """The estimates from a panorama (H, W, 3) by slow features, and by keyframes without the
+        `pattern` that the light adds, see `OtherLight`.
+        """
+        guess = slow.position if np.isfinite(slow.position).all() else None
+        match = self.keyframes.match(panorama, guess, pattern)
+        return View(*slow, match, self.keyframes.noise, self.keyframes.poses[:, :2].mean(0))
+
+    def slow_poses(self, panoramas: Image) -> list[SlowPose]:
+        """The estimates from panoramas (T, H, W, 3) by slow features alone."""
         maps = self.network.maps(panoramas)
         slow = slow_features(maps)
         spread = disagreement(maps[-1])
@@ -259,15 +283,7 @@ class PlaceModel:
                 spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, covariances)
             )
         joined = _joined(covariances, yaw_variance)
-        matches = map(self._matched, panoramas, positions)
-        noise, center = self.keyframes.noise, self.keyframes.poses[:, :2].mean(0)
-        return [
-            View(slow[t], positions[t], float(yaw[t]), joined[t], match, noise, center)
-            for t, match in enumerate(matches)
-        ]
-
-    def _matched(self, panorama: Image, guess: Array) -> Match:
-        return self.keyframes.match(panorama, guess if np.isfinite(guess).all() else None)
+        return [SlowPose(slow[t], positions[t], float(yaw[t]), joined[t]) for t in range(len(slow))]
 
     def headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         """Yaw (T,) rad in the map, NaN without a compass, and its variance (T,), from the maps of

@@ -31,8 +31,19 @@ def panorama(pose=(0.0, 0.0, 0.0), seed=0, novelty=0.5, level=120, spread=40):
     return image
 
 
+class InTwoSteps:
+    """Slow features before keyframes, as a model has them, of one that has only `views`."""
+
+    def slow_poses(self, images):
+        return [None] * len(images)
+
+    def view(self, image, slow, pattern=None):
+        (view,) = self.views(image[None])
+        return view
+
+
 @dataclasses.dataclass
-class PictureReader:
+class PictureReader(InTwoSteps):
     """Reads what `panorama` wrote; positions are positive."""
 
     panorama: PanoramaConfig = SIZE

@@ -1,13 +1,13 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is unlike because of the light, and what because no keyframe is near."""
+"""What the light adds to all images; what is unlike by it, and what because no keyframe is near."""
 
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres
-from test_keyframes import CONFIG, holds, learnt, unseen
+from test_keyframes import CONFIG, COUNTER, holds, learnt, unseen
 
-from sfa_localization.features.keyframes import MatchNoise
+from sfa_localization.features.keyframes import Match, MatchNoise
 from sfa_localization.features.nearby import Nearby
 from sfa_localization.features.other_light import OtherLight
 
@@ -27,10 +27,14 @@ def seen(unlike: float, variation: float, aside: float = 0.2) -> Nearby:
     return Nearby(np.zeros(2), 0.0, unlike, np.zeros((2, 2)), variation, aside)
 
 
+def matched(nearby: Nearby, left: np.ndarray | None = None, x: float = 0.0) -> Match:
+    return Match(np.array([x, 0.0, 0.0]), np.eye(3), 0.8, 0.0, nearby, 0.0, 0.0, left)
+
+
 def after(nearby) -> float:
     light = OtherLight()
     for one in nearby:
-        light.add(one, NOISE)
+        light.add(matched(one), NOISE)
     return light.unlike
 
 
@@ -83,7 +87,7 @@ def test_in_another_light_ellipses_are_small_and_hold():
     plain, known = [], []
     for image in repainted(world, 0.5).panoramas(poses, CONFIG):
         match = keyframes.match(image)
-        light.add(match.nearby, keyframes.noise)
+        light.add(match, keyframes.noise)
         plain.append(match)
         known.append(match.in_light(light.unlike, keyframes.noise))
     late = slice(50, None)
@@ -93,3 +97,82 @@ def test_in_another_light_ellipses_are_small_and_hold():
     assert light.unlike > 0.1
     assert sizes[1] < 0.7 * sizes[0]
     assert np.mean([holds(m, p) for m, p in zip(known[late], poses[late], strict=True)]) > 0.9
+
+
+def far_away(world: Spheres, share: float) -> Spheres:
+    """The same in the sky: what stays in its direction wherever the robot is."""
+    places, heights, radii = (1e6 * each for each in (world.places, world.heights, world.radii))
+    return Spheres(places, heights, radii, share * world.colors)
+
+
+def drive_in_other_light(config, share, seed=1, number=150):
+    """Errors (m) of single images in a light that adds a pattern, without and with what the images
+    before have shown of it.
+    """
+    world, poses = Spheres.about(seed), unseen(number)
+    keyframes, light, sun = learnt(world, config), OtherLight(), far_away(Spheres.about(77), share)
+    images = world.panoramas(poses, config) + (sun.panoramas(poses, config) - 128.0)
+    errors = []
+    for image, pose in zip(np.clip(images, 0, 255).astype(np.uint8), poses, strict=True):
+        plain, known = keyframes.match(image), keyframes.match(image, pattern=light.pattern)
+        light.add(known, keyframes.noise)
+        errors.append([np.hypot(*(found.pose - pose)[:2]) for found in (plain, known)])
+    return np.array(errors)[40:].mean(0), light
+
+
+@pytest.mark.parametrize('config', [CONFIG, COUNTER])
+@pytest.mark.parametrize('seed', [1, 2])
+def test_what_the_light_adds_everywhere_moves_no_place(config, seed):
+    (plain, known), light = drive_in_other_light(config, 0.3, seed)
+    assert known < 0.75 * plain
+    assert light.pattern is not None and light.pattern.any()
+
+
+def test_in_the_light_of_the_training_nothing_changes():
+    (plain, known), light = drive_in_other_light(CONFIG, 0.0)
+    assert known < 1.1 * plain
+    assert np.linalg.norm(light.pattern) < 0.2 * np.linalg.norm(
+        drive_in_other_light(CONFIG, 0.3)[1].pattern
+    )
+
+
+LEFT = np.ones((3, 4), np.complex64)
+
+
+def test_a_robot_that_stands_learns_nothing_of_the_light():
+    """What is unusual about one place, as a visitor there, is none of the others' business."""
+    light, near = OtherLight(), seen(0.1, 0.05)
+    light.add(matched(near, LEFT), NOISE)
+    once = light.pattern.copy()
+    for _ in range(100):
+        light.add(matched(near, LEFT, 0.1), NOISE)
+    assert np.array_equal(light.pattern, once)
+    light.add(matched(near, LEFT, 0.4), NOISE)
+    assert np.all(light.pattern.real > once.real)
+
+
+def test_the_pattern_is_a_mean_over_places():
+    light, near, rng = OtherLight(), seen(0.0, 0.3), np.random.default_rng(0)
+    for k in range(300):
+        known = light.pattern if light.pattern is not None else 0 * LEFT
+        shown = LEFT + rng.normal(0, 1.0, LEFT.shape)
+        light.add(matched(near, (shown - known).astype(np.complex64), 0.3 * k), NOISE)
+    assert np.abs(light.pattern.mean() - 1) < 0.15
+    assert np.std(light.pattern) < 0.3
+
+
+def test_beside_all_keyframes_no_pattern_is_learned():
+    light = OtherLight()
+    light.add(matched(seen(0.1, 0.05, aside=0.7), LEFT), NOISE)
+    assert light.pattern is None
+
+
+def test_an_image_that_is_suddenly_unlike_adds_little():
+    found = []
+    for unlike in (0.0, 3.0):
+        light = OtherLight()
+        for k in range(100):
+            light.add(matched(seen(0.0, 0.05), 0 * LEFT, 0.3 * k), NOISE)
+        light.add(matched(seen(unlike, 0.05), LEFT, 100.0), NOISE)
+        found.append(np.abs(light.pattern).mean())
+    assert found[1] < 0.2 * found[0]

@@ -13,7 +13,7 @@ import threading
 
 import numpy as np
 import pytest
-from picture_readers import AsLocated
+from picture_readers import AsLocated, InTwoSteps
 from robustness.readme import TABLE, robustness_table
 from ros_domains import free_domain
 
@@ -71,7 +71,7 @@ NODES = {
 
 
 @dataclasses.dataclass
-class ReadsPixels:
+class ReadsPixels(InTwoSteps):
     """A model whose position is the first pixel's blue and green; it can be held up."""
 
     panorama: PanoramaConfig = SIZE

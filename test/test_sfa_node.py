@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from cylinder_worlds import place
-from picture_readers import AsLocated
+from picture_readers import AsLocated, InTwoSteps
 from ros_domains import free_domain
 
 from sfa_localization.camera.settings import PanoramaConfig
@@ -56,7 +56,7 @@ pytestmark = pytest.mark.ros
 
 
 @dataclasses.dataclass
-class FakeModel:
+class FakeModel(InTwoSteps):
     """Says that the position is the first pixel's blue and green; novelty is a thing to set."""
 
     heading: bool = True

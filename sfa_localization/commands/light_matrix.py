@@ -237,8 +237,8 @@ def _summary(scores: Mapping[str, Any]) -> Cell:
 
 def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
     """Scores of slow features without the keyframes, which verify and replace their estimates."""
-    views = [view for batch in run.panoramas.batches(BATCH) for view in model.views(batch)]
-    poses = np.array([[*view.position, view.yaw] for view in views])
+    slow = [one for batch in run.panoramas.batches(BATCH) for one in model.slow_poses(batch)]
+    poses = np.array([[*one.position, one.yaw] for one in slow])
     truth = _truth(run)
     return _summary(score(truth, moved(Trajectory(truth.stamps_ns, poses), transform)))
 

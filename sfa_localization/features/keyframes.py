@@ -132,7 +132,8 @@ class Match:
     with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
     near a guess minus `score`, in temperatures: 0 where the best is among them; `nearby` is what
     the keyframes around the best one say, `by_place` how unlike the place makes the image, and
-    `beyond` the standard deviation m of what all estimates from it miss outside the keyframes.
+    `beyond` the standard deviation m of what all estimates from it miss outside the keyframes;
+    `left` is `Nearby.left` as of an image with yaw 0.
     """
 
     pose: Array
@@ -142,6 +143,7 @@ class Match:
     nearby: Nearby
     by_place: float
     beyond: float
+    left: Spectra | None = None
 
     def in_light(self, light: float, noise: MatchNoise) -> Match:
         """The same where the image is known to be so unlike because of its light, by itself: that
@@ -352,9 +354,12 @@ class Keyframes:
         """Which keyframes are of the training (K,)."""
         return self.drives < self.trained
 
-    def match(self, panorama: Image, guess: Array | None = None) -> Match:
+    def match(
+        self, panorama: Image, guess: Array | None = None, pattern: Spectra | None = None
+    ) -> Match:
         """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
-        estimate of its place.
+        estimate of its place, and `pattern` (rows, F) what the light adds to images, see
+        `OtherLight`.
 
         The likeliest by a coarse correlation, their best's neighbors and those of the guess are
         correlated in full.
@@ -367,7 +372,7 @@ class Keyframes:
         self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
         best = self.poses[int(scores.argmax()), :2]
         self._add(image, self._around(best), scores, shifts)
-        return self.located(image[0], scores, shifts, guess)
+        return self.located(image[0], scores, shifts, guess, pattern)
 
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
         """Find the spectrum (rows, F) of an image with some keyframes alone."""
@@ -422,15 +427,16 @@ class Keyframes:
         scores: NDArray[np.float32],
         shifts: NDArray[np.float32],
         guess: Array | None = None,
+        pattern: Spectra | None = None,
     ) -> Match:
         """The match of the spectrum (rows, F) of an image, by its correlations (K,), -inf where
-        unknown, and shifts (K,) of the columns.
+        unknown, and shifts (K,) of the columns; without a `pattern` that its light adds.
         """
         best = int(scores.argmax())
         turn = (-2 if self.clockwise else 2) * np.pi / self._columns
         yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
         reach = self.reach(best)
-        found, yaw = self._regressed(spectrum, scores, yaws, reach)
+        found, yaw = self._regressed(spectrum, scores, yaws, reach, pattern)
         weight = self.likelihood(scores, self.noise.temperature)
         offset = self.elsewhere(scores, found.place, reach)
         apart = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
@@ -449,16 +455,23 @@ class Keyframes:
                 support = float(near.max() - scores[best]) / self.noise.temperature
         pose = np.array([*found.place, wrap_angle(yaw)])
         beyond = self.noise.beyond(found)
-        return Match(pose, covariance, float(scores[best]), support, found, by_place, beyond)
+        left = None if found.left is None else turned(found.left, self._sign * yaw)
+        return Match(pose, covariance, float(scores[best]), support, found, by_place, beyond, left)
 
     def _regressed(
-        self, spectrum: Spectra, scores: NDArray[np.float32], yaws: Array, reach: float
+        self,
+        spectrum: Spectra,
+        scores: NDArray[np.float32],
+        yaws: Array,
+        reach: float,
+        pattern: Spectra | None,
     ) -> tuple[Nearby, float]:
-        """Where the spectrum (rows, F) of an image is among the keyframes around the best one, of
-        those whose correlations (K,) are known, and its yaw rad; `yaws` (K,) rad are what each of
-        them shows, `reach` m how far the place may be from the best.
+        """Where the spectrum (rows, F) of an image without the light's `pattern` is among the
+        keyframes around the best one, of those whose correlations (K,) are known, and its yaw rad;
+        `yaws` (K,) rad are what each of them shows, `reach` m how far the place may be from the
+        best.
         """
-        best, sign, columns = int(scores.argmax()), 1 if self.clockwise else -1, self._columns
+        best, sign, columns = int(scores.argmax()), self._sign, self._columns
         start, yaw = self.poses[best, :2], float(yaws[best])
         unlike = _unlike(float(scores[best]))
         found = Nearby(np.array(start), 0.0, unlike, np.zeros((2, 2)), 0.0, 1.0)
@@ -468,8 +481,9 @@ class Keyframes:
             if len(near) < _FEWEST:
                 break
             around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
+            image = spectrum if pattern is None else spectrum - turned(pattern, -sign * yaw)
             found = place_among(
-                spectrum, around, self.poses[near, :2], columns, self._channels, self.drives[near]
+                image, around, self.poses[near, :2], columns, self._channels, self.drives[near]
             )
             step, limit = found.place - start, 2 * np.pi / columns
             apart = float(np.hypot(*step))
@@ -498,6 +512,11 @@ class Keyframes:
     @property
     def _columns(self) -> int:
         return int(self.textures.shape[2])
+
+    @property
+    def _sign(self) -> int:
+        """Of the angle by which `turned` makes of an image at some yaw that at another."""
+        return 1 if self.clockwise else -1
 
     @property
     def _channels(self) -> tuple[slice, ...]:

@@ -41,7 +41,7 @@ _WEIGHED = 2
 _SECTORS = 16
 
 
-def turned(spectra: Spectra, angle: Array) -> Spectra:
+def turned(spectra: Spectra, angle: Array | float) -> Spectra:
     """Spectra (..., rows, F) of textures whose content is moved by `angle` (...) rad, to the left
     for positive ones.
     """
@@ -58,7 +58,8 @@ class Nearby:
     `noise` (2, 2) m^2 is the covariance of the place by what is left of the image; `variation`
     how much the keyframes that are like it differ, in the unit of `unlike`: much where none of
     them is near, in any light. `aside` is how far the place is from the middle of them, of their
-    mean distance: 0 among them, 0.64 at a straight border of theirs, 1 far beside all.
+    mean distance: 0 among them, 0.64 at a straight border of theirs, 1 far beside all. `left`
+    (rows, F) is the spectrum of what no place among them explains of the image; None unknown.
     """
 
     place: Array
@@ -67,6 +68,7 @@ class Nearby:
     noise: Array
     variation: float
     aside: float
+    left: Spectra | None = None
 
     @property
     def at_border(self) -> bool:
@@ -131,9 +133,12 @@ class _Channel:
         products[:, -1] /= gain
         return _Compared(turning, gain, products)
 
-    def moved(self, found: _Regression, compared: _Compared, columns: int) -> Array:
-        """By how much, m, what is left of the channel moves the place in each sector of the
-        panorama, (2, sectors): light and what hides the view are alike within one, not in all.
+    def remainder(
+        self, found: _Regression, compared: _Compared, columns: int
+    ) -> tuple[Spectra, Array]:
+        """What is left of the channel, (rows, F), and by how much, m, it moves the place in each
+        sector of the panorama, (2, sectors): light and what hides the view are alike within one,
+        not in all.
         """
         combine = found.combine.astype(np.float32)
         own = combine[:, -1:] / np.float32(compared.gain) * self.vectors[-1]
@@ -143,7 +148,8 @@ class _Channel:
         pull = np.stack([(along_x * left).sum(axis=0), (along_y * left).sum(axis=0)])
         sectors = min(_SECTORS, columns)
         starts = np.arange(sectors) * columns // sectors
-        return np.add.reduceat(pull, starts, axis=1).astype(np.float64)
+        moved = np.add.reduceat(pull, starts, axis=1).astype(np.float64)
+        return np.asarray(spectra[0] * np.float32(compared.gain), np.complex64), moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,14 +220,15 @@ def place_among(
         basis = basis.about(found.place)
         compared = [part.about(basis.mean) for part in parts]
         found = _found(compared, trust, basis)
-    moved = sum(
-        by * part.moved(found, one, columns)
-        for by, part, one in zip(trust, parts, compared, strict=True)
-    )
+    remainders = [
+        part.remainder(found, one, columns) for part, one in zip(parts, compared, strict=True)
+    ]
+    moved = sum(by * each for by, (_, each) in zip(trust, remainders, strict=True))
+    left = np.concatenate([of_channel for of_channel, _ in remainders])
     offset = places - found.place
     aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
     noise = moved @ moved.T
-    return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside)
+    return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside, left)
 
 
 def _trust(compared: Sequence[_Compared], basis: _Basis) -> Array:

@@ -108,19 +108,19 @@ class Remembering:
     """A model that looks at each picture once: most faults leave most pictures as they are."""
 
     def __init__(self, model):
-        self._model, self._views = model, {}
+        self._model, self._slow = model, {}
 
     def __getattr__(self, name):
         return getattr(self._model, name)
 
-    def views(self, panoramas):
-        return [self._view(panorama) for panorama in panoramas]
+    def slow_poses(self, panoramas):
+        return [self._slow_pose(panorama) for panorama in panoramas]
 
-    def _view(self, panorama):
+    def _slow_pose(self, panorama):
         key = hashlib.sha1(panorama.tobytes(), usedforsecurity=False).digest()
-        if key not in self._views:
-            (self._views[key],) = self._model.views(panorama[None])
-        return self._views[key]
+        if key not in self._slow:
+            (self._slow[key],) = self._model.slow_poses(panorama[None])
+        return self._slow[key]
 
 
 @functools.cache
