@@ -38,8 +38,7 @@ __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 HISTORY_S = 5.0
 """How late a measurement may come: many times what any camera, network and model take."""
 TIME_JUMP_S = 60.0
-"""An image stamped this far ahead, or odometry beyond HISTORY_S, which would make all that follows
-too old, needs AHEAD_COUNT like it within this time: one alone is a damaged message."""
+"""A stamp this far ahead needs AHEAD_COUNT like it: one alone is a damaged message."""
 AHEAD_COUNT = 3
 """So many images in a row beyond the history are no accident: their clock is another one. They are
 used where no odometry comes between them, which then has ended."""
@@ -319,7 +318,7 @@ class PoseFilter:
         newest = self._history.newest_ns
         if newest is None:
             return
-        if stamp_ns > newest + (HISTORY_S if rank == _ODOMETRY else TIME_JUMP_S) * 1e9:
+        if stamp_ns > newest + TIME_JUMP_S * 1e9:
             self._require_others_ahead(stamp_ns)
         elif self._keeps_time(rank):
             self._ahead = (0, 0)
