@@ -107,6 +107,15 @@ def test_a_camera_that_was_put_back_is_trusted_again():
     assert not found[-1][0].problem and found[-1][2] < 0.3
 
 
+@pytest.mark.parametrize('seed', range(5))
+def test_images_from_anywhere_show_no_lever_and_are_forgotten(seed):
+    drive, rng = Drive(seconds=90, seed=seed, **NOISY, **ALIKE), np.random.default_rng(seed)
+    drive.seen[200:350] = drive.seen[rng.integers(0, len(drive.seen), 150)]
+    found = fed(drive)
+    assert not any(suspected(found)[450:])
+    assert abs(found[-1][0].lever) < 0.2
+
+
 def test_images_that_show_no_direction_show_no_lever():
     drive = displaced(Drive(seconds=30, **NOISY), 0.9)
     assert {mounting for mounting, *_ in fed(drive, heading=False)} == {None}

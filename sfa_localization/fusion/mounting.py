@@ -30,7 +30,12 @@ _DEPENDENCE = 4.0  # images a quarter of a meter apart, of errors that are alike
 _SPACING_M, _SPACING_RAD = 0.25, 0.26  # nearer ones show nothing of their own
 _DRIFT_M, _SLIP_M = 0.05, 0.14  # of the odometry: m per m of a bias, and per root of a m
 _LEAST_KNOWN_RAD = 0.3  # images less certain of the heading show no lever
-_OUTLIER_D2 = 9.0  # beyond it, images lose weight
+_KNOWN_M = (
+    0.3  # standard deviation of a lever that is still believed where the robot is found again
+)
+# Images beyond this d2 show neither; they make both less certain, by this factor on the variances,
+# the place at most by so much (m).
+_OUTLIER_D2, _WIDENING, _LARGEST_M = 9.0, 4.0, 100.0
 
 
 class Mounting(NamedTuple):
@@ -80,9 +85,13 @@ def mounted(last: Mounting | None, image: Evidence, driven_variance: float) -> M
 
 
 def elsewhere(last: Mounting | None, image: Evidence, driven_variance: float) -> Mounting | None:
-    """After the estimate was moved: the place is known anew, the lever stays as it was."""
+    """After the estimate was moved: the place is known anew, and the lever stays as it was, where
+    images that showed the robot elsewhere did not make it uncertain.
+    """
     if last is None or not image.yaw_variance < _LEAST_KNOWN_RAD**2:
         return last
+    if last.lever_variance > _KNOWN_M**2:
+        return _placed(0j, LEVER_STD_M**2, image, driven_variance)
     begun = _placed(last.lever, last.lever_variance, image, driven_variance)
     return begun._replace(suspected=last.suspected)
 
@@ -127,20 +136,43 @@ def _corrected(driven: Mounting, image: Evidence) -> Mounting:
     of_place = driven.place_variance + driven.covariance * toward.conjugate()
     of_lever = driven.covariance.conjugate() + driven.lever_variance * toward.conjugate()
     expected = (of_place + toward * of_lever).real + _DEPENDENCE * image.variance
-    expected *= max(1.0, abs(innovation) ** 2 / expected / _OUTLIER_D2)
+    if abs(innovation) ** 2 > _OUTLIER_D2 * expected:
+        return _widened(driven)
     place_gain, lever_gain = of_place / expected, of_lever / expected
-    lever = driven.lever + lever_gain * innovation
-    variance = driven.lever_variance - expected * abs(lever_gain) ** 2
-    return driven._replace(
-        place=driven.place + place_gain * innovation,
-        lever=lever,
-        place_variance=driven.place_variance - expected * abs(place_gain) ** 2,
-        covariance=driven.covariance - expected * place_gain * lever_gain.conjugate(),
-        lever_variance=variance,
-        suspected=_is_none_by_chance(lever, variance, RELEASED if driven.suspected else 1.0),
+    return _judged(
+        driven._replace(
+            place=driven.place + place_gain * innovation,
+            lever=driven.lever + lever_gain * innovation,
+            place_variance=driven.place_variance - expected * abs(place_gain) ** 2,
+            covariance=driven.covariance - expected * place_gain * lever_gain.conjugate(),
+            lever_variance=driven.lever_variance - expected * abs(lever_gain) ** 2,
+        )
     )
 
 
-def _is_none_by_chance(lever: complex, variance: float, part: float) -> bool:
-    std = math.sqrt(max(variance, 0.0))
-    return abs(lever) > part * max(SUSPECTED_M, SUSPECTED_STDS * std)
+def _widened(driven: Mounting) -> Mounting:
+    """Both less certain: the robot may have been carried, the camera moved, or the image wrong.
+
+    What is known of the lever fades into what was before, and the place moves with it.
+    """
+    before = max(driven.lever_variance, 1e-9)
+    variance = _WIDENING / (1 / before + (_WIDENING - 1) / LEVER_STD_M**2)
+    lever = driven.lever * variance / (_WIDENING * before)
+    of_lever = variance / before
+    of_place = min(_WIDENING, _LARGEST_M**2 / max(driven.place_variance, 1e-9))
+    return _judged(
+        driven._replace(
+            place=driven.place + driven.covariance / before * (lever - driven.lever),
+            lever=lever,
+            place_variance=of_place * driven.place_variance,
+            covariance=math.sqrt(of_place * of_lever) * driven.covariance,
+            lever_variance=variance,
+        )
+    )
+
+
+def _judged(mounting: Mounting) -> Mounting:
+    """Whether the lever is none by chance."""
+    part = RELEASED if mounting.suspected else 1.0
+    least_m = part * max(SUSPECTED_M, SUSPECTED_STDS * math.sqrt(max(mounting.lever_variance, 0.0)))
+    return mounting._replace(suspected=abs(mounting.lever) > least_m)
