@@ -95,6 +95,13 @@ def test_nothing_that_is_read_is_replaced(tmp_path, capsys, name):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize('folder', ['.', '/', '', '..'])
+def test_a_folder_is_no_output(tmp_path, capsys, folder):
+    logs = write_logs(tmp_path, Drive(seconds=5))
+    assert main(['filter', *map(str, logs), '--output', folder]) == 1
+    assert 'cannot be written: it is a folder' in capsys.readouterr().err
+
+
 def test_the_covariances_beside_the_output_replace_nothing_that_is_read(tmp_path, capsys):
     odometry, positions = write_logs(tmp_path, Drive(seconds=5))
     moved = positions.rename(tmp_path / 'poses.covariance.csv')

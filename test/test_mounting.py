@@ -45,7 +45,7 @@ def test_a_camera_that_was_moved_is_noticed_and_found(lever, every, seed):
     drive = displaced(Drive(seconds=60, every=every, seed=seed, **NOISY, **ALIKE), lever)
     found = fed(drive)
     mounting, status, _ = found[-1]
-    assert all(suspected(found)[len(found) // 3 :])
+    assert all(suspected(found)[len(found) // 2 :])
     assert abs(mounting.lever - lever) < 0.25
     assert status.level is not Level.LOCALISED and mounting.problem in status.reasons
     wrong = [level.level is Level.LOCALISED and off_m > 1.0 for _, level, off_m in found]

@@ -59,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Filter; print what was skipped, rejected and written."""
     from sfa_localization import filtering
 
+    if arguments.output.is_dir():
+        raise DataError(f'{arguments.output}: cannot be written: it is a folder')
     beside = arguments.output.with_suffix('.covariance.csv')
     _require_other_files(arguments, (arguments.output, beside))
     truth = filtering.read_truth(arguments.truth) if arguments.truth else None
