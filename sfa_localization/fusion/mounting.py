@@ -30,9 +30,8 @@ _DEPENDENCE = 4.0  # images a quarter of a meter apart, of errors that are alike
 _SPACING_M, _SPACING_RAD = 0.25, 0.26  # nearer ones show nothing of their own
 _DRIFT_M, _SLIP_M = 0.05, 0.14  # of the odometry: m per m of a bias, and per root of a m
 _LEAST_KNOWN_RAD = 0.3  # images less certain of the heading show no lever
-_KNOWN_M = (
-    0.3  # standard deviation of a lever that is still believed where the robot is found again
-)
+# Standard deviation of a lever that is still believed where the robot is found again.
+_KNOWN_M = 0.3
 # Images beyond this d2 show neither; they make both less certain, by this factor on the variances,
 # the place at most by so much (m).
 _OUTLIER_D2, _WIDENING, _LARGEST_M = 9.0, 4.0, 100.0
