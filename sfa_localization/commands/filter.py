@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,10 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Filter; print what was skipped, rejected and written."""
     from sfa_localization import filtering
 
-    if arguments.output.is_dir():
-        raise DataError(f'{arguments.output}: cannot be written: it is a folder')
-    beside = arguments.output.with_suffix('.covariance.csv')
-    _require_other_files(arguments, (arguments.output, beside))
+    beside = _beside(arguments)
     truth = filtering.read_truth(arguments.truth) if arguments.truth else None
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
@@ -98,12 +94,17 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _require_other_files(arguments: argparse.Namespace, outputs: Sequence[Path]) -> None:
-    """Require that nothing replaces what is read."""
+def _beside(arguments: argparse.Namespace) -> Path:
+    """The file of covariances. Raises DataError where an output would replace what is read."""
+    if arguments.output.is_dir():
+        raise DataError(f'{arguments.output}: cannot be written: it is a folder')
+    beside = Path(arguments.output.with_suffix('.covariance.csv'))
+    outputs = [os.path.realpath(output) for output in (arguments.output, beside)]
     inputs = (arguments.odometry, arguments.positions, arguments.config, arguments.truth)
     for path in filter(None, inputs):
-        if os.path.realpath(path) in [os.path.realpath(output) for output in outputs]:
+        if os.path.realpath(path) in outputs:
             raise DataError(f'{path}: would be replaced by the output: give another --output')
+    return beside
 
 
 def _print_counts(odometry: Table, positions: Table, result: Filtered) -> None:

@@ -32,15 +32,14 @@ _DRIFT_M, _SLIP_M = 0.05, 0.14  # of the odometry: m per m of a bias, and per ro
 _LEAST_KNOWN_RAD = 0.3  # images less certain of the heading show no lever
 # Standard deviation of a lever that is still believed where the robot is found again.
 _KNOWN_M = 0.3
-# Images beyond this d2 show neither; they make both less certain, by this factor on the variances,
-# the place at most by so much (m).
-_OUTLIER_D2, _WIDENING, _LARGEST_M = 9.0, 4.0, 100.0
+# An image beyond this d2 shows neither; so many in a row show that nothing is known any more.
+_OUTLIER_D2, _OUTLIERS = 9.0, 2
 
 
 class Mounting(NamedTuple):
     """The robot's place by images and odometry, and the `lever`, both x + i y in m; the lever's
     axes are ahead and left. With it the variances of both along each axis, m^2, and their
-    covariance, at the last image that counted.
+    covariance, at the last image that counted, and how many `outliers` came since.
     """
 
     place: complex
@@ -51,6 +50,7 @@ class Mounting(NamedTuple):
     dead_reckoned: tuple[float, float, float]
     traveled_m: float
     driven_variance: float
+    outliers: int = 0
     suspected: bool = False
 
     @property
@@ -75,7 +75,7 @@ def mounted(last: Mounting | None, image: Evidence, driven_variance: float) -> M
     if not image.yaw_variance < _LEAST_KNOWN_RAD**2:
         return last
     if last is None:
-        return _placed(0j, LEVER_STD_M**2, image, driven_variance)
+        return _unknown(image, driven_variance)
     way_m = abs(image.traveled_m - last.traveled_m)
     turned = abs(wrap_angle(image.dead_reckoned[2] - last.dead_reckoned[2]))
     if way_m < _SPACING_M and turned < _SPACING_RAD:
@@ -90,9 +90,14 @@ def elsewhere(last: Mounting | None, image: Evidence, driven_variance: float) ->
     if last is None or not image.yaw_variance < _LEAST_KNOWN_RAD**2:
         return last
     if last.lever_variance > _KNOWN_M**2:
-        return _placed(0j, LEVER_STD_M**2, image, driven_variance)
+        return _unknown(image, driven_variance)
     begun = _placed(last.lever, last.lever_variance, image, driven_variance)
     return begun._replace(suspected=last.suspected)
+
+
+def _unknown(image: Evidence, driven_variance: float) -> Mounting:
+    """Nothing is known but one image."""
+    return _placed(0j, LEVER_STD_M**2, image, driven_variance)
 
 
 def _placed(
@@ -136,42 +141,23 @@ def _corrected(driven: Mounting, image: Evidence) -> Mounting:
     of_lever = driven.covariance.conjugate() + driven.lever_variance * toward.conjugate()
     expected = (of_place + toward * of_lever).real + _DEPENDENCE * image.variance
     if abs(innovation) ** 2 > _OUTLIER_D2 * expected:
-        return _widened(driven)
+        if driven.outliers + 1 >= _OUTLIERS:
+            return _unknown(image, driven.driven_variance)
+        return driven._replace(outliers=driven.outliers + 1)
     place_gain, lever_gain = of_place / expected, of_lever / expected
-    return _judged(
-        driven._replace(
-            place=driven.place + place_gain * innovation,
-            lever=driven.lever + lever_gain * innovation,
-            place_variance=driven.place_variance - expected * abs(place_gain) ** 2,
-            covariance=driven.covariance - expected * place_gain * lever_gain.conjugate(),
-            lever_variance=driven.lever_variance - expected * abs(lever_gain) ** 2,
-        )
+    lever = driven.lever + lever_gain * innovation
+    variance = driven.lever_variance - expected * abs(lever_gain) ** 2
+    return driven._replace(
+        place=driven.place + place_gain * innovation,
+        lever=lever,
+        place_variance=driven.place_variance - expected * abs(place_gain) ** 2,
+        covariance=driven.covariance - expected * place_gain * lever_gain.conjugate(),
+        lever_variance=variance,
+        outliers=0,
+        suspected=_is_none_by_chance(lever, variance, RELEASED if driven.suspected else 1.0),
     )
 
 
-def _widened(driven: Mounting) -> Mounting:
-    """Both less certain: the robot may have been carried, the camera moved, or the image wrong.
-
-    What is known of the lever fades into what was before, and the place moves with it.
-    """
-    before = max(driven.lever_variance, 1e-9)
-    variance = _WIDENING / (1 / before + (_WIDENING - 1) / LEVER_STD_M**2)
-    lever = driven.lever * variance / (_WIDENING * before)
-    of_lever = variance / before
-    of_place = min(_WIDENING, _LARGEST_M**2 / max(driven.place_variance, 1e-9))
-    return _judged(
-        driven._replace(
-            place=driven.place + driven.covariance / before * (lever - driven.lever),
-            lever=lever,
-            place_variance=of_place * driven.place_variance,
-            covariance=math.sqrt(of_place * of_lever) * driven.covariance,
-            lever_variance=variance,
-        )
-    )
-
-
-def _judged(mounting: Mounting) -> Mounting:
-    """Whether the lever is none by chance."""
-    part = RELEASED if mounting.suspected else 1.0
-    least_m = part * max(SUSPECTED_M, SUSPECTED_STDS * math.sqrt(max(mounting.lever_variance, 0.0)))
-    return mounting._replace(suspected=abs(mounting.lever) > least_m)
+def _is_none_by_chance(lever: complex, variance: float, part: float) -> bool:
+    least_m = max(SUSPECTED_M, SUSPECTED_STDS * math.sqrt(max(variance, 0.0)))
+    return abs(lever) > part * least_m
