@@ -23,9 +23,9 @@ def displaced(drive, lever, pictures=slice(None)):
     return drive
 
 
-def fed(drive, fused=None, heading=True):
+def fed(drive, heading=True):
     """What the filter believes of the camera after each image, its status and its error."""
-    fused, found = fused or PoseFilter(FilterConfig(), ErrorCorrelation(0.7, 0.6)), []
+    fused, found = PoseFilter(FilterConfig(), ErrorCorrelation(0.7, 0.6)), []
     for event in drive.events():
         drive.give(fused, event, heading)
         if event[1] == 1:
@@ -112,8 +112,8 @@ def test_images_from_anywhere_show_no_lever_and_are_forgotten(seed):
     drive, rng = Drive(seconds=90, seed=seed, **NOISY, **ALIKE), np.random.default_rng(seed)
     drive.seen[200:350] = drive.seen[rng.integers(0, len(drive.seen), 150)]
     found = fed(drive)
-    assert not any(suspected(found)[450:])
-    assert abs(found[-1][0].lever) < 0.2
+    assert not any(suspected(found)[400:])
+    assert abs(found[-1][0].lever) < 0.15
 
 
 def test_images_that_show_no_direction_show_no_lever():

@@ -433,7 +433,7 @@ class Keyframes:
         unknown, and shifts (K,) of the columns; without a `pattern` that its light adds.
         """
         best = int(scores.argmax())
-        turn = (-2 if self.clockwise else 2) * np.pi / self._columns
+        turn = -2 * self._sign * np.pi / self._columns
         yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
         reach = self.reach(best)
         found, yaw = self._regressed(spectrum, scores, yaws, reach, pattern)

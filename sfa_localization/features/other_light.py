@@ -5,7 +5,7 @@
 The sun shines on the same sides of all things, so that much of what it adds to an image is a
 pattern over the directions, the same wherever the robot is. What no place explains of the images,
 averaged over many places, is that pattern: without it, images of another light lie where those of
-the training did. Before, they were moved by what of it looks like another place, all of them alike.
+the training did; with it, all are moved alike, by what of it looks like another place.
 
 An image may be unlike because no keyframe is near, and then its place is uncertain by as much; or
 because the light is another one, which is nearly the same for all images of some minutes, and

@@ -25,7 +25,7 @@ LEVER_STD_M, WALK_M = 1.0, 0.03
 more than any camera moves, so that a mean over the last twenty meters or so remains."""
 SUSPECTED_M, SUSPECTED_STDS, RELEASED = 0.4, 3.5, 0.5
 """A lever beyond both is none by chance, and until it is below this part of both. On honest drives,
-in any light, it is below 0.1 m; such places are wrong by up to twice the lever after turning."""
+in any light, it is at most 0.11 m; such places are wrong by up to twice the lever after turning."""
 _DEPENDENCE = 4.0  # images a quarter of a meter apart, of errors that are alike over a meter
 _SPACING_M, _SPACING_RAD = 0.25, 0.26  # nearer ones show nothing of their own
 _DRIFT_M, _SLIP_M = 0.05, 0.14  # of the odometry: m per m of a bias, and per root of a m
