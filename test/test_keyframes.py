@@ -41,6 +41,14 @@ def path(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
 
 
+def sunny(images: np.ndarray) -> np.ndarray:
+    """Images (N, H, W, 3) with a bright side and less contrast in what is bright."""
+    width = images.shape[2]
+    shade = 1 + 0.6 * np.cos(np.arange(width) * 2 * np.pi / width - 2.0)
+    bright = np.clip(images * shade[:, None], 0, 255)
+    return (255 * (bright / 255) ** 1.6).astype(np.uint8)
+
+
 def learnt(world: Spheres, config: PanoramaConfig = CONFIG) -> Keyframes:
     poses = drive()
     textures = np.stack([texture(image) for image in world.panoramas(poses, config)])
@@ -188,7 +196,8 @@ def test_drives_of_the_training_are_kept_apart_and_none_is_added():
     assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
 
 
-def test_keyframes_that_a_drive_added_elsewhere_change_nothing_here():
+@pytest.mark.parametrize('trained', [1, 2])
+def test_keyframes_of_a_drive_elsewhere_change_nothing_here(trained):
     world, other = Spheres.about(0), Spheres.about(1)
     keyframes = learnt(world)
     poses = np.column_stack([np.linspace(6.0, 12.0, 40), np.zeros((40, 2))])
@@ -199,10 +208,31 @@ def test_keyframes_that_a_drive_added_elsewhere_change_nothing_here():
         keyframes.noise,
         keyframes.clockwise,
         np.repeat([0, 1], [len(keyframes.poses), 40]).astype(np.int32),
-        keyframes.trained,
+        trained,
     )
     for image in world.panoramas(unseen(20), CONFIG):
         assert np.allclose(more.match(image).pose, keyframes.match(image).pose, atol=2e-3)
+
+
+def test_each_drive_of_the_training_shows_the_place_in_its_own_light():
+    """Images in the light of one drive lie where that drive alone puts them, or better."""
+    world, (poses, again), images = Spheres.about(1), (drive(0.57), drive(0.57) + 0.05), unseen()
+    plain = [world.panoramas(at, CONFIG) for at in (poses, again, images)]
+    lit = [sunny(one) for one in plain]
+    textures = [quantized(np.stack([texture(i) for i in one])) for one in (plain[0], lit[1])]
+    both = fit_keyframes(
+        np.concatenate(textures),
+        np.concatenate([poses, again]),
+        np.concatenate([path(poses), 1000 + path(again)]),
+        drives=np.repeat([0, 1], len(poses)).astype(np.int32),
+    )
+    alone = (
+        fit_keyframes(textures[0], poses, path(poses)),
+        fit_keyframes(textures[1], again, path(again)),
+    )
+    for seen, own, other in ((plain[2], *alone), (lit[2], *alone[::-1])):
+        joint, best, worst = (errors(k, seen, images)[0].mean() for k in (both, own, other))
+        assert joint < 1.25 * best and joint < worst / 2
 
 
 def test_many_images_are_thinned_evenly():

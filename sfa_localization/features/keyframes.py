@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.nearby import Nearby, Spectra, place_among, turned
+from sfa_localization.features.nearby import Nearby, Spectra, averaged, place_among, turned
 
 Texture = NDArray[np.float32]
 
@@ -42,9 +42,11 @@ _STEPS = 127 / 4.0  # for a standard deviation
 NEIGHBORS = 24
 """Keyframes about a place that may be it."""
 _FEWEST = 6  # a place, its slopes along both axes, and as many to spare
-# Keyframes of the regression; it is repeated once around where it has put the image, where that is
-# farther from the best keyframe than this part of its reach.
+# Keyframes of each regression; it is repeated once around where it has put the image, where that
+# is farther from the best keyframe than this part of its reach.
 _REGRESSED, _REPEATED, _NEARER = 64, 2, 0.5
+# Drives of the training, at most, that say where an image is.
+_DRIVES = 3
 # How far it may put the image from the best keyframe, of the distance to its farthest neighbor.
 _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
@@ -371,7 +373,8 @@ class Keyframes:
             wanted.append(self.nearest(guess))
         self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
         best = self.poses[int(scores.argmax()), :2]
-        self._add(image, self._around(best), scores, shifts)
+        around = [self._around(best, drive) for drive in self._likeliest_drives(scores)]
+        self._add(image, np.unique(np.concatenate(around)), scores, shifts)
         return self.located(image[0], scores, shifts, guess, pattern)
 
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
@@ -408,18 +411,22 @@ class Keyframes:
         """So many keyframes nearest to a place (2,) m."""
         return np.asarray(self.tree.query(place, min(number, len(self.poses)))[1], np.int64)
 
-    def _around(self, place: Array) -> NDArray[np.int64]:
-        """The keyframes of the regression about a place (2,) m: the nearest of the training, in
-        that order, and of those that later drives added as many that are no farther.
+    def _likeliest_drives(self, scores: NDArray[np.float32]) -> list[int]:
+        """The drives of the training that the likeliest keyframes are of, by correlations (K,)."""
+        first, likest = self.first, np.full(self.trained, -np.inf, np.float32)
+        np.maximum.at(likest, self.drives[first], scores[first])
+        numbers: list[int] = np.argsort(-likest, kind='stable')[:_DRIVES].tolist()
+        return numbers
+
+    def _around(self, place: Array, drive: int) -> NDArray[np.int64]:
+        """The keyframes of the regression about a place (2,) m: the nearest of a drive of the
+        training, in that order, and of those that later drives added as many that are no farther.
         """
-        first = self.first
-        if first.all():
-            return self.nearest(place, _REGRESSED)
         apart = np.hypot(*(self.poses[:, :2] - place).T)
-        trained, added = np.flatnonzero(first), np.flatnonzero(~first)
-        trained = trained[np.argsort(apart[trained])[:_REGRESSED]]
-        added = added[apart[added] <= apart[trained[-1]]]
-        return np.concatenate([trained, added[np.argsort(apart[added])[:_REGRESSED]]])
+        own, added = np.flatnonzero(self.drives == drive), np.flatnonzero(~self.first)
+        own = own[np.argsort(apart[own])[:_REGRESSED]]
+        added = added[apart[added] <= apart[own].max(initial=0.0)]
+        return np.concatenate([own, added[np.argsort(apart[added])[:_REGRESSED]]])
 
     def located(
         self,
@@ -469,29 +476,59 @@ class Keyframes:
         """Where the spectrum (rows, F) of an image without the light's `pattern` is among the
         keyframes around the best one, of those whose correlations (K,) are known, and its yaw rad;
         `yaws` (K,) rad are what each of them shows, `reach` m how far the place may be from the
-        best.
+        best. Each drive of the training says so by itself, and counts by how certain it is.
         """
-        best, sign, columns = int(scores.argmax()), self._sign, self._columns
-        start, yaw = self.poses[best, :2], float(yaws[best])
-        unlike = _unlike(float(scores[best]))
-        found = Nearby(np.array(start), 0.0, unlike, np.zeros((2, 2)), 0.0, 1.0)
+        best, known = int(scores.argmax()), np.isfinite(scores)
+        start = np.append(self.poses[best, :2], yaws[best])
+        by_drive = [
+            self._among(drive, spectrum, start, known, reach, pattern)
+            for drive in self._likeliest_drives(scores)
+        ]
+        parts = [one for one in by_drive if one is not None]
+        unlike, none = _unlike(float(scores[best])), np.zeros((2, 2))
+        found = Nearby(start[:2], 0.0, unlike, none, 0.0, 1.0)
+        if parts:
+            found = averaged(parts, [1 / self._variance(one) for one in parts])
+        return found, float(yaws[best]) + self._sign * found.angle
+
+    def _among(
+        self,
+        drive: int,
+        spectrum: Spectra,
+        start: Array,
+        known: NDArray[np.bool_],
+        reach: float,
+        pattern: Spectra | None,
+    ) -> Nearby | None:
+        """The same among the `known` (K,) keyframes of one drive, from a pose (3,) on; None where
+        they are too few.
+        """
+        sign, columns, found = self._sign, self._columns, None
+        place, angle, limit = start[:2], 0.0, 2 * np.pi / self._columns
         for _ in range(_REPEATED):
-            near = self._around(found.place)
-            near = near[np.isfinite(scores[near])]
+            near = self._around(place, drive)
+            near = near[known[near]]
             if len(near) < _FEWEST:
                 break
+            yaw = float(start[2]) + sign * angle
             around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
             image = spectrum if pattern is None else spectrum - turned(pattern, -sign * yaw)
             found = place_among(
                 image, around, self.poses[near, :2], columns, self._channels, self.drives[near]
             )
-            step, limit = found.place - start, 2 * np.pi / columns
+            step = found.place - start[:2]
             apart = float(np.hypot(*step))
-            found = replace(found, place=start + step * min(1.0, reach / max(apart, 1e-9)))
-            yaw += sign * float(np.clip(found.angle, -limit, limit))
+            place = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
+            angle += float(np.clip(found.angle, -limit, limit))
+            found = replace(found, place=place, angle=angle)
             if apart < _NEARER * reach:
                 break
-        return found, yaw
+        return found
+
+    def _variance(self, nearby: Nearby) -> float:
+        """Variance m^2 along each axis of a place by the keyframes of one drive."""
+        by_place, beyond = self.noise.by_place(nearby.unlike), self.noise.beyond(nearby)
+        return self.noise.variance(by_place) + float(np.trace(nearby.noise)) / 2 + beyond**2
 
     def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
         """How likely each of the keyframes (M,) whose correlations (K,) are known is the place, of
@@ -528,9 +565,10 @@ class Keyframes:
 
     def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""
-        start = self.poses[best, :2]
-        farthest = self._around(start)[:NEIGHBORS][-1]
-        return _REACH_SHARE * max(float(np.hypot(*(self.poses[farthest, :2] - start))), 1e-6)
+        own = self.drives == self.drives[best]
+        apart = self.poses[own if self.first[best] else self.first, :2] - self.poses[best, :2]
+        farthest = np.sort(np.hypot(*apart.T))[:NEIGHBORS][-1]
+        return _REACH_SHARE * max(float(farthest), 1e-6)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
         """Arrays to save, without pickle; drives where there are several."""

@@ -231,6 +231,27 @@ def place_among(
     return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside, left)
 
 
+def averaged(parts: Sequence[Nearby], weights: Sequence[float]) -> Nearby:
+    """The mean of what several drives say of one image, all with what is left of it, by weights
+    (N,).
+    """
+    share = np.array(weights) / np.sum(weights)
+
+    def mean(values: Sequence[Array | float]) -> Array:
+        return np.tensordot(share, np.array(values), 1)
+
+    left = [one.left for one in parts if one.left is not None]
+    return Nearby(
+        mean([one.place for one in parts]),
+        float(mean([one.angle for one in parts])),
+        float(mean([one.unlike for one in parts])),
+        mean([one.noise for one in parts]),
+        float(mean([one.variation for one in parts])),
+        float(mean([one.aside for one in parts])),
+        np.tensordot(share.astype(np.float32), np.array(left), 1),
+    )
+
+
 def _trust(compared: Sequence[_Compared], basis: _Basis) -> Array:
     """How much each channel counts, 1 at most: by how well the keyframes explain it there."""
     products = np.array([one.products for one in compared])
