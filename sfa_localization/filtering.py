@@ -310,7 +310,7 @@ def _remarks(found: Learned, position_std: float) -> tuple[str, ...]:
     share = f', {noise.share:.0%} of the variance alike over {noise.distance_m:.1f} m'
     said = [
         f'learned from the log: positions err by {position_std:.2f} m'
-        + (share if float(noise.share) > 2 * NEARLY_WHITE else ''),
+        + (share if float(noise.share) > 5 * NEARLY_WHITE else ''),
         f'noise of the odometry: speed {noise.speed:.2g}, slip {noise.slip:.2g}, '
         f'turn {noise.turn:.2g} of the expected',
     ]

@@ -58,7 +58,7 @@ def test_stated_variances_that_are_right_stay():
     drive = Drive(seconds=200, rate_hz=10, every=5, **USUAL)
     fit = filtering.fitted(*tables(drive), FilterConfig())
     assert position_std(fit) == pytest.approx(0.2, rel=0.1)
-    assert fit.correlation.share == pytest.approx(NEARLY_WHITE)
+    assert fit.correlation.share < 2 * NEARLY_WHITE
     assert np.array_equal(fit.odometry.columns['v'], drive.read[:, 0])
 
 
@@ -68,6 +68,15 @@ def test_errors_that_neighbors_share_are_found():
     fit = filtering.fitted(*tables(drive, 0.3), FilterConfig())
     assert 0.6 < fit.correlation.share < 0.93
     assert 0.3 < fit.correlation.distance_m < 1.3
+
+
+def test_a_small_share_that_neighbors_have_in_common_is_expected_where_the_log_suggests_it():
+    shares = []
+    for share in (0.0, 0.15):
+        drive = Drive(seconds=300, rate_hz=10, every=5, share=share, length=1.0,
+                      **{**USUAL, 'position_std': 0.2})  # fmt: skip
+        shares.append(float(filtering.fitted(*tables(drive), FilterConfig()).correlation.share))
+    assert shares[0] < 2 * NEARLY_WHITE and shares[1] > 3 * NEARLY_WHITE
 
 
 @pytest.mark.parametrize('walk', [0.05, 0.15])

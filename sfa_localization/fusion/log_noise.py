@@ -38,8 +38,8 @@ from sfa_localization.fusion.settings import FilterConfig
 
 MOST_POSITIONS = 2000
 """Of more, so many are taken, evenly: they determine the noise well enough."""
-NEARLY_WHITE = 0.02
-"""Share of the positions' errors that neighbors have in common where the log shows none."""
+NEARLY_WHITE = 0.01
+"""Share of the positions' errors that neighbors have in common, as is expected of most logs."""
 LAGS_S = np.linspace(-1.0, 1.0, 21)
 """Delays of the motion behind the odometry's stamps for which it is tabulated, s."""
 _OUTLIERS = 0.02
@@ -100,12 +100,14 @@ _SCALES = {
     'speed': _Scale(np.log, np.exp, 1.5),
     'slip': _Scale(np.log, np.exp, 1.0),
     'position': _Scale(np.log, np.exp, 0.5),
-    'share': _Scale(_logit, _expit, 1.5),
+    'share': _Scale(_logit, _expit, 2.0),
     'distance_m': _Scale(np.log, np.exp, 0.5),
     'lag_s': _Scale(np.asarray, np.asarray, 0.25),
 }
 _NAMES = Noise._fields
 _CORRELATED = ('share', 'distance_m')
+# Over which small shares fade shows in no log.
+_UNKNOWN = frozenset(['distance_m'])
 # Shares and distances (m) from which correlated errors are sought.
 _SHARED_STARTS = [(share, distance) for share in (0.3, 0.7, 0.9) for distance in (0.3, 1.0)]
 # Odometry noisier than expected by more than this factor is no odometry: then it is rather the
@@ -200,12 +202,12 @@ def learn(log: Log, config: FilterConfig, start: Noise, held: frozenset[str]) ->
     """
     log = log.thinned()
     drive = _Drive(log, config)
-    found = _Search(drive, start, held | set(_CORRELATED)).best()
+    found = _Search(drive, start, held | _UNKNOWN).best()
     after = _Drive(log.held_forward(), config)
     prompt = found._replace(noise=found.noise._replace(lag_s=np.array(0.0)))
     other = min(_likelihood_cost(one, after) for one in (found, prompt))
     if other < _likelihood_cost(found, drive) - _FORWARD_GAIN:
-        drive, found = after, _Search(after, start, held | set(_CORRELATED)).best()
+        drive, found = after, _Search(after, start, held | _UNKNOWN).best()
     forward = drive is after
     found = _correlated(drive, found, start, held)
     return Learned(found.settled(), forward, found.cost, drive.fits(_likelihood_cost(found, drive)))
@@ -220,8 +222,8 @@ def _likelihood_cost(found: _Found, drive: _Drive) -> float:
 def _correlated(drive: _Drive, found: _Found, start: Noise, held: frozenset[str]) -> _Found:
     """The noise with correlated errors, where the log clearly shows them, else that `found`.
 
-    Two numbers more have to raise the log-likelihood by the logarithm of the positions' number
-    (Bayesian information criterion).
+    A large share and its distance have to raise the log-likelihood by the logarithm of the
+    positions' number, as two numbers have to (Bayesian information criterion).
     """
     known = {name: getattr(found.noise, name) for name in _NAMES if name not in _CORRELATED}
     near = start._replace(**known)
