@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.fusion.arrivals import Arrivals
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.history import History
@@ -69,6 +70,7 @@ class PoseFilter:
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
         self._watch, self._off = TurnWatch(), False
+        self._arrivals = Arrivals()
         self._rules = Rules(self.config, self.correlation)
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._forget()
@@ -94,6 +96,7 @@ class PoseFilter:
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
         self._watch.forget_time()
         self._history = self._fresh(self._rules.recovery.blank(0))
+        self._suspect_late(Arrivals())
         self._backward = 0
         self._ahead = (0, 0)
         self._apart = (0, 0)
@@ -173,6 +176,7 @@ class PoseFilter:
             factor = self.config.measurement_factor
             fused, noise = read_measurement(value, covariance, factor)
             taken_ns = self._taken(stamp_ns)
+            self._note_arrival(taken_ns)
             self._note_apart(taken_ns)
             self._require_place(taken_ns, _MEASUREMENT)
         except DataError as error:
@@ -204,6 +208,22 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+
+    def _note_arrival(self, taken_ns: int) -> None:
+        """Suspect images that arrive late, by the odometry, of being stamped early."""
+        odometry_ns, arrivals = self._history.newest.odometry_ns, self._arrivals
+        if odometry_ns is not None:
+            self._suspect_late(arrivals.after((odometry_ns - taken_ns) * 1e-9))
+
+    def _suspect_late(self, arrivals: Arrivals) -> None:
+        before_s, self._arrivals = self._arrivals.late_s, arrivals
+        if arrivals.late_s == before_s:
+            return
+        if before_s > 0:
+            self._watch.acquit(-before_s)
+        if arrivals.late_s > 0:
+            self._watch.suspect(-arrivals.late_s)
+        self._judge_time()
 
     def _judge_time(self) -> None:
         """Whether images are likely of another time; once they were, until that is unlikely."""

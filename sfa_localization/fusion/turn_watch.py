@@ -41,6 +41,10 @@ _DRIFT, _LEAVE = 0.1, 0.2
 slowly; and the share of it with which images that are in time begin to be late."""
 DOUBT = 0.3
 """Probability of any other delay where images have just moved the estimate."""
+_SUGGESTED, _ACQUITTED = 0.95, 1e-2
+"""Probability of a delay that something else than turns suggests, and what is left of it."""
+_ALIKE = 0.5
+"""What a pair counts where all that come are weighed for one delay."""
 _LEAST_RAD, _MOST_RAD, _START_RAD = 0.008, 0.1, 0.010
 """Standard deviation of a turn between two images against the odometry's: limits and start. Below a
 half degree the noise of the odometry itself would decide between delays."""
@@ -87,6 +91,7 @@ class TurnWatch:
         self._settled: Array = odds / odds.sum()
         self._odds = self._settled
         self._std = _START_RAD
+        self._lasting = False
         self.forget_time()
 
     def forget_time(self) -> None:
@@ -127,6 +132,22 @@ class TurnWatch:
         self._settled = (1 - DOUBT) * self._settled + DOUBT / len(self._settled)
         self._odds = (1 - DOUBT) * self._odds + DOUBT / len(self._odds)
 
+    def suspect(self, delay_s: float) -> None:
+        """Something else than turns suggests this delay, which lasts: until turns deny it, it is
+        likely.
+        """
+        self._lasting = True
+        there = _there(delay_s)
+        self._settled = (1 - _SUGGESTED) * self._settled + _SUGGESTED * there
+        self._odds = (1 - _SUGGESTED) * self._odds + _SUGGESTED * there
+
+    def acquit(self, delay_s: float) -> None:
+        """Nothing suggests this delay any more but turns, if they do."""
+        self._lasting = False
+        left = np.where(_there(delay_s) > 0, _ACQUITTED, 1.0)
+        self._settled = self._settled * left / (self._settled @ left)
+        self._odds = self._odds * left / (self._odds @ left)
+
     def apart(self, compensated_s: float) -> float:
         """Probability that images are off by more than TOLERATED_S from a compensated delay."""
         near = np.abs(_DELAYS - compensated_s) <= TOLERATED_S
@@ -153,13 +174,21 @@ class TurnWatch:
         while self._pairs and self._pairs[0].stop_ns + _FINALLY_NS <= now_ns:
             pair, settled = self._pairs.popleft(), True
             residual, std = self._residuals(pair)
-            self._settled = _weighed(self._settled, residual, std)
+            self._settled = self._after(self._settled, residual, std)
             self._learn(residual)
         count = sum(pair.stop_ns + _SOON_NS <= now_ns for pair in self._pairs)
         if settled or count != self._counted:
             self._counted, self._odds = count, self._settled
             for pair in list(self._pairs)[:count]:
-                self._odds = _weighed(self._odds, *self._residuals(pair))
+                self._odds = self._after(self._odds, *self._residuals(pair))
+
+    def _after(self, odds: Array, residual: Array, std: Array) -> Array:
+        """The odds after a pair, before the next one; of a delay that lasts, neighboring pairs
+        err alike.
+        """
+        if self._lasting:
+            return _weighed(odds, residual, std, _ALIKE)
+        return _moved(_weighed(odds, residual, std))
 
     def _residuals(self, pair: Pair) -> tuple[Array, Array]:
         """By which the turn differs from the odometry's, and its standard deviation, by delay.
@@ -198,8 +227,8 @@ class TurnWatch:
         self._std = min(max(std, _LEAST_RAD), _MOST_RAD)
 
 
-def _weighed(odds: Array, residual: Array, std: Array) -> Array:
-    """Bayes: the odds after a pair that leaves these residuals; then the delay may change."""
+def _weighed(odds: Array, residual: Array, std: Array, power: float = 1.0) -> Array:
+    """Bayes: the odds after a pair that leaves these residuals, its likelihood to a power."""
     mismatch = _density(residual, _MISMATCH_RAD)
     fits = (1 - _MISMATCH) * _density(residual, std) + _MISMATCH * mismatch
     now = residual[_NOW]
@@ -208,9 +237,8 @@ def _weighed(odds: Array, residual: Array, std: Array) -> Array:
         return odds
     # Of times without odometry nothing is known.
     fits = np.append(np.where(np.isfinite(fits), fits, unrelated), unrelated)
-    odds = odds * fits
-    odds /= odds.sum()
-    return _moved(odds)
+    weighed = odds * fits**power
+    return np.asarray(weighed / weighed.sum())
 
 
 def _moved(odds: Array) -> Array:
@@ -223,6 +251,12 @@ def _moved(odds: Array) -> Array:
     moved = drifted * (1 - np.where(_NEAR, _BREAK, _HEAL)) + _BREAK * good / len(drifted)
     moved[_NEAR] += _HEAL * (1 - good) / _NEAR.sum()
     return np.asarray(moved / moved.sum())
+
+
+def _there(delay_s: float) -> Array:
+    """Odds that are even near a delay, or near the earliest that is distinguished."""
+    near = np.abs(_DELAYS - max(delay_s, EARLIEST_S)) <= _EXPECTED_S
+    return np.append(near / near.sum(), 0.0)
 
 
 def _at(times: Array, known: Array, yaws: Array, rate: float) -> Array:
