@@ -22,7 +22,7 @@ from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import listed, short_line
 from sfa_localization.data.run import Stamps, Trajectory, integrate
-from sfa_localization.fusion.inputs import POSITION_STD, read_twist
+from sfa_localization.fusion.inputs import LARGEST_VARIANCE, POSITION_STD, read_twist
 from sfa_localization.fusion.log_noise import EXPECTED, NEARLY_WHITE, Learned, Log, Noise, learn
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
@@ -36,6 +36,8 @@ _STRETCH = 20
 """Positions that are aligned with odometry together: so few that odometry hardly drifts."""
 ENOUGH_POSITIONS = 5 * _STRETCH
 """With fewer, chance decides on what would be learned from a log."""
+_LEAST_STD_M = 1e-4
+"""Of a position: no smaller one is stated in earnest."""
 _UNTRUE = 2.0
 """A standard deviation that is too small by more than this factor is replaced."""
 _MEDIAN_OF_RAYLEIGH = 1.1774
@@ -339,7 +341,8 @@ def _spreads(positions: Table) -> Array:
     x, y = (positions.columns.get(name, empty) for name in ('var_x', 'var_y'))
     x, y = (np.where(np.isfinite(one) & (one > 0), one, other) for one, other in ((x, y), (y, x)))
     both = np.column_stack([x, y])
-    return np.where(np.isfinite(both) & (both > 0), both, POSITION_STD**2)
+    known = np.isfinite(both) & (both > 0)
+    return np.where(known, np.maximum(both, _LEAST_STD_M**2), POSITION_STD**2)
 
 
 def position_std_of(odometry: Table, positions: Table) -> float:
@@ -453,7 +456,7 @@ def _measurement(columns: dict[str, Array], i: int) -> tuple[Array, Array]:
     """Position or pose and its covariance; a missing variance is 0, for unknown."""
     position = np.array([columns['x'][i], columns['y'][i]])
     x, y = _cell(columns, 'var_x', i, 0.0), _cell(columns, 'var_y', i, 0.0)
-    x, y = (x or y, y or x)
+    x, y = (max(one, _LEAST_STD_M**2) if one > 0 else one for one in (x or y, y or x))
     xy = _cell(columns, 'var_xy', i, 0.0)
     covariance = np.array([[x, xy], [xy, y]]) if x > 0 else np.zeros((2, 2))
     yaw, yaw_variance = _cell(columns, 'yaw', i, math.nan), _cell(columns, 'var_yaw', i, 0.0)
@@ -552,6 +555,8 @@ def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[
             skipped['no stamp'] += 1
         elif not all(math.isfinite(cells[columns.index(name)]) for name in needed):
             skipped['no number'] += 1
+        elif reason := _impossible(dict(zip(columns, cells, strict=True))):
+            skipped[reason] += 1
         else:
             stamps.append(stamp_ns)
             numbers.append(cells)
@@ -567,6 +572,15 @@ def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[
         {name: data[:, k] for k, name in enumerate(columns)},
         skipped,
     )
+
+
+def _impossible(cells: dict[str, float]) -> str:
+    """Why the variances of a row are none, or ''; 0 is that of an unknown one."""
+    if any(cells[name] < 0 for name in cells if name.startswith('var_')):
+        return 'negative variance'
+    if any(cells.get(name, 0.0) >= LARGEST_VARIANCE for name in ('var_x', 'var_y')):
+        return 'variance that means that nothing is known'
+    return ''
 
 
 def _stamp(row: list[str], at: dict[str, int]) -> int | None:

@@ -59,7 +59,7 @@ def errors(drive, found, shift_ns=0):
 
 
 def test_the_command_tells_what_the_live_filter_would_have(tmp_path):
-    drive = Drive(seconds=20, **NOISY)
+    drive = Drive(seconds=20, **NOISY, seed=1)
     code, (stamps, poses) = run(tmp_path, drive)
     assert code == 0
     tables = (
@@ -67,6 +67,7 @@ def test_the_command_tells_what_the_live_filter_would_have(tmp_path):
         filtering.read_position_table(tmp_path / 'positions.csv'),
     )
     fit = filtering.fitted(*tables, FilterConfig())
+    assert fit.lag_ns == 0
     live = PoseFilter(fit.config, fit.correlation)
     read = np.column_stack([fit.odometry.columns[name] for name in ('v', 'omega')])
     told = {}
@@ -177,6 +178,20 @@ def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
     )
     assert done.counts['odometry: duplicate stamp'] == 1
     assert errors(drive, (done.stamps_ns, done.poses)).max() < 0.6
+
+
+@pytest.mark.parametrize(('stated', 'reason'), [
+    ('-1', 'negative variance'),
+    ('1e300', 'variance that means that nothing is known'),
+])  # fmt: skip
+def test_rows_with_impossible_variances_are_left_out_and_counted(tmp_path, stated, reason):
+    path = tmp_path / 'positions.csv'
+    path.write_text(f'stamp_s,x_m,y_m,var_x,var_y\n1,0,0,0.1,0.1\n2,1,0,{stated},0.1\n3,1,0,0,\n')
+    table = filtering.read_position_table(path)
+    assert len(table) == 2 and table.skipped == {reason: 1}
+    path.write_text(f'stamp_s,x_m,y_m,var_x,var_y\n1,0,0,{stated},0.1\n')
+    with pytest.raises(DataError, match=f'positions.csv: none of the 1 rows.*{reason}'):
+        filtering.read_position_table(path)
 
 
 @pytest.mark.parametrize('shift', [-START_NS, -START_NS - 10**12])

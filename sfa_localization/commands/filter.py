@@ -28,7 +28,7 @@ EXAMPLES = """\
 ODOM.csv: stamp_s,v_mps,omega_radps[,var_v,var_omega]
 POSITIONS.csv: stamp_s,x_m,y_m[,var_x,var_y][,var_xy][,yaw_rad,var_yaw]
 TRUTH: TUM lines, or stamp_s,x_m,y_m,yaw_rad.
-Seconds, meters, radians; variances in their squares; empty: unknown."""
+Seconds, meters, radians; variances in their squares; empty or 0: unknown."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -23,7 +23,8 @@ POSITION_STD_FLOOR, YAW_STD_FLOOR = 0.05, 0.02
 """Least standard deviations of a measurement (m, rad): no map from images is better everywhere."""
 YAW_STD_LIMIT = 1.0
 """A heading less certain than this (rad) is left out: its error is not Gaussian any more."""
-_LARGEST_VARIANCE = 1e6  # m^2 or rad^2: messages with it mean that nothing is known
+LARGEST_VARIANCE = 1e6
+"""m^2 or rad^2: messages with it mean that nothing is known."""
 _LARGEST_COORDINATE = 1e9  # m
 _LARGEST_TWIST = 100.0  # m/s and rad/s
 _LARGEST_YAW = 1e6  # rad, beyond which an angle has no digits left
@@ -54,7 +55,7 @@ def read_twist(
 
 
 def _variance(claimed: float, factor: float, floor: float, default: float) -> float:
-    if not (math.isfinite(claimed) and 0 < claimed < _LARGEST_VARIANCE):
+    if not (math.isfinite(claimed) and 0 < claimed < LARGEST_VARIANCE):
         return default**2
     return max(factor * float(claimed), floor**2)
 
@@ -78,7 +79,7 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
         rows = np.diag(np.square(stds)).tolist()
     if not _is_positive(rows):
         raise DataError('covariance is not symmetric positive')
-    if rows[0][0] >= _LARGEST_VARIANCE or rows[1][1] >= _LARGEST_VARIANCE:
+    if rows[0][0] >= LARGEST_VARIANCE or rows[1][1] >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
     return np.array(pose), _conditioned(rows, factor)
 
