@@ -19,9 +19,10 @@ def straight(seconds):
     return np.zeros(round(seconds * HZ))
 
 
-def driven(omega, held_s=0.0, ahead_s=lambda t: 0.0):
+def driven(omega, held_s=0.0, ahead_s=lambda t: 0.0, useless_ns=()):
     """Time s, status and error m at each image of a filter that receives images `held_s` after
-    they were taken, and odometry that is stamped ahead_s(t) too far ahead, as they come.
+    they were taken, and odometry that is stamped ahead_s(t) too far ahead, as they come; before
+    each image some with stamps `useless_ns`.
     """
     drive = Drive(every=EVERY, twists=np.column_stack([np.ones(len(omega)), omega]), **NOISY)
     coming = []
@@ -36,8 +37,8 @@ def driven(omega, held_s=0.0, ahead_s=lambda t: 0.0):
             now = index
             continue
         fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[index], 2]))
-        drive_seen, covariance = drive.seen[index], drive.covariance(True)
-        fused.add_measurement(stamp_ns, drive_seen, covariance)
+        for seen_ns in (*useless_ns, stamp_ns):
+            fused.add_measurement(seen_ns, drive.seen[index], drive.covariance(True))
         if fused.state is not None:
             apart = fused.state.pose - drive.poses[now]
             found.append((t, fused.status, math.hypot(apart[0], apart[1])))
@@ -72,8 +73,10 @@ def test_a_clock_of_the_odometry_that_steps_ahead_on_a_straight_line_is_noticed(
     assert sum(wrong) <= 1.0 * HZ / EVERY
 
 
-def test_images_in_time_need_no_turn():
-    assert localised(driven(straight(20.0), held_s=0.2), 4.0) == 1.0
+@pytest.mark.parametrize('useless_ns', [(), (0, 0, 0), (START_NS - 10_000_000_000,) * 3])
+def test_images_in_time_need_no_turn_whatever_unusable_ones_come(useless_ns):
+    found = driven(straight(20.0), held_s=0.2, useless_ns=useless_ns)
+    assert localised(found, 4.0) == 1.0
 
 
 @pytest.mark.parametrize('held_s', [0.6, 1.0])

@@ -176,9 +176,9 @@ class PoseFilter:
             factor = self.config.measurement_factor
             fused, noise = read_measurement(value, covariance, factor)
             taken_ns = self._taken(stamp_ns)
-            self._note_arrival(taken_ns)
             self._note_apart(taken_ns)
             self._require_place(taken_ns, _MEASUREMENT)
+            self._note_arrival(taken_ns)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
