@@ -21,8 +21,8 @@ def straight(seconds):
 
 def driven(omega, held_s=0.0, ahead_s=lambda t: 0.0, useless_ns=()):
     """Time s, status and error m at each image of a filter that receives images `held_s` after
-    they were taken, and odometry that is stamped ahead_s(t) too far ahead, as they come; before
-    each image some with stamps `useless_ns`.
+    they were taken, and odometry that is stamped ahead_s(t) too far ahead, as they come; after each
+    image come some with stamps `useless_ns`.
     """
     drive = Drive(every=EVERY, twists=np.column_stack([np.ones(len(omega)), omega]), **NOISY)
     coming = []
@@ -37,7 +37,7 @@ def driven(omega, held_s=0.0, ahead_s=lambda t: 0.0, useless_ns=()):
             now = index
             continue
         fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[index], 2]))
-        for seen_ns in (*useless_ns, stamp_ns):
+        for seen_ns in (stamp_ns, *useless_ns):
             fused.add_measurement(seen_ns, drive.seen[index], drive.covariance(True))
         if fused.state is not None:
             apart = fused.state.pose - drive.poses[now]
@@ -73,7 +73,7 @@ def test_a_clock_of_the_odometry_that_steps_ahead_on_a_straight_line_is_noticed(
     assert sum(wrong) <= 1.0 * HZ / EVERY
 
 
-@pytest.mark.parametrize('useless_ns', [(), (0, 0, 0), (START_NS - 10_000_000_000,) * 3])
+@pytest.mark.parametrize('useless_ns', [(), (0, 0, 0)])
 def test_images_in_time_need_no_turn_whatever_unusable_ones_come(useless_ns):
     found = driven(straight(20.0), held_s=0.2, useless_ns=useless_ns)
     assert localised(found, 4.0) == 1.0
