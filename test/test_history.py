@@ -30,6 +30,20 @@ def test_adding_tells_the_belief_right_after_the_event():
     assert history.newest == ('a', 'b', 'c')
 
 
+def test_events_that_lie_ahead_are_redone_when_they_are_asked_for_alone():
+    stepped = []
+    history = History(1000, (), lambda belief, event: stepped.append(event) or (*belief, event))
+    for stamp in (100, 101, 102):
+        history.add((stamp, 0), stamp)
+    del stepped[:]
+    for stamp in range(50):
+        assert history.add((stamp, 0), stamp) == tuple(range(stamp + 1))
+        assert history.before(stamp) == tuple(range(stamp + 1))
+    assert stepped == list(range(50))
+    assert history.newest == (*range(50), 100, 101, 102)
+    assert len(stepped) == 53
+
+
 def test_rank_orders_equal_stamps_and_equal_keys_replace():
     history = trail()
     history.add((1, 2), 'late')

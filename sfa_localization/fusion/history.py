@@ -3,7 +3,8 @@
 """A bounded, sorted history of events, replayed from where a late one belongs.
 
 Beliefs are a pure function of the sorted events: an event that comes late has exactly the effect
-that it would have had in time.
+that it would have had in time. What follows it is redone when it is asked for: events that lie
+ahead of all that come would be redone by each of them.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class History(Generic[E, B]):
 
     @property
     def newest(self) -> B:
-        return self._beliefs[-1] if self._beliefs else self._base
+        return self._belief(len(self._keys))
 
     @property
     def newest_ns(self) -> int | None:
@@ -71,37 +72,32 @@ class History(Generic[E, B]):
         return self._horizon_ns is None or stamp_ns > self._horizon_ns
 
     def add(self, key: Key, event: E) -> B:
-        """Place an event, in place of one of the same key, and redo what follows it.
-
-        Returns the belief right after it.
-        """
-        if not self._keys or key > self._keys[-1]:
-            belief = self._step(self.newest, event)
-            self._keys.append(key)
-            self._events.append(event)
-            self._beliefs.append(belief)
-            self._until_forgetting -= 1
-            if self._until_forgetting <= 0:
-                self._forget()
-            return belief
+        """Place an event, in place of one of the same key. Returns the belief right after it."""
         at = bisect_left(self._keys, key)
-        if self._keys[at] == key:
+        if at == len(self._keys):
+            self._until_forgetting -= 1
+        if at < len(self._keys) and self._keys[at] == key:
             self._events[at] = event
         else:
             self._keys.insert(at, key)
             self._events.insert(at, event)
-        belief = self._beliefs[at - 1] if at else self._base
-        redone = []
-        for later in self._events[at:]:
-            belief = self._step(belief, later)
-            redone.append(belief)
-        self._beliefs[at:] = redone
-        return redone[0]
+        del self._beliefs[at:]
+        belief = self._belief(at + 1)
+        if self._until_forgetting <= 0:
+            self._forget()
+        return belief
 
     def before(self, stamp_ns: int) -> B:
         """The belief after the last event up to the stamp."""
-        at = bisect_right(self._keys, (stamp_ns, 1 << 30))
-        return self._beliefs[at - 1] if at else self._base
+        return self._belief(bisect_right(self._keys, (stamp_ns, 1 << 30)))
+
+    def _belief(self, count: int) -> B:
+        """The belief after the first events, as many as `count`; those before it are made too."""
+        belief = self._beliefs[-1] if self._beliefs else self._base
+        for event in self._events[len(self._beliefs) : count]:
+            belief = self._step(belief, event)
+            self._beliefs.append(belief)
+        return self._beliefs[count - 1] if count else self._base
 
     def _forget(self) -> None:
         """Drop what lies beyond the span, now and then; its last belief is the new base."""
@@ -109,7 +105,7 @@ class History(Generic[E, B]):
         cut = bisect_left(self._keys, (self._keys[-1][0] - self._span_ns, 0))
         if cut == 0:
             return
-        self._base = self._beliefs[cut - 1]
+        self._base = self._belief(cut)
         self._horizon_ns = self._keys[cut - 1][0]
         if self._archive is not None:
             self._archive += self._events[:cut]
