@@ -19,10 +19,11 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import listed, short_line
 from sfa_localization.data.run import Stamps, Trajectory, integrate
-from sfa_localization.fusion.inputs import LARGEST_VARIANCE, POSITION_STD, read_twist
+from sfa_localization.fusion.inputs import POSITION_STD, read_twist
 from sfa_localization.fusion.log_noise import EXPECTED, NEARLY_WHITE, Learned, Log, Noise, learn
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
@@ -340,9 +341,13 @@ def _spreads(positions: Table) -> Array:
     empty = np.full(len(positions), np.nan)
     x, y = (positions.columns.get(name, empty) for name in ('var_x', 'var_y'))
     x, y = (np.where(np.isfinite(one) & (one > 0), one, other) for one, other in ((x, y), (y, x)))
-    both = np.column_stack([x, y])
-    known = np.isfinite(both) & (both > 0)
-    return np.where(known, np.maximum(both, _LEAST_STD_M**2), POSITION_STD**2)
+    both = _in_earnest(np.column_stack([x, y]))
+    return np.where(np.isfinite(both) & (both > 0), both, POSITION_STD**2)
+
+
+def _in_earnest(variances: Array) -> Array:
+    """Variances m^2 of positions, none that is known smaller than what is stated in earnest."""
+    return np.where(variances > 0, np.maximum(variances, _LEAST_STD_M**2), variances)
 
 
 def position_std_of(odometry: Table, positions: Table) -> float:
@@ -456,7 +461,7 @@ def _measurement(columns: dict[str, Array], i: int) -> tuple[Array, Array]:
     """Position or pose and its covariance; a missing variance is 0, for unknown."""
     position = np.array([columns['x'][i], columns['y'][i]])
     x, y = _cell(columns, 'var_x', i, 0.0), _cell(columns, 'var_y', i, 0.0)
-    x, y = (max(one, _LEAST_STD_M**2) if one > 0 else one for one in (x or y, y or x))
+    x, y = _in_earnest(np.array([x or y, y or x])).tolist()
     xy = _cell(columns, 'var_xy', i, 0.0)
     covariance = np.array([[x, xy], [xy, y]]) if x > 0 else np.zeros((2, 2))
     yaw, yaw_variance = _cell(columns, 'yaw', i, math.nan), _cell(columns, 'var_yaw', i, 0.0)

@@ -21,6 +21,7 @@ from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
 from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
@@ -28,7 +29,7 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
 from sfa_localization.place_model import Estimate, PlaceModel, SlowPose, require_panorama
 
-UNKNOWN_VARIANCE = 1e6
+UNKNOWN_VARIANCE = LARGEST_VARIANCE
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
 
 

@@ -18,8 +18,8 @@ NANOSECONDS = 1_000_000_000
 NO_STAMP = 'zero or negative stamp'
 _LARGEST = 1e9
 """No robot reaches this number of m, rad, m/s or rad/s: such a field was never set."""
-_LARGEST_VARIANCE = 1e6
-"""Drivers mark an unknown variance by numbers as large as this (SI units)."""
+LARGEST_VARIANCE = 1e6
+"""Drivers mark an unknown variance by numbers as large as this (SI units); so do the nodes."""
 _SHORTEST_QUATERNION = 1e-3
 """A shorter quaternion has no direction; normalized ones have length 1."""
 
@@ -78,4 +78,4 @@ def require_sane(name: str, *numbers: float) -> None:
 
 def _variance(value: float) -> float:
     """A variance, or 0 (unknown) where the message holds an impossible one."""
-    return float(value) if math.isfinite(value) and 0 < value < _LARGEST_VARIANCE else 0.0
+    return float(value) if math.isfinite(value) and 0 < value < LARGEST_VARIANCE else 0.0

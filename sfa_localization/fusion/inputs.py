@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.fusion.motion import Twist
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -23,8 +24,6 @@ POSITION_STD_FLOOR, YAW_STD_FLOOR = 0.05, 0.02
 """Least standard deviations of a measurement (m, rad): no map from images is better everywhere."""
 YAW_STD_LIMIT = 1.0
 """A heading less certain than this (rad) is left out: its error is not Gaussian any more."""
-LARGEST_VARIANCE = 1e6
-"""m^2 or rad^2: messages with it mean that nothing is known."""
 _LARGEST_COORDINATE = 1e9  # m
 _LARGEST_TWIST = 100.0  # m/s and rad/s
 _LARGEST_YAW = 1e6  # rad, beyond which an angle has no digits left

@@ -129,17 +129,14 @@ class TurnWatch:
 
     def doubt(self) -> None:
         """Images have moved the estimate: perhaps they are of another time."""
-        self._settled = (1 - DOUBT) * self._settled + DOUBT / len(self._settled)
-        self._odds = (1 - DOUBT) * self._odds + DOUBT / len(self._odds)
+        self._expect(DOUBT, np.full(len(self._odds), 1 / len(self._odds)))
 
     def suspect(self, delay_s: float) -> None:
         """Something else than turns suggests this delay, which lasts: until turns deny it, it is
         likely.
         """
         self._lasting = True
-        there = _there(delay_s)
-        self._settled = (1 - _SUGGESTED) * self._settled + _SUGGESTED * there
-        self._odds = (1 - _SUGGESTED) * self._odds + _SUGGESTED * there
+        self._expect(_SUGGESTED, _there(delay_s))
 
     def acquit(self, delay_s: float) -> None:
         """Nothing suggests this delay any more but turns, if they do."""
@@ -181,6 +178,11 @@ class TurnWatch:
             self._counted, self._odds = count, self._settled
             for pair in list(self._pairs)[:count]:
                 self._odds = self._after(self._odds, *self._residuals(pair))
+
+    def _expect(self, share: float, odds: Array) -> None:
+        """Of all probability, lay a share out by these odds."""
+        self._settled = (1 - share) * self._settled + share * odds
+        self._odds = (1 - share) * self._odds + share * odds
 
     def _after(self, odds: Array, residual: Array, std: Array) -> Array:
         """The odds after a pair, before the next one; of a delay that lasts, neighboring pairs
