@@ -431,5 +431,5 @@ def regression(basis: Basis, features: Array, places: Array) -> Array:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, at once or not at all. Raises LocalizationError."""
     text = json.dumps(content, indent=2) + '\n'
-    with atomic_write(path, make_folder=True) as file:
+    with atomic_write(path) as file:
         file.write(text.encode())

@@ -530,8 +530,12 @@ def _header(rows: list[list[str]], known: dict[str, tuple[str, ...]]) -> tuple[l
 def _column_indices(
     path: Path, names: list[str], known: dict[str, tuple[str, ...]], needed: tuple[str, ...]
 ) -> dict[str, int]:
-    """Index of each known column. Raises DataError when a needed one is missing."""
+    """Index of each known column. Raises DataError when a needed one is missing, or one is twice."""
     wanted = {'stamp_s': _STAMP, 'stamp_ns': _STAMP_NS, **known}
+    used = {alias for aliases in wanted.values() for alias in aliases}
+    for name, count in Counter(names).items():
+        if count > 1 and name in used:
+            raise DataError(f'{path}: has {count} columns {name}: give each a name of its own')
     at = {}
     for name, aliases in wanted.items():
         found = next((names.index(alias) for alias in aliases if alias in names), None)

@@ -330,13 +330,20 @@ def test_a_path_that_is_no_bag_is_rejected(path: str, complaint: str, tmp_path: 
         pass
 
 
-@pytest.mark.parametrize('text', ['', 'a: [', '[1, 2]', 'rosbag2_bagfile_information: 3'])
-def test_damaged_metadata_is_rebuilt(text: str, tmp_path: Path, messages: list[Message]) -> None:
+@pytest.mark.parametrize(('text', 'why'), [
+    ('', 'its entries are not'), ('a: [', 'is not YAML'), ('[1, 2]', 'its entries are not'),
+    ('a: 3', 'it has no rosbag2_bagfile_information'),
+    ('rosbag2_bagfile_information: 3', 'its entries are not'),
+    ('rosbag2_bagfile_information: {}', 'it has no version'),
+])  # fmt: skip
+def test_damaged_metadata_is_rebuilt(
+    text: str, why: str, tmp_path: Path, messages: list[Message]
+) -> None:
     path = write_version(tmp_path / 'bag', messages, 5)
     (path / 'metadata.yaml').write_text(text)
     with Bag(path) as bag:
         assert {t.name: t.count for t in bag.topics.values()} == COUNTS
-        assert any('metadata.yaml is damaged' in problem for problem in bag.problems)
+        assert any(f'metadata.yaml is damaged ({why}' in problem for problem in bag.problems)
     with pytest.raises(BagError, match=r'metadata\.yaml is damaged'), Bag(path, strict=True):
         pass
 

@@ -210,8 +210,9 @@ def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path, text
 def test_a_missing_file_and_an_unwritable_one_are_named(tmp_path):
     with pytest.raises(ConfigError, match='cannot be read'):
         load_settings(tmp_path / 'none.yaml', 'ekf_node', FilterConfig)
+    (tmp_path / 'file').touch()
     with pytest.raises(ConfigError, match='cannot be written'):
-        write_config(tmp_path / 'no' / 'c.yaml')
+        write_config(tmp_path / 'file' / 'c.yaml')
 
 
 def test_the_command_prints_and_writes(tmp_path, capsys):

@@ -280,6 +280,7 @@ def test_a_parameter_file_is_obeyed(tmp_path, capsys):
     ('', 'stamp_s,x_m,y_m\n1,2,3\n', 'holds no rows'),
     ('stamp_s,v_mps\n1,2\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'no column omega_radps'),
     ('a,b,c\n1,2,3\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'no column stamp_s'),
+    ('t,v,v,omega\n1,2,3,4\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'has 2 columns v: give each'),
     ('stamp_s,v_mps,omega_radps\nx,y,z\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'none of the 1 rows'),
     ('stamp_s,v_mps,omega_radps\n1,2,3\n', 'stamp_s,x_m,y_m\n9,2,3\n', 'no time in common'),
     ('stamp_s,v_mps,omega_radps\n1,0,0\n', 'stamp_s,x_m,y_m\n1,2,3\n', 'never started'),
@@ -303,9 +304,10 @@ def test_a_missing_or_binary_file_is_named(tmp_path, capsys):
 
 
 def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path):
+    (tmp_path / 'no').touch()
     with pytest.raises(DataError, match='cannot be written'):
         filtering.write_tum(tmp_path / 'no' / 'out.tum', np.array([1]), np.zeros((1, 3)))
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ['no']
 
 
 @pytest.mark.parametrize('kind', ['csv', 'tum'])

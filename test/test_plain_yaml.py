@@ -22,7 +22,7 @@ BOMB = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
 HOSTILE = {
     'alias bomb': (BOMB, 'more than 500000 values'),
     'alias of itself': ('a: &a [*a]', "alias 'a' stands for itself"),
-    'date that is none': ('a: 2001-99-99', 'month must be in'),
+    'date that is none': ('a: 2001-99-99', 'has a date or a number that cannot be: month must'),
     'number of 5001 digits': (f'a: {"9" * 5001}', 'a number of 5001 characters'),
     'hexadecimal number': (f'a: 0x{"f" * 5000}', 'a number of 5002 characters'),
     'tagged number': (f'a: !!int "{"9" * 5001}"', 'a number of 5001 characters'),

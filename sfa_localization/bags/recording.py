@@ -274,6 +274,8 @@ def parse_metadata(text: str) -> Metadata:
             channel = make_channel(*names, qos)
             metadata.channels.append(channel)
             metadata.counts[channel.topic] += int(entry['message_count'])
-    except (KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise ValueError(type(error).__name__) from None
+    except KeyError as error:
+        raise ValueError(f'it has no {one_line(error.args[0])}') from None
+    except (TypeError, AttributeError, OverflowError):
+        raise ValueError('its entries are not those of a bag') from None
     return metadata

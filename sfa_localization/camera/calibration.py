@@ -364,5 +364,5 @@ def write_check(path: Path, image: Image) -> None:
 
 
 def _write_file(path: Path, data: bytes) -> None:
-    with atomic_write(path, CameraError, make_folder=True) as file:
+    with atomic_write(path, CameraError) as file:
         file.write(data)

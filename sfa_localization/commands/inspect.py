@@ -69,7 +69,7 @@ def _unreadable(report: BagReport) -> bool:
 def write_json(path: Path, reports: Sequence[BagReport]) -> None:
     """Write all reports to one file. Raises BagError when that is not possible."""
     text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
-    with atomic_write(path, BagError, make_folder=True) as file:
+    with atomic_write(path, BagError) as file:
         file.write(f'{text}\n'.encode())
 
 

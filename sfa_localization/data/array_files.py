@@ -57,7 +57,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         header = json.loads(str(plain[_HEADER]))
         header[_CHECKSUM] = checksum(plain, header)
         plain[_HEADER] = np.array(json.dumps(header, sort_keys=True))
-    with atomic_write(Path(path), ModelError, make_folder=True) as file:
+    with atomic_write(Path(path), ModelError) as file:
         np.savez(file, **plain)
 
 

@@ -48,19 +48,18 @@ def read_regular(path: Path | str, largest: int) -> bytes:
 
 @contextmanager
 def atomic_write(
-    path: Path, error: type[LocalizationError] = LocalizationError, *, make_folder: bool = False
+    path: Path, error: type[LocalizationError] = LocalizationError
 ) -> Iterator[IO[bytes]]:
     """Write to a temporary file that becomes `path` at the end, or is removed after any error.
 
-    Of a symbolic link the file that it leads to is replaced; a file keeps its permissions.
-    `make_folder` creates missing folders first. Raises `error`, naming the path, also where it is
-    a folder, a device or a pipe.
+    Missing folders are made. Of a symbolic link the file that it leads to is replaced; a file
+    keeps its permissions. Raises `error`, naming the path, also where it is a folder, a device or
+    a pipe.
     """
     temporary = None
     try:
         target = Path(os.path.realpath(path))
-        if make_folder:
-            target.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         mode = replaced_mode(target)
         handle, temporary = tempfile.mkstemp('.part', f'.{target.name}-', target.parent)
         with os.fdopen(handle, 'wb') as file:

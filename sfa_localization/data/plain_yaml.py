@@ -8,6 +8,7 @@ stack on nested brackets, and aliases of aliases become millions of values.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Hashable, Iterator
 from typing import Any
@@ -40,20 +41,24 @@ def load_yaml(text: str, loader: Any = YamlLoader, *, first: bool = False) -> An
         raise ValueError(f'has {len(text)} characters, more than {LONGEST}')
     try:
         documents = _checked_documents(text)
-        if first:
-            next(documents, None)
-            return next(iter(yaml.load_all(text, loader)), None)
-        for _ in documents:
+        for _ in itertools.islice(documents, 1 if first else None):
             pass
-        return yaml.load(text, loader)
+        return _loaded(text, loader, first)
     except yaml.MarkedYAMLError as error:
         raise ValueError(f'is not YAML: {_described(error)}') from None
     except yaml.YAMLError as error:
         raise ValueError(f'is not YAML: {" ".join(str(error).split())[:200]}') from None
-    except ValueError:
+
+
+def _loaded(text: str, loader: Any, first: bool) -> Any:
+    """The document of a text within the limits. Raises ValueError, and yaml.YAMLError."""
+    try:
+        return next(iter(yaml.load_all(text, loader)), None) if first else yaml.load(text, loader)
+    except yaml.YAMLError:
         raise
     except Exception as error:  # dates and numbers that cannot be fail in many ways
-        raise ValueError(f'is not YAML: {type(error).__name__}') from None
+        why = ' '.join(str(error).split())[:200]
+        raise ValueError(f'has a date or a number that cannot be: {why}') from None
 
 
 def _described(error: yaml.MarkedYAMLError) -> str:

@@ -47,7 +47,7 @@ def save_pose(path: Path, saved: SavedPose) -> None:
         'pose': saved.pose.tolist(),
         'covariance': saved.covariance.tolist(),
     }
-    with atomic_write(path, make_folder=True) as file:
+    with atomic_write(path) as file:
         file.write((json.dumps(content) + '\n').encode())
 
 

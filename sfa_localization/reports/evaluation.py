@@ -321,11 +321,11 @@ def number(value: float | None, column: str) -> str:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path, make_folder=True) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
 
 
 def save_text(path: Path, text: str) -> None:
     """Write a text file, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path, make_folder=True) as file:
+    with atomic_write(path) as file:
         file.write(text.encode())
