@@ -530,7 +530,7 @@ def _header(rows: list[list[str]], known: dict[str, tuple[str, ...]]) -> tuple[l
 def _column_indices(
     path: Path, names: list[str], known: dict[str, tuple[str, ...]], needed: tuple[str, ...]
 ) -> dict[str, int]:
-    """Index of each known column. Raises DataError when a needed one is missing, or one is twice."""
+    """Index of each known column. Raises DataError where one is missing or there twice."""
     wanted = {'stamp_s': _STAMP, 'stamp_ns': _STAMP_NS, **known}
     used = {alias for aliases in wanted.values() for alias in aliases}
     for name, count in Counter(names).items():

@@ -96,13 +96,18 @@ class Recovery:
             memory=Memory(),
         )
 
-    def precise_ns(self, belief: Belief, event: MeasurementEvent) -> int | None:
-        """When the last image came that shows the place well by itself, now that one is accepted.
+    def with_accepted(self, memory: Memory, belief: Belief, event: MeasurementEvent) -> Memory:
+        """The memory with an image that was accepted.
 
-        Many weak ones together do not: what makes them weak is the same for all.
+        Many weak ones together do not show the place well: what makes them weak is the same for
+        all.
         """
         weak = self.alike and largest_std(event.covariance) > self._config.degraded_std
-        return belief.memory.precise_ns if weak else event.stamp_ns
+        return memory._replace(
+            accepted_ns=event.stamp_ns,
+            accepted_m=belief.traveled_m,
+            precise_ns=belief.memory.precise_ns if weak else event.stamp_ns,
+        )
 
     def placed(self, belief: Belief, event: PoseEvent) -> Belief:
         """The pose was set from outside: earlier images do not count any more."""
@@ -154,16 +159,13 @@ class Recovery:
         pose = found.pose if isinstance(found, Relocation) else found.value
         memory = Memory(
             support=1,
-            accepted_ns=event.stamp_ns,
-            accepted_m=belief.traveled_m,
-            precise_ns=self.precise_ns(belief, event),
             update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
             trust=_trust(belief, pose, relocated=isinstance(found, Relocation)),
             scatter=belief.memory.scatter,
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, found.covariance, self._correlation.share)
-        return placed._replace(memory=memory)
+        return placed._replace(memory=self.with_accepted(memory, belief, event))
 
     def _widened(self, belief: Belief) -> Belief:
         """In doubt, the pose becomes less certain with every new place that contradicts it."""

@@ -144,11 +144,7 @@ class Correction:
         memory = belief.memory._replace(evidence=evidence, update=update)
         if not near:
             return belief._replace(memory=memory)
-        memory = memory._replace(
-            accepted_ns=event.stamp_ns,
-            accepted_m=belief.traveled_m,
-            precise_ns=self._recovery.precise_ns(belief, event),
-        )
+        memory = self._recovery.with_accepted(memory, belief, event)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
     def _gated(self, belief: Belief, event: MeasurementEvent) -> Belief:
@@ -165,9 +161,6 @@ class Correction:
             return self._recovery.weighed(belief, event, rejected)
         memory = Memory(
             support=belief.memory.support + 1,
-            accepted_ns=event.stamp_ns,
-            accepted_m=belief.traveled_m,
-            precise_ns=self._recovery.precise_ns(belief, event),
             evidence=remember(belief, event, accepted=True),
             update=update,
             trust=belief.memory.trust,
@@ -179,6 +172,7 @@ class Correction:
         if outlying > 1 and self._recovery.alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, belief.covariance, lighter)
+        memory = self._recovery.with_accepted(memory, belief, event)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
 
