@@ -63,7 +63,7 @@ class Evaluation:
     """A judged drive. `estimates` are in the truth's frame.
 
     `features` (N, K) are those of the usable images, of which `estimates['sfa']` is.
-    `aligned_on` names the drive on which `transform`, from map to truth, was fitted.
+    `aligned_on` names the drives on which `transform`, from map to truth, was fitted.
     """
 
     truth: Trajectory
@@ -144,7 +144,7 @@ def evaluate(
     model: PlaceModel,
     bag: Path,
     *,
-    align_bag: Path | None = None,
+    align_bags: Sequence[Path] = (),
     recipe: Recipe | None = None,
     config: FilterConfig | None = None,
     watch: WatchConfig | None = None,
@@ -154,21 +154,20 @@ def evaluate(
 ) -> Evaluation:
     """Judge a model on a drive with ground truth, by what sfa_node and ekf_node would publish.
 
-    The transform to the truth is fitted on `align_bag`, a training drive; without one, on the
+    The transform to the truth is fitted on `align_bags`, training drives; without any, on the
     drive itself; a known `transform`, of an earlier evaluation, is used as it is. `smooth` adds the
     filter's estimates smoothed after the drive. Unusable images count as skipped observations.
     Raises BagError or DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
-    trained = None
-    if align_bag is not None:
-        trained = _locate(align_bag, Observer(model, watch), recipe, progress)
+    trained = [_locate(one, Observer(model, watch), recipe, progress) for one in align_bags]
     kind = Smoother if smooth else PoseFilter
     replay = _replay(bag, Localizer(model, config, watch, kind), recipe, progress)
     drive = replay.located
-    aligned_on = 'an earlier evaluation' if transform else str(align_bag or bag)
-    reference = trained or drive
-    transform = transform or fit_transform(reference.truth, reference.images.poses)
+    aligned_on = ', '.join(map(str, align_bags or [bag]))
+    aligned_on = 'an earlier evaluation' if transform else aligned_on
+    pairs = [(one.truth, one.images.poses) for one in trained or [drive]]
+    transform = transform or fit_transform(*pairs)
     estimates = _in_truth(model, replay, trained, transform)
     false_s = _false_localised_s(replay, estimates['ekf'])
     return Evaluation(
@@ -183,13 +182,13 @@ def evaluate(
 
 
 def _in_truth(
-    model: PlaceModel, replay: _Replay, trained: _Located | None, transform: RigidTransform
+    model: PlaceModel, replay: _Replay, trained: Sequence[_Located], transform: RigidTransform
 ) -> dict[str, Trajectory]:
     """All estimates in the frame of the truth."""
     drive = replay.located
     estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
     estimates |= {name: moved(track.poses, transform) for name, track in replay.tracks.items()}
-    if trained is not None:
+    if trained:
         estimates['supervised'] = _supervised(model, trained, drive)
     return estimates
 
@@ -303,22 +302,30 @@ def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
     return truth.covers(stamps_ns, _TRUTH_TOLERANCE_NS)
 
 
-def fit_transform(truth: Trajectory, estimate: Trajectory) -> RigidTransform:
-    """Rotation and translation that lay the estimates (in the map) on the truth. DataError."""
-    mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
-    if np.count_nonzero(mask) < 2:
+def fit_transform(*drives: tuple[Trajectory, Trajectory]) -> RigidTransform:
+    """Rotation and translation that lay estimates, in the map, on the truth: of each drive its
+    truth and its estimates. Raises DataError.
+    """
+    found, right = (np.concatenate(parts) for parts in zip(*map(_pairs, drives), strict=True))
+    if len(found) < 2:
         raise DataError('the ground truth covers fewer than two images: are the clocks the same?')
-    return align(estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2])
+    return align(found, right)
+
+
+def _pairs(drive: tuple[Trajectory, Trajectory]) -> tuple[Array, Array]:
+    """Estimated and true positions (N, 2) m of a truth and its estimates, where both are known."""
+    truth, estimate = drive
+    mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
+    return estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2]
 
 
 def similarity(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
     """`mean` error (m) that is left when rotation, translation and `scale` are fitted on the
     estimate itself: what remains when the wheels' radius and the map's place do not matter.
     """
-    mask = known(truth, estimate.stamps_ns) & np.isfinite(estimate.poses[:, 0])
-    if np.count_nonzero(mask) < 2:
+    found, right = _pairs((truth, estimate))
+    if len(found) < 2:
         return {'mean': None, 'scale': None}
-    found, right = estimate.poses[mask, :2], truth.at(estimate.stamps_ns[mask])[:, :2]
     laid = align(found, right).apply(found)
     offset, center = laid - laid.mean(0), right.mean(0)
     square = float((offset**2).sum())
@@ -409,12 +416,15 @@ def _summary(values: Array) -> dict[str, float]:
     }
 
 
-def _supervised(model: PlaceModel, trained: _Located, drive: _Located) -> Trajectory:
-    """The drive by the model's own regression, fitted on the ground truth of a training drive."""
-    stamps = trained.images.poses.stamps_ns
-    mask = known(trained.truth, stamps)
-    places = trained.truth.at(stamps[mask])[:, :2]
-    weights = regression(model.metric.basis, trained.features[mask], places)
+def _supervised(model: PlaceModel, trained: Sequence[_Located], drive: _Located) -> Trajectory:
+    """The drive by the model's own regression, fitted on the ground truth of training drives."""
+    features, places = [], []
+    for one in trained:
+        stamps = one.images.poses.stamps_ns
+        mask = known(one.truth, stamps)
+        features.append(one.features[mask])
+        places.append(one.truth.at(stamps[mask])[:, :2])
+    weights = regression(model.metric.basis, np.concatenate(features), np.concatenate(places))
     positions = model.metric.basis.expand(drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
     stamps = drive.images.poses.stamps_ns

@@ -506,7 +506,7 @@ def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     def simulated(settings, out, panorama, progress):
         notes.extend((name, getattr(settings, name)) for name in ('world', 'seed', 'area'))
 
-    def judged(_model, _bag, _align_bag, transform):
+    def judged(_model, _bag, _trained, transform):
         return {'sfa': {'mean_m': 0.1}, 'localized': 1.0}, transform
 
     def noted_experiment(_site, _results, name, seed, _figures):

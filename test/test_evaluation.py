@@ -3,6 +3,7 @@
 """evaluate and tune look at a drive as the nodes do, by the same parameter file."""
 
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -184,12 +185,37 @@ def test_a_map_from_wheels_of_a_wrong_radius_fits_the_truth_when_scaled():
     truth, estimate = spread_out(2, 1e-6 * np.eye(2))
     places = 0.97 * estimate.poses[:, :2] @ rotation(0.4) + [3.0, 1.0]
     small = Trajectory(estimate.stamps_ns, np.column_stack([places, estimate.poses[:, 2]]))
-    laid = evaluation.moved(small, evaluation.fit_transform(truth, small))
+    laid = evaluation.moved(small, evaluation.fit_transform((truth, small)))
     assert evaluation.score(truth, laid)['mean'] > 0.05
     for one in (small, laid):
         found = evaluation.similarity(truth, one)
         assert found['scale'] == pytest.approx(1 / 0.97, abs=1e-3)
         assert found['mean'] < 0.005
+
+
+def test_the_map_is_laid_on_the_truth_by_all_training_drives():
+    """Two drives with as many images, one of which the map shows 0.2 m beside its place."""
+    drives = []
+    for seed, shift in ((3, [0.0, 0.0]), (4, [0.2, 0.0])):
+        truth, estimate = spread_out(seed, 1e-6 * np.eye(2))
+        places = estimate.poses[:, :2] + shift
+        drives.append((truth, Trajectory(estimate.stamps_ns, np.column_stack([places, places]))))
+    one, both = evaluation.fit_transform(drives[0]), evaluation.fit_transform(*drives)
+    assert one.x_m == pytest.approx(0.0, abs=0.01) and both.x_m == pytest.approx(-0.1, abs=0.03)
+
+
+def test_each_aligning_drive_is_named_and_the_reference_is_fitted_on_all(
+    bag, tmp_path, capsys, monkeypatch
+):
+    def supervised(_model, trained, drive):
+        assert len(trained) == 2 and len(trained[0].features) == len(drive.features)
+        return drive.images.poses
+
+    monkeypatch.setattr(evaluation, '_supervised', supervised)
+    shutil.copytree(bag, tmp_path / 'second')
+    aligning = '--align', str(bag), '--align', str(tmp_path / 'second')
+    assert main(['evaluate', 'reader.npz', str(bag), *aligning]) == 0
+    assert f'aligned on {bag}, {tmp_path / "second"}' in capsys.readouterr().out
 
 
 @pytest.mark.slow

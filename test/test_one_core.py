@@ -127,7 +127,7 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeyp
     judged = evaluate(
         PictureReader(), recording.write(tmp_path / 'drive'), config=config, watch=watch
     )
-    to_truth = fit_transform(judged.truth, seen)
+    to_truth = fit_transform((judged.truth, seen))
     same(moved(seen, to_truth), judged.estimates['sfa'])
     same(moved(fused, to_truth), judged.estimates['ekf'])
 

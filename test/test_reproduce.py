@@ -112,7 +112,7 @@ def test_each_training_is_tested_in_each_light(made):
 def test_a_known_transform_is_used_instead_of_a_fit(made):
     out, cells = made
     model, drive = PlaceModel.load(out / 'day.npz'), out / 'test_evening_summer'
-    first = evaluate(model, drive, align_bag=out / 'train_day')
+    first = evaluate(model, drive, align_bags=[out / 'train_day'])
     again = evaluate(model, drive, transform=first.transform)
     assert again.scores['sfa']['mean'] == first.scores['sfa']['mean'] == cells[1]['sfa']['mean_m']
     assert again.transform == first.transform

@@ -50,8 +50,8 @@ def notes(monkeypatch):
         newer.save(path)
         return SimpleNamespace(model=newer, sentence=lambda: 'one image')
 
-    def evaluated(model, bag, align_bag, transform):
-        noted.judged.append((model.history, bag.name, align_bag and align_bag.name))
+    def evaluated(model, bag, align_bags, transform):
+        noted.judged.append((model.history, bag.name, align_bags[0].name if align_bags else None))
         return SimpleNamespace(
             scores={'ekf': {'mean': 0.1}, 'sfa': {'mean': 0.2}},
             counts={'states_s': {'LOCALISED': 3.0, 'LOST': 1.0}, 'false_localised_s': 0.5},

@@ -87,7 +87,7 @@ def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
     if name == RETRIEVAL:
         return _retrieved(study)
     if name == WHOLE:
-        judged = evaluate(model, site.test, align_bag=site.training[-1], recipe=site.recipe)
+        judged = evaluate(model, site.test, align_bags=site.training, recipe=site.recipe)
         return {'test': judged.scores['sfa']['mean'], 'ekf': judged.scores['ekf']['mean']}
     segments = study.segments(SegmentConfig())
     fitted = np.concatenate([segment.images for segment in segments])
@@ -239,9 +239,9 @@ def _ablated(site: Site, study: Study, whole: PlaceModel, variant: Variant) -> C
     same = variant.same_network and variant.same_map
     model = whole if same else learned(network, variant.drives(study), recipe)
     model = variant.reduced(model)
-    judged = evaluate(model, site.test, align_bag=site.training[-1], recipe=site.recipe)
+    judged = evaluate(model, site.test, align_bags=site.training, recipe=site.recipe)
     alone = Variant(second_pass=False, keyframes=False).reduced(model)
-    slow = evaluate(alone, site.test, align_bag=site.training[-1], recipe=site.recipe)
+    slow = evaluate(alone, site.test, align_bags=site.training, recipe=site.recipe)
     heading = judged.scores['ekf']['yaw_deg']
     return {
         'slow': slow.scores['sfa']['mean'],

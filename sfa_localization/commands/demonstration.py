@@ -100,7 +100,9 @@ def _compare(
     trained: Trained, live: Mapping[str, Trajectory], bags: Mapping[str, Path], progress: bool
 ) -> tuple[Evaluation, float]:
     """Evaluate the live estimates; also return their mean distance (m) from the offline ones."""
-    offline = evaluate(trained.model, bags['test'], align_bag=bags['coverage'], progress=progress)
+    offline = evaluate(
+        trained.model, bags['test'], align_bags=[bags['coverage']], progress=progress
+    )
     live_in_truth = {name: moved(estimate, offline.transform) for name, estimate in live.items()}
     estimates = {**offline.estimates, **live_in_truth}
     scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}

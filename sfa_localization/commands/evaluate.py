@@ -35,7 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('model', type=Path, metavar='MODEL.npz')
     parser.add_argument('bag', type=Path, metavar='BAG', help='drive with ground truth')
     parser.add_argument(
-        '--align', type=Path, metavar='TRAIN_BAG', help='drive that aligns the map with the truth'
+        '--align',
+        type=Path,
+        action='append',
+        default=[],
+        metavar='TRAIN_BAG',
+        help='drive that aligns the map with the truth; of several training drives, give each one '
+        'with --align',
     )
     parser.add_argument('--config', type=Path, help='parameter file')
     parser.add_argument(
@@ -59,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = evaluation.evaluate(
         model,
         arguments.bag,
-        align_bag=arguments.align,
+        align_bags=arguments.align,
         recipe=recipe(arguments),
         config=settings(FilterConfig, arguments, arguments.config),
         watch=settings(WatchConfig, arguments, arguments.config),

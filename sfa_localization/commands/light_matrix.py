@@ -187,7 +187,7 @@ def _fill(work: _Work, training: Training, keep: Callable[[Cell], None]) -> None
         for test, drive in zip(training.tests, drives, strict=True):
             work.progress.say(f'{" + ".join(training.lights)}, tested in {" ".join(test)}')
             run = _read(drive, cache / drive.name, recipe)
-            cell, transform = _judged(model, drive, bags[0], transform)
+            cell, transform = _judged(model, drive, bags, transform)
             beside = {'retrieval': _retrieved(retrieval, run)}
             if transform is not None:
                 beside['slow'] = _slow_alone(model, run, transform)
@@ -203,18 +203,16 @@ def _read(bag: Path, cache: Path, recipe: Recipe) -> Run:
 
 
 def _judged(
-    model: PlaceModel, bag: Path, align_bag: Path, transform: RigidTransform | None
+    model: PlaceModel, bag: Path, trained: Sequence[Path], transform: RigidTransform | None
 ) -> tuple[Cell, RigidTransform | None]:
     """Scores of one drive: `sfa` and `ekf` with `mean_m`, `heading_deg` and `within_95`, seconds
     `false_localised_s` and the share `localized` of the drive; and the transform to the truth.
 
-    The map is laid on the truth by the first training drive, once. A drive without one usable
+    The map is laid on the truth by the training drives, once. A drive without one usable
     image has only the `problem`.
     """
     try:
-        result = evaluate(
-            model, bag, align_bag=None if transform else align_bag, transform=transform
-        )
+        result = evaluate(model, bag, align_bags=() if transform else trained, transform=transform)
     except DataError as error:
         return {'problem': str(error)}, transform
     states = result.counts['states_s']
@@ -262,7 +260,7 @@ def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
     def located(run: Run, features: Array) -> Trajectory:
         return Trajectory(run.panoramas.stamps_ns, flat(metric.predict(features)[0]))
 
-    transform = fit_transform(_truth(training), located(training, features))
+    transform = fit_transform((_truth(training), located(training, features)))
     return lambda drive: _summary(
         score(_truth(drive), moved(located(drive, features_of(slow, drive)), transform))
     )

@@ -165,9 +165,9 @@ def _judged(
     """Mean errors `ekf_m` and `sfa_m`, seconds `false_localised_s` and the share `localized` of a
     drive, and the transform to the truth; only the `problem` of one without a usable image.
     """
-    align = None if transform else align_bag
+    align = () if transform else (align_bag,)
     try:
-        result = evaluate(model, bag, align_bag=align, transform=transform)
+        result = evaluate(model, bag, align_bags=align, transform=transform)
     except DataError as error:
         return {'problem': str(error)}, transform
     states = result.counts['states_s']

@@ -148,7 +148,7 @@ def to_truth():
         if not seen.problem:
             stamps.append(stamp_ns)
             poses.append(seen.pose)
-    return fit_transform(run.ground_truth, Trajectory(np.array(stamps), np.array(poses)))
+    return fit_transform((run.ground_truth, Trajectory(np.array(stamps), np.array(poses))))
 
 
 def simulated(name, **settings):
