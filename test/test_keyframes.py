@@ -185,15 +185,30 @@ def test_they_are_saved_and_read(several):
         assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
 
 
-def test_drives_of_the_training_are_kept_apart_and_none_is_added():
-    poses = drive()
-    images = Spheres.about(0).panoramas(poses, CONFIG)
-    textures = quantized(np.stack([texture(image) for image in images]))
-    halves = (np.arange(len(poses)) >= len(poses) // 2).astype(np.int32)
-    keyframes = fit_keyframes(textures, poses, path(poses), drives=halves)
-    assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
-    off, turned, _ = errors(keyframes, Spheres.about(0).panoramas(unseen(), CONFIG), unseen())
-    assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
+def test_drives_in_one_light_are_one_and_those_elsewhere_or_in_another_are_not():
+    """Together the drives in one light are nearer to any place, and locate it better."""
+    world, steps = Spheres.about(0), (0.0, 0.13, 0.27)
+    poses, again, third = (drive(0.5) + np.array([step, step, 0.0]) for step in steps)
+    plain = [world.panoramas(at, CONFIG) for at in (poses, again, third)]
+    lit, images = sunny(plain[1]), world.panoramas(unseen(), CONFIG)
+    for parts, numbers in (
+        ([plain[0], plain[1], plain[2]], [0, 0, 0]),
+        ([plain[0], lit, plain[2]], [0, 1, 0]),
+        ([lit, plain[1], plain[2]], [0, 1, 1]),
+    ):
+        textures = [quantized(np.stack([texture(image) for image in part])) for part in parts]
+        keyframes = fit_keyframes(
+            np.concatenate(textures),
+            np.concatenate([poses, again, third]),
+            np.concatenate([path(poses), 1000 + path(again), 2000 + path(third)]),
+            drives=np.repeat([3, 5, 7], len(poses)).astype(np.int32),
+        )
+        assert keyframes.drives.tolist() == np.repeat(numbers, len(poses)).tolist()
+        assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
+        if max(numbers) == 0:
+            alone = fit_keyframes(textures[0], poses, path(poses))
+            mean, worse = (errors(k, images, unseen())[0].mean() for k in (keyframes, alone))
+            assert mean < worse
 
 
 @pytest.mark.parametrize('trained', [1, 2])

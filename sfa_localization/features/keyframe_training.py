@@ -51,6 +51,10 @@ _LEAST_YAW_STD = 1e-3
 # Keyframes that are matched as if they were so far outside, m: about as far as any are known.
 _BEYOND_TRIALS, _BEYOND_M = 200, (0.2, 3.0)
 _LEAST_UNLIKE = 1e-3
+# Keyframes of a drive that are compared with those of others, and the least number; and the part of
+# images, by squares, that is alike everywhere and that no place explains, where lights differ:
+# 0.03 to 0.14 there, 0.001 in one light.
+_COMPARED, _FEWEST, _OF_LIGHT = 60, 20, 0.01
 # Keeps novelty's scale finite where all images look alike.
 _LEAST_RANGE = 0.05
 
@@ -64,7 +68,7 @@ def fit_keyframes(
 ) -> Keyframes:
     """From textures (N, rows, columns) of training images, their poses (N, 3) in the map, the
     distance (N,) m driven until each, which must jump between drives, and the numbers (N,) of
-    these; one drive by default.
+    these; one drive by default. Drives in one light become one.
 
     Raises DataError for too few images.
     """
@@ -73,7 +77,39 @@ def fit_keyframes(
     keyframes = Keyframes.of(
         textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise, own
     )
+    keyframes = _by_light(keyframes)
     return dataclasses.replace(keyframes, noise=_noise(keyframes, path_m[kept]))
+
+
+def _by_light(keyframes: Keyframes) -> Keyframes:
+    """With one number for all drives in one light: together they are nearer to any place."""
+    lights, known = np.full(len(keyframes.drives), -1, np.int32), 0
+    for drive in np.unique(keyframes.drives).tolist():
+        own = keyframes.drives == drive
+        seen = dataclasses.replace(keyframes, drives=lights)
+        apart = [_of_light(seen, np.flatnonzero(own), light) for light in range(known)]
+        best = int(np.argmin(apart)) if apart else -1
+        lights[own] = best if apart and apart[best] < _OF_LIGHT else known
+        known = int(lights.max()) + 1
+    return dataclasses.replace(keyframes, drives=lights, trained=known)
+
+
+def _of_light(keyframes: Keyframes, rows: NDArray[np.int64], light: int) -> float:
+    """The part of the keyframes `rows` that those in a light do not explain and that is alike
+    everywhere: 0 in the same light, more in another; 1 where they do not meet.
+    """
+    others = np.flatnonzero(keyframes.drives == light)
+    left = []
+    for row in rows[np.linspace(0, len(rows) - 1, min(_COMPARED, len(rows))).astype(int)].tolist():
+        match = keyframes.match_among(keyframes.spectra[row], others)
+        if match.score >= LOWEST and match.left is not None and not match.nearby.at_border:
+            left.append(match.left)
+    if len(left) < _FEWEST:
+        return 1.0
+    # Two halves, so that the errors of single images are not alike by being the same.
+    one, other = np.mean(left[::2], axis=0), np.mean(left[1::2], axis=0)
+    whole = np.square(np.abs(keyframes.spectra[rows])).sum(axis=(1, 2)).mean()
+    return float((one * other.conj()).sum().real / whole)
 
 
 def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:

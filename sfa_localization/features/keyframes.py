@@ -316,7 +316,7 @@ class Keyframes:
     """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
     `drives` (K,) are the numbers of their drives, of which the first `trained` were those of the
-    training.
+    training; drives of the training in one light have one number.
     """
 
     textures: NDArray[np.int8]
