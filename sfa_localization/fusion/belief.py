@@ -167,7 +167,8 @@ class Belief(NamedTuple):
     `added` are the variances that driving has added so far, to the heading (as expected, without
     the factor of `turns`) and to the position along each axis. `trail` is the dead-reckoned path of
     the last seconds, `lateness` what images beside it show about their time, and `mounting` where
-    they show the camera on the robot.
+    they show the camera on the robot. `omega` rad/s is the mean turn rate, as odometry shows it,
+    over the time before its last message.
     """
 
     stamp_ns: int
@@ -186,6 +187,7 @@ class Belief(NamedTuple):
     trail: tuple[Knot, ...] = ()
     lateness: Lateness | None = None
     mounting: Mounting | None = None
+    omega: float = 0.0
 
     @property
     def state(self) -> State | None:

@@ -169,10 +169,29 @@ def twist_from_poses(
     reset = distance > reach_m or abs(turn) > reach_rad
     if seconds <= 0 or reset or reach_rad > math.pi or (distance == 0.0 and turn == 0.0):
         return None
-    half = turn / 2
-    chord = dx * math.cos(before[2] + turn / 2) + dy * math.sin(before[2] + turn / 2)
+    return twist_between(before, after, seconds, fastest)
+
+
+def twist_between(
+    before: tuple[float, float, float],
+    after: tuple[float, float, float],
+    seconds: float,
+    reading: Twist,
+) -> Twist:
+    """The mean twist from pose to pose, with the variances of a reading."""
+    turn = wrap(after[2] - before[2])
+    half, heading = turn / 2, before[2] + turn / 2
+    chord = (after[0] - before[0]) * math.cos(heading) + (after[1] - before[1]) * math.sin(heading)
     arc = chord * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
-    return fastest._replace(v=arc / seconds, omega=turn / seconds)
+    return reading._replace(v=arc / seconds, omega=turn / seconds)
+
+
+def moved_on(
+    pose: tuple[float, float, float], twist: Twist, seconds: float
+) -> tuple[float, float, float]:
+    """The pose after so long at a constant twist."""
+    arc = _arc(pose[2], twist.v, twist.omega, seconds)
+    return pose[0] + arc.dx, pose[1] + arc.dy, pose[2] + arc.dyaw
 
 
 class _Arc(NamedTuple):
@@ -214,8 +233,11 @@ def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
     )
 
 
-def drive(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
-    """Move by odometry: `twist`, held over the last `dt` seconds, becomes the state's v and omega.
+def drive(
+    mean: Array, twist: Twist, dt: float, noise: MotionNoise, now: Twist | None = None
+) -> Step:
+    """Move by odometry: `twist`, held over the last `dt` seconds. It becomes the state's v and
+    omega, or the twist of `now` does.
 
     v' = (1 + scale) v_odometry - loss |omega_odometry| (with the sign of v; none on the spot) and
     omega' = omega_odometry - bias: the columns of the old v and omega in the Jacobian vanish; those
@@ -224,19 +246,29 @@ def drive(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
     """
     if twist.stands:
         return _stand(mean)
-    v, omega = (1.0 + float(mean[SCALE])) * twist.v, twist.omega - float(mean[BIAS])
-    loss, by_loss = float(mean[LOSS]), 0.0
-    # A loss slows a robot down, but turns no motion around.
-    if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(loss)) * abs(twist.omega):
-        by_loss = -math.copysign(abs(twist.omega), twist.v)
-    step = _advance(mean, v + by_loss * loss, omega, twist, dt, noise)
+    v, omega, by_loss = _corrected(mean, twist)
+    step = _advance(mean, v, omega, twist, dt, noise)
     gain = step.jacobian[:, V : OMEGA + 1].copy()
     step.jacobian[:, V] = step.jacobian[:, OMEGA] = 0.0
     step.jacobian[:, SCALE] += twist.v * gain[:, 0]
     step.jacobian[:, LOSS] += by_loss * gain[:, 0]
     step.jacobian[:, BIAS] -= gain[:, 1]
+    if now is not None:
+        step.mean[V], step.mean[OMEGA], slowed = _corrected(mean, now)
+        step.jacobian[V, SCALE] += now.v - twist.v
+        step.jacobian[V, LOSS] += slowed - by_loss
     white = (gain * np.array([twist.v_variance, twist.omega_variance])).dot(gain.T)
     return step._replace(noise=white + step.noise)
+
+
+def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
+    """Speed and turn rate by a reading, and the derivative of the speed by the loss."""
+    loss, by_loss = float(mean[LOSS]), 0.0
+    # A loss slows a robot down, but turns no motion around.
+    if abs(twist.v) > max(SPOT_RADIUS_M, 2 * abs(loss)) * abs(twist.omega):
+        by_loss = -math.copysign(abs(twist.omega), twist.v)
+    v = (1.0 + float(mean[SCALE])) * twist.v + by_loss * loss
+    return v, twist.omega - float(mean[BIAS]), by_loss
 
 
 def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:

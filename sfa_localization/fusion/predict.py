@@ -18,6 +18,11 @@ COAST_S = 2.0
 """Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
 _BRIDGED_S = 10.0
 """A longer silence is not bridged by the twist after it: most of it was spent somehow else."""
+_MOMENT_S = 0.05
+"""Motion that odometry's poses show between messages stamped almost together took about so long."""
+_SUDDEN_V, _SUDDEN_OMEGA = 0.3, 0.3
+"""A mean twist between two poses that differs from the reading by more than the reading itself and
+this, m/s and rad/s, was faster or slower only by its stamps."""
 
 
 class Prediction:
@@ -40,20 +45,23 @@ class Prediction:
         if silence_s > _BRIDGED_S:
             belief = self.coast(belief, event.stamp_ns)
         gap = belief.odometry_ns is not None and silence_s > ODOMETRY_TIMEOUT_S
+        dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
+        whole, shown, now = event.twist, False, None
         if gap:
             twist, shown = _bridged(belief, event, silence_s)
         else:
-            twist, shown = _shown(belief, event, silence_s, event.twist) or event.twist, False
-            event = event._replace(twist=twist)
-        dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
+            whole = _shown(belief, event, silence_s, event.twist) or event.twist
+            twist = _remaining(belief, event, whole, dt)
+            now = _lately(belief, whole, event.twist, silence_s)
+            event = event._replace(twist=now)
         factor, noise = belief.turn_factor, self._noise
         if factor != 1.0:
             twist = twist._replace(omega_variance=twist.omega_variance * factor**2)
             noise = noise._replace(yaw_per_radian=noise.yaw_per_radian * factor)
-        step = motion.drive(belief.mean, twist, dt, noise)
+        step = motion.drive(belief.mean, twist, dt, noise, now)
         if silence_s > COAST_S and not shown:
             motion.add_unknown_motion(step.noise, twist, min(dt, silence_s - COAST_S))
-        driven = self._moved(belief, event.stamp_ns, step, event)
+        driven = self._moved(belief, event.stamp_ns, step, event, whole.omega)
         if silence_s > ODOMETRY_TIMEOUT_S:
             # What the robot did meanwhile is unknown: its path begins anew.
             driven = driven._replace(trail=((event.stamp_ns, *driven.dead_reckoned),))
@@ -79,7 +87,12 @@ class Prediction:
         return belief
 
     def _moved(
-        self, belief: Belief, stamp_ns: int, step: Step, event: OdometryEvent | None = None
+        self,
+        belief: Belief,
+        stamp_ns: int,
+        step: Step,
+        event: OdometryEvent | None = None,
+        omega: float = 0.0,
     ) -> Belief:
         """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
         before_x, before_y, before_yaw = belief.mean[:3].tolist()
@@ -108,6 +121,7 @@ class Prediction:
             extended(belief.trail, (stamp_ns, *reckoned)),
             belief.lateness,
             belief.mounting,
+            omega,
         )
 
     @staticmethod
@@ -124,6 +138,34 @@ def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist)
     if belief.odometry_pose is None or event.pose is None:
         return None
     return motion.twist_from_poses(belief.odometry_pose, event.pose, seconds, fastest)
+
+
+def _remaining(belief: Belief, event: OdometryEvent, whole: Twist, dt: float) -> Twist:
+    """The mean twist by the odometry's poses over the last `dt` s of an interval, of which images
+    have claimed the begin: they were fused where the last twist led.
+    """
+    if whole is event.twist or belief.odometry_pose is None or event.pose is None:
+        return whole
+    coasted_s = (belief.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
+    if coasted_s <= 0 or dt <= 0:
+        return whole
+    reached = motion.moved_on(belief.odometry_pose, belief.twist, coasted_s)
+    return motion.twist_between(reached, event.pose, dt, whole)
+
+
+def _lately(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> Twist:
+    """The twist to go on with after an interval: messages stamped almost together, or long after
+    each other, show no speed.
+    """
+    sudden_v = abs(whole.v - reading.v) > abs(reading.v) + _SUDDEN_V
+    sudden_omega = abs(whole.omega - reading.omega) > abs(reading.omega) + _SUDDEN_OMEGA
+    if not (sudden_v or sudden_omega):
+        return whole
+    before, new = belief.twist, -math.expm1(-seconds / _MOMENT_S)
+    return whole._replace(
+        v=before.v + new * (whole.v - before.v),
+        omega=before.omega + new * (whole.omega - before.omega),
+    )
 
 
 def _bridged(belief: Belief, event: OdometryEvent, seconds: float) -> tuple[Twist, bool]:

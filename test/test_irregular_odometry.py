@@ -1,0 +1,45 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry whose stamps are irregular, because messages are bundled or stamped on reception."""
+
+import math
+
+import numpy as np
+import pytest
+from filter_drives import START_NS, Drive
+
+from sfa_localization.data.run import Trajectory
+from sfa_localization.fusion.pose_filter import Level, PoseFilter
+
+
+def bursts(times):
+    """Stamps s of odometry at 50 Hz that is stamped in pairs, 1 ms apart."""
+    return times - np.where(np.arange(len(times)) % 2, 0.0, -0.019)
+
+
+def received(times):
+    """Stamps s of odometry that is stamped on reception, exponentially late; order is kept."""
+    late = np.random.default_rng(0).exponential(0.01, len(times))
+    return np.maximum.accumulate(times + late) + 1e-6 * np.arange(len(times))
+
+
+@pytest.mark.parametrize('stamped', [bursts, received])
+def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
+    """The poses show how far it was, whatever the stamps; images come at 8 Hz in between."""
+    drive, fused, errors = Drive(seconds=20, omega_std=0.01, v_std=0.02), PoseFilter(), []
+    times = np.arange(len(drive.stamps_ns)) / 50.0
+    coming = [(t, 0, i) for i, t in enumerate(stamped(times).tolist())]
+    coming += [(t, 1, 0) for t in np.arange(1.013, 19.0, 0.125).tolist()]
+    path = Trajectory(drive.stamps_ns, drive.poses)
+    for t, kind, i in sorted(coming):
+        stamp_ns = START_NS + round(t * 1e9)
+        if kind == 0:
+            fused.add_odometry(stamp_ns, *drive.read[i], drive.variances(), drive.reckoned[i])
+            continue
+        pose = path.at(np.array([stamp_ns]))[0]
+        update = fused.add_measurement(stamp_ns, pose, np.diag([0.0025, 0.0025, 0.0004]))
+        errors.append(math.hypot(*(fused.state.pose - pose)[:2]))
+        assert update.accepted and abs(fused.state.twist[0]) < 2.5
+        if t > 8.0:
+            assert fused.status.level is Level.LOCALISED
+    assert max(errors) < 0.1
