@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.pose_filter import PoseFilter
 
@@ -80,3 +80,9 @@ def test_the_filter_takes_the_models_value_over_the_default():
     assert fused.correlation == ErrorCorrelation(0.4, 2.0)
     fused.reconfigure(correlation=ErrorCorrelation(0.1, 3.0))
     assert fused.correlation == ErrorCorrelation(0.1, 3.0)
+
+
+@pytest.mark.parametrize('distance_m', [0.0, 1e-308, LEAST_M / 2, math.nan, math.inf])
+def test_errors_that_change_over_no_distance_are_impossible(distance_m):
+    with pytest.raises(DataError, match='impossible'):
+        ErrorCorrelation(0.3, distance_m)

@@ -11,7 +11,7 @@ import pytest
 from filter_drives import START_NS, Drive, winding
 from scipy.stats import chi2
 
-from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion import inputs, motion, recover
@@ -651,6 +651,17 @@ def test_dropouts_of_the_odometry_are_bridged(gap):
         if event[1] or t % 5.0 > gap:
             drive.give(fused, event, True)
     assert drive.error(fused, len(drive.stamps_ns) - 1)[0] < 0.6
+
+
+def test_another_models_correlation_may_be_much_longer_or_shorter():
+    fused, drive = known(), Drive(seconds=30, position_std=0.05, yaw_std=0.02)
+    correlations = {10.0: (0.3, LEAST_M), 15.0: (0.7, 1e6), 20.0: (0.9, LEAST_M), 25.0: (0.7, 1.0)}
+    for begin_s in (0.0, *correlations):
+        if begin_s in correlations:
+            fused.reconfigure(correlation=ErrorCorrelation(*correlations[begin_s]))
+        drive.feed(fused, True, begin_s, begin_s + (10.0 if begin_s == 0 else 5.0))
+        assert np.isfinite(fused.state.covariance).all()
+    assert drive.error(fused, -1)[0] < 0.15
 
 
 def through_a_gap(pose=None):

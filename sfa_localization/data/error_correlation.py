@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 
+LEAST_M = 0.01
+"""Images nearer to each other than this show one place: no errors change over less."""
 LARGEST_SHARE = 0.95
 """Below 1, so that every image remains some evidence."""
 _FARTHEST_M = 8.0
@@ -44,10 +46,10 @@ class ErrorCorrelation:
     distance_m: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.share < 1.0 and 0.0 < self.distance_m < math.inf):
+        if not (0.0 <= self.share < 1.0 and LEAST_M <= self.distance_m < math.inf):
             raise DataError(
                 f'a correlation of {self.share} over {self.distance_m} m is impossible: share must '
-                f'be in [0, 1), distance_m positive and finite'
+                f'be in [0, 1), distance_m finite and {LEAST_M} or more'
             )
 
     @classmethod

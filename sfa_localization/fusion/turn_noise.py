@@ -105,7 +105,8 @@ def _predicted(noise: TurnNoise, driven: Driven) -> tuple[Array, Array]:
     c, s = np.cos(turn), np.sin(turn)
     x, y = driven.pose[0] - before.pose[0], driven.pose[1] - before.pose[1]
     dx, dy = c * x - s * y, s * x + c * y
-    fade = math.exp(before.faded - driven.faded)
+    # Another model's errors fade over another distance: what has faded stays so.
+    fade = math.exp(min(before.faded - driven.faded, 0.0))
     mean[:, 0] += dx
     mean[:, 1] += dy
     mean[:, 2] += float(wrap_angle(driven.pose[2] - before.pose[2]))
