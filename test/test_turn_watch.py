@@ -13,7 +13,7 @@ from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level
-from sfa_localization.fusion.turn_watch import TOLERATED_S, TurnWatch
+from sfa_localization.fusion.turn_watch import TOLERATED_S, Seen, TurnWatch
 
 HZ, EVERY = 25, 5
 NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.08, 'yaw_std': 0.02, 'rate_hz': HZ}
@@ -126,6 +126,22 @@ def test_a_filter_in_time_stays_localised():
     begun = 3 * HZ // EVERY  # until driving has confirmed the start
     levels = {status.level for status, *_ in driven(0.0)[begun:]}
     assert levels == {Level.LOCALISED}
+
+
+@pytest.mark.parametrize(('gap_s', 'delay_s'), [(1.0, 0.0), (1.0, 1.2), (2.0, 0.0), (2.0, 1.5)])
+def test_headings_in_the_map_show_delays_of_slow_cameras(gap_s, delay_s):
+    """Images a second or more apart: their visual turns do not count, those of their poses do."""
+    rng, watch, omega, found = np.random.default_rng(0), TurnWatch(), curve(80.0), []
+    yaw = np.cumsum(omega) / HZ
+    for i, rate in enumerate(omega):
+        stamp_ns = START_NS + round(i * 1e9 / HZ)
+        watch.add_odometry(stamp_ns, rate + rng.normal(0, 0.02))
+        if i % round(gap_s * HZ) == 0 and i >= delay_s * HZ:
+            shown = float(yaw[i - round(delay_s * HZ)])
+            watch.add_heading(stamp_ns, shown)
+            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.01)), 0.02**2))
+            found.append(watch.apart(0.0))
+    assert min(found[-20:]) > 0.5 if delay_s else max(found) < 0.3
 
 
 @pytest.mark.parametrize(('delay_s', 'at_most_s'), [(1.2, 4.0), (2.0, 2.0), (4.0, 2.0)])

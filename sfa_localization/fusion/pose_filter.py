@@ -31,7 +31,7 @@ from sfa_localization.fusion.predict import COAST_S, ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.rules import Rules
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
-from sfa_localization.fusion.turn_watch import TurnWatch
+from sfa_localization.fusion.turn_watch import Seen, TurnWatch
 from sfa_localization.fusion.update import measurement_event
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
@@ -160,8 +160,8 @@ class PoseFilter:
         self._alone = 0
         event = OdometryEvent(stamp_ns, twist, _finite(pose))
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
-        self._camera.add_odometry(stamp_ns, driven.twist.omega)
-        self._watch.add_odometry(stamp_ns, driven.twist.omega - float(driven.mean[BIAS]))
+        self._camera.add_odometry(stamp_ns, driven.omega)
+        self._watch.add_odometry(stamp_ns, driven.omega - float(driven.mean[BIAS]))
         self._judge_time()
         return ''
 
@@ -182,6 +182,8 @@ class PoseFilter:
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
+        if len(fused) == 3:
+            self._watch.add_seen(Seen(stamp_ns, float(fused[2]), float(noise[2, 2])))
         noise = noise + self._time_noise(taken_ns, stamp_ns, fused)
         event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update

@@ -54,8 +54,9 @@ _GAIN = 0.05
 """Standard deviation, relative, of turns by wheels: they slip, and their track is not exact."""
 _MISMATCH, _MISMATCH_RAD = 0.05, 0.3
 """Share of pairs whose turn is wrong, and by how much: something covers a part of the image."""
-_UNRELATED_RAD = 0.05
-"""Turns of images that have nothing to do with the odometry differ by so much per pair."""
+_UNRELATED_RAD, _UNRELATED_STDS = 0.05, 2.0
+"""Turns of images that have nothing to do with the odometry differ by so much per pair, and by so
+many of the standard deviations of turns that have."""
 _SMOOTH_S = 0.2
 """Turns of robots that drive last longer."""
 _ACCELERATION = 0.3
@@ -65,7 +66,10 @@ _LATER = np.where(_IN_TIME[:-1] & ~_IN_TIME[1:], _LEAVE, 1.0)
 _SOONER = np.where(_IN_TIME[1:] & ~_IN_TIME[:-1], _LEAVE, 1.0)
 _NEAR_NS, _APART_NS = 150_000_000, 750_000_000
 """Closer images turn too little. Farther ones, most of a meter at walking speed, show other sides
-of near things, which shifts them as a turn does."""
+of near things, which shifts them as a turn does: their turn is that of the headings in the map."""
+_FARTHEST_NS = 4_000_000_000
+_OWN = 0.25
+"""Share of the variances of headings in the map that neighboring images have not in common."""
 _SOON_NS, _FINALLY_NS = 300_000_000, round(-EARLIEST_S * 1e9)
 """A pair counts after so long, with odometry that goes on as before where images may be early; and
 for good when all of the odometry is there."""
@@ -74,11 +78,20 @@ _REMEMBERED_NS = round((LATEST_S + 4.0) * 1e9)
 
 
 class Pair(NamedTuple):
-    """Two images and the turn between them, rad."""
+    """Two images and the turn between them, rad, with its variance beside the usual one."""
 
     start_ns: int
     stop_ns: int
     turn: float
+    variance: float = 0.0
+
+
+class Seen(NamedTuple):
+    """The heading in the map, rad, that an image of a known place shows, and its variance."""
+
+    stamp_ns: int
+    yaw: float
+    variance: float
 
 
 class TurnWatch:
@@ -102,6 +115,7 @@ class TurnWatch:
         self._pairs: deque[Pair] = deque()
         self._counted = 0
         self._last: tuple[int, float] | None = None
+        self._seen: Seen | None = None
 
     def add_odometry(self, stamp_ns: int, omega: float) -> None:
         """Take a turn rate rad/s, without bias, held since the one before; skip late ones."""
@@ -126,6 +140,14 @@ class TurnWatch:
         if last and 0 < gap < _APART_NS:
             self._pairs.append(Pair(last[0], stamp_ns, float(wrap_angle(yaw_rad - last[1]))))
         self._last = stamp_ns, yaw_rad
+
+    def add_seen(self, seen: Seen) -> None:
+        """Take the heading in the map that an image shows: that of slow cameras shows turns."""
+        last, self._seen = self._seen, seen
+        if last and _APART_NS <= seen.stamp_ns - last.stamp_ns <= _FARTHEST_NS:
+            turn = float(wrap_angle(seen.yaw - last.yaw))
+            variance = _OWN * (last.variance + seen.variance)
+            self._pairs.append(Pair(last.stamp_ns, seen.stamp_ns, turn, variance))
 
     def doubt(self) -> None:
         """Images have moved the estimate: perhaps they are of another time."""
@@ -205,7 +227,10 @@ class TurnWatch:
         driven = _at(stop - _DELAYS, times, yaws, rate) - _at(start - _DELAYS, times, yaws, rate)
         unknown = np.maximum(stop - _DELAYS, 0.0)
         std = np.sqrt(
-            self._std**2 + (_GAIN * driven) ** 2 + (_ACCELERATION * unknown * (stop - start)) ** 2
+            self._std**2
+            + pair.variance
+            + (_GAIN * driven) ** 2
+            + (_ACCELERATION * unknown * (stop - start)) ** 2
         )
         paused = np.interp(stop - _DELAYS, times, silent) - np.interp(
             start - _DELAYS, times, silent
@@ -234,7 +259,8 @@ def _weighed(odds: Array, residual: Array, std: Array, power: float = 1.0) -> Ar
     mismatch = _density(residual, _MISMATCH_RAD)
     fits = (1 - _MISMATCH) * _density(residual, std) + _MISMATCH * mismatch
     now = residual[_NOW]
-    unrelated = 0.8 * _density(now, _UNRELATED_RAD) + 0.2 * mismatch[_NOW]
+    wide = max(_UNRELATED_RAD, _UNRELATED_STDS * float(std[_NOW]))
+    unrelated = 0.8 * _density(now, wide) + 0.2 * mismatch[_NOW]
     if not math.isfinite(now):
         return odds
     # Of times without odometry nothing is known.
