@@ -165,6 +165,20 @@ def delayed(seconds, spread_s=0.0):
     return late
 
 
+def bundled(message, _):
+    """Sent, and stamped, together with all of the same 40 ms, hardly apart."""
+    bundle_ns = SECOND_NS // 25
+    left_ns = -message.stamp_ns % bundle_ns
+    at_ns = message.stamp_ns + left_ns - left_ns // 40
+    return [dataclasses.replace(message, at_ns=at_ns, stamp_ns=at_ns)]
+
+
+def received(message, rng):
+    """Stamped when it arrives, 10 ms late on average."""
+    at_ns = message.at_ns + round(rng.exponential(0.01) * SECOND_NS)
+    return [dataclasses.replace(message, at_ns=at_ns, stamp_ns=at_ns)]
+
+
 def doubled(message, _):
     return [message, dataclasses.replace(message, at_ns=message.at_ns + SECOND_NS // 10)]
 
@@ -184,6 +198,10 @@ enter_all({
     'odometry in disorder': changed(Reading, delayed(0.0, 0.5)),
     'images and odometry dropped': changed((Picture, Reading), dropped(1.0)),
 })  # fmt: skip
+enter_all({
+    'odometry sent in bundles': changed(Reading, bundled, 0.0, NEVER),
+    'odometry stamped on reception': changed(Reading, received, 0.0, NEVER),
+}, ends_s=NEVER)  # fmt: skip
 
 
 # Pictures that are damaged, stand still, are hidden, or show something else.
