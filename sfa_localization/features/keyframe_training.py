@@ -52,8 +52,8 @@ _LEAST_YAW_STD = 1e-3
 _BEYOND_TRIALS, _BEYOND_M = 200, (0.2, 3.0)
 _LEAST_UNLIKE = 1e-3
 # Keyframes of a drive that are compared with those of others, and the least number; and the part of
-# images, by squares, that is alike everywhere and that no place explains, where lights differ:
-# 0.03 to 0.14 there, 0.001 in one light.
+# images, by squares, that is alike everywhere and that no place explains, from which lights differ:
+# 0.03 to 0.1 between day, morning and overcast, 0.005 at most in one light.
 _COMPARED, _FEWEST, _OF_LIGHT = 60, 20, 0.01
 # Keeps novelty's scale finite where all images look alike.
 _LEAST_RANGE = 0.05

@@ -121,7 +121,7 @@ class Prediction:
             extended(belief.trail, (stamp_ns, *reckoned)),
             belief.lateness,
             belief.mounting,
-            omega,
+            omega if event else belief.omega,
         )
 
     @staticmethod
