@@ -558,6 +558,30 @@ def test_the_models_error_correlation_is_what_an_offline_filter_uses(bench):
     assert told['knows'] < 0.9 * told['ignores']
 
 
+def test_after_an_error_inside_it_starts_anew_and_goes_on(bench, monkeypatch):
+    """An error that every message would raise again does not leave the last state standing."""
+    drive = Drive(seconds=8, **NOISY)
+    node, events = bench.run(EkfNode), drive.events()
+    states = bench.listen(String, 'ekf/state', latched_qos())
+    play(bench, node, drive, events[: len(events) // 2])
+    assert until(lambda: states and states[-1].data.startswith('LOCALISED'))
+    works, resets = node._filter.add_odometry, []
+
+    def add_odometry(*given):
+        if not resets:
+            raise OverflowError
+        return works(*given)
+
+    anew = node._filter.reset
+    monkeypatch.setattr(node._filter, 'add_odometry', add_odometry)
+    monkeypatch.setattr(node._filter, 'reset', lambda: (resets.append(1), anew()))
+    begun = len(states)
+    play(bench, node, drive, events[len(events) // 2 :])
+    assert node.monitor('odom').refused == {'internal error: OverflowError': 1} and resets == [1]
+    assert until(lambda: states[-1].data.startswith('LOCALISED'))
+    assert any(not state.data.startswith('LOCALISED') for state in states[begun:])
+
+
 def test_turns_of_images_reach_the_filter(bench, monkeypatch):
     """They show how late images are stamped."""
     taken = []
@@ -568,7 +592,9 @@ def test_turns_of_images_reach_the_filter(bench, monkeypatch):
     assert taken == [(START_NS, pytest.approx(0.5))]
 
 
-@pytest.mark.parametrize('numbers', [[], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]])
+@pytest.mark.parametrize(
+    'numbers', [[], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0], [0.3, 1e-308]]
+)
 def test_a_malformed_error_correlation_is_rejected(bench, numbers):
     node = bench.run(EkfNode)
     message = Float64MultiArray(data=numbers)

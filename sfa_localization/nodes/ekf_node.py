@@ -278,6 +278,12 @@ class EkfNode(LocalizationNode):
             saved = SavedPose(state.stamp_ns, frame, state.pose, state.pose_covariance)
             save_pose(FilePath(self._config.pose_file), saved)
 
+    def _defect(self, name: str, error: Exception) -> str:
+        """What failed inside may fail at every message from now on: the filter starts anew."""
+        reason = super()._defect(name, error)
+        self._forget()
+        return reason
+
     def _forget(self) -> None:
         self._filter.reset()
         self._broadcast.reset()
