@@ -38,6 +38,7 @@ from sfa_localization.nodes.settings import NodeConfig
 
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
+_AWAKE_S = 0.5  # between looks whether a signal has come
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -457,6 +458,9 @@ def _initialised(args: Sequence[str] | None) -> bool:
 
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
+    # A signal just before the executor waits does not always wake it; an inactive node has nothing
+    # else that would.
+    node.create_timer(_AWAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
     executor.add_node(node)
     while rclpy.ok():
         try:
