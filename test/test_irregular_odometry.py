@@ -14,7 +14,7 @@ from sfa_localization.fusion.pose_filter import Level, PoseFilter
 
 def bursts(times):
     """Stamps s of odometry at 50 Hz that is stamped in pairs, 1 ms apart."""
-    return times - np.where(np.arange(len(times)) % 2, 0.0, -0.019)
+    return times + np.where(np.arange(len(times)) % 2, 0.0, 0.019)
 
 
 def received(times):

@@ -185,7 +185,7 @@ def test_they_are_saved_and_read(several):
         assert np.array_equal(a.pose, b.pose) and np.array_equal(a.covariance, b.covariance)
 
 
-def test_drives_in_one_light_are_one_and_those_elsewhere_or_in_another_are_not():
+def test_drives_in_one_light_are_one_and_those_in_another_are_not():
     """Together the drives in one light are nearer to any place, and locate it better."""
     world, steps = Spheres.about(0), (0.0, 0.13, 0.27)
     poses, again, third = (drive(0.5) + np.array([step, step, 0.0]) for step in steps)
@@ -207,8 +207,26 @@ def test_drives_in_one_light_are_one_and_those_elsewhere_or_in_another_are_not()
         assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
         if max(numbers) == 0:
             alone = fit_keyframes(textures[0], poses, path(poses))
-            mean, worse = (errors(k, images, unseen())[0].mean() for k in (keyframes, alone))
-            assert mean < worse
+            (off, turned, _), (worse, *_) = (
+                errors(k, images, unseen()) for k in (keyframes, alone)
+            )
+            assert off.mean() < min(worse.mean(), 0.1) and np.degrees(turned.mean()) < 1.0
+
+
+def test_drives_that_do_not_meet_are_kept_apart():
+    poses, steps = drive(), (0.0, 50.0)
+    images = Spheres.about(0).panoramas(poses, CONFIG)
+    textures = quantized(np.stack([texture(image) for image in images]))
+    others = quantized(np.stack([texture(i) for i in Spheres.about(1).panoramas(poses, CONFIG)]))
+    keyframes = fit_keyframes(
+        np.concatenate([textures, others]),
+        np.concatenate([poses + np.array([step, 0.0, 0.0]) for step in steps]),
+        np.concatenate([path(poses) + 1000 * step for step in steps]),
+        drives=np.repeat([0, 1], len(poses)).astype(np.int32),
+    )
+    assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
+    off, turned, _ = errors(keyframes, Spheres.about(0).panoramas(unseen(), CONFIG), unseen())
+    assert off.mean() < 0.1 and np.degrees(turned.mean()) < 1.0
 
 
 @pytest.mark.parametrize('trained', [1, 2])

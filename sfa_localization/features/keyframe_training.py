@@ -88,8 +88,8 @@ def _by_light(keyframes: Keyframes) -> Keyframes:
         own = keyframes.drives == drive
         seen = dataclasses.replace(keyframes, drives=lights)
         apart = [_of_light(seen, np.flatnonzero(own), light) for light in range(known)]
-        best = int(np.argmin(apart)) if apart else -1
-        lights[own] = best if apart and apart[best] < _OF_LIGHT else known
+        same = [light for light in range(known) if apart[light] < _OF_LIGHT]
+        lights[own] = min(same, key=apart.__getitem__, default=known)
         known = int(lights.max()) + 1
     return dataclasses.replace(keyframes, drives=lights, trained=known)
 

@@ -253,7 +253,7 @@ def drive(
     step.jacobian[:, SCALE] += twist.v * gain[:, 0]
     step.jacobian[:, LOSS] += by_loss * gain[:, 0]
     step.jacobian[:, BIAS] -= gain[:, 1]
-    if now is not None:
+    if now is not None and now is not twist:
         step.mean[V], step.mean[OMEGA], slowed = _corrected(mean, now)
         step.jacobian[V, SCALE] += now.v - twist.v
         step.jacobian[V, LOSS] += slowed - by_loss

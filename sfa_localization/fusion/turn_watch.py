@@ -64,10 +64,10 @@ _ACCELERATION = 0.3
 # Shares of the drift by one step between neighbors, either way.
 _LATER = np.where(_IN_TIME[:-1] & ~_IN_TIME[1:], _LEAVE, 1.0)
 _SOONER = np.where(_IN_TIME[1:] & ~_IN_TIME[:-1], _LEAVE, 1.0)
-_NEAR_NS, _APART_NS = 150_000_000, 750_000_000
+_NEAR_NS, _APART_NS, _FARTHEST_NS = 150_000_000, 750_000_000, 4_000_000_000
 """Closer images turn too little. Farther ones, most of a meter at walking speed, show other sides
-of near things, which shifts them as a turn does: their turn is that of the headings in the map."""
-_FARTHEST_NS = 4_000_000_000
+of near things, which shifts them as a turn does: their turn is that of the headings in the map, as
+long as the odometry between them is good for it."""
 _OWN = 0.25
 """Share of the variances of headings in the map that neighboring images have not in common."""
 _SOON_NS, _FINALLY_NS = 300_000_000, round(-EARLIEST_S * 1e9)
