@@ -8,10 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 from metric_worlds import criss_cross, drive, garden_features, grid, lanes, meander
+from scipy.spatial import cKDTree
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align
-from sfa_localization.metric import selection, sufficiency
+from sfa_localization.metric import learning, selection, sufficiency
 from sfa_localization.metric.alternation import MetricProblem
 from sfa_localization.metric.expansions import Process
 from sfa_localization.metric.forecast import (
@@ -181,6 +182,20 @@ def test_keyframes_improve_what_is_left_out_but_not_the_drive():
     known = Forecast(np.zeros((2, 2)), np.ones(2), np.array([0.3, 0.0]), np.array([0.4, 0.1]))
     assert known.errors == pytest.approx([0.5, 0.1])
     assert known.improved(0.5).errors == pytest.approx([np.hypot(0.15, 0.4), 0.1])
+
+
+def test_the_drive_is_as_uncertain_as_in_the_map(monkeypatch):
+    """Also where left-out images show that the fit claims too little, as with real wheels."""
+    _, segments, features, _ = legs()
+    quick_and_tolerant(monkeypatch)
+    monkeypatch.setattr(learning, 'needed_factor', lambda *_: 4.0)
+    result = learn_metric(features, segments, CONFIG)
+    images, places = positions(result, segments)
+    sway = np.einsum('ij,jkl->ikl', result.map.basis.expand(features[images]), result.map.sway)
+    claimed = np.sqrt(4.0 * (sway**2).sum((1, 2)))
+    nearest = cKDTree(places).query(result.forecast.points)[1]
+    # Where two images are as near, either is right.
+    assert np.isclose(result.forecast.drive_std, claimed[nearest]).mean() > 0.9
 
 
 def test_a_forecast_moves_with_its_map():

@@ -93,6 +93,10 @@ class Forecast:
         weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)
         return np.asarray(weights / weights.sum())
 
+    def widened(self, factor: float) -> Forecast:
+        """With the variances of the drive's own positions larger by a factor."""
+        return replace(self, drive_std=np.sqrt(factor) * self.drive_std)
+
     def improved(self, share: float) -> Forecast:
         """With this share of the left-out errors; nothing learned from a drive improves its own."""
         return replace(self, left_out=share * self.left_out)

@@ -167,7 +167,7 @@ def _result(
         left_out=plane(left.errors * turn),
         left_out_variance=left.variances * inflation,
         left_out_weight=weight,
-        forecast=expected.moved(frame),
+        forecast=expected.widened(inflation).moved(frame),
         diagnostics=diagnostics,
         history=history,
     )
