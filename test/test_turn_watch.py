@@ -27,7 +27,7 @@ def curve(seconds=40.0):
     return 0.3 + 0.12 * smooth / smooth.std()
 
 
-def watched(omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, math.inf)):
+def watched(omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, math.inf), v=1.0):
     """Probability of being apart after each image, that shows the heading at time shown(t)."""
     rng, watch = np.random.default_rng(seed), watch or TurnWatch()
     yaw, found = np.cumsum(omega) / HZ, []
@@ -35,7 +35,7 @@ def watched(omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, mat
     for i, rate in enumerate(omega):
         stamp_ns = START_NS + round(i * 1e9 / HZ)
         if not silent[0] <= i / HZ < silent[1]:
-            watch.add_odometry(stamp_ns, rate + rng.normal(0, 0.02))
+            watch.add_odometry(stamp_ns, v, rate + rng.normal(0, 0.02))
         if i % EVERY == 0:
             seen = np.interp(shown(i / HZ), np.arange(len(yaw)) / HZ, yaw)
             heading += rng.normal(0, noise)
@@ -67,6 +67,28 @@ def test_a_small_delay_is_tolerated_and_a_compensated_one_too(seconds):
     assert found.max() < 0.5
     assert watch.apart(seconds) < 0.1
     assert watch.apart(seconds - math.copysign(2 * TOLERATED_S, seconds)) > 0.9
+
+
+@pytest.mark.parametrize(
+    ('v', 'turns', 'delay_s', 'small'),
+    [(0.3, 1.0, 0.6, True), (0.1, 0.5, 0.9, True), (0.1, 3.0, 0.6, False), (2.0, 1.0, 0.42, False)],
+)
+def test_what_delay_is_small_is_a_matter_of_how_fast_the_robot_moves(v, turns, delay_s, small):
+    found, watch = watched(turns * curve(), lambda t: t - delay_s, v=v)
+    assert found[-50:].max() < 0.2 if small else found[-50:].min() > 0.5
+    assert (watch.error_s(0.0) < 0.3) == small
+    # A stop makes no delay small: the robot drives on.
+    before = watch.tolerated_s
+    watch.add_odometry(START_NS + 41_000_000_000, 0.0, 0.0)
+    assert watch.tolerated_s == before
+
+
+@pytest.mark.parametrize('turn_rate', [0.0, 0.4])
+def test_minutes_that_show_no_delay_suggest_none(turn_rate):
+    for noise, most in ((0.004, 0.0), (0.008, 0.1)):
+        for seed in range(3):
+            found, _ = watched(np.full(200 * HZ, turn_rate), lambda t: t, seed, noise=noise)
+            assert np.mean(found > 0.5) <= most
 
 
 def test_what_was_found_lasts_on_a_straight_line_and_ends_with_the_fault():
@@ -135,13 +157,31 @@ def test_headings_in_the_map_show_delays_of_slow_cameras(gap_s, delay_s):
     yaw = np.cumsum(omega) / HZ
     for i, rate in enumerate(omega):
         stamp_ns = START_NS + round(i * 1e9 / HZ)
-        watch.add_odometry(stamp_ns, rate + rng.normal(0, 0.02))
+        watch.add_odometry(stamp_ns, 1.0, rate + rng.normal(0, 0.02))
         if i % round(gap_s * HZ) == 0 and i >= delay_s * HZ:
             shown = float(yaw[i - round(delay_s * HZ)])
             watch.add_heading(stamp_ns, shown)
             watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.01)), 0.02**2))
             found.append(watch.apart(0.0))
     assert min(found[-20:]) > 0.5 if delay_s else max(found) < 0.3
+
+
+@pytest.mark.parametrize('gap_s', [0.5, 1.0, 2.0])
+@pytest.mark.parametrize('growth', [0.05, 0.1])
+def test_a_delay_that_grows_shows_in_few_images_as_well(gap_s, growth):
+    rng, watch, omega, found = np.random.default_rng(0), TurnWatch(), curve(60.0), []
+    yaw = np.cumsum(omega) / HZ
+    for i, rate in enumerate(omega):
+        now, stamp_ns = i / HZ, START_NS + round(i * 1e9 / HZ)
+        watch.add_odometry(stamp_ns, 1.0, rate + rng.normal(0, 0.02))
+        if i % round(gap_s * HZ) == 0:
+            late_s = growth * max(now - 10.0, 0.0)
+            shown = np.interp(now - late_s, np.arange(len(yaw)) / HZ, yaw)
+            watch.add_heading(stamp_ns, float(wrap_angle(shown + rng.normal(0, 0.004))))
+            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.02)), 0.02**2))
+            found.append((late_s, watch.apart(0.0)))
+    late, apart = np.transpose(found)
+    assert apart[late < 0.2].max() < 0.5 and np.mean(apart[late > 1.2] > 0.5) > 0.7
 
 
 @pytest.mark.parametrize(('delay_s', 'at_most_s'), [(1.2, 4.0), (2.0, 2.0), (4.0, 2.0)])

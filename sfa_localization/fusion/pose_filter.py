@@ -26,7 +26,7 @@ from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import read_measurement, read_pose, read_twist
 from sfa_localization.fusion.lateness import CLEARED, SUSPECTED
-from sfa_localization.fusion.motion import BIAS, State
+from sfa_localization.fusion.motion import BIAS, State, V
 from sfa_localization.fusion.predict import COAST_S, ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.rules import Rules
 from sfa_localization.fusion.settings import FilterConfig
@@ -161,7 +161,8 @@ class PoseFilter:
         event = OdometryEvent(stamp_ns, twist, _finite(pose))
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.omega)
-        self._watch.add_odometry(stamp_ns, driven.omega - float(driven.mean[BIAS]))
+        speed, bias = driven.mean[[V, BIAS]].tolist()
+        self._watch.add_odometry(stamp_ns, speed, driven.omega - bias)
         self._judge_time()
         return ''
 

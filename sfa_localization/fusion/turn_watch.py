@@ -23,22 +23,32 @@ from sfa_localization.data.geometry import Array, wrap_angle
 EARLIEST_S, LATEST_S = -1.5, 6.0
 """Delays that are distinguished; those beyond look like images without relation to the odometry."""
 TOLERATED_S = 0.45
-"""Delays within this around the one that is compensated are small: 0.45 m at walking speed."""
+"""Delays within this around the one that is compensated are small at walking speed."""
+_TOLERATED_M, _TOLERATED_RAD = 0.45, 0.3
+_LEAST_TOLERATED_S, _MOST_TOLERATED_S = 0.35, 1.25
+"""And for all robots those in which it drives and turns less than this, within limits in s."""
+_PACE_S, _STANDING = 10.0, 0.01
+"""Over how long a robot's usual speed and turn rate are taken; m/s and rad/s of one that stands."""
 _STEP_S = 0.1
 _DELAYS: Array = np.arange(EARLIEST_S / _STEP_S, LATEST_S / _STEP_S + 0.5) * _STEP_S
 _NOW = int(np.argmin(np.abs(_DELAYS)))
 _IN_TIME = np.abs(_DELAYS) <= TOLERATED_S
 _NEAR = np.append(_IN_TIME, False)
+_CLOSE = np.abs(_DELAYS) <= 1.0
 _EXPECTED_S = 0.3
 """Where the delay is expected at the start: synchronized clocks, and a camera's latency."""
 _SURPRISE = 1e-2
 """Probability of anything else at the start."""
-_BREAK, _HEAL = 1e-4, 1e-3
-"""Probabilities, per pair of images, that images in time come to any other delay at once, and the
-reverse: where nothing shows a delay for long, it is rather none."""
-_DRIFT, _LEAVE = 0.1, 0.2
-"""Probability, per pair, that a delay moves by a step, as of clocks that drift and videos that run
-slowly; and the share of it with which images that are in time begin to be late."""
+_BREAK, _HEAL = 1e-4, 2e-3
+"""Probabilities that images in time come to any other delay at once, and the reverse: where nothing
+shows a delay for long, it is rather none."""
+_DRIFT = 0.1
+"""Probability that a delay moves by a step, as of clocks that drift and videos that run slowly,
+where the robot turns so that it would show."""
+_CLEAR = 0.8
+"""1/s: by how much, for each second between its images, a pair in a curve tells delays apart."""
+_PER_S = 0.15
+"""These are probabilities per so much time between the images of a pair."""
 DOUBT = 0.3
 """Probability of any other delay where images have just moved the estimate."""
 _SUGGESTED, _ACQUITTED = 0.95, 1e-2
@@ -61,9 +71,6 @@ _SMOOTH_S = 0.2
 """Turns of robots that drive last longer."""
 _ACCELERATION = 0.3
 """rad/s^2: how fast a turn rate changes, for times of which no odometry has come yet."""
-# Shares of the drift by one step between neighbors, either way.
-_LATER = np.where(_IN_TIME[:-1] & ~_IN_TIME[1:], _LEAVE, 1.0)
-_SOONER = np.where(_IN_TIME[1:] & ~_IN_TIME[:-1], _LEAVE, 1.0)
 _NEAR_NS, _APART_NS, _FARTHEST_NS = 150_000_000, 750_000_000, 4_000_000_000
 """Closer images turn too little. Farther ones, most of a meter at walking speed, show other sides
 of near things, which shifts them as a turn does: their turn is that of the headings in the map, as
@@ -105,6 +112,7 @@ class TurnWatch:
         self._odds = self._settled
         self._std = _START_RAD
         self._lasting = False
+        self._moved_s, self._usual, self._pace = 0.0, np.zeros(2), (0.0, 0.0)
         self.forget_time()
 
     def forget_time(self) -> None:
@@ -117,11 +125,14 @@ class TurnWatch:
         self._last: tuple[int, float] | None = None
         self._seen: Seen | None = None
 
-    def add_odometry(self, stamp_ns: int, omega: float) -> None:
-        """Take a turn rate rad/s, without bias, held since the one before; skip late ones."""
+    def add_odometry(self, stamp_ns: int, v: float, omega: float) -> None:
+        """Take a speed m/s and a turn rate rad/s, without bias, held since those before; skip late
+        ones.
+        """
         gap = stamp_ns - self._stamps[-1] if self._stamps else 1
         if gap <= 0:
             return
+        self._keep_pace(abs(v), abs(omega), gap * 1e-9)
         paused = gap if gap > _PAUSE_NS else 0
         self._yaws.append((self._yaws[-1] + omega * gap * 1e-9) if self._yaws else 0.0)
         self._silent.append((self._silent[-1] if self._silent else 0.0) + paused * 1e-9)
@@ -167,22 +178,30 @@ class TurnWatch:
         self._settled = self._settled * left / (self._settled @ left)
         self._odds = self._odds * left / (self._odds @ left)
 
+    @property
+    def tolerated_s(self) -> float:
+        """Delays within this around the one that is compensated are small for this robot."""
+        v, omega = self._pace
+        limits = _TOLERATED_M / v if v else np.inf, _TOLERATED_RAD / omega if omega else np.inf
+        known = min(limits) if v or omega else TOLERATED_S
+        return min(max(known, _LEAST_TOLERATED_S), _MOST_TOLERATED_S)
+
     def apart(self, compensated_s: float) -> float:
-        """Probability that images are off by more than TOLERATED_S from a compensated delay."""
-        near = np.abs(_DELAYS - compensated_s) <= TOLERATED_S
+        """Probability that images are off by more than is tolerated from a compensated delay."""
+        near = np.abs(_DELAYS - compensated_s) <= self.tolerated_s
         return 1.0 - float(self._odds[:-1][near].sum())
 
     def error_s(self, compensated_s: float) -> float:
         """Root mean square of the time by which images are off; unrelated ones by any."""
         square = (_DELAYS - compensated_s) ** 2
-        far = np.where(np.abs(_DELAYS - compensated_s) > TOLERATED_S, square, 0.0)
+        far = np.where(np.abs(_DELAYS - compensated_s) > self.tolerated_s, square, 0.0)
         return math.sqrt(float(self._odds[:-1] @ far + self._odds[-1] * square.mean()))
 
     def problem(self, compensated_s: float) -> str:
         """How images and odometry are most likely apart in time."""
         best = int(np.argmax(self._odds))
         off_s = 0.0 if best == len(_DELAYS) else float(_DELAYS[best]) - compensated_s
-        if abs(off_s) <= TOLERATED_S:
+        if abs(off_s) <= self.tolerated_s:
             return 'images and odometry turn differently'
         late = 'late' if off_s > 0 else 'early'
         return f'images are stamped {abs(off_s):.1f} s {late}, or delayed: synchronize the clocks'
@@ -193,26 +212,41 @@ class TurnWatch:
         while self._pairs and self._pairs[0].stop_ns + _FINALLY_NS <= now_ns:
             pair, settled = self._pairs.popleft(), True
             residual, std = self._residuals(pair)
-            self._settled = self._after(self._settled, residual, std)
+            self._settled = self._after(self._settled, pair, residual, std)
             self._learn(residual)
         count = sum(pair.stop_ns + _SOON_NS <= now_ns for pair in self._pairs)
         if settled or count != self._counted:
             self._counted, self._odds = count, self._settled
             for pair in list(self._pairs)[:count]:
-                self._odds = self._after(self._odds, *self._residuals(pair))
+                self._odds = self._after(self._odds, pair, *self._residuals(pair))
+
+    def _keep_pace(self, v: float, omega: float, seconds: float) -> None:
+        """The usual turn rate; of usual and present speed, the larger. A stop changes nothing."""
+        if v < _STANDING and omega < _STANDING:
+            return
+        self._moved_s = min(self._moved_s + seconds, _PACE_S)
+        share = min(seconds / self._moved_s, 1.0)
+        self._usual = self._usual + share * (np.square([v, omega]) - self._usual)
+        usual_v, usual_omega = np.sqrt(self._usual).tolist()
+        self._pace = max(usual_v, v), usual_omega
 
     def _expect(self, share: float, odds: Array) -> None:
         """Of all probability, lay a share out by these odds."""
         self._settled = (1 - share) * self._settled + share * odds
         self._odds = (1 - share) * self._odds + share * odds
 
-    def _after(self, odds: Array, residual: Array, std: Array) -> Array:
+    def _after(self, odds: Array, pair: Pair, residual: Array, std: Array) -> Array:
         """The odds after a pair, before the next one; of a delay that lasts, neighboring pairs
         err alike.
         """
         if self._lasting:
             return _weighed(odds, residual, std, _ALIKE)
-        return _moved(_weighed(odds, residual, std))
+        seconds = (pair.stop_ns - pair.start_ns) * 1e-9
+        odds = _weighed(odds, residual, std)
+        drift = _DRIFT * min(_shown(residual, std) / (_CLEAR * seconds), 1.0)
+        for _ in range(max(round(seconds / _PER_S), 1)):
+            odds = _moved(odds, drift)
+        return odds
 
     def _residuals(self, pair: Pair) -> tuple[Array, Array]:
         """By which the turn differs from the odometry's, and its standard deviation, by delay.
@@ -269,12 +303,18 @@ def _weighed(odds: Array, residual: Array, std: Array, power: float = 1.0) -> Ar
     return np.asarray(weighed / weighed.sum())
 
 
-def _moved(odds: Array) -> Array:
-    """The odds before the next pair: delays drift, begin and end."""
-    later, sooner = _DRIFT * _LATER * odds[:-2], _DRIFT * _SOONER * odds[1:-1]
+def _shown(residual: Array, std: Array) -> float:
+    """How well a pair tells close delays apart: the variance of its turns over that of one."""
+    differs = float(np.std(residual[_CLOSE])) / float(std[_NOW])
+    return differs**2 if math.isfinite(differs) else 0.0
+
+
+def _moved(odds: Array, drift: float) -> Array:
+    """The odds _PER_S later: delays drift, begin and end."""
+    later = drift * (odds[:-2] - odds[1:-1])
     drifted = odds.copy()
-    drifted[:-2] += sooner - later
-    drifted[1:-1] += later - sooner
+    drifted[:-2] -= later
+    drifted[1:-1] += later
     good = float(drifted[:-1][_IN_TIME].sum())
     moved = drifted * (1 - np.where(_NEAR, _BREAK, _HEAL)) + _BREAK * good / len(drifted)
     moved[_NEAR] += _HEAL * (1 - good) / _NEAR.sum()
