@@ -17,9 +17,9 @@ from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.fusion import inputs, motion, recover
 from sfa_localization.fusion import update as update_module
 from sfa_localization.fusion.belief import LARGEST_STD_M
+from sfa_localization.fusion.pace import TOLERATED_S
 from sfa_localization.fusion.pose_filter import HISTORY_S, Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.fusion.turn_watch import TOLERATED_S
 
 SECOND = 1_000_000_000
 NOISY = {

@@ -10,10 +10,11 @@ import pytest
 from filter_drives import START_NS, Drive
 
 from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.fusion.pace import TOLERATED_S
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level
-from sfa_localization.fusion.turn_watch import TOLERATED_S, Seen, TurnWatch
+from sfa_localization.fusion.turn_watch import Seen, TurnWatch
 
 HZ, EVERY = 25, 5
 NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.08, 'yaw_std': 0.02, 'rate_hz': HZ}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sfa_localization.fusion.turn_watch import TOLERATED_S
+from sfa_localization.fusion.pace import TOLERATED_S
 
 _COUNT = 3
 """Images in a row that are late: one may have been held up."""

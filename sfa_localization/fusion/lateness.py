@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.fusion.pace import STANDING, TOLERATED_S, tolerated_s
 
 LATEST_S = 10.0
 """Delays that are distinguished; images that are later look like images of elsewhere."""
-TOLERATED_S = 0.55
-"""Smaller delays are no fault: 0.55 m at walking speed, by which images err in places."""
+_MARGIN_S = 0.1
+"""Images err in places, so longer delays than those that turns show are no fault."""
 SUSPECTED, CLEARED = 0.5, 0.3
 """Probability of images of another time from which the estimate is not trusted, and below which it
 is again."""
@@ -35,16 +36,17 @@ TRAIL_NS = round(LATEST_S * 1e9) + KNOT_NS
 _STEP_S = 0.1
 _DELAYS: Array = _STEP_S * np.arange(LATEST_S / _STEP_S + 0.5)
 _COUNT = len(_DELAYS)
-_NEAR = _DELAYS <= TOLERATED_S
+_LATEST_STEPS = 5
+"""Of the path, whose speed is the present one."""
+_NEAR = _DELAYS <= TOLERATED_S + _MARGIN_S
 _NEAR_SHARE = _NEAR / _NEAR.sum()
 _SURPRISE = 1e-2
 """Probability of larger delays at the start."""
 _BREAK, _HEAL, _ELSEWHERE = 1e-4, 1e-3, 1e-4
 """Probabilities, per image, that images in time come to any other delay, that others come to be in
 time, and that any are of elsewhere from now on."""
-_DRIFT, _LEAVE = 0.1, 0.2
-"""Probability, per image, that a delay moves by a step, and the share of it with which one that is
-tolerated grows beyond."""
+_DRIFT, _MOST_DRIFT = 0.7, 1 / 3
+"""Probability, per second, that a delay moves by a step; the most of it per image."""
 _ELSEWHERE_DENSITY = 1 / (100.0 * 2 * math.pi)
 """Of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _OUTLIERS = 0.05
@@ -75,6 +77,17 @@ class Path(NamedTuple):
     yaws: Array
     known: NDArray[np.bool_]
 
+    @property
+    def tolerated(self) -> NDArray[np.bool_]:
+        """(K,): which delays are small for a robot as fast as on this path."""
+        steps = np.array([np.abs(np.diff(self.places)), np.abs(np.diff(self.yaws))]) / _STEP_S
+        moving = self.known[1:] & (steps > STANDING).any(axis=0)
+        if not moving.any():
+            return _NEAR
+        v, omega = np.sqrt(np.mean(steps[:, moving] ** 2, axis=1)).tolist()
+        latest = float(steps[0, moving][:_LATEST_STEPS].mean())
+        return tolerated_s(max(v, latest), omega) + _MARGIN_S >= _DELAYS
+
 
 class Lateness(NamedTuple):
     """The odds (K + 1,) of each delay and of elsewhere, and transforms from odometry to the map.
@@ -96,19 +109,19 @@ class Lateness(NamedTuple):
     @property
     def apart(self) -> float:
         """Probability of images of another time or place."""
-        return 1.0 - float(self.odds[:-1][_NEAR].sum())
+        return 1.0 - float(self.odds[:-1][self.path.tolerated].sum())
 
     @property
     def error_s(self) -> float:
         """Root mean square of the delay; those that are tolerated count nothing."""
-        return math.sqrt(float(self.odds[:-1] @ np.where(_NEAR, 0.0, _DELAYS**2)))
+        return math.sqrt(float(self.odds[:-1] @ np.where(self.path.tolerated, 0.0, _DELAYS**2)))
 
     @property
     def problem(self) -> str:
         """What is most likely the matter; '' where nothing is suspected."""
         if not self.suspected:
             return ''
-        far = np.where(np.append(_NEAR, False), 0.0, self.odds)
+        far = np.where(np.append(self.path.tolerated, False), 0.0, self.odds)
         best = int(np.argmax(far))
         if best == _COUNT:
             return 'images and odometry show different motions'
@@ -148,7 +161,8 @@ def followed(
     if trail and trail[0][0] > late.stamp_ns:
         return _judged(_anew(late, begun))
     if restarted or _moved(late.path, path):
-        late = _corrected(_predicted(late, path), pose, variance, yaw_variance)
+        seconds = (now[0] - late.stamp_ns) * 1e-9
+        late = _corrected(_predicted(late, path, seconds), pose, variance, yaw_variance)
         late = late._replace(stamp_ns=now[0])
     if restarted:
         late = _replaced(late, begun)
@@ -222,9 +236,9 @@ def _replaced(late: Lateness, begun: Lateness) -> Lateness:
     )
 
 
-def _predicted(late: Lateness, path: Path) -> Lateness:
+def _predicted(late: Lateness, path: Path, seconds: float) -> Lateness:
     """Before the next image: delays drift, begin and end, and the odometry errs."""
-    came, near = _came(late.odds[:-1])
+    came, near = _came(late.odds[:-1], min(_DRIFT * seconds, _MOST_DRIFT))
     total = came.sum(axis=0)
     came /= np.maximum(total, _TINY)
     turns, shifts, variances, yaw_variances = (
@@ -249,19 +263,19 @@ def _predicted(late: Lateness, path: Path) -> Lateness:
     )
 
 
-def _came(odds: Array) -> tuple[Array, Array]:
+def _came(odds: Array, drift: float) -> tuple[Array, Array]:
     """The odds (4, K) that come to a delay from the one before, itself, the next, and all in time.
 
     And the shares (K,) of those that are in time.
     """
-    later = _DRIFT * np.where(_NEAR[:-1] & ~_NEAR[1:], _LEAVE, 1.0)
-    stay = 1 - np.append(later, 0.0) - np.append(0.0, np.full(_COUNT - 1, _DRIFT))
+    moves = np.full(_COUNT - 1, drift)
+    stay = 1 - np.append(moves, 0.0) - np.append(0.0, moves)
     near = np.where(_NEAR, odds, 0.0)
     in_time = float(near.sum())
     came = [
-        np.append(0.0, later * odds[:-1]),
+        np.append(0.0, drift * odds[:-1]),
         stay * odds * np.where(_NEAR, 1 - _BREAK, 1 - _HEAL),
-        np.append(_DRIFT * odds[1:], 0.0),
+        np.append(drift * odds[1:], 0.0),
         np.full(_COUNT, _BREAK * in_time / _COUNT),
     ]
     return np.array(came), near / max(in_time, _TINY)

@@ -19,16 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.fusion.pace import STANDING, TOLERATED_S, tolerated_s
 
 EARLIEST_S, LATEST_S = -1.5, 6.0
 """Delays that are distinguished; those beyond look like images without relation to the odometry."""
-TOLERATED_S = 0.45
-"""Delays within this around the one that is compensated are small at walking speed."""
-_TOLERATED_M, _TOLERATED_RAD = 0.45, 0.3
-_LEAST_TOLERATED_S, _MOST_TOLERATED_S = 0.35, 1.25
-"""And for all robots those in which it drives and turns less than this, within limits in s."""
-_PACE_S, _STANDING = 10.0, 0.01
-"""Over how long a robot's usual speed and turn rate are taken; m/s and rad/s of one that stands."""
+_PACE_S = 10.0
+"""Over how long a robot's usual speed and turn rate are taken."""
 _STEP_S = 0.1
 _DELAYS: Array = np.arange(EARLIEST_S / _STEP_S, LATEST_S / _STEP_S + 0.5) * _STEP_S
 _NOW = int(np.argmin(np.abs(_DELAYS)))
@@ -181,10 +177,7 @@ class TurnWatch:
     @property
     def tolerated_s(self) -> float:
         """Delays within this around the one that is compensated are small for this robot."""
-        v, omega = self._pace
-        limits = _TOLERATED_M / v if v else np.inf, _TOLERATED_RAD / omega if omega else np.inf
-        known = min(limits) if v or omega else TOLERATED_S
-        return min(max(known, _LEAST_TOLERATED_S), _MOST_TOLERATED_S)
+        return tolerated_s(*self._pace)
 
     def apart(self, compensated_s: float) -> float:
         """Probability that images are off by more than is tolerated from a compensated delay."""
@@ -222,7 +215,7 @@ class TurnWatch:
 
     def _keep_pace(self, v: float, omega: float, seconds: float) -> None:
         """The usual turn rate; of usual and present speed, the larger. A stop changes nothing."""
-        if v < _STANDING and omega < _STANDING:
+        if v < STANDING and omega < STANDING:
             return
         self._moved_s = min(self._moved_s + seconds, _PACE_S)
         share = min(seconds / self._moved_s, 1.0)
