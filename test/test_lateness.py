@@ -22,9 +22,9 @@ NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.08, 'yaw_std': 0.02
 COVARIANCE = np.diag([0.05**2, 0.05**2, 0.01**2])
 
 
-def drive_of(omega, **options):
-    """A noisy drive at 1 m/s with turn rates (N,)."""
-    return Drive(every=EVERY, twists=np.column_stack([np.ones(len(omega)), omega]),
+def drive_of(omega, v=1.0, **options):
+    """A noisy drive at a speed with turn rates (N,)."""
+    return Drive(every=EVERY, twists=np.column_stack([np.full(len(omega), v), omega]),
                  **{**NOISY, **options})  # fmt: skip
 
 
@@ -97,6 +97,14 @@ def test_a_delay_that_begins_is_measured_and_its_end_is_noticed(delay_s):
     assert min(late.apart for late in during) > 0.9
     assert during[-1].error_s == pytest.approx(delay_s, abs=0.25)
     assert all(late.apart < CLEARED for at_s, *_, late in found if at_s > 30.0)
+
+
+@pytest.mark.parametrize(('v', 'small'), [(0.2, True), (1.0, False)])
+def test_a_second_is_a_small_delay_of_a_slow_robot(v, small):
+    _, found = driven(drive_of(v * winding(60), v), lambda t: t - 1.0)
+    late = found[-1][-1]
+    assert late.suspected != small
+    assert (late.error_s < 0.3) == small and bool(late.problem) != small
 
 
 def test_a_robot_that_was_carried_is_not_late_where_it_is_found_again():
