@@ -42,7 +42,7 @@ _DRIFT = 0.1
 """Probability that a delay moves by a step, as of clocks that drift and videos that run slowly,
 where the robot turns so that it would show."""
 _CLEAR = 0.8
-"""1/s: by how much, for each second between its images, a pair in a curve tells delays apart."""
+"""1/s: by how much, for each second between its images, a pair in a curve distinguishes delays."""
 _PER_S = 0.15
 """These are probabilities per so much time between the images of a pair."""
 DOUBT = 0.3
@@ -297,7 +297,7 @@ def _weighed(odds: Array, residual: Array, std: Array, power: float = 1.0) -> Ar
 
 
 def _shown(residual: Array, std: Array) -> float:
-    """How well a pair tells close delays apart: the variance of its turns over that of one."""
+    """How well a pair distinguishes close delays: the variance of its turns over that of one."""
     differs = float(np.std(residual[_CLOSE])) / float(std[_NOW])
     return differs**2 if math.isfinite(differs) else 0.0
 
