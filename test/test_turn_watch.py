@@ -92,6 +92,24 @@ def test_minutes_that_show_no_delay_suggest_none(turn_rate):
             assert np.mean(found > 0.5) <= most
 
 
+@pytest.mark.parametrize('gap_s', [0.36, 0.52, 2.0])
+def test_a_fast_robot_with_few_images_is_in_time(gap_s):
+    """At 2.5 m/s near things shift between images; exposures begin a little early or late."""
+    rng, watch, omega, found = np.random.default_rng(0), TurnWatch(), 4.0 * (curve(60.0) - 0.3), []
+    yaw, turned = np.cumsum(omega) / HZ, 0.0
+    for i, rate in enumerate(omega):
+        stamp_ns = START_NS + round(i * 1e9 / HZ)
+        watch.add_odometry(stamp_ns, 2.5, rate + rng.normal(0, 0.02))
+        if i % round(gap_s * HZ) == 0:
+            at = i + HZ * rng.normal(0, 0.02)
+            shown = float(np.interp(at, np.arange(len(yaw)), yaw))
+            turned += rng.normal(0, 0.1)
+            watch.add_heading(stamp_ns, float(wrap_angle(shown + turned)))
+            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.02)), 0.02**2))
+            found.append(watch.apart(0.0))
+    assert max(found) < 0.5
+
+
 def test_what_was_found_lasts_on_a_straight_line_and_ends_with_the_fault():
     omega = np.concatenate([curve(20.0), np.zeros(20 * HZ), curve(30.0)])
     found, _ = watched(omega, lambda t: t - 2.0 if 5.0 <= t < 42.0 else t)

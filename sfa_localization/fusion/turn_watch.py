@@ -58,19 +58,22 @@ _LEARNING = 0.03  # relative change of that standard deviation per pair
 _MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 _GAIN = 0.05
 """Standard deviation, relative, of turns by wheels: they slip, and their track is not exact."""
+_JITTER_S = 0.02
+"""Standard deviation of images' stamps."""
 _MISMATCH, _MISMATCH_RAD = 0.05, 0.3
 """Share of pairs whose turn is wrong, and by how much: something covers a part of the image."""
-_UNRELATED_RAD, _UNRELATED_STDS = 0.05, 2.0
-"""Turns of images that have nothing to do with the odometry differ by so much per pair, and by so
-many of the standard deviations of turns that have."""
+_UNRELATED_RAD, _UNRELATED_STDS, _UNRELATED_SHARE = 0.05, 2.0, 0.5
+"""Turns of images that have nothing to do with the odometry differ by so much per pair, by so many
+of the standard deviations of turns that have, and by such a share of what the robot turns."""
 _SMOOTH_S = 0.2
 """Turns of robots that drive last longer."""
 _ACCELERATION = 0.3
 """rad/s^2: how fast a turn rate changes, for times of which no odometry has come yet."""
-_NEAR_NS, _APART_NS, _FARTHEST_NS = 150_000_000, 750_000_000, 4_000_000_000
-"""Closer images turn too little. Farther ones, most of a meter at walking speed, show other sides
-of near things, which shifts them as a turn does: their turn is that of the headings in the map, as
-long as the odometry between them is good for it."""
+_NEAR_NS, _FARTHEST_NS = 150_000_000, 4_000_000_000
+"""Closer images turn too little; between farther ones the odometry is not good for a turn."""
+_APART_NS, _APART_M = 750_000_000, 0.75
+"""Images that are farther apart in time or on the way show other sides of near things, which shifts
+them as a turn does: their turn is that of the headings in the map."""
 _OWN = 0.25
 """Share of the variances of headings in the map that neighboring images have not in common."""
 _SOON_NS, _FINALLY_NS = 300_000_000, round(-EARLIEST_S * 1e9)
@@ -144,14 +147,14 @@ class TurnWatch:
         gap = stamp_ns - last[0] if last else _APART_NS
         if 0 <= gap < _NEAR_NS:
             return
-        if last and 0 < gap < _APART_NS:
+        if last and 0 < gap < self._apart_ns:
             self._pairs.append(Pair(last[0], stamp_ns, float(wrap_angle(yaw_rad - last[1]))))
         self._last = stamp_ns, yaw_rad
 
     def add_seen(self, seen: Seen) -> None:
         """Take the heading in the map that an image shows: that of slow cameras shows turns."""
         last, self._seen = self._seen, seen
-        if last and _APART_NS <= seen.stamp_ns - last.stamp_ns <= _FARTHEST_NS:
+        if last and self._apart_ns <= seen.stamp_ns - last.stamp_ns <= _FARTHEST_NS:
             turn = float(wrap_angle(seen.yaw - last.yaw))
             variance = _OWN * (last.variance + seen.variance)
             self._pairs.append(Pair(last.stamp_ns, seen.stamp_ns, turn, variance))
@@ -199,6 +202,12 @@ class TurnWatch:
         late = 'late' if off_s > 0 else 'early'
         return f'images are stamped {abs(off_s):.1f} s {late}, or delayed: synchronize the clocks'
 
+    @property
+    def _apart_ns(self) -> int:
+        """The time between images from which their turn is that of the headings in the map."""
+        v = self._pace[0]
+        return min(_APART_NS, round(_APART_M / v * 1e9)) if v else _APART_NS
+
     def _weigh(self, now_ns: int) -> None:
         """The odds by now: from pairs for good, and from those that are not complete yet."""
         settled = False
@@ -233,9 +242,9 @@ class TurnWatch:
         err alike.
         """
         if self._lasting:
-            return _weighed(odds, residual, std, _ALIKE)
+            return _weighed(odds, pair.turn, residual, std, _ALIKE)
         seconds = (pair.stop_ns - pair.start_ns) * 1e-9
-        odds = _weighed(odds, residual, std)
+        odds = _weighed(odds, pair.turn, residual, std)
         drift = _DRIFT * min(_shown(residual, std) / (_CLEAR * seconds), 1.0)
         for _ in range(max(round(seconds / _PER_S), 1)):
             odds = _moved(odds, drift)
@@ -257,6 +266,7 @@ class TurnWatch:
             self._std**2
             + pair.variance
             + (_GAIN * driven) ** 2
+            + 2 * (_JITTER_S * driven / (stop - start)) ** 2
             + (_ACCELERATION * unknown * (stop - start)) ** 2
         )
         paused = np.interp(stop - _DELAYS, times, silent) - np.interp(
@@ -281,12 +291,13 @@ class TurnWatch:
         self._std = min(max(std, _LEAST_RAD), _MOST_RAD)
 
 
-def _weighed(odds: Array, residual: Array, std: Array, power: float = 1.0) -> Array:
+def _weighed(odds: Array, turn: float, residual: Array, std: Array, power: float = 1.0) -> Array:
     """Bayes: the odds after a pair that leaves these residuals, its likelihood to a power."""
     mismatch = _density(residual, _MISMATCH_RAD)
     fits = (1 - _MISMATCH) * _density(residual, std) + _MISMATCH * mismatch
     now = residual[_NOW]
-    wide = max(_UNRELATED_RAD, _UNRELATED_STDS * float(std[_NOW]))
+    turned = abs(float(wrap_angle(turn - now)))
+    wide = max(_UNRELATED_RAD, _UNRELATED_STDS * float(std[_NOW]), _UNRELATED_SHARE * turned)
     unrelated = 0.8 * _density(now, wide) + 0.2 * mismatch[_NOW]
     if not math.isfinite(now):
         return odds
