@@ -105,7 +105,7 @@ def test_a_fast_robot_with_few_images_is_in_time(gap_s):
             shown = float(np.interp(at, np.arange(len(yaw)), yaw))
             turned += rng.normal(0, 0.1)
             watch.add_heading(stamp_ns, float(wrap_angle(shown + turned)))
-            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.02)), 0.02**2))
+            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.01)), 0.02**2))
             found.append(watch.apart(0.0))
     assert max(found) < 0.5
 
