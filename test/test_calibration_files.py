@@ -277,14 +277,15 @@ def test_what_is_written_is_read_again(tmp_path, model):
         (CAMERA_INFO.format(model='strange', n=4, coefficients=[0, 0, 0, 0]), 'strange'),
         (CAMERA_INFO.replace('400.5', '0.0').format(model='', n=0, coefficients=[]), 'not calib'),
         (KALIBR.format(model='ds', intrinsics=[1, 2, 3, 4, 5, 6], distortion='none'), "'ds'"),
-        (KALIBR.format(model='omni', intrinsics=[1, 2], distortion='none'), 'no camera calib'),
+        (KALIBR.format(model='omni', intrinsics=[1, 2], distortion='none'), '1 numbers of'),
         (KALIBR.replace('752', 'x').format(model='omni', intrinsics=[1] * 5, distortion=''), 'x'),
         (MEI.replace('MEI', 'SCARAMUZZA'), 'SCARAMUZZA'),
         ('camera_model: fisheye\ncx: 1.0\nfx: 2.0', 'cy, fy, distortion missing'),
         ('camera_model: panorama\nmirored: yes', "did you mean 'mirrored'"),
         ('camera_model: strange', 'strange'),
         ('camera_model: panorama\nimage_width: -1', 'image_width'),
-        (MEI.replace('gamma1', 'gamma'), 'gamma1'),
+        (MEI.replace('gamma1', 'gamma'), "'gamma1' is missing"),
+        ('model_type: SCARAMUZZA', "'projection_parameters' is missing"),
     ],
 )
 def test_unusable_files_are_named_with_the_reason(tmp_path, text, words):

@@ -78,7 +78,7 @@ def read_calibration(path: Path) -> LensCalibration:
         fields = _from_yaml(text) if path.suffix.lower() != '.txt' else _from_ocam(text)
         return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **fields})
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-        reason = short_line(str(error))
+        reason = short_line(str(error) + (' is missing' if isinstance(error, KeyError) else ''))
         raise CameraError(f'{path}: no camera calibration ({reason}); {_KNOWN}') from None
     except (CameraError, ConfigError) as error:
         raise CameraError(f'{path}: {error}') from None
@@ -206,6 +206,8 @@ def _lens(
     has_mirror: bool = False,
 ) -> dict[str, Any]:
     """Fields of a lens with focal = [fx, fy, cx, cy]; `kind` is the name of the distortion."""
+    if len(focal) != 4:
+        raise CameraError(f'{len(focal)} numbers of focal lengths and center, not 4')
     lens = dict(zip(('fx', 'fy', 'cx', 'cy'), focal, strict=True))
     coefficients = tuple((distortion + [0.0] * 4)[:4]) if any(distortion) else ()
     if any(distortion[4:]):
