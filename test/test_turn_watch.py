@@ -45,6 +45,29 @@ def watched(omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, mat
     return np.array(found), watch
 
 
+def few_images(
+    omega, gap_s, late=lambda t: 0.0, v=1.0, heading_std=0.0, seen_std=0.01, jitter_s=0.0
+):
+    """Times s of images that far apart, and the probability of being apart after each.
+
+    They show the robot late(t) s ago, and not before it began; the headings that they add up to
+    wander by `heading_std` per image, those in the map err by `seen_std`.
+    """
+    rng, watch, found, wandered = np.random.default_rng(0), TurnWatch(), [], 0.0
+    yaw, at_s = np.cumsum(omega) / HZ, np.arange(len(omega)) / HZ
+    for i, rate in enumerate(omega):
+        now, stamp_ns = i / HZ, START_NS + round(i * 1e9 / HZ)
+        watch.add_odometry(stamp_ns, v, rate + rng.normal(0, 0.02))
+        if i % round(gap_s * HZ) == 0 and now >= late(now):
+            shown = float(np.interp(now - late(now) + rng.normal(0, jitter_s), at_s, yaw))
+            wandered += rng.normal(0, heading_std)
+            watch.add_heading(stamp_ns, float(wrap_angle(shown + wandered)))
+            seen = float(wrap_angle(shown + rng.normal(0, seen_std)))
+            watch.add_seen(Seen(stamp_ns, seen, 0.02**2))
+            found.append((now, watch.apart(0.0)))
+    return np.transpose(found)
+
+
 def test_images_in_time_are_never_suspected():
     for seed in range(4):
         for omega in (curve(), np.zeros(100 * HZ), np.full(100 * HZ, 0.4)):
@@ -95,19 +118,9 @@ def test_minutes_that_show_no_delay_suggest_none(turn_rate):
 @pytest.mark.parametrize('gap_s', [0.36, 0.52, 2.0])
 def test_a_fast_robot_with_few_images_is_in_time(gap_s):
     """At 2.5 m/s near things shift between images; exposures begin a little early or late."""
-    rng, watch, omega, found = np.random.default_rng(0), TurnWatch(), 4.0 * (curve(60.0) - 0.3), []
-    yaw, turned = np.cumsum(omega) / HZ, 0.0
-    for i, rate in enumerate(omega):
-        stamp_ns = START_NS + round(i * 1e9 / HZ)
-        watch.add_odometry(stamp_ns, 2.5, rate + rng.normal(0, 0.02))
-        if i % round(gap_s * HZ) == 0:
-            at = i + HZ * rng.normal(0, 0.02)
-            shown = float(np.interp(at, np.arange(len(yaw)), yaw))
-            turned += rng.normal(0, 0.1)
-            watch.add_heading(stamp_ns, float(wrap_angle(shown + turned)))
-            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.01)), 0.02**2))
-            found.append(watch.apart(0.0))
-    assert max(found) < 0.5
+    omega = 4.0 * (curve(60.0) - 0.3)
+    _, apart = few_images(omega, gap_s, v=2.5, heading_std=0.1, jitter_s=0.02)
+    assert apart.max() < 0.5
 
 
 def test_what_was_found_lasts_on_a_straight_line_and_ends_with_the_fault():
@@ -172,35 +185,19 @@ def test_a_filter_in_time_stays_localised():
 @pytest.mark.parametrize(('gap_s', 'delay_s'), [(1.0, 0.0), (1.0, 1.2), (2.0, 0.0), (2.0, 1.5)])
 def test_headings_in_the_map_show_delays_of_slow_cameras(gap_s, delay_s):
     """Images a second or more apart: their visual turns do not count, those of their poses do."""
-    rng, watch, omega, found = np.random.default_rng(0), TurnWatch(), curve(80.0), []
-    yaw = np.cumsum(omega) / HZ
-    for i, rate in enumerate(omega):
-        stamp_ns = START_NS + round(i * 1e9 / HZ)
-        watch.add_odometry(stamp_ns, 1.0, rate + rng.normal(0, 0.02))
-        if i % round(gap_s * HZ) == 0 and i >= delay_s * HZ:
-            shown = float(yaw[i - round(delay_s * HZ)])
-            watch.add_heading(stamp_ns, shown)
-            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.01)), 0.02**2))
-            found.append(watch.apart(0.0))
-    assert min(found[-20:]) > 0.5 if delay_s else max(found) < 0.3
+    _, apart = few_images(curve(80.0), gap_s, lambda t: delay_s)
+    assert apart[-20:].min() > 0.5 if delay_s else apart.max() < 0.3
 
 
 @pytest.mark.parametrize('gap_s', [0.5, 1.0, 2.0])
 @pytest.mark.parametrize('growth', [0.05, 0.1])
 def test_a_delay_that_grows_shows_in_few_images_as_well(gap_s, growth):
-    rng, watch, omega, found = np.random.default_rng(0), TurnWatch(), curve(60.0), []
-    yaw = np.cumsum(omega) / HZ
-    for i, rate in enumerate(omega):
-        now, stamp_ns = i / HZ, START_NS + round(i * 1e9 / HZ)
-        watch.add_odometry(stamp_ns, 1.0, rate + rng.normal(0, 0.02))
-        if i % round(gap_s * HZ) == 0:
-            late_s = growth * max(now - 10.0, 0.0)
-            shown = np.interp(now - late_s, np.arange(len(yaw)) / HZ, yaw)
-            watch.add_heading(stamp_ns, float(wrap_angle(shown + rng.normal(0, 0.004))))
-            watch.add_seen(Seen(stamp_ns, wrap_angle(shown + rng.normal(0, 0.02)), 0.02**2))
-            found.append((late_s, watch.apart(0.0)))
-    late, apart = np.transpose(found)
-    assert apart[late < 0.2].max() < 0.5 and np.mean(apart[late > 1.2] > 0.5) > 0.7
+    def late(t):
+        return growth * max(t - 10.0, 0.0)
+
+    at_s, apart = few_images(curve(60.0), gap_s, late, heading_std=0.004, seen_std=0.02)
+    late_s = np.array([late(t) for t in at_s])
+    assert apart[late_s < 0.2].max() < 0.5 and np.mean(apart[late_s > 1.2] > 0.5) > 0.7
 
 
 @pytest.mark.parametrize(('delay_s', 'at_most_s'), [(1.2, 4.0), (2.0, 2.0), (4.0, 2.0)])

@@ -19,17 +19,16 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.fusion.pace import STANDING, TOLERATED_S, tolerated_s
+from sfa_localization.fusion.pace import TOLERATED_S, Pace
 
 EARLIEST_S, LATEST_S = -1.5, 6.0
 """Delays that are distinguished; those beyond look like images without relation to the odometry."""
-_PACE_S = 10.0
-"""Over how long a robot's usual speed and turn rate are taken."""
 _STEP_S = 0.1
 _DELAYS: Array = np.arange(EARLIEST_S / _STEP_S, LATEST_S / _STEP_S + 0.5) * _STEP_S
 _NOW = int(np.argmin(np.abs(_DELAYS)))
 _IN_TIME = np.abs(_DELAYS) <= TOLERATED_S
 _NEAR = np.append(_IN_TIME, False)
+_NEAR_COUNT = int(_NEAR.sum())
 _CLOSE = np.abs(_DELAYS) <= 1.0
 _EXPECTED_S = 0.3
 """Where the delay is expected at the start: synchronized clocks, and a camera's latency."""
@@ -38,13 +37,14 @@ _SURPRISE = 1e-2
 _BREAK, _HEAL = 1e-4, 2e-3
 """Probabilities that images in time come to any other delay at once, and the reverse: where nothing
 shows a delay for long, it is rather none."""
+_STAY = 1 - np.where(_NEAR, _BREAK, _HEAL)
 _DRIFT = 0.1
 """Probability that a delay moves by a step, as of clocks that drift and videos that run slowly,
 where the robot turns so that it would show."""
+_PER_S = 0.15
+"""All three are probabilities per so much time between the images of a pair."""
 _CLEAR = 0.8
 """1/s: by how much, for each second between its images, a pair in a curve distinguishes delays."""
-_PER_S = 0.15
-"""These are probabilities per so much time between the images of a pair."""
 DOUBT = 0.3
 """Probability of any other delay where images have just moved the estimate."""
 _SUGGESTED, _ACQUITTED = 0.95, 1e-2
@@ -111,7 +111,7 @@ class TurnWatch:
         self._odds = self._settled
         self._std = _START_RAD
         self._lasting = False
-        self._moved_s, self._usual, self._pace = 0.0, np.zeros(2), (0.0, 0.0)
+        self._pace = Pace()
         self.forget_time()
 
     def forget_time(self) -> None:
@@ -131,7 +131,7 @@ class TurnWatch:
         gap = stamp_ns - self._stamps[-1] if self._stamps else 1
         if gap <= 0:
             return
-        self._keep_pace(abs(v), abs(omega), gap * 1e-9)
+        self._pace.add(v, omega, gap * 1e-9)
         paused = gap if gap > _PAUSE_NS else 0
         self._yaws.append((self._yaws[-1] + omega * gap * 1e-9) if self._yaws else 0.0)
         self._silent.append((self._silent[-1] if self._silent else 0.0) + paused * 1e-9)
@@ -180,7 +180,7 @@ class TurnWatch:
     @property
     def tolerated_s(self) -> float:
         """Delays within this around the one that is compensated are small for this robot."""
-        return tolerated_s(*self._pace)
+        return self._pace.tolerated_s
 
     def apart(self, compensated_s: float) -> float:
         """Probability that images are off by more than is tolerated from a compensated delay."""
@@ -205,7 +205,7 @@ class TurnWatch:
     @property
     def _apart_ns(self) -> int:
         """The time between images from which their turn is that of the headings in the map."""
-        v = self._pace[0]
+        v = self._pace.v
         return min(_APART_NS, round(_APART_M / v * 1e9)) if v else _APART_NS
 
     def _weigh(self, now_ns: int) -> None:
@@ -221,16 +221,6 @@ class TurnWatch:
             self._counted, self._odds = count, self._settled
             for pair in list(self._pairs)[:count]:
                 self._odds = self._after(self._odds, pair, *self._residuals(pair))
-
-    def _keep_pace(self, v: float, omega: float, seconds: float) -> None:
-        """The usual turn rate; of usual and present speed, the larger. A stop changes nothing."""
-        if v < STANDING and omega < STANDING:
-            return
-        self._moved_s = min(self._moved_s + seconds, _PACE_S)
-        share = min(seconds / self._moved_s, 1.0)
-        self._usual = self._usual + share * (np.square([v, omega]) - self._usual)
-        usual_v, usual_omega = np.sqrt(self._usual).tolist()
-        self._pace = max(usual_v, v), usual_omega
 
     def _expect(self, share: float, odds: Array) -> None:
         """Of all probability, lay a share out by these odds."""
@@ -293,14 +283,14 @@ class TurnWatch:
 
 def _weighed(odds: Array, turn: float, residual: Array, std: Array, power: float = 1.0) -> Array:
     """Bayes: the odds after a pair that leaves these residuals, its likelihood to a power."""
+    now = residual[_NOW]
+    if not math.isfinite(now):
+        return odds
     mismatch = _density(residual, _MISMATCH_RAD)
     fits = (1 - _MISMATCH) * _density(residual, std) + _MISMATCH * mismatch
-    now = residual[_NOW]
     turned = abs(float(wrap_angle(turn - now)))
     wide = max(_UNRELATED_RAD, _UNRELATED_STDS * float(std[_NOW]), _UNRELATED_SHARE * turned)
     unrelated = 0.8 * _density(now, wide) + 0.2 * mismatch[_NOW]
-    if not math.isfinite(now):
-        return odds
     # Of times without odometry nothing is known.
     fits = np.append(np.where(np.isfinite(fits), fits, unrelated), unrelated)
     weighed = odds * fits**power
@@ -320,8 +310,8 @@ def _moved(odds: Array, drift: float) -> Array:
     drifted[:-2] -= later
     drifted[1:-1] += later
     good = float(drifted[:-1][_IN_TIME].sum())
-    moved = drifted * (1 - np.where(_NEAR, _BREAK, _HEAL)) + _BREAK * good / len(drifted)
-    moved[_NEAR] += _HEAL * (1 - good) / _NEAR.sum()
+    moved = drifted * _STAY + _BREAK * good / len(drifted)
+    moved[_NEAR] += _HEAL * (1 - good) / _NEAR_COUNT
     return np.asarray(moved / moved.sum())
 
 

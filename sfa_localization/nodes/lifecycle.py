@@ -460,7 +460,7 @@ def _initialised(args: Sequence[str] | None) -> bool:
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
     # A signal just before the executor waits does not always wake it; an inactive node has nothing
     # else that would.
-    node.create_timer(_AWAKE_S, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    node.create_timer(_AWAKE_S, lambda: None, clock=node._steady)
     executor.add_node(node)
     while rclpy.ok():
         try:
