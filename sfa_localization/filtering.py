@@ -7,7 +7,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -130,7 +130,6 @@ def run_filter(
     odometry: Table,
     positions: Table,
     config: FilterConfig,
-    start: Sequence[float] | None = None,
     progress: bool = False,
     smooth: bool = False,
     correlation: ErrorCorrelation | None = None,
@@ -138,15 +137,12 @@ def run_filter(
 ) -> Filtered:
     """Fuse two tables as a live filter would, by earlier rows only; `smooth`: by all rows.
 
-    `start` is x m, y m, yaw rad, if known; `correlation` is that of the positions' errors; the
-    robot moves `lag_ns` after the stamps of the odometry. Raises DataError when the tables do not
-    overlap.
+    `correlation` is that of the positions' errors; the robot moves `lag_ns` after the stamps of
+    the odometry. Raises DataError when the tables do not overlap.
     """
     _require_overlap(odometry, positions)
     shift = _shift(odometry, positions, abs(lag_ns))
     fused = (Smoother if smooth else PoseFilter)(config, correlation)
-    if start is not None:
-        fused.set_pose(int(odometry.stamps_ns[0]) + shift, start)
     odometry = replace(odometry, stamps_ns=odometry.stamps_ns + lag_ns)
     answers, updates = list[State | None](), list[Update]()
     feed = _feed(fused, odometry, positions, shift, updates)

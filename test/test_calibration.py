@@ -176,6 +176,17 @@ def test_given_circles_are_checked():
     assert given_circles((1.0, 2.0), (0.0, 4.0)).hole is None
 
 
+@pytest.mark.parametrize('center', [(320.0, 240.0), (0.0, 480.0), (640.0, 240.0)])
+def test_a_rim_may_lie_partly_outside_the_image_but_not_wholly(center):
+    picture = np.zeros((480, 640, 3), np.uint8)
+    farthest = float(np.hypot(max(center[0], 640 - center[0]), max(center[1], 480 - center[1])))
+    given_circles(center, (40.0, farthest - 1), [picture])
+    beyond, beside = (center, (40.0, farthest + 1)), ((-1.0, 240.0), (4.0, 9.0))
+    for wrong_center, radii in (beyond, beside, ((9.0, float('nan')), (0.0, 9.0))):
+        with pytest.raises(CameraError, match='not in an image of 640x480 pixels'):
+            given_circles(wrong_center, radii, [picture])
+
+
 def test_of_center_and_radii_what_is_not_given_is_found():
     picture = scene(1)
     found = find_circles([picture])

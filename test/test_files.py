@@ -137,7 +137,8 @@ def test_what_is_no_regular_file_is_not_replaced(tmp_path):
     (tmp_path / 'folder').mkdir()
     (tmp_path / 'link').symlink_to('/dev/null')
     for path in (tmp_path / 'pipe', tmp_path / 'folder', tmp_path / 'link', Path('/dev/null')):
-        with pytest.raises(DataError, match='it is no regular file'), atomic_write(path, DataError):
+        what = 'it is a folder' if path.is_dir() else 'it is no regular file'
+        with pytest.raises(DataError, match=what), atomic_write(path, DataError):
             raise AssertionError
     assert stat.S_ISFIFO((tmp_path / 'pipe').stat().st_mode)
     assert stat.S_ISCHR(Path('/dev/null').stat().st_mode)

@@ -15,6 +15,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 
+STARTED = FilterConfig(initial_pose=(0.0, 0.0, 0.0))
 NOISY = {'v_std': 0.02, 'omega_std': 0.01, 'position_std': 0.2, 'scale': 1.01, 'bias': 0.002}
 
 
@@ -103,6 +104,26 @@ def test_a_folder_is_no_output(tmp_path, capsys, folder):
     assert 'cannot be written: it is a folder' in capsys.readouterr().err
 
 
+def test_an_output_that_cannot_be_is_noticed_before_the_work(tmp_path, capsys):
+    absent = [str(tmp_path / name) for name in ('o.csv', 'p.csv')]
+    assert main(['filter', *absent, '--output', '/dev/null']) == 1
+    assert '/dev/null: cannot be written: it is no regular file' in capsys.readouterr().err
+
+
+def test_a_start_is_checked_on_the_command_line_and_read_from_the_parameter_file(tmp_path, capsys):
+    drive = Drive(seconds=5, start=(4.0, 2.0, 1.0))
+    with pytest.raises(SystemExit):
+        run(tmp_path, drive, '--initial-pose', '0', '0', 'north')
+    logs = [str(path) for path in write_logs(tmp_path, drive)]
+    output = ['--output', str(tmp_path / 'poses.tum')]
+    assert main(['filter', *logs, *output, '--initial-pose', '1e9', '0', '0']) == 1
+    assert 'initial_pose: 1000000000.0 is outside' in capsys.readouterr().err
+    start = ['ekf_node:', '  ros__parameters:', '    initial_pose: [4.0, 2.0, 1.0]']
+    (tmp_path / 'start.yaml').write_text('\n'.join(start))
+    assert main(['filter', *logs, *output, '--config', str(tmp_path / 'start.yaml')]) == 0
+    assert 'before the start' not in capsys.readouterr().out
+
+
 def test_the_covariances_beside_the_output_replace_nothing_that_is_read(tmp_path, capsys):
     odometry, positions = write_logs(tmp_path, Drive(seconds=5))
     moved = positions.rename(tmp_path / 'poses.covariance.csv')
@@ -173,9 +194,7 @@ def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
     assert len(table) == len(drive.stamps_ns) + 1
     assert table.skipped['no stamp'] == 3 and table.skipped['no number'] == 3
     assert np.all(np.diff(table.stamps_ns) >= 0)
-    done = filtering.run_filter(
-        table, filtering.read_position_table(positions), FilterConfig(), (0, 0, 0)
-    )
+    done = filtering.run_filter(table, filtering.read_position_table(positions), STARTED)
     assert done.counts['odometry: duplicate stamp'] == 1
     assert errors(drive, (done.stamps_ns, done.poses)).max() < 0.6
 
@@ -203,7 +222,7 @@ def test_stamps_may_count_from_zero_or_below(tmp_path, shift):
     tables = filtering.read_odometry_table(odometry), filtering.read_position_table(positions)
     if shift <= -START_NS - 1:
         tables = tuple(filtering.Table(t.stamps_ns + shift, t.columns, t.skipped) for t in tables)
-    done = filtering.run_filter(*tables, FilterConfig(), (0, 0, 0))
+    done = filtering.run_filter(*tables, STARTED)
     assert len(done.stamps_ns) == len(drive.stamps_ns)
     assert errors(drive, (done.stamps_ns, done.poses), shift).max() < 0.6
 

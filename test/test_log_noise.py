@@ -96,11 +96,12 @@ def test_a_robot_that_moves_late_by_its_odometry_is_set_right(lag_s, smooth):
     drive = Drive(seconds=150, rate_hz=10, every=5, **{**USUAL, 'position_std': 0.1})
     drive.read = np.roll(drive.read, -round(lag_s * 10), axis=0)
     odometry, positions = tables(drive, 0.1)
-    fit = filtering.fitted(odometry, positions, FilterConfig())
+    start = FilterConfig(initial_pose=tuple(drive.poses[0].tolist()))
+    fit = filtering.fitted(odometry, positions, start)
     assert fit.lag_ns * 1e-9 == pytest.approx(lag_s, abs=0.1)
     errors = []
     for lag_ns in (0, fit.lag_ns):
-        found = filtering.run_filter(fit.odometry, positions, fit.config, drive.poses[0],
+        found = filtering.run_filter(fit.odometry, positions, fit.config,
                                      False, smooth, fit.correlation, lag_ns)  # fmt: skip
         inner = found.stamps_ns[(found.stamps_ns > drive.stamps_ns[20])]
         inner = inner[inner < drive.stamps_ns[-20]]

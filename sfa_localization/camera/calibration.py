@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -263,7 +264,8 @@ def given_circles(
 ) -> MirrorCircles:
     """Circles given by the user: center as column, row, and radii as hole, rim, in pixels.
 
-    What is not given is found in the images (H, W, 3). Raises CameraError.
+    What is not given is found in the images (H, W, 3), in which the rim must lie. Raises
+    CameraError.
     """
     if center is None or radii is None:
         if not images:
@@ -275,7 +277,20 @@ def given_circles(
         raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
     column, row = center
     hole = Circle(column, row, radii[0], 1.0) if radii[0] else None
-    return MirrorCircles(Circle(column, row, radii[1], 1.0), hole)
+    circles = MirrorCircles(Circle(column, row, radii[1], 1.0), hole)
+    if images:
+        _require_inside(circles, images[0])
+    return circles
+
+
+def _require_inside(circles: MirrorCircles, image: Image) -> None:
+    rim, (height, width) = circles.rim, image.shape[:2]
+    farthest = math.hypot(max(rim.column, width - rim.column), max(rim.row, height - rim.row))
+    if not (0 <= rim.column <= width and 0 <= rim.row <= height and rim.radius <= farthest):
+        raise CameraError(
+            f'a center at {rim.column:g}x{rim.row:g} with a rim of {rim.radius:g} pixels is not in '
+            f'an image of {width}x{height} pixels: correct --center or --radii'
+        )
 
 
 _GREEN, _RED, _WHITE = (80, 220, 80), (60, 60, 255), (255, 255, 255)

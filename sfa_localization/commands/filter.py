@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfa_localization.commands.options import settings
+from sfa_localization.commands.options import destination, settings
 from sfa_localization.data.errors import DataError
+from sfa_localization.data.files import require_replaceable
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -38,9 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, help='parameter file; section ekf_node is read')
     parser.add_argument(
         '--initial-pose',
+        dest=destination(FilterConfig, 'initial_pose'),
         nargs=3,
         type=float,
         metavar=('X', 'Y', 'YAW'),
+        default=argparse.SUPPRESS,
         help='initial pose (m, m, rad), where it is known',
     )
     parser.add_argument(
@@ -67,13 +70,12 @@ def run(arguments: argparse.Namespace) -> int:
     for remark in fit.remarks:
         print(remark)
     if not fit.fits:
-        print('odometry and positions do not belong together: ' + _consequence(arguments))
-        positions = filtering.without_positions(positions) if arguments.initial_pose else positions
+        print('odometry and positions do not belong together: ' + _consequence(config))
+        positions = filtering.without_positions(positions) if config.initial_pose else positions
     result = filtering.run_filter(
         fit.odometry,
         positions,
         fit.config,
-        arguments.initial_pose,
         progress=True,
         smooth=arguments.smooth,
         correlation=fit.correlation,
@@ -96,8 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _beside(arguments: argparse.Namespace) -> Path:
     """The file of covariances. Raises DataError where an output would replace what is read."""
-    if arguments.output.is_dir():
-        raise DataError(f'{arguments.output}: cannot be written: it is a folder')
+    require_replaceable(arguments.output, DataError)
     beside = Path(arguments.output.with_suffix('.covariance.csv'))
     outputs = [os.path.realpath(output) for output in (arguments.output, beside)]
     inputs = (arguments.odometry, arguments.positions, arguments.config, arguments.truth)
@@ -132,7 +133,7 @@ def _judgement(truth: Trajectory, result: Filtered) -> str:
     )
 
 
-def _consequence(arguments: argparse.Namespace) -> str:
-    if arguments.initial_pose:
+def _consequence(config: FilterConfig) -> str:
+    if config.initial_pose:
         return 'positions are left out'
     return 'check clocks and units, or give --initial-pose X Y YAW to use the odometry alone'

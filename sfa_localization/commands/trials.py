@@ -220,8 +220,7 @@ class Trial:
         filtered = run_filter(
             Table(odometry.stamps_ns, driven),
             Table(stamps, {**seen, 'var_xy': var[:, 0, 1]}),
-            KNOWN_START,
-            start=start_of(run).tolist(),
+            replace(KNOWN_START, initial_pose=tuple(start_of(run).tolist())),
             correlation=correlation,
         )
         return Trajectory(filtered.stamps_ns, filtered.poses)

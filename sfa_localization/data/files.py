@@ -80,5 +80,13 @@ def replaced_mode(target: Path) -> int:
     except FileNotFoundError:
         return NEW_FILE_MODE
     if not stat.S_ISREG(there.st_mode):
-        raise OSError('it is no regular file')
+        raise OSError(f'it {absence(target)}')
     return stat.S_IMODE(there.st_mode)
+
+
+def require_replaceable(path: Path, error: type[LocalizationError]) -> None:
+    """Raise `error` before long work whose result atomic_write could not put there."""
+    try:
+        replaced_mode(Path(os.path.realpath(path)))
+    except OSError as reason:
+        raise error(f'{path}: cannot be written: {reason.strerror or reason}') from None
