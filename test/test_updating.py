@@ -87,8 +87,11 @@ def test_an_updated_model_still_knows_the_place_when_the_season_goes_on():
 
 def test_the_old_season_gets_no_worse():
     model, _, newer = updated()
-    old = drive(share=0.0, seed=8)
-    assert errors(newer, old).mean() < 1.05 * errors(model, old).mean()
+    before, after = (
+        np.mean([errors(one, drive(share=0.0, seed=seed)).mean() for seed in (8, 10, 12)])
+        for one in (model, newer)
+    )
+    assert after < 1.05 * before
 
 
 def test_network_maps_and_first_keyframes_stay():
