@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import Drive
+from filter_drives import Drive, winding
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import wrap_angle
@@ -173,7 +173,7 @@ def compared(trust):
     return trust._replace(recent=(item,) * COMPARED_IMAGES)
 
 
-def test_every_move_doubles_the_distance_that_confirms():
+def test_every_move_of_a_confirmed_place_doubles_the_distance_that_confirms():
     trust = Trust()
     assert doubts(trust, 0.0) == []
     trust = compared(moved(trust, 10.0))
@@ -183,9 +183,35 @@ def test_every_move_doubles_the_distance_that_confirms():
     shown = 'placed anew 2 times in a row, confirmed over 3.0 m: driving on confirms it'
     assert shown in doubts(trust, 23.0)
     assert doubts(trust, 20.0 + 2 * AGREEING_DISTANCE_M) == []
-    for _ in range(10):
-        trust = compared(moved(trust, 30.0))
-    assert doubts(trust, 30.0 + LONGEST_M - 0.1) != [] and doubts(trust, 30.0 + LONGEST_M) == []
+    for traveled_m in range(30, 130, 10):
+        trust = compared(moved(trust, traveled_m))
+    assert doubts(trust, 120 + LONGEST_M - 0.1) != [] and doubts(trust, 120 + LONGEST_M) == []
+
+
+def test_what_was_not_confirmed_yet_is_moved_on_and_not_again():
+    trust = compared(moved(Trust(), 10.0))
+    for traveled_m in (10.5, 11.0, 11.5):
+        trust = compared(moved(trust, traveled_m, accepted_m=traveled_m))
+    assert doubts(trust, 11.5 + AGREEING_DISTANCE_M - 0.1) != []
+    assert doubts(trust, 11.5 + AGREEING_DISTANCE_M) == []
+    again = compared(moved(trust, 14.0, accepted_m=13.9))
+    assert doubts(again, 14.0 + AGREEING_DISTANCE_M) != []
+
+
+@pytest.mark.parametrize('share', [0.0, 0.5])
+def test_two_meters_after_wheels_spun_or_slipped_the_filter_is_sure_again(share):
+    """Images move the estimate many times meanwhile, and are right. A gyroscope shows the turns."""
+    spinning, wheels = slice(1000, 1400), winding(60.0, speed=0.6)
+    moves = wheels.copy()
+    moves[spinning] *= share
+    drive = Drive(twists=moves, **NOISY)
+    drive.read[spinning, 0] += (wheels - moves)[spinning, 0]
+    found = fed(drive)
+    assert wrong_and_sure(found) <= 2
+    levels = [status.level for status, *_ in found]
+    ended = spinning.stop // drive.every
+    assert levels[ended - 10] is not Level.LOCALISED
+    assert set(levels[ended + round(10 * (AGREEING_DISTANCE_M + 1.0) / 0.6) :]) == {Level.LOCALISED}
 
 
 @pytest.mark.parametrize(('meters', 'moves'), [(FORGIVEN_M, 1), (FORGIVEN_M + 3.0, 0)])

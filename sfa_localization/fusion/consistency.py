@@ -6,7 +6,7 @@ An image that repeats, a camera that was knocked or a clock that is seconds off 
 pass the gate now and then. Over some meters they show: laid on the odometry's path, which is
 turned and shifted as one piece, the images lie beside it, move farther or less far, or look into
 another direction than the one in which they move. An estimate that was moved once has to be
-confirmed by driving, and one that is moved again and again by driving far. Images that all lie on
+confirmed by driving, and one that is moved again after that by driving far. Images that all lie on
 one side of the estimate, each within what it claims, contradict it together.
 """
 
@@ -70,12 +70,21 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
     return trust._replace(recent=recent, problem=problem, misfit=misfit, moves=moves)
 
 
-def moved(trust: Trust, traveled_m: float, jump_m: float = 0.0) -> Trust:
-    """The trust after images moved the estimate, however young, by a distance."""
+def moved(
+    trust: Trust, traveled_m: float, jump_m: float = 0.0, accepted_m: float = math.inf
+) -> Trust:
+    """The trust after images moved the estimate by a distance; the last that fitted it before came
+    at `accepted_m`.
+
+    What had not been confirmed yet is moved on, not again: wheels that spin or slip for seconds
+    make images move an estimate many times, and all is well when they end.
+    """
+    again = trust.moves == 0 or not trust.unconfirmed(accepted_m)
+    moves = trust.moves + int(again)
     return Trust(
-        moves=trust.moves + 1,
+        moves=moves,
         moved_m=traveled_m,
-        confirming_m=min(AGREEING_DISTANCE_M * 2.0**trust.moves, LONGEST_M),
+        confirming_m=min(AGREEING_DISTANCE_M * 2.0 ** (moves - 1), LONGEST_M),
         jump_m=min(WRONG_MOVE * jump_m, LARGEST_JUMP_M),
     )
 

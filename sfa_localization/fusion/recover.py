@@ -216,7 +216,7 @@ def _trust(belief: Belief, pose: Array, *, relocated: bool) -> Trust:
     trust = belief.memory.trust
     if belief.located or trust.moves > 0:
         jump_m = math.hypot(*(pose[:2] - belief.mean[:2])) if belief.located else 0.0
-        return moved(trust, belief.traveled_m, jump_m)
+        return moved(trust, belief.traveled_m, jump_m, belief.memory.accepted_m)
     return Trust() if relocated else begun(belief.traveled_m)
 
 

@@ -160,8 +160,9 @@ class TurnWatch:
             self._pairs.append(Pair(last.stamp_ns, seen.stamp_ns, turn, variance))
 
     def doubt(self) -> None:
-        """Images have moved the estimate: perhaps they are of another time."""
-        self._expect(DOUBT, np.full(len(self._odds), 1 / len(self._odds)))
+        """Images have moved the estimate: perhaps they are of another time, once or many times."""
+        apart = 1.0 - float(self._settled[_NEAR].sum())
+        self._expect(max(DOUBT - apart, 0.0), np.full(len(self._odds), 1 / len(self._odds)))
 
     def suspect(self, delay_s: float) -> None:
         """Something else than turns suggests this delay, which lasts: until turns deny it, it is
