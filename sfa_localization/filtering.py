@@ -123,7 +123,12 @@ def read_odometry_table(path: Path | str) -> Table:
 
 def read_position_table(path: Path | str) -> Table:
     """Read `stamp_s,x_m,y_m[,var_x,var_y][,var_xy][,yaw_rad,var_yaw]`. Raises DataError."""
-    return _read_table(Path(path), _POSITIONS, ('x', 'y'))
+    table = _read_table(Path(path), _POSITIONS, ('x', 'y'))
+    nothing = np.full(len(table), np.nan)
+    yaw, variance = (table.columns.get(name, nothing) for name in ('yaw', 'var_yaw'))
+    if unsure := int(np.count_nonzero(np.isfinite(yaw) & ~(variance > 0))):
+        table.skipped['(heading without var_yaw, left out)'] = unsure
+    return table
 
 
 def run_filter(
@@ -461,10 +466,11 @@ def _measurement(columns: dict[str, Array], i: int) -> tuple[Array, Array]:
     xy = _cell(columns, 'var_xy', i, 0.0)
     covariance = np.array([[x, xy], [xy, y]]) if x > 0 else np.zeros((2, 2))
     yaw, yaw_variance = _cell(columns, 'yaw', i, math.nan), _cell(columns, 'var_yaw', i, 0.0)
-    if not (math.isfinite(yaw) and yaw_variance > 0 and covariance.any()):
+    if not (math.isfinite(yaw) and yaw_variance > 0):
         return position, covariance
-    full = np.zeros((3, 3))
-    full[:2, :2], full[2, 2] = covariance, yaw_variance
+    full = np.diag([POSITION_STD**2, POSITION_STD**2, yaw_variance])
+    if covariance.any():
+        full[:2, :2] = covariance
     return np.append(position, yaw), full
 
 
@@ -556,8 +562,8 @@ def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[
             continue
         stamp_ns = _stamp(row, at)
         cells = [_float(row, at[name]) for name in columns]
-        if stamp_ns is None:
-            skipped['no stamp'] += 1
+        if isinstance(stamp_ns, str):
+            skipped[stamp_ns] += 1
         elif not all(math.isfinite(cells[columns.index(name)]) for name in needed):
             skipped['no number'] += 1
         elif reason := _impossible(dict(zip(columns, cells, strict=True))):
@@ -585,17 +591,22 @@ def _impossible(cells: dict[str, float]) -> str:
         return 'negative variance'
     if any(cells.get(name, 0.0) >= LARGEST_VARIANCE for name in ('var_x', 'var_y')):
         return 'variance that means that nothing is known'
+    x, y = cells.get('var_x', 0.0), cells.get('var_y', 0.0)
+    if x > 0 and cells.get('var_xy', 0.0) ** 2 >= x * (y or x):
+        return 'var_xy larger than var_x and var_y allow'
     return ''
 
 
-def _stamp(row: list[str], at: dict[str, int]) -> int | None:
-    """Exact nanoseconds, which a float cannot hold; None where the cell is no stamp."""
+def _stamp(row: list[str], at: dict[str, int]) -> int | str:
+    """Exact nanoseconds, which a float cannot hold; or why the cell is no stamp."""
     name = 'stamp_ns' if 'stamp_ns' in at else 'stamp_s'
     number = _number(row[at[name]]) if at[name] < len(row) else None
     if number is None:
-        return None
+        return 'no stamp'
     stamp_ns = int(number if name == 'stamp_ns' else (number * _NS).to_integral_value())
-    return stamp_ns if abs(stamp_ns) < 2**62 else None
+    if abs(stamp_ns) < 2**62:
+        return stamp_ns
+    return f'{name} of the far future: in another unit? Columns are stamp_s or stamp_ns'
 
 
 def _number(cell: str) -> Decimal | None:

@@ -143,6 +143,7 @@ def test_from_a_calibration_file(tmp_path):
         (['raw.png', '--center', '3'], '--radii'),
         (['--calibration', 'missing.yaml'], 'missing.yaml'),
         (['filled.png'], 'inner circle'),
+        (['raw.png', '--angle-min', '120', '--angle-max', '80'], 'angle'),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys, arguments, words):
@@ -157,6 +158,19 @@ def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys
     assert words in error
     assert '\n' not in error
     assert not output.exists()
+
+
+@pytest.mark.parametrize('option', ['--output', '--check'])
+def test_what_is_read_is_not_replaced(tmp_path, monkeypatch, capsys, picture, option):
+    monkeypatch.chdir(tmp_path)
+    before = picture.read_bytes()
+    assert cli.main(['calibrate', str(picture), option, str(picture)]) == 1
+    assert 'would be replaced' in capsys.readouterr().err and picture.read_bytes() == before
+    assert cli.main(['calibrate', str(picture), '--output', 'camera.yaml']) == 0
+    before = (tmp_path / 'camera.yaml').read_bytes()
+    known = ['--calibration', 'camera.yaml', '--mount-rpy', '0x0x90']
+    assert cli.main(['calibrate', *known, '--output', './camera.yaml']) == 1
+    assert (tmp_path / 'camera.yaml').read_bytes() == before
 
 
 def test_the_check_image_marks_the_directions():

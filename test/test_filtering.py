@@ -213,6 +213,42 @@ def test_rows_with_impossible_variances_are_left_out_and_counted(tmp_path, state
         filtering.read_position_table(path)
 
 
+def test_a_covariance_that_is_none_is_counted(tmp_path):
+    path = tmp_path / 'positions.csv'
+    path.write_text('stamp_s,x_m,y_m,var_x,var_y,var_xy\n1,0,0,0.01,0.01,0.05\n2,0,0,0.01,,0.001\n')
+    table = filtering.read_position_table(path)
+    assert len(table) == 1 and table.skipped == {'var_xy larger than var_x and var_y allow': 1}
+
+
+@pytest.mark.parametrize('factor', [1000, 10**9])
+def test_stamps_in_another_unit_are_named(tmp_path, factor):
+    path = tmp_path / 'positions.csv'
+    path.write_text(f'stamp_s,x_m,y_m\n{1_700_000_000 * factor},0,0\n')
+    with pytest.raises(DataError, match=r'none of the 1 rows.*in another unit.*stamp_ns'):
+        filtering.read_position_table(path)
+
+
+def test_headings_count_without_variances_of_positions_but_not_without_their_own(tmp_path):
+    """With a heading the first row starts the filter; without, it waits for some meters."""
+    drive = Drive(seconds=30, **NOISY, yaw_std=0.05)
+    odometry, positions = write_logs(tmp_path, drive, variance=False)
+    head, *rows = positions.read_text().splitlines()
+    yaws = [f'{row},{yaw!r}' for row, yaw in zip(rows, drive.seen[:, 2].tolist(), strict=True)]
+    waited = {}
+    for name, lines in {
+        'none': [head, *rows],
+        'unsure': [head + ',yaw_rad', *yaws],
+        'sure': [head + ',yaw_rad,var_yaw', *(f'{row},0.0025' for row in yaws)],
+    }.items():
+        positions.write_text('\n'.join(lines))
+        table = filtering.read_position_table(positions)
+        left = {'(heading without var_yaw, left out)': len(rows)} if name == 'unsure' else {}
+        assert table.skipped == left
+        done = filtering.run_filter(filtering.read_odometry_table(odometry), table, FilterConfig())
+        waited[name] = done.before_start
+    assert waited['sure'] <= drive.every < waited['none'] == waited['unsure']
+
+
 @pytest.mark.parametrize('shift', [-START_NS, -START_NS - 10**12])
 def test_stamps_may_count_from_zero_or_below(tmp_path, shift):
     drive = Drive(seconds=10, **NOISY)

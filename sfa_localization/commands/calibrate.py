@@ -15,6 +15,7 @@ from sfa_localization.camera.settings import (
 )
 from sfa_localization.commands.options import add_settings, given, numbers, settings
 from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.files import require_outputs
 
 WRITES = 'with --output a calibration file, with --check an image; else nothing'
 EXAMPLES = """\
@@ -62,6 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.camera import calibration, calibration_files
     from sfa_localization.camera.panorama import Unwrapper
 
+    outputs = [path for path in (arguments.output, arguments.check) if path]
+    require_outputs(outputs, [*arguments.images, arguments.calibration])
     images = calibration.read_images(arguments.images)
     circles = None
     if arguments.center or arguments.radii:
@@ -71,11 +74,13 @@ def run(arguments: argparse.Namespace) -> int:
     camera = settings(CameraConfig, arguments)
     text = calibration_files.calibration_text(lens, camera.mount_rpy)
     print(text, end='')
-    if arguments.check:
-        if not images:
-            raise LocalizationError('--check needs an image of the camera to draw in')
-        unwrapper = Unwrapper(camera, PanoramaConfig(), lens)
-        calibration.write_check(arguments.check, calibration.check_image(images[0], unwrapper))
+    if images:
+        # Without --check too: what is written can be used.
+        check = calibration.check_image(images[0], Unwrapper(camera, PanoramaConfig(), lens))
+        if arguments.check:
+            calibration.write_check(arguments.check, check)
+    elif arguments.check:
+        raise LocalizationError('--check needs an image of the camera to draw in')
     if arguments.output:
         calibration.write_calibration(arguments.output, text)
     return 0

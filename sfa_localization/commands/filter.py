@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from sfa_localization.commands.options import destination, settings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import require_replaceable
+from sfa_localization.data.files import require_outputs
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -61,7 +60,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Filter; print what was skipped, rejected and written."""
     from sfa_localization import filtering
 
-    beside = _beside(arguments)
+    read = arguments.odometry, arguments.positions, arguments.config, arguments.truth
+    require_outputs([arguments.output], read, DataError)
+    beside = arguments.output.with_suffix('.covariance.csv')
+    require_outputs([beside], read, DataError)
     truth = filtering.read_truth(arguments.truth) if arguments.truth else None
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
@@ -94,18 +96,6 @@ def run(arguments: argparse.Namespace) -> int:
     waited = f', {result.before_start} rows before the start' if result.before_start else ''
     print(f'{arguments.output}: {len(result.poses)} poses{waited}')
     return 0
-
-
-def _beside(arguments: argparse.Namespace) -> Path:
-    """The file of covariances. Raises DataError where an output would replace what is read."""
-    require_replaceable(arguments.output, DataError)
-    beside = Path(arguments.output.with_suffix('.covariance.csv'))
-    outputs = [os.path.realpath(output) for output in (arguments.output, beside)]
-    inputs = (arguments.odometry, arguments.positions, arguments.config, arguments.truth)
-    for path in filter(None, inputs):
-        if os.path.realpath(path) in outputs:
-            raise DataError(f'{path}: would be replaced by the output: give another --output')
-    return beside
 
 
 def _print_counts(odometry: Table, positions: Table, result: Filtered) -> None:

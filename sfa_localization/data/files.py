@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -84,9 +84,20 @@ def replaced_mode(target: Path) -> int:
     return stat.S_IMODE(there.st_mode)
 
 
-def require_replaceable(path: Path, error: type[LocalizationError]) -> None:
-    """Raise `error` before long work whose result atomic_write could not put there."""
-    try:
-        replaced_mode(Path(os.path.realpath(path)))
-    except OSError as reason:
-        raise error(f'{path}: cannot be written: {reason.strerror or reason}') from None
+def require_outputs(
+    outputs: Iterable[Path],
+    inputs: Iterable[Path | None],
+    error: type[LocalizationError] = LocalizationError,
+) -> None:
+    """Raise `error` before the work where atomic_write could not put its results, or they would
+    replace what is read.
+    """
+    targets = {path: os.path.realpath(path) for path in outputs}
+    for path, target in targets.items():
+        try:
+            replaced_mode(Path(target))
+        except OSError as reason:
+            raise error(f'{path}: cannot be written: {reason.strerror or reason}') from None
+    for path in filter(None, inputs):
+        if os.path.realpath(path) in targets.values():
+            raise error(f'{path}: would be replaced by the output: give another --output')
