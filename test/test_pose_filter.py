@@ -773,3 +773,19 @@ def test_the_history_stays_bounded():
 def test_parameters_are_checked_together(values, why):
     with pytest.raises(ConfigError, match=why):
         FilterConfig(**values)
+
+
+def test_unusable_images_show_how_long_the_odometry_has_been_silent():
+    drive = Drive(seconds=20, **NOISY)
+    fused = PoseFilter(FilterConfig())
+    drive.feed(fused, heading=True)
+    assert fused.status.level is Level.LOCALISED
+    last_ns, nothing = int(drive.stamps_ns[-1]), np.diag([1e6, 1e6, 1e6])
+    levels = []
+    for late_s in (0.2, 1.0, 5.0, 20.0, 90.0):
+        fused.add_measurement(last_ns + round(late_s * 1e9), np.zeros(3), nothing)
+        levels.append(fused.status.level)
+    # A minute is no silence, but another clock.
+    assert levels == [Level.LOCALISED, Level.DEGRADED, Level.LOST, Level.LOST, Level.LOCALISED]
+    assert fused.add_odometry(last_ns + 20_000_000, *drive.read[-1]) == ''
+    assert fused.status.level is Level.LOCALISED

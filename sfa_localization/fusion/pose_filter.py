@@ -101,6 +101,7 @@ class PoseFilter:
         self._ahead = (0, 0)
         self._apart = (0, 0)
         self._alone = 0
+        self._unusable_ns = 0
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
             self._waiting = np.array(self.config.initial_pose), self._initial_covariance()
@@ -157,7 +158,7 @@ class PoseFilter:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
-        self._alone = 0
+        self._alone = self._unusable_ns = 0
         event = OdometryEvent(stamp_ns, twist, _finite(pose))
         driven = self._history.add((stamp_ns, _ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.omega)
@@ -182,6 +183,7 @@ class PoseFilter:
             self._note_arrival(taken_ns)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
+            self._unusable_ns = max(stamp_ns, self._unusable_ns)
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
         if len(fused) == 3:
             self._watch.add_seen(Seen(stamp_ns, float(fused[2]), float(noise[2, 2])))
@@ -306,8 +308,14 @@ class PoseFilter:
 
     @property
     def status(self) -> Status:
-        """How far the estimate at the newest message can be trusted, and why not further."""
-        status = status_of(self._history.newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
+        """How far the estimate at the newest message can be trusted, and why not further.
+
+        While the odometry is silent, images that cannot be used show how time goes on.
+        """
+        newest = self._history.newest
+        if 0 < self._unusable_ns - newest.stamp_ns <= TIME_JUMP_S * 1e9:
+            newest = self._rules.prediction.coast(newest, self._unusable_ns)
+        status = status_of(newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
         reasons = [why for why in self._apart_in_time() if why not in status.reasons]
         if not reasons:
             return status
