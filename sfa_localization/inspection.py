@@ -473,7 +473,9 @@ def directions(places: Array) -> int:
 def lacks(report: BagReport, config: InspectionConfig) -> list[str]:
     """The reasons why a bag is not enough to train on, each with the remedy."""
     if report.images is None or report.drive is None:
-        return [] if report.lacks else ['neither images nor odometry could be read']
+        parts = ('images', report.images), ('odometry', report.drive)
+        missing = ' and no '.join(name for name, part in parts if part is None)
+        return [] if report.lacks else [f'no {missing} could be read']
     places = report.drive.places
     apart = abs(report.drive.clock.delay_ns) > DELAY_LIMIT_NS
     return [

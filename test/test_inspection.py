@@ -195,6 +195,19 @@ def test_a_topic_of_which_nothing_can_be_read_is_an_error(tmp_path: Path, capsys
     assert '5 of 5 messages: zero or negative stamp' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(('images_at', 'odometry_at', 'missing'), [
+    (0, START, 'images'), (START, 0, 'odometry'), (0, 0, 'images and no odometry'),
+])  # fmt: skip
+def test_what_cannot_be_read_is_named(tmp_path: Path, images_at, odometry_at, missing) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(5):
+            picture = np.full((8, 60, 3), 90, np.uint8)
+            bag.image('/panorama', images_at and images_at + index * STEP, picture, 'camera')
+            at = odometry_at and odometry_at + index * STEP
+            bag.odometry('/odom', at, (0, 0, 0), (0, 0), (0, 0))
+    assert inspect(tmp_path / 'bag').lacks == [f'no {missing} could be read']
+
+
 def test_a_topic_without_a_name_is_not_taken_for_missing_images(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         for index in range(20):

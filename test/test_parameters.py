@@ -456,3 +456,11 @@ def test_the_tables_name_parameters_that_there_are():
 def test_values_that_would_block_a_node_are_rejected_at_once(given, message):
     with pytest.raises(ConfigError, match=message):
         CameraConfig.from_mapping(given, 'parameters')
+
+
+@pytest.mark.parametrize(
+    'frames', [{'odom_frame': 'map'}, {'base_frame': 'odom'}, {'map_frame': 'base_link'}]
+)
+def test_frames_that_are_one_are_rejected(frames):
+    with pytest.raises(ConfigError, match='three different frames'):
+        EkfNodeConfig.from_mapping(frames, 'parameters')

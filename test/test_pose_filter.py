@@ -768,6 +768,7 @@ def test_the_history_stays_bounded():
     ({'speed_std': math.nan}, 'finite'), ({'odometry_factor': 0.0}, 'outside'),
     ({'initial_pose': (1.0, 2.0)}, '2 numbers given; give x'),
     ({'initial_pose': (1.0, 2.0, math.inf)}, 'finite'),
+    ({'initial_pose': (1.0, 2.0, 90.0)}, 'give radians'),
     ({'initial_pose': ('x', 2.0, 3.0)}, 'initial_pose'),
 ])  # fmt: skip
 def test_parameters_are_checked_together(values, why):

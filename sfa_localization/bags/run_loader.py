@@ -173,11 +173,12 @@ class _Loader:
         """The images with odometry near enough on both sides."""
         keep = odometry.trajectory.covers(file.stamps_ns, int(self._tolerance_s * 1e9))
         lost = int(np.count_nonzero(~keep))
-        images.tally.withdraw(f'no odometry within {self._tolerance_s:g} s', lost)
+        near = f'within {self._tolerance_s:g} s' if self._tolerance_s else 'before and after'
+        images.tally.withdraw(f'no odometry {near}', lost)
         if not keep.any():
             raise BagError(
-                f'{self._bag.path}: none of {lost} images of {images.topic} has odometry within '
-                f'{self._tolerance_s:g} s; are both stamped by one clock (stamp_source: receive)?'
+                f'{self._bag.path}: none of {lost} images of {images.topic} has odometry '
+                f'{near}; are both stamped by one clock (stamp_source: receive)?'
             )
         return file.finish(keep)
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from sfa_localization.data.errors import ConfigError
@@ -91,6 +92,11 @@ class FilterConfig(Settings):
             raise ConfigError(
                 f'initial_pose: {len(self.initial_pose)} numbers given; '
                 'give x (m), y (m) and yaw (rad), or none'
+            )
+        if self.initial_pose and abs(self.initial_pose[2]) > 2 * math.pi:
+            raise ConfigError(
+                f'initial_pose: a yaw of {self.initial_pose[2]:g} rad is more than a turn: '
+                'give radians'
             )
         if self.degraded_std > self.lost_std:
             raise ConfigError('degraded_std must not exceed lost_std')

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, setting
 
 
@@ -70,3 +71,9 @@ class EkfNodeConfig(Settings):
         high=1200.0,
         live=True,
     )
+
+    def __post_init__(self) -> None:
+        Settings.__post_init__(self)
+        frames = self.map_frame, self.odom_frame, self.base_frame
+        if len(set(frames)) < len(frames):
+            raise ConfigError('map_frame, odom_frame and base_frame must be three different frames')

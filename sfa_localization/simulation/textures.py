@@ -138,7 +138,8 @@ class Atlas:
     def sample(self, u: Floats, v: Floats, surface: Floats, footprint_m: Floats) -> Image:
         """Colors (..., 3) at meters (u, v) on surfaces by index, averaged over footprint_m."""
         texel = PERIOD_M / TILE
-        level = np.clip(np.rint(np.log2(footprint_m / texel + 1e-6)), 0, LEVELS - 1)
+        widest = np.minimum(footprint_m, texel * 2.0**LEVELS)
+        level = np.clip(np.rint(np.log2(widest / texel + 1e-6)), 0, LEVELS - 1)
         side = np.exp2(-level) * TILE
         # Widths of the wider levels to the left, and two columns of padding for each.
         left = 2 * TILE - 2 * side + 2 * level
