@@ -175,15 +175,13 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         try:
-            factor = self.config.measurement_factor
-            fused, noise = read_measurement(value, covariance, factor)
+            fused, noise = self._read(stamp_ns, value, covariance)
             taken_ns = self._taken(stamp_ns)
             self._note_apart(taken_ns)
             self._require_place(taken_ns, _MEASUREMENT)
             self._note_arrival(taken_ns)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
-            self._unusable_ns = max(stamp_ns, self._unusable_ns)
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
         if len(fused) == 3:
             self._watch.add_seen(Seen(stamp_ns, float(fused[2]), float(noise[2, 2])))
@@ -234,6 +232,13 @@ class PoseFilter:
         """Whether images are likely of another time; once they were, until that is unlikely."""
         limit = CLEARED if self._off else SUSPECTED
         self._off = self._watch.apart(self._compensated_s) > limit
+
+    def _read(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
+        try:
+            return read_measurement(value, covariance, self.config.measurement_factor)
+        except DataError:
+            self._unusable_ns = max(stamp_ns, self._unusable_ns)
+            raise
 
     def _taken(self, stamp_ns: int) -> int:
         """When an image was taken, on the clock of the odometry."""
