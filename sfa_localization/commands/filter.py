@@ -61,9 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization import filtering
 
     read = arguments.odometry, arguments.positions, arguments.config, arguments.truth
-    require_outputs([arguments.output], read, DataError)
+    require_outputs([arguments.output], read)
     beside = arguments.output.with_suffix('.covariance.csv')
-    require_outputs([beside], read, DataError)
+    require_outputs([beside], read)
     truth = filtering.read_truth(arguments.truth) if arguments.truth else None
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)

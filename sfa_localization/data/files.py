@@ -84,20 +84,20 @@ def replaced_mode(target: Path) -> int:
     return stat.S_IMODE(there.st_mode)
 
 
-def require_outputs(
-    outputs: Iterable[Path],
-    inputs: Iterable[Path | None],
-    error: type[LocalizationError] = LocalizationError,
-) -> None:
-    """Raise `error` before the work where atomic_write could not put its results, or they would
-    replace what is read.
+def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Raise LocalizationError before the work where atomic_write could not put its results, or
+    they would replace what is read.
     """
     targets = {path: os.path.realpath(path) for path in outputs}
     for path, target in targets.items():
         try:
             replaced_mode(Path(target))
         except OSError as reason:
-            raise error(f'{path}: cannot be written: {reason.strerror or reason}') from None
+            raise LocalizationError(
+                f'{path}: cannot be written: {reason.strerror or reason}'
+            ) from None
     for path in filter(None, inputs):
         if os.path.realpath(path) in targets.values():
-            raise error(f'{path}: would be replaced by the output: give another --output')
+            raise LocalizationError(
+                f'{path}: would be replaced by the output: give another --output'
+            )
