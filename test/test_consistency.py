@@ -198,6 +198,13 @@ def test_what_was_not_confirmed_yet_is_moved_on_and_not_again():
     assert doubts(again, 14.0 + AGREEING_DISTANCE_M) != []
 
 
+@pytest.mark.parametrize(('jump_m', 'again'), [(1.4, False), (1.6, True), (8.0, True)])
+def test_wheels_that_spin_explain_no_move_beyond_the_way_driven(jump_m, again):
+    trust = compared(moved(Trust(), 10.0, 8.0))
+    trust = compared(moved(trust, 11.0, jump_m, accepted_m=10.8))
+    assert (doubts(trust, 11.0 + AGREEING_DISTANCE_M) != []) == again
+
+
 @pytest.mark.parametrize('share', [0.0, 0.5])
 def test_two_meters_after_wheels_spun_or_slipped_the_filter_is_sure_again(share):
     """Images move the estimate many times meanwhile, and are right. A gyroscope shows the turns."""

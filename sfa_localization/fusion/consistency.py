@@ -42,6 +42,8 @@ WRONG_MOVE, LARGEST_JUMP_M = 0.22, 1.4
 """Standard deviation of an estimate that images have just moved, of the way by which they did: one
 in twenty such moves is wrong, by all of it; and its limit (m), because a robot that was carried far
 is not lost."""
+SLACK_M = 0.5
+"""By so much an estimate may be moved beside what wheels that spun explain: images err."""
 PULLED_OVER_M = 5.0
 """Distance over which offsets of images are averaged: their errors are alike over about one."""
 PULLED, PULLED_M, RELEASED = 0.6, 0.3, 0.5
@@ -76,10 +78,12 @@ def moved(
     """The trust after images moved the estimate by a distance; the last that fitted it before came
     at `accepted_m`.
 
-    What had not been confirmed yet is moved on, not again: wheels that spin or slip for seconds
-    make images move an estimate many times, and all is well when they end.
+    What had not been confirmed yet is moved on, not again, if by no more than was driven since:
+    wheels that spin or slip for seconds make images move an estimate many times, and all is well
+    when they end.
     """
-    again = trust.moves == 0 or not trust.unconfirmed(accepted_m)
+    slipped = jump_m <= traveled_m - trust.moved_m + SLACK_M
+    again = trust.moves == 0 or not (slipped and trust.unconfirmed(accepted_m))
     moves = trust.moves + int(again)
     return Trust(
         moves=moves,
