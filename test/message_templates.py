@@ -22,7 +22,7 @@ REASONS = {
         '_contradictions',
         '_silences',
     ),
-    'fusion/consistency.py': ('doubts', 'compared', '_turned'),
+    'fusion/consistency.py': ('doubts', 'compared', 'stood', '_turned'),
     'fusion/mounting.py': ('problem',),
     'fusion/turn_watch.py': ('problem',),
     'fusion/pose_filter.py': ('_apart_in_time', '_require_place', '_require_others_ahead'),

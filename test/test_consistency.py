@@ -143,6 +143,52 @@ def test_without_headings_only_the_motion_counts():
     assert contradiction(seen(poses, places, np.full(16, np.nan))) == ''
 
 
+@pytest.mark.parametrize(
+    ('way_m', 'images', 'spread_m', 'stand'),
+    [
+        (0.6, 4, 0.005, True),
+        (0.4, 4, 0.005, False),
+        (0.6, 2, 0.005, False),
+        (0.6, 4, 0.1, False),
+        (3.0, 8, 0.005, True),
+    ],
+)
+def test_images_in_one_place_are_noticed_after_half_a_meter(way_m, images, spread_m, stand):
+    """However much each claims: they drove before, and stand while the odometry drives on."""
+    poses, places, yaws = bend()
+    x = np.linspace(0, way_m, images)
+    more = poses[-1] + np.column_stack([x, 0 * x, 0 * x])
+    items = seen(
+        np.concatenate([poses, more[1:]]),
+        np.concatenate([places, places[-1] + noise(images, spread_m)[1:]]),
+        np.concatenate([yaws, np.full(images - 1, yaws[-1])]),
+        std=0.8,
+    )
+    trust = Trust()
+    for item in items[: len(poses)]:
+        trust = watched(trust, item)
+        assert not trust.problem
+    for item in items[len(poses) :]:
+        trust = watched(trust, item)
+    shown = 'images stay in one place while the odometry drives'
+    assert (trust.problem == shown) == stand
+    assert trust.misfit[0] == pytest.approx(way_m if stand else 0.0, rel=0.3)
+
+
+def test_while_wheels_spin_slowly_weak_images_show_it():
+    """At 0.1 m/s what is compared otherwise takes 20 s."""
+    spinning, moves = slice(1000, 1750), winding(100.0, speed=0.1)
+    read, moves = moves.copy(), moves.copy()
+    moves[spinning] = 0.0
+    noise = {'v_std': 0.005, 'omega_std': 0.005, 'position_std': 0.5, 'yaw_std': 0.15}
+    drive = Drive(twists=moves, seed=1, **noise)
+    drive.read[spinning] += read[spinning]
+    at = spinning.start // drive.every
+    drive.seen[at : spinning.stop // drive.every] = drive.seen[at]
+    found = fed(drive)
+    assert wrong_and_sure(found, 0.8) == 0
+
+
 def test_too_few_images_or_too_short_a_path_contradict_nothing():
     poses, places, yaws = bend()
     repeated = np.full(len(places), places[0])

@@ -3,7 +3,8 @@
 """Whether images and odometry show the same motion, and whether the estimate had to be moved.
 
 An image that repeats, a camera that was knocked or a clock that is seconds off gives poses that
-pass the gate now and then. Over some meters they show: laid on the odometry's path, which is
+pass the gate now and then. Images that stay in one place while the odometry drives half a meter
+show it at once. Over some meters the others show: laid on the odometry's path, which is
 turned and shifted as one piece, the images lie beside it, move farther or less far, or look into
 another direction than the one in which they move. An estimate that was moved once has to be
 confirmed by driving, and one that is moved again after that by driving far. Images that all lie on
@@ -20,7 +21,12 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, align_complex, wrap_angle
 from sfa_localization.fusion.belief import COMPARED_IMAGES, Evidence, Pull, Trust
-from sfa_localization.fusion.evidence import AGREEING_DISTANCE_M, AGREEING_VARIANCES, ODOMETRY_DRIFT
+from sfa_localization.fusion.evidence import (
+    AGREEING_DISTANCE_M,
+    AGREEING_VARIANCES,
+    FEW_IMAGES,
+    ODOMETRY_DRIFT,
+)
 
 SPACING_M = 0.1
 """Images nearer than this to the last one kept show no motion of their own."""
@@ -28,6 +34,10 @@ WINDOW_M = 1.5 * AGREEING_DISTANCE_M
 """The newest images over this distance are compared, or more where a slow camera took too few."""
 AGREEING_HALF = 0.5
 """Fewer than half of the images on the odometry's path are no outliers: motions differ."""
+STOOD_M, STOOD = 0.5, 0.1
+"""Images within this part of so long a way, as the odometry drives it, stand: places of a moving
+robot spread over half of it or more, over a sixth where images are worst; those of one that stands
+over a fortieth at most."""
 TURNED_RAD, STRETCHED, CHANCE_STDS = math.radians(12.0), 0.25, 3.5
 """Headings that differ from the direction of motion by more than both angle and standard deviations
 were not drawn by chance, nor were images that move farther or less far than odometry by this part:
@@ -66,7 +76,9 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
         recent = recent[1:]
     since_m = newest.traveled_m - trust.moved_m - trust.confirming_m
     doubted = trust.problem or since_m < YOUNG_M
-    problem, misfit = compared(recent, DOUBTED_STDS if doubted else CHANCE_STDS)
+    problem, misfit = stood(recent)
+    if not problem:
+        problem, misfit = compared(recent, DOUBTED_STDS if doubted else CHANCE_STDS)
     settled = since_m > FORGIVEN_M
     moves = 0 if settled and not problem else trust.moves
     return trust._replace(recent=recent, problem=problem, misfit=misfit, moves=moves)
@@ -123,6 +135,21 @@ def doubts(trust: Trust, accepted_m: float, pull: Pull | None = None) -> list[st
         again = f' anew{times}' if trust.moves else ''
         found.append(f'placed{again}, confirmed over {since_m:.1f} m: driving on confirms it')
     return found
+
+
+def stood(recent: Sequence[Evidence]) -> tuple[str, tuple[float, float]]:
+    """The contradiction where the newest images stay in one place while the odometry drives, and
+    how far (m, rad) it did; '' where they move, or are too few.
+    """
+    path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
+    places = np.array([complex(*item.position) for item in recent])
+    driven = np.abs(path - path[-1])
+    moves = np.abs(places - places[-1]) > STOOD * np.maximum(driven, STOOD_M)
+    first = int(np.flatnonzero(moves)[-1]) + 1 if moves.any() else 0
+    way_m = float(driven[first:].max())
+    if way_m < STOOD_M or len(recent) - first < FEW_IMAGES:
+        return '', (0.0, 0.0)
+    return 'images stay in one place while the odometry drives', (way_m, 0.0)
 
 
 def contradiction(recent: Sequence[Evidence]) -> str:
