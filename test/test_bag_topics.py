@@ -3,6 +3,7 @@
 """Which topics of a bag are used, how their messages are read, and which stamps count."""
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -441,6 +442,36 @@ def test_a_pose_that_is_never_kept_is_summed_up_from_the_twist(tmp_path: Path) -
         x = bag.odometry().poses[:, 0]
         assert x == pytest.approx(np.arange(100) * PERIOD * 1e-9)
         assert bag.problems == ['/odom: the pose is constant; the twist is integrated instead']
+
+
+@pytest.mark.parametrize(
+    ('twist', 'pose_turns', 'found'),
+    [
+        ((1.0, 0.5), 1.0, ''),
+        ((1.2, 0.4), 1.0, ''),
+        ((0.0, 0.0), 1.0, ''),  # a twist that is never set claims nothing
+        ((1000.0, 0.5), 1.0, r'/odom: poses drive 1[0-9.]+ m, twists 1[.0-9]+e\+04 m: are'),
+        ((1.0, 28.6), 1.0, r'/odom: poses turn 7[0-9.]* rad, twists 4[0-9]+ rad: are both'),
+        ((1.0, 0.5), 0.0, r'/odom: poses turn 0 rad, twists 7[0-9.]* rad: are both in'),
+    ],
+)
+def test_poses_and_twists_in_other_units_are_named(
+    twist: tuple[float, float], pose_turns: float, found: str, tmp_path: Path
+) -> None:
+    """The robot drives a circle of 2 m at 1 m/s, and then stands with a flickering twist."""
+
+    def pose(k: int) -> tuple[float, float, float]:
+        yaw = 0.5 * min(k, 150) * PERIOD * 1e-9
+        return 2 * math.sin(yaw), 2 * (1 - math.cos(yaw)), yaw * pose_turns
+
+    with BagWriter(tmp_path / 'bag') as writer:
+        for k in range(300):
+            given = np.array(twist) if k <= 150 else np.array([0.0, 0.04 * any(twist)])
+            writer.odometry('/odom', stamp(k), np.array(pose(k)), given, np.zeros(2))
+    with Bag(tmp_path / 'bag') as bag:
+        bag.odometry()
+        assert len(bag.problems) == bool(found)
+        assert re.match(found, ''.join(bag.problems))
 
 
 # The writer.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfa_localization.data.geometry import Array, compose, invert, relative
+from sfa_localization.data.geometry import Array, compose, invert, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, differences, integrate
 
 StampedValues = list[tuple[int, Any]]
@@ -18,6 +18,12 @@ RESET_M = 2.0
 messages are lost for about a second."""
 _DRIVING_MPS = 0.01
 """A robot this fast is driving (m/s): above the noise of wheel encoders at rest."""
+
+_COMPARED_S, _COUNTED = 1.0, 0.05
+"""Motion of poses and twists is compared by the second, from so much on (m, rad): a robot that
+stands for long adds up noise."""
+_ENOUGH, _UNEQUAL = 3.0, 1.5
+"""From such a sum on (m, rad) a larger factor between them is none of wheels or of sampling."""
 
 
 def _stamps(values: StampedValues) -> Stamps:
@@ -56,6 +62,27 @@ def is_pose_constant(odometry: Odometry) -> bool:
     if len(odometry.stamps_ns) < 2 or np.ptp(odometry.poses, axis=0).any():
         return False
     return bool(np.abs(odometry.twists[:, 0]).max() > _DRIVING_MPS)
+
+
+def disagreement(odometry: Odometry) -> str:
+    """How poses and twists drive or turn another way in sum, in words; '' where they agree.
+
+    Twists may lag, and average over any time; one that is always 0 claims nothing.
+    """
+    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
+    at = np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
+    twisted = integrate(odometry.stamps_ns, odometry.twists)
+    turned = np.cumsum(odometry.twists[1:, 1] * np.diff(seconds))
+    turned = np.concatenate([[0.0], turned])[at]
+    driven = [np.hypot(*np.diff(poses[at, :2], axis=0).T) for poses in (odometry.poses, twisted)]
+    even = np.diff(seconds[at]) < 2 * _COMPARED_S  # odometry that paused shows the motion by poses
+    turns = np.abs([wrap_angle(np.diff(odometry.poses[at, 2])), np.diff(turned)])
+    for verb, unit, steps in ('turn', 'rad', turns), ('drive', 'm', np.array(driven)):
+        by_pose, by_twist = steps[:, even & (steps > _COUNTED).any(axis=0)].sum(axis=1).tolist()
+        least, most = sorted([by_pose, by_twist])
+        if by_twist > 0 and most > _ENOUGH and most > _UNEQUAL * least:
+            return f'poses {verb} {by_pose:.3g} {unit}, twists {by_twist:.3g} {unit}'
+    return ''
 
 
 def _joined(stamps: Stamps, poses: Array, twists: Array) -> tuple[Array, int]:

@@ -19,6 +19,7 @@ from rosbags.interfaces import Qos
 from sfa_localization.bags import decoding
 from sfa_localization.bags.motion_arrays import (
     StampedValues,
+    disagreement,
     is_pose_constant,
     to_odometry,
     to_trajectory,
@@ -207,6 +208,9 @@ class Bag:
             self.recording.problems.append(text)
             poses = integrate(odometry.stamps_ns, odometry.twists)
             odometry = replace(odometry, poses=poses)
+        elif differing := disagreement(odometry):
+            text = f'{stream.topic}: {differing}: are both in meters, radians and seconds?'
+            self.recording.problems.append(text)
         if resets:
             text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
             self.recording.problems.append(text)
