@@ -265,9 +265,9 @@ def inspect(
         survey = _Survey(bag, image, odometry)
         survey.read()
         report.topics = survey.topics()
-        report.problems, report.notes = bag.problems, bag.recording.notes
         report.images = survey.images()
         report.drive = survey.drive(report.images)
+        report.problems, report.notes = bag.problems, bag.recording.notes
     if report.drive is not None and _one_route(report.drive.places):
         report.notes.append(ROUTE)
     report.lacks += lacks(report, config)

@@ -173,6 +173,22 @@ def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
     assert problems['/odom'] == ['1 of 20 messages: zero or negative stamp', 'pause of 10.2 s']
 
 
+def test_what_is_unusual_about_odometry_is_a_problem(tmp_path: Path) -> None:
+    """A pose that is never kept, one that was reset, and twists in other units."""
+    x = np.arange(50.0) / 5
+    shown = {
+        'constant': (0 * x, 1.0, 'the pose is constant; the twist is integrated instead'),
+        'reset': (x - 6 * (x >= 6), 1.0, 'odometry was reset 1 times; joined by its twist'),
+        'millimeters': (x, 1000.0, 'poses drive 9 m, twists 9e+03 m: are both in meters, radians '),
+    }
+    for name, (places, speed, text) in shown.items():
+        with BagWriter(tmp_path / name) as bag:
+            for index, place in enumerate(places):
+                bag.odometry('/odom', START + index * STEP, (place, 0, 0), (speed, 0), (0, 0))
+        (problem,) = inspect(tmp_path / name).problems
+        assert problem.startswith(f'/odom: {text}')
+
+
 def test_a_topic_that_speaks_only_on_change_does_not_pause(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         for at in (0, 0.1, 7, 7.5, 30, 30.1, 30.2, 55, 56, 80):
