@@ -166,6 +166,8 @@ def test_what_is_read_is_not_replaced(tmp_path, monkeypatch, capsys, picture, op
     before = picture.read_bytes()
     assert cli.main(['calibrate', str(picture), option, str(picture)]) == 1
     assert 'would be replaced' in capsys.readouterr().err and picture.read_bytes() == before
+    assert cli.main(['calibrate', str(picture), '--output', 'a', '--check', './a']) == 1
+    assert 'a: named for two outputs: give each its own' in capsys.readouterr().err
     assert cli.main(['calibrate', str(picture), '--output', 'camera.yaml']) == 0
     before = (tmp_path / 'camera.yaml').read_bytes()
     known = ['--calibration', 'camera.yaml', '--mount-rpy', '0x0x90']

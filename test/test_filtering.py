@@ -106,8 +106,12 @@ def test_a_folder_is_no_output(tmp_path, capsys, folder):
 
 def test_an_output_that_cannot_be_is_noticed_before_the_work(tmp_path, capsys):
     absent = [str(tmp_path / name) for name in ('o.csv', 'p.csv')]
-    assert main(['filter', *absent, '--output', '/dev/null']) == 1
-    assert '/dev/null: cannot be written: it is no regular file' in capsys.readouterr().err
+    reading, writing = os.pipe()  # where a terminal's `| less` leads
+    for output in ('/dev/null', f'/dev/fd/{writing}'):
+        assert main(['filter', *absent, '--output', output]) == 1
+        assert f'{output}: cannot be written: it is no regular file' in capsys.readouterr().err
+    os.close(reading)
+    os.close(writing)
 
 
 def test_a_start_is_checked_on_the_command_line_and_read_from_the_parameter_file(tmp_path, capsys):

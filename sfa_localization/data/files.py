@@ -60,7 +60,7 @@ def atomic_write(
     try:
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
-        mode = replaced_mode(target)
+        mode = replaced_mode(path)
         handle, temporary = tempfile.mkstemp('.part', f'.{target.name}-', target.parent)
         with os.fdopen(handle, 'wb') as file:
             yield file
@@ -73,31 +73,35 @@ def atomic_write(
             Path(temporary).unlink(missing_ok=True)
 
 
-def replaced_mode(target: Path) -> int:
-    """The permissions of what `target` replaces. Raises OSError where that is no regular file."""
+def replaced_mode(path: Path) -> int:
+    """The permissions of what `path` replaces. Raises OSError where that is no regular file."""
     try:
-        there = target.stat()
+        there = path.stat()
     except FileNotFoundError:
         return NEW_FILE_MODE
     if not stat.S_ISREG(there.st_mode):
-        raise OSError(f'it {absence(target)}')
+        raise OSError(f'it {absence(path)}')
     return stat.S_IMODE(there.st_mode)
 
 
 def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
     """Raise LocalizationError before the work where atomic_write could not put its results, or
-    they would replace what is read.
+    they would replace each other or what is read.
     """
-    targets = {path: os.path.realpath(path) for path in outputs}
-    for path, target in targets.items():
+    targets: set[str] = set()
+    for path in outputs:
+        target = os.path.realpath(path)
+        if target in targets:
+            raise LocalizationError(f'{path}: named for two outputs: give each its own')
+        targets.add(target)
         try:
-            replaced_mode(Path(target))
+            replaced_mode(path)
         except OSError as reason:
             raise LocalizationError(
                 f'{path}: cannot be written: {reason.strerror or reason}'
             ) from None
     for path in filter(None, inputs):
-        if os.path.realpath(path) in targets.values():
+        if os.path.realpath(path) in targets:
             raise LocalizationError(
                 f'{path}: would be replaced by the output: give another --output'
             )
