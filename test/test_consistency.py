@@ -214,9 +214,12 @@ def test_the_window_holds_the_newest_images_over_both_distance_and_number():
 
 
 def compared(trust):
-    """The trust after as many images as a comparison needs."""
-    item = Evidence((0.0, 0.0, 0.0), 0.0, (0.0, 0.0), 0.0, 0.01, 0.001, True)
-    return trust._replace(recent=(item,) * COMPARED_IMAGES)
+    """The trust after as many images, over as long a way, as a comparison needs."""
+    poses, places, yaws = bend(AGREEING_DISTANCE_M + 0.1, COMPARED_IMAGES)
+    trust = trust._replace(recent=())
+    for item in seen(poses, places, yaws):
+        trust = watched(trust, item._replace(traveled_m=item.traveled_m + trust.moved_m))
+    return trust
 
 
 def test_every_move_of_a_confirmed_place_doubles_the_distance_that_confirms():
@@ -342,10 +345,17 @@ def test_a_camera_mounted_askew_is_not_trusted_at_any_rate(degrees, every, at_mo
     assert every / 50 * sum(sure) <= at_most_s
 
 
-def test_of_a_slow_camera_too_few_images_confirm_nothing():
+@pytest.mark.parametrize(
+    ('length_m', 'images', 'confirmed'), [(9.0, 4, False), (9.0, 5, True), (1.95, 20, False)]
+)
+def test_images_that_could_not_be_compared_confirm_nothing(length_m, images, confirmed):
+    """Too few of a slow camera, or over too short a way, whatever the last that fits says."""
     trust = moved(Trust(), 10.0)
-    few = compared(trust).recent[1:]
-    assert doubts(trust._replace(recent=few), 20.0) and not doubts(compared(trust), 20.0)
+    for item in seen(*bend(length_m, images)):
+        trust = watched(trust, item._replace(traveled_m=item.traveled_m + 10.0))
+    assert (doubts(trust, 20.0) == []) == confirmed
+    # The image that moves the estimate once more is the first of those that are compared next.
+    assert moved(trust, 20.0).recent == trust.recent[-1:]
 
 
 def test_after_a_knock_of_the_camera_the_filter_is_not_sure():

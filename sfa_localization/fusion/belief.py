@@ -87,7 +87,8 @@ COMPARED_IMAGES = 5
 
 
 class Trust(NamedTuple):
-    """Images over the last meters, and how they contradict the odometry's motion, '' if not.
+    """Images over the last meters, and how they contradict the odometry's motion, '' if not;
+    `judged` are those enough to do so.
 
     With a problem, `misfit` are the standard deviations (m, rad) by which they do. `moves` counts
     how often images moved the estimate elsewhere lately, `moved_m` is the distance traveled when
@@ -96,6 +97,7 @@ class Trust(NamedTuple):
     """
 
     recent: tuple[Evidence, ...] = ()
+    judged: bool = False
     problem: str = ''
     misfit: tuple[float, float] = (0.0, 0.0)
     moves: int = 0
@@ -104,11 +106,11 @@ class Trust(NamedTuple):
     jump_m: float = 0.0
 
     def unconfirmed(self, accepted_m: float) -> bool:
-        """Whether no image has fitted yet that far from where images moved the estimate, or too
-        few came since to be compared with the odometry's motion.
+        """Whether no image has fitted yet that far from where images moved the estimate, or those
+        since then could not be compared with the odometry's motion.
         """
-        few = len(self.recent) < COMPARED_IMAGES and self.confirming_m > 0.0
-        return few or accepted_m - self.moved_m < self.confirming_m
+        unjudged = not self.judged and self.confirming_m > 0.0
+        return unjudged or accepted_m - self.moved_m < self.confirming_m
 
     def variances(self, accepted_m: float) -> tuple[float, float, float]:
         """Of x, y and yaw, on top, while the estimate is not trusted."""

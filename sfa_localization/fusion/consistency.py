@@ -81,7 +81,8 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
         problem, misfit = compared(recent, DOUBTED_STDS if doubted else CHANCE_STDS)
     settled = since_m > FORGIVEN_M
     moves = 0 if settled and not problem else trust.moves
-    return trust._replace(recent=recent, problem=problem, misfit=misfit, moves=moves)
+    judged = comparable(recent)
+    return trust._replace(recent=recent, judged=judged, problem=problem, misfit=misfit, moves=moves)
 
 
 def moved(
@@ -98,6 +99,7 @@ def moved(
     again = trust.moves == 0 or not (slipped and trust.unconfirmed(accepted_m))
     moves = trust.moves + int(again)
     return Trust(
+        recent=trust.recent[-1:],
         moves=moves,
         moved_m=traveled_m,
         confirming_m=min(AGREEING_DISTANCE_M * 2.0 ** (moves - 1), LONGEST_M),
@@ -157,15 +159,21 @@ def contradiction(recent: Sequence[Evidence]) -> str:
     return compared(recent)[0]
 
 
+def comparable(recent: Sequence[Evidence]) -> bool:
+    """Whether images are enough, and over a distance long enough, to show a motion."""
+    span_m = recent[-1].traveled_m - recent[0].traveled_m
+    return len(recent) >= COMPARED_IMAGES and span_m >= AGREEING_DISTANCE_M
+
+
 def compared(
     recent: Sequence[Evidence], stds: float = CHANCE_STDS
 ) -> tuple[str, tuple[float, float]]:
     """The contradiction, and by how much (m, rad) the images differ; see `contradiction`. Within
     so many `stds` headings differ by chance.
     """
-    span_m = recent[-1].traveled_m - recent[0].traveled_m
-    if len(recent) < COMPARED_IMAGES or span_m < AGREEING_DISTANCE_M:
+    if not comparable(recent):
         return '', (0.0, 0.0)
+    span_m = recent[-1].traveled_m - recent[0].traveled_m
     path = np.array([complex(*item.dead_reckoned[:2]) for item in recent])
     places = np.array([complex(*item.position) for item in recent])
     variance = np.array([item.variance for item in recent]) + (ODOMETRY_DRIFT * span_m / 2) ** 2
