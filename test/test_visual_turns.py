@@ -5,6 +5,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
@@ -72,6 +73,30 @@ def test_what_the_robot_carries_in_every_image_does_not_count():
     images[:, :, 20:35], images[:, -6:, 60:100] = 0, 255
     masked = replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images))
     assert clock_of(masked).delay_s == pytest.approx(0.2, abs=0.02)
+
+
+def tilted(images, degrees, seed=0):
+    """As of a robot on rough ground: each image (N, H, W, C), of 60 degrees, rolled and pitched."""
+    rng, (height, width) = np.random.default_rng(seed), images.shape[1:3]
+    azimuths = np.linspace(0, 2 * np.pi, width, endpoint=False)
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    for image in images:
+        roll, pitch = rng.normal(0, degrees * height / 60, 2)
+        moved = rows + roll * np.sin(azimuths) + pitch * np.cos(azimuths)
+        maps = columns.astype(np.float32), moved.astype(np.float32)
+        yield cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_robot_that_shuttles_over_rough_ground_does_not_turn(seed):
+    odometry = wander(400, seed, hz=10.0)
+    twists = np.stack([0.6 * np.sign(np.sin(np.arange(400) / 20)), np.zeros(400)], axis=1)
+    odometry = replace(odometry, poses=integrate(odometry.stamps_ns, twists), twists=twists)
+    run = run_of(odometry, seed)
+    images = np.stack(list(tilted(run.panoramas.images, 3.0, seed)))
+    stamps_ns = run.panoramas.stamps_ns
+    seen = wrap_angle(np.diff(list(headings(PanoramaArray(stamps_ns, images)))))
+    assert np.abs(seen).max() < 0.1
 
 
 @pytest.mark.parametrize('kind', ['straight', 'even', 'noise', 'dark', 'few'])

@@ -8,6 +8,7 @@ The shift between neighboring images is measured without any map or training.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -23,8 +24,21 @@ _COLUMNS, _ROWS = 200, 10
 _WIDEST = 0.2
 # What every image shows alike (the robot, a mask) is the mean of so many that differ so much.
 _STATIC_MIN, _STATIC_MAX, _DIFFERENT = 8, 64, 0.95
+# What is left beside it shows a turn only where one shift stands out by so many standard deviations
+# of all. Of a robot that hardly turns, that mean holds the surroundings, and noise is left: by 3.
+_STANDS_OUT = 3.2
 # Contrast beyond a factor e, as at the edge of a mask, counts no more.
 _CONTRAST = np.float32(1.0)
+
+
+class _Shift(NamedTuple):
+    """Columns by which one texture must be shifted to give the other; by how many standard
+    deviations it is then more alike than elsewhere, and the square sum of what differs still.
+    """
+
+    columns: float
+    stands_out: float
+    error: float
 
 
 class VisualGyro:
@@ -48,13 +62,14 @@ class VisualGyro:
             self._before, self._static, self._statics = texture, np.zeros_like(texture), 0
             self._last_static = texture
             return self.yaw_rad
-        before, after = self._before, texture
+        shift = _shift(self._before, texture)
         if self._static is not None and self._statics >= _STATIC_MIN:
-            before, after = before - self._static, after - self._static
-        shift = _shift(before, after)
+            rest = _shift(self._before - self._static, texture - self._static)
+            if rest.stands_out > _STANDS_OUT and rest.error < shift.error:
+                shift = rest
         self._learn_static(texture)
         self._before = texture
-        turn = self._sign * shift * 2 * np.pi / texture.shape[1]
+        turn = self._sign * shift.columns * 2 * np.pi / texture.shape[1]
         self.yaw_rad = float(wrap_angle(self.yaw_rad + turn))
         return self.yaw_rad
 
@@ -85,15 +100,17 @@ def _likeness(a: Texture, b: Texture) -> float:
     return float((a * b).sum()) / np.sqrt(power) if power > 0 else 1.0
 
 
-def _shift(before: Texture, after: Texture) -> float:
-    """Columns by which one texture must be shifted to give the other, to a part of a column."""
+def _shift(before: Texture, after: Texture) -> _Shift:
+    """The shift, to a part of a column, by which one texture gives the other best."""
     width = before.shape[1]
     product = np.conj(np.fft.rfft(before, axis=1)) * np.fft.rfft(after, axis=1)
     score = np.fft.irfft(product.sum(0), width)
     top = int(np.argmax(score))
-    left, middle, right = score[top - 1], score[top], score[(top + 1) % width]
+    left, middle, right = map(float, (score[top - 1], score[top], score[(top + 1) % width]))
     bend = left - 2 * middle + right
-    return top + (0.5 * float((left - right) / bend) if bend < 0 else 0.0)
+    columns = top + (0.5 * (left - right) / bend if bend < 0 else 0.0)
+    spread, powers = float(score.std()), float((before * before).sum() + (after * after).sum())
+    return _Shift(columns, middle / spread if spread > 0 else 0.0, powers - 2 * middle)
 
 
 def headings(panoramas: Panoramas, clockwise: bool = True) -> Iterator[float]:
