@@ -28,7 +28,9 @@ def curve(seconds=40.0):
     return 0.3 + 0.12 * smooth / smooth.std()
 
 
-def watched(omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, math.inf), v=1.0):
+def watched(
+    omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, math.inf), v=1.0, rate_std=0.02
+):
     """Probability of being apart after each image, that shows the heading at time shown(t)."""
     rng, watch = np.random.default_rng(seed), watch or TurnWatch()
     yaw, found = np.cumsum(omega) / HZ, []
@@ -36,7 +38,7 @@ def watched(omega, shown, seed=0, watch=None, noise=0.004, silent=(math.inf, mat
     for i, rate in enumerate(omega):
         stamp_ns = START_NS + round(i * 1e9 / HZ)
         if not silent[0] <= i / HZ < silent[1]:
-            watch.add_odometry(stamp_ns, v, rate + rng.normal(0, 0.02))
+            watch.add_odometry(stamp_ns, v, rate + rng.normal(0, rate_std))
         if i % EVERY == 0:
             seen = np.interp(shown(i / HZ), np.arange(len(yaw)) / HZ, yaw)
             heading += rng.normal(0, noise)
@@ -72,6 +74,11 @@ def test_images_in_time_are_never_suspected():
     for seed in range(4):
         for omega in (curve(), np.zeros(100 * HZ), np.full(100 * HZ, 0.4)):
             assert watched(omega, lambda t: t, seed)[0].max() < 0.5
+
+
+def test_noise_of_the_odometry_on_a_straight_line_shows_no_delay():
+    for seed in range(8):
+        assert watched(np.zeros(100 * HZ), lambda t: t, seed, rate_std=0.1)[0].max() < 0.3
 
 
 @pytest.mark.parametrize('seconds', [-1.2, -0.8, 0.8, 1.2, 2.0, 4.0])

@@ -17,6 +17,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.fusion.pace import TOLERATED_S, Pace
@@ -58,6 +59,9 @@ _LEARNING = 0.03  # relative change of that standard deviation per pair
 _MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 _GAIN = 0.05
 """Standard deviation, relative, of turns by wheels: they slip, and their track is not exact."""
+_NOISY = 1.25
+"""Turns by odometry that differ between delays by this part of that standard deviation are half
+noise, which on a straight line would decide."""
 _JITTER_S = 0.02
 """Standard deviation of images' stamps."""
 _MISMATCH, _MISMATCH_RAD = 0.05, 0.3
@@ -251,7 +255,12 @@ class TurnWatch:
         yaws, silent = np.array(self._yaws), np.array(self._silent)
         start, stop = (pair.start_ns - newest) * 1e-9, (pair.stop_ns - newest) * 1e-9
         rate = self._newest_rate(times, yaws)
+        paused = np.interp(stop - _DELAYS, times, silent) - np.interp(
+            start - _DELAYS, times, silent
+        )
+        seen = (start - _DELAYS >= times[0]) & (paused <= 0)
         driven = _at(stop - _DELAYS, times, yaws, rate) - _at(start - _DELAYS, times, yaws, rate)
+        driven = _beyond_noise(driven, seen, _NOISY * self._std)
         unknown = np.maximum(stop - _DELAYS, 0.0)
         std = np.sqrt(
             self._std**2
@@ -260,10 +269,6 @@ class TurnWatch:
             + 2 * (_JITTER_S * driven / (stop - start)) ** 2
             + (_ACCELERATION * unknown * (stop - start)) ** 2
         )
-        paused = np.interp(stop - _DELAYS, times, silent) - np.interp(
-            start - _DELAYS, times, silent
-        )
-        seen = (start - _DELAYS >= times[0]) & (paused <= 0)
         return np.where(seen, wrap_angle(pair.turn - driven), np.nan), std
 
     @staticmethod
@@ -280,6 +285,12 @@ class TurnWatch:
         larger = abs(residual[best]) > _MEDIAN * self._std
         std = self._std * math.exp(_LEARNING if larger else -_LEARNING)
         self._std = min(max(std, _LEAST_RAD), _MOST_RAD)
+
+
+def _beyond_noise(driven: Array, seen: NDArray[np.bool_], noise: float) -> Array:
+    """Turns by delay, rad, drawn to their mean where those `seen` differ by noise alone."""
+    mean, differ = (driven[seen].mean(), driven[seen].std()) if seen.any() else (0.0, 0.0)
+    return np.asarray(mean + (driven - mean) / (1 + (noise / max(differ, 1e-9)) ** 4))
 
 
 def _weighed(odds: Array, turn: float, residual: Array, std: Array, power: float = 1.0) -> Array:
