@@ -6,6 +6,7 @@ import ast
 import errno
 import io
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from sfa_localization import evaluation, filtering
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera import calibration
+from sfa_localization.cli import main
 from sfa_localization.commands import inspect as inspect_command
 from sfa_localization.commands.demo import DemoConfig
 from sfa_localization.data import array_files, files
@@ -30,6 +32,7 @@ from sfa_localization.inspection import BagReport
 from sfa_localization.reports import bag as report_bag
 from sfa_localization.reports import evaluation as report
 
+BAGS = Path(__file__).parents[1] / 'bags'
 FULL = OSError(errno.ENOSPC, 'No space left on device')
 PICTURE = np.zeros((8, 16, 3), np.uint8)
 PLACES = np.zeros((5, 3))
@@ -218,3 +221,37 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert writing.wait(60) == 0
     assert writing.stderr.read() == b''
     writing.stderr.close()
+
+
+@pytest.mark.parametrize(
+    'command',
+    [
+        'inspect bag --json bag/sample.mcap',
+        'inspect bag/metadata.yaml --json bag/metadata.yaml',
+        'inspect link --json bag/sample.mcap',
+        'evaluate model.npz bag --json model.npz',
+        'evaluate model.npz bag --json bag/sample.mcap',
+        'evaluate model.npz other --align bag --json bag/sample.mcap',
+        'evaluate model.npz bag --config a.yaml --json a.yaml',
+        'train bag --output bag/sample.mcap',
+        'train bag --update model.npz --output bag/sample.mcap',
+        'tune bag --model model.npz --output model.npz',
+        'tune odom.csv positions.csv --output odom.csv',
+    ],
+)
+def test_no_output_replaces_what_is_read(command, tmp_path, monkeypatch, capsys):
+    bag = shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
+    (tmp_path / 'link').symlink_to(bag)
+    for name in ('model.npz', 'a.yaml', 'odom.csv', 'positions.csv'):
+        (tmp_path / name).write_text('# no data\n')
+    before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == 1
+    assert 'would be replaced by an output' in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == before
+
+
+def test_an_output_beside_the_files_of_a_bag_is_written(tmp_path):
+    bag = shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
+    for _ in range(2):
+        assert main(['inspect', str(bag), '--json', str(bag / 'found.json')]) == 0

@@ -51,6 +51,16 @@ READERS: dict[bytes, Callable[[Path], Storage]] = {
 }
 
 
+def recorded_files(path: Path) -> list[Path]:
+    """The files of the bag at a path that is a folder or a metadata.yaml; any other path alone."""
+    folder = path.parent if path.name == METADATA else path
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return [path]
+    return [folder / name for name in names if name == METADATA or name.endswith(SUFFIXES)]
+
+
 @dataclass
 class Metadata:
     """The content of metadata.yaml of any version: files, channels, messages per topic."""

@@ -14,6 +14,7 @@ from sfa_localization.commands.options import (
     TOPIC_OPTIONS,
     add_topics,
     recipe,
+    require_read_only,
     require_same_panorama,
     settings,
 )
@@ -60,6 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.place_model import PlaceModel
     from sfa_localization.reports.evaluation import heading_table, table, trust_lines, write_report
 
+    if arguments.json:
+        read = arguments.model, arguments.bag, *arguments.align, arguments.config
+        require_read_only([arguments.json], read)
     model = PlaceModel.load(arguments.model)
     require_same_panorama(arguments.config, model.panorama)
     result = evaluation.evaluate(

@@ -11,7 +11,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sfa_localization.bags.settings import TopicNames
-from sfa_localization.commands.options import add_settings, add_topics, settings
+from sfa_localization.commands.options import (
+    add_settings,
+    add_topics,
+    require_read_only,
+    settings,
+)
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
@@ -43,6 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Inspect all bags; an unreadable one is reported and does not stop the others."""
     topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
+    if arguments.json:
+        require_read_only([arguments.json], arguments.bags)
     reports = []
     for path in arguments.bags:
         try:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,6 +14,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.config import SECTIONS, load_settings
 from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.files import require_outputs
 from sfa_localization.data.settings import Settings
 
 if TYPE_CHECKING:
@@ -26,6 +27,13 @@ TOPIC_OPTIONS = {
     'imu': '--imu-topic',
     'ground_truth': '--ground-truth-topic',
 }
+
+
+def require_read_only(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Raise LocalizationError where an output would replace an input, or a file of an input bag."""
+    from sfa_localization.bags.recording import recorded_files
+
+    require_outputs(outputs, [file for path in inputs if path for file in recorded_files(path)])
 
 
 def add_settings(

@@ -15,6 +15,7 @@ from sfa_localization.commands.options import (
     add_topics,
     given,
     recipe,
+    require_read_only,
     require_same_panorama,
     settings,
 )
@@ -60,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
+    require_read_only([arguments.output], [*arguments.bags, arguments.config])
     if arguments.update:
         return _update(arguments)
     from sfa_localization import training

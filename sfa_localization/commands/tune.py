@@ -15,6 +15,7 @@ from sfa_localization.commands.options import (
     add_settings,
     add_topics,
     recipe,
+    require_read_only,
     require_same_panorama,
     settings,
 )
@@ -61,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Tune; write the file, print what changed and the cost."""
     config = settings(FilterConfig, arguments, arguments.config)
+    require_read_only([arguments.output], [*arguments.drives, arguments.model])
     tables = [path.suffix == '.csv' for path in arguments.drives]
     if any(tables):
         if not all(tables) or len(tables) % 2:

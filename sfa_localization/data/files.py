@@ -103,5 +103,5 @@ def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> N
     for path in filter(None, inputs):
         if os.path.realpath(path) in targets:
             raise LocalizationError(
-                f'{path}: would be replaced by the output: give another --output'
+                f'{path}: would be replaced by an output: give that another name'
             )
