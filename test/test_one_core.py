@@ -136,6 +136,7 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeyp
         'image is unlike any of training': 4,
         'image is dark': 2,
         'image is covered: it shows nothing': 1,
+        'image repeats the one before': 3,
         'camera is frozen: it repeats its image': 6,
     }
     assert judged.scores['ekf']['p95'] < 0.3

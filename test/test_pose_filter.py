@@ -500,6 +500,18 @@ def test_a_pose_given_before_the_first_message_is_not_lost(stamp):
     assert drive.error(fused, -1)[0] < 1e-6
 
 
+@pytest.mark.parametrize(('off_m', 'std'), [(1.6, 0.2), (1.2, 0.1), (2.5, 0.7)])
+def test_a_pose_from_outside_that_its_first_images_deny_claims_no_more(off_m, std):
+    fused, covariance = PoseFilter(), np.diag(np.square([0.5, 0.5, 0.1]))
+    fused.set_pose(START_NS, (off_m, 0.0, 0.0), np.diag(np.square([std, std, 0.1])))
+    for i, stamp_ns in enumerate(range(START_NS, START_NS + 30 * SECOND, SECOND // 20)):
+        fused.add_odometry(stamp_ns, 0.0, 0.0)
+        if i % 7 == 6:
+            fused.add_measurement(stamp_ns, np.zeros(3), covariance)
+        if i > 6:
+            assert math.hypot(*fused.state.pose[:2]) < 2 * fused.state.position_std
+
+
 @pytest.mark.parametrize('pose', [(math.nan, 0, 0), (0, 0), (1e12, 0, 0)])
 def test_a_malformed_pose_is_rejected(pose):
     with pytest.raises(DataError):

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which images can be used: dark, covered, frozen and novel ones cannot."""
+"""Which images can be used: dark, covered, repeated and novel ones cannot."""
 
 from __future__ import annotations
 
@@ -67,7 +67,13 @@ class ImageWatch:
             return 'image is covered: it shows nothing'
         if self._frozen.repeats + 1 >= FROZEN_IMAGES:
             return 'camera is frozen: it repeats its image'
-        return ''
+        # It shows where the robot was, not where it is.
+        return 'image repeats the one before' if self.repeats else ''
+
+    @property
+    def repeats(self) -> bool:
+        """Whether the last image repeats one, but not for so long that the camera is frozen."""
+        return 0 < self._frozen.repeats < FROZEN_IMAGES - 1
 
     def judge_novelty(self, novelty: float) -> str:
         """Why an image of this novelty cannot be used; '' when it can."""

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy.stats import chi2
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.fusion.belief import (
     Belief,
     Evidence,
@@ -55,6 +55,8 @@ PERIOD_STEP = 0.1
 WIDE_GATE = 4.0
 """A prior of so many times a measurement's variance would follow it anywhere (gain above 0.8)."""
 _OUTLYING = {size: float(chi2.ppf(OUTLYING_SHARE, size)) for size in (2, 3)}
+_UNLIKELY = {size: float(chi2.ppf(0.9, size)) for size in (1, 2)}
+"""A pose from outside is taken at its word where its first image lies within this."""
 _OBSERVED = np.eye(3, SIZE)
 _SEEN_BY_POSITION = (X, Y, ERROR, ERROR + 1, ERROR + 2)
 _NOT_SEEN_BY_POSITION = tuple(sorted({*range(SIZE)} - {*_SEEN_BY_POSITION}))
@@ -159,6 +161,9 @@ class Correction:
             reason = 'not confirmed after an outage yet'
             rejected = update._replace(accepted=False, reason=reason)
             return self._recovery.weighed(belief, event, rejected)
+        if belief.memory.support == 0:
+            belief = belief._replace(covariance=_doubted(belief, event))
+            mean, covariance, _ = kalman.corrected(belief, belief.covariance, event)
         memory = Memory(
             support=belief.memory.support + 1,
             evidence=remember(belief, event, accepted=True),
@@ -232,6 +237,20 @@ def _pulls_far(belief: Belief, event: MeasurementEvent) -> bool:
         return False
     offset = event.value[:2] - belief.mean[:2]
     return bool(offset @ np.linalg.solve(own[:2, :2], offset) > _GATES[2])
+
+
+def _doubted(belief: Belief, event: MeasurementEvent) -> Array:
+    """The covariance of a pose from outside, before its first image: one that lies unlikely far
+    off claims too much, and is as uncertain as it is off.
+    """
+    covariance, offset = belief.covariance.copy(), event.value - belief.mean[: event.value.size]
+    offset[YAW:] = wrap_angle(offset[YAW:])
+    for part in (slice(X, YAW), slice(YAW, event.value.size)):
+        off, size = offset[part], len(offset[part])
+        both = covariance[part, part] + event.covariance[part, part]
+        if size and off @ np.linalg.solve(both, off) > _UNLIKELY[size]:
+            covariance[part, part] += float(off @ off) * np.eye(size)
+    return covariance
 
 
 def _confirmed(belief: Belief, event: MeasurementEvent) -> bool:

@@ -210,7 +210,8 @@ class SfaNode(LocalizationNode):
         if self.monitor(self._topic).used == 0:
             return _ERROR, 'no image has been usable', values
         if problem:
-            return _ERROR, problem, values
+            late = self._observer is not None and self._observer.watch.repeats
+            return _WARN if late else _ERROR, problem, values
         if novelty > NOVELTY_WARNING:
             return _WARN, 'images are unlike those of training', values
         return _OK, 'locating', values
