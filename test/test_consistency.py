@@ -64,6 +64,15 @@ def test_images_on_the_path_of_odometry_contradict_nothing():
         assert contradiction(seen(poses, places + noise(16, 0.1, seed), drawn)) == ''
 
 
+@pytest.mark.parametrize('jitter_m', [0.03, 0.1, 0.2])
+def test_images_of_a_standing_robot_whose_odometry_jitters_show_no_turned_camera(jitter_m):
+    for seed in range(200):
+        path, stands = noise(24, jitter_m, seed), np.full(24, 3 - 4j)
+        poses = np.column_stack([path.real, path.imag, np.zeros(24)])
+        found = contradiction(seen(poses, stands + noise(24, 0.1, seed + 1000), np.full(24, 2.0)))
+        assert 'look' not in found
+
+
 def test_a_third_of_wrong_images_contradict_nothing():
     poses, places, yaws = bend()
     places[::3] += 5.0

@@ -60,6 +60,8 @@ PULLED, PULLED_M, RELEASED = 0.6, 0.3, 0.5
 """Mean offset, in standard deviations and in m, from which the estimate is not trusted, and the
 part of both below which it is again. One that follows its images is nearer, in any light: after
 slip, offsets of 0.9 standard deviations were 0.1 m."""
+LEAST_FACTOR = 0.05
+"""Least factor by which images of a standing robot are taken to move beside its odometry."""
 LEAST_APART_M = 0.1
 """Standard deviation of images about the odometry's path of which none is sure to be less."""
 _HEADING_DRIFT_RAD = 0.05  # of odometry over the window
@@ -186,13 +188,16 @@ def compared(
     agree = square <= AGREEING_VARIANCES
     if agree.mean() < AGREEING_HALF:
         return 'images and odometry show different motions', (math.sqrt(np.mean(apart**2)), 0.0)
-    # Neighboring images err alike, over about a meter.
-    dependence = max(1.0, len(recent) / (1 + span_m))
+    # Neighboring images err alike, over about a meter: those of a robot that stands, all of them.
+    extent_m = min(2 * float(np.abs(path - path.mean()).max()), span_m)
+    dependence = max(1.0, len(recent) / (1 + extent_m))
     factor, spread = _stretch(path[agree], places[agree], variance[agree], dependence)
     stretch, std = abs(factor) - 1, math.sqrt(spread + ODOMETRY_DRIFT**2)
     if abs(stretch) > max(STRETCHED, CHANCE_STDS * std):
         shown = f'images move {abs(factor):.1f} times as far as the odometry'
         return shown, (abs(stretch) * span_m, 0.0)
+    # Images that hardly move show no direction.
+    spread /= max(abs(factor), LEAST_FACTOR) ** 2
     return _turned(recent, agree, float(np.angle(turn)), spread, stds)
 
 
