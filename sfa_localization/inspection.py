@@ -20,6 +20,7 @@ from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.turns import VisualGyro
+from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Odometry, Stamps
@@ -49,6 +50,8 @@ SAMPLES = 16
 """Images on the contact sheet: as many as can be seen at once."""
 SAMPLE_SIDE = 640
 """Longer side of an image on the contact sheet (pixels)."""
+REPEATED = 0.05
+"""Share of images that repeat the one before that is worth a word."""
 STANDING_M = 0.02
 """Images nearer to each other than this (m) were taken standing."""
 GRID = 100
@@ -292,7 +295,7 @@ class _Survey:
         self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
         self._motion: list[tuple[int, Any]] = []
         self._turned: list[tuple[int, float]] = []
-        self._gyro = VisualGyro()
+        self._gyro, self._frozen, self._repeats = VisualGyro(), FrozenWatch(), 0
         self._sizes: dict[tuple[int, ...], int] = {}
         self._samples: list[Image] = []
         self._streams: list[Stream] = []
@@ -325,6 +328,7 @@ class _Survey:
         Returns how far images have turned so far, rad.
         """
         image = decoding.image_of(message)
+        self._repeats += not self._frozen.add(image)
         number = sum(self._sizes.values())
         self._sizes[image.shape[:2]] = self._sizes.get(image.shape[:2], 0) + 1
         if number % self._every == 0 and len(self._samples) < SAMPLES:
@@ -352,6 +356,8 @@ class _Survey:
         if self._image and stream.topic == self._image and len(self._sizes) > 1:
             sizes = ', '.join(f'{w}x{h}' for h, w in self._sizes)
             yield f'images of several sizes: {sizes}'
+        if stream.topic == self._image and self._repeats > REPEATED * report.recorded:
+            yield f'{self._repeats} of {report.recorded} images repeat the one before'
 
     def images(self) -> ImageTopic | None:
         if not self._samples:

@@ -166,11 +166,24 @@ def test_pauses_sizes_and_faulty_messages_are_problems(tmp_path: Path) -> None:
         for index in range(20):
             at = START + index * STEP + (10**10 if index > 9 else 0)
             width = 60 if index % 5 else 80
-            bag.image('/panorama', at, np.zeros((8, width, 3), np.uint8), 'camera')
+            bag.image('/panorama', at, np.full((8, width, 3), index, np.uint8), 'camera')
             bag.odometry('/odom', 0 if index == 3 else at, (0, 0, 0), (0, 0), (0, 0))
     problems = {topic.name: topic.problems for topic in inspect(tmp_path / 'bag').topics}
     assert problems['/panorama'] == ['pause of 10.2 s', 'images of several sizes: 80x8, 60x8']
     assert problems['/odom'] == ['1 of 20 messages: zero or negative stamp', 'pause of 10.2 s']
+
+
+@pytest.mark.parametrize(
+    ('each', 'problems'), [(1, []), (2, ['10 of 20 images repeat the one before'])]
+)
+def test_images_that_a_driver_sends_twice_are_counted(
+    each: int, problems: list[str], tmp_path: Path
+) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index in range(20):
+            image = np.full((8, 60, 3), index // each, np.uint8)
+            bag.image('/panorama', START + index * STEP, image, 'camera')
+    assert inspect(tmp_path / 'bag').topics[0].problems == problems
 
 
 def test_what_is_unusual_about_odometry_is_a_problem(tmp_path: Path) -> None:
