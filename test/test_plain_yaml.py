@@ -19,6 +19,8 @@ from sfa_localization.data.plain_yaml import load_yaml
 BOMB = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'{new}: &{new} [{", ".join([f"*{old}"] * 9)}]\n' for old, new in pairwise('abcdefghi')
 )
+TOO_DEEP = 'nested deeper than 32|maximum nesting depth'
+"""The second from libyaml 0.2.6 on, which reads ahead and stops at 1000 levels."""
 HOSTILE = {
     'alias bomb': (BOMB, 'more than 500000 values'),
     'alias of itself': ('a: &a [*a]', "alias 'a' stands for itself"),
@@ -27,12 +29,13 @@ HOSTILE = {
     'hexadecimal number': (f'a: 0x{"f" * 5000}', 'a number of 5002 characters'),
     'tagged number': (f'a: !!int "{"9" * 5001}"', 'a number of 5001 characters'),
     'sexagesimal number': ('a: 1' + ':59' * 500, 'a number of 1501 characters'),
-    'brackets': ('a: ' + '[' * 30_000, 'nested deeper than 32'),
-    'closed brackets': ('a: ' + '[' * 30_000 + ']' * 30_000, 'nested deeper than 32'),
-    'braces': ('{a: ' * 5000, 'nested deeper than 32'),
+    'few brackets': ('a: ' + '[' * 40 + ']' * 40, 'nested deeper than 32'),
+    'brackets': ('a: ' + '[' * 30_000, TOO_DEEP),
+    'closed brackets': ('a: ' + '[' * 30_000 + ']' * 30_000, TOO_DEEP),
+    'braces': ('{a: ' * 5000, TOO_DEEP),
     'indentation': (
         ''.join(f'{" " * i}a:\n' for i in range(100)),
-        'nested deeper than 32',
+        TOO_DEEP,
     ),
     'the same key twice': ('a: 1\nb: 2\na: 3', "the key 'a' twice, again in line 3"),
     'the same key below': ('a:\n  b: 1\n  b: 2', "the key 'b' twice, again in line 3"),
