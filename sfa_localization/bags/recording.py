@@ -55,10 +55,14 @@ def recorded_files(path: Path) -> list[Path]:
     """The files of the bag at a path that is a folder or a metadata.yaml; any other path alone."""
     folder = path.parent if path.name == METADATA else path
     try:
-        names = os.listdir(folder)
+        return [folder / name for name in _bag_files(folder)] + [folder / METADATA]
     except OSError:
         return [path]
-    return [folder / name for name in names if name == METADATA or name.endswith(SUFFIXES)]
+
+
+def _bag_files(folder: Path) -> list[str]:
+    """Names of the files of a folder that can be of a bag. Raises OSError."""
+    return [name for name in os.listdir(folder) if name.endswith(SUFFIXES)]
 
 
 @dataclass
@@ -156,7 +160,7 @@ class Recording:
     def _found(self) -> list[str]:
         """Names of the bag files in the folder. Raises BagError."""
         try:
-            return [file.name for file in self.path.iterdir() if file.name.endswith(SUFFIXES)]
+            return _bag_files(self.path)
         except OSError as error:
             raise BagError(f'{self.path}: cannot be read: {error.strerror}') from None
 
