@@ -434,6 +434,22 @@ def test_images_without_odometry_are_skipped_and_counted(
     }
 
 
+@pytest.mark.parametrize(('distinct', 'used'), [(False, [0, 1, 2, 3, 4, 5]), (True, [0, 3, 5])])
+def test_learning_leaves_out_images_that_repeat_the_one_before(
+    distinct: bool, used: list[int], tmp_path: Path
+) -> None:
+    """A driver that was late sends an old image with a new stamp: it shows another place."""
+    path = tmp_path / 'bag'
+    with BagWriter(path) as bag:
+        for index, shown in enumerate((0, 0, 0, 3, 3, 0)):
+            bag.image('/image', stamp(index), image(shown), 'camera')
+            bag.odometry('/odom', stamp(index), pose(index), (1, 0), (0, 0))
+    run = load_run(path, cache=tmp_path / 'cache', distinct=distinct)
+    assert run.panoramas.stamps_ns.tolist() == [stamp(i) for i in used]
+    skipped = {'image repeats the one before': 3} if distinct else {}
+    assert run.counts['images'].as_dict() == {'used': len(used), 'skipped': skipped}
+
+
 @pytest.mark.parametrize(('tolerance', 'used'), [(0.05, IMAGES // 2), (0.1, IMAGES - 1)])
 def test_odometry_tolerance_is_an_argument(
     tolerance: float, used: int, tmp_path: Path, messages: list[Message]

@@ -100,8 +100,13 @@ def read_drives(
     *,
     strict: bool = False,
 ) -> tuple[Run, ...]:
-    """Read different drives with panoramas of one size. Raises BagError or DataError."""
-    runs = tuple(read_drive(bag, cache, recipe, progress, strict=strict) for bag in bags)
+    """Read different drives to learn from, with panoramas of one size.
+
+    Images that repeat the one before are left out. Raises BagError or DataError.
+    """
+    runs = tuple(
+        read_drive(bag, cache, recipe, progress, strict=strict, distinct=True) for bag in bags
+    )
     for k, run in enumerate(runs):
         for other in runs[:k]:
             if _same_recording(run, other):
@@ -145,6 +150,7 @@ def read_drive(
     want_truth: bool = False,
     strict: bool = False,
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
+    distinct: bool = False,
 ) -> Run:
     """Read one bag as a run of panoramas; raw camera images are unwrapped. Raises BagError."""
     with progress_bar(f'read {Path(bag).name}', shown=progress) as bar:
@@ -163,6 +169,7 @@ def read_drive(
             strict=strict,
             config=recipe.bag,
             odometry_tolerance_s=odometry_tolerance_s,
+            distinct=distinct,
         )
 
 

@@ -20,6 +20,7 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Count, Image, Odometry, PanoramaArray, Run, Stamps
@@ -43,17 +44,19 @@ def load_run(
     strict: bool = False,
     config: BagConfig | None = None,
     odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
+    distinct: bool = False,
 ) -> Run:
     """Read a drive in one pass; its images go to a file in the folder `cache`, which is yours.
 
     `unwrap` makes panoramas of images that are none yet. `progress` is called with the numbers of
     images (done, total). Without `want_truth` no topic of true poses is even opened. Images
     farther than `odometry_tolerance_s` from odometry (0: outside all of it), or of another size
-    than the first, are skipped and counted. Raises BagError.
+    than the first, are skipped and counted; where only `distinct` ones are wanted, also those that
+    repeat the one before, which was taken elsewhere. Raises BagError.
     """
     with Bag(path, strict=strict, config=config) as bag:
         loader = _Loader(bag, topics or TopicNames(), want_truth, odometry_tolerance_s)
-        run = loader.load(Path(cache), unwrap, progress)
+        run = loader.load(Path(cache), _Decoder(unwrap, distinct), progress)
         for problem in bag.problems:
             logger.warning('%s: %s', path, problem)
     return run
@@ -143,11 +146,11 @@ class _Loader:
             return False
         return bool(found)
 
-    def load(self, cache: Path, unwrap: Unwrap | None, progress: Progress | None) -> Run:
+    def load(self, cache: Path, decoder: _Decoder, progress: Progress | None) -> Run:
         try:
             with PanoramaFile(cache, self._bag.path.name) as file:
                 images = self._bag.stream(
-                    self._image_topic, lambda m: file.check_size(_panorama(m, unwrap))
+                    self._image_topic, lambda m: file.check_size(decoder.panorama(m))
                 )
                 self._read(images, file, progress)
                 odometry = self._bag.to_odometry(
@@ -197,9 +200,17 @@ class _Loader:
         )
 
 
-def _panorama(message: Any, unwrap: Unwrap | None) -> Image:
-    """The image of a message as a panorama. Raises LocalizationError."""
-    image = decoding.image_of(message)
-    if unwrap is None or looks_like_panorama(*image.shape[:2]):
+class _Decoder:
+    """Makes panoramas of messages."""
+
+    def __init__(self, unwrap: Unwrap | None, distinct: bool) -> None:
+        self._unwrap, self._watch = unwrap, FrozenWatch() if distinct else None
+
+    def panorama(self, message: Any) -> Image:
+        """The image of a message as a panorama. Raises LocalizationError."""
+        image = decoding.image_of(message)
+        if self._unwrap is not None and not looks_like_panorama(*image.shape[:2]):
+            image = self._unwrap(image)
+        if self._watch is not None and not self._watch.add(image):
+            raise MessageError('image repeats the one before')
         return image
-    return unwrap(image)
