@@ -24,7 +24,7 @@ from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import listed, short_line
 from sfa_localization.data.run import Stamps, Trajectory, integrate
 from sfa_localization.fusion.inputs import POSITION_STD, read_twist
-from sfa_localization.fusion.log_noise import EXPECTED, NEARLY_WHITE, Learned, Log, Noise, learn
+from sfa_localization.fusion.log_noise import EXPECTED, Learned, Log, Noise, learn
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
@@ -314,7 +314,7 @@ def _remarks(found: Learned, position_std: float) -> tuple[str, ...]:
     share = f', {noise.share:.0%} of the variance alike over {noise.distance_m:.1f} m'
     said = [
         f'learned from the log: positions err by {position_std:.2f} m'
-        + (share if float(noise.share) > 5 * NEARLY_WHITE else ''),
+        + (share if float(noise.share) > 0 else ''),
         f'noise of the odometry: speed {noise.speed:.2g}, slip {noise.slip:.2g}, '
         f'turn {noise.turn:.2g} of the expected',
     ]

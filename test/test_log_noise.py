@@ -11,7 +11,6 @@ from sfa_localization.cli import main
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
 from sfa_localization.fusion.inputs import RATE_STD_FLOOR
-from sfa_localization.fusion.log_noise import NEARLY_WHITE
 from sfa_localization.fusion.motion import ODOMETRY_CORRELATION_S
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -58,7 +57,7 @@ def test_stated_variances_that_are_right_stay():
     drive = Drive(seconds=200, rate_hz=10, every=5, **USUAL)
     fit = filtering.fitted(*tables(drive), FilterConfig())
     assert position_std(fit) == pytest.approx(0.2, rel=0.1)
-    assert fit.correlation.share < 2 * NEARLY_WHITE
+    assert fit.correlation.share == 0.0
     assert np.array_equal(fit.odometry.columns['v'], drive.read[:, 0])
 
 
@@ -70,13 +69,13 @@ def test_errors_that_neighbors_share_are_found():
     assert 0.3 < fit.correlation.distance_m < 1.3
 
 
-def test_a_small_share_that_neighbors_have_in_common_is_expected_where_the_log_suggests_it():
+def test_a_small_share_that_neighbors_have_in_common_is_found_and_none_where_there_is_none():
     shares = []
     for share in (0.0, 0.15):
         drive = Drive(seconds=300, rate_hz=10, every=5, share=share, length=1.0,
                       **{**USUAL, 'position_std': 0.2})  # fmt: skip
         shares.append(float(filtering.fitted(*tables(drive), FilterConfig()).correlation.share))
-    assert shares[0] < 2 * NEARLY_WHITE and shares[1] > 3 * NEARLY_WHITE
+    assert shares[0] == 0.0 and shares[1] == pytest.approx(0.15, abs=0.08)
 
 
 @pytest.mark.parametrize('walk', [0.05, 0.15])

@@ -23,7 +23,6 @@ from sfa_localization.config import load_changes, write_config
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import Odometry, integrate
-from sfa_localization.fusion.log_noise import NEARLY_WHITE
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.tuning import TuneConfig
 
@@ -162,5 +161,5 @@ def _drive(odometry: Table, positions: Table) -> TuningDrive:
     return tuning.TuningDrive(
         Odometry(stamps_ns, integrate(stamps_ns, twists), twists, variances),
         tuning.ImagePoses(positions.stamps_ns, values, covariances),
-        correlation=ErrorCorrelation(NEARLY_WHITE),
+        correlation=ErrorCorrelation(0.0),
     )

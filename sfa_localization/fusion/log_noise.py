@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit, logit
 
 from sfa_localization.data.geometry import SPOT_RADIUS_M, Array
 from sfa_localization.data.run import Stamps, integrate
@@ -38,8 +39,6 @@ from sfa_localization.fusion.settings import FilterConfig
 
 MOST_POSITIONS = 2000
 """Of more, so many are taken, evenly: they determine the noise well enough."""
-NEARLY_WHITE = 0.01
-"""Share of the positions' errors that neighbors have in common, as is expected of most logs."""
 LAGS_S = np.linspace(-1.0, 1.0, 21)
 """Delays of the motion behind the odometry's stamps for which it is tabulated, s."""
 _OUTLIERS = 0.02
@@ -62,8 +61,9 @@ class Noise(NamedTuple):
     """What a log suffers from; numbers, or arrays (C,) of trials.
 
     `turn`, `speed` and `slip` are factors on the standard deviations of the odometry, `position`
-    that on those of the positions. Of their errors, `share` is common to positions close together,
-    and fades over `distance_m`. The motion is `lag_s` behind the odometry's stamps.
+    that on those of the positions. Of their variance, `share` is common to positions close
+    together, and fades over `distance_m`; it is 0 where the errors are white. The motion is `lag_s`
+    behind the odometry's stamps.
     """
 
     turn: Array
@@ -83,15 +83,7 @@ class _Scale(NamedTuple):
     std: float
 
 
-def _logit(share: Array) -> Array:
-    return np.asarray(np.log(share / (1 - share)))
-
-
-def _expit(logit: Array) -> Array:
-    return np.asarray(1 / (1 + np.exp(-logit)))
-
-
-EXPECTED = Noise(*map(np.array, (1.0, 1.0, 1.0, 1.0, NEARLY_WHITE, 1.0, 0.0)))
+EXPECTED = Noise(*map(np.array, (1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0)))
 """The noise that the parameters suppose, with white errors of positions."""
 # Odometry may be several times better or worse than the parameters suppose; stated variances of
 # positions are mostly right; real wheels lag behind their readings by up to half a second.
@@ -100,16 +92,17 @@ _SCALES = {
     'speed': _Scale(np.log, np.exp, 1.5),
     'slip': _Scale(np.log, np.exp, 1.0),
     'position': _Scale(np.log, np.exp, 0.5),
-    'share': _Scale(_logit, _expit, 2.0),
-    'distance_m': _Scale(np.log, np.exp, 0.5),
+    'share': _Scale(logit, expit, 1.5),
+    'distance_m': _Scale(np.log, np.exp, 1.0),
     'lag_s': _Scale(np.asarray, np.asarray, 0.25),
 }
 _NAMES = Noise._fields
-_CORRELATED = ('share', 'distance_m')
-# Over which small shares fade shows in no log.
-_UNKNOWN = frozenset(['distance_m'])
-# Shares and distances (m) from which correlated errors are sought.
-_SHARED_STARTS = [(share, distance) for share in (0.3, 0.7, 0.9) for distance in (0.3, 1.0)]
+_STDS = np.array([scale.std for scale in _SCALES.values()])
+# Errors are white, or else neighbors share some of them: usually half of the variance, over 1 m.
+_CORRELATED = frozenset(['share', 'distance_m'])
+_SHARED = {'share': np.array(0.5), 'distance_m': np.array(1.0)}
+# Shares and distances (m) from which shared errors are sought.
+_SHARED_STARTS = [(share, distance) for share in (0.1, 0.4, 0.8) for distance in (0.3, 1.0)]
 # Odometry noisier than expected by more than this factor is no odometry: then it is rather the
 # positions that are worthless.
 _LARGEST = 10.0
@@ -199,17 +192,20 @@ def learn(log: Log, config: FilterConfig, start: Noise, held: frozenset[str]) ->
 
     Factors are those of the mean variance, not of the likeliest: where the log determines them
     poorly, too little noise does more harm than too much. A lag within its uncertainty is none.
+    Errors of positions are white, or shared by neighbors, whichever the log makes likelier.
     """
     log = log.thinned()
     drive = _Drive(log, config)
-    found = _Search(drive, start, held | _UNKNOWN).best()
+    white = held | _CORRELATED
+    found = _Search(drive, start, white).best()
     after = _Drive(log.held_forward(), config)
     prompt = found._replace(noise=found.noise._replace(lag_s=np.array(0.0)))
     other = min(_likelihood_cost(one, after) for one in (found, prompt))
     if other < _likelihood_cost(found, drive) - _FORWARD_GAIN:
-        drive, found = after, _Search(after, start, held | _UNKNOWN).best()
+        drive, found = after, _Search(after, start, white).best()
     forward = drive is after
-    found = _correlated(drive, found, start, held)
+    shared = _Search(drive, start._replace(**_SHARED), held, found.heads).best(found.noise)
+    found = min(found, shared, key=lambda one: one.improbability)
     return Learned(found.settled(), forward, found.cost, drive.fits(_likelihood_cost(found, drive)))
 
 
@@ -219,31 +215,17 @@ def _likelihood_cost(found: _Found, drive: _Drive) -> float:
     return float(drive.costs(trial, found.heads)[0, 0])
 
 
-def _correlated(drive: _Drive, found: _Found, start: Noise, held: frozenset[str]) -> _Found:
-    """The noise with correlated errors, where the log clearly shows them, else that `found`.
-
-    A large share and its distance have to raise the log-likelihood by the logarithm of the
-    positions' number, as two numbers have to (Bayesian information criterion).
-    """
-    known = {name: getattr(found.noise, name) for name in _NAMES if name not in _CORRELATED}
-    near = start._replace(**known)
-    starts = [near._replace(share=np.array(s), distance_m=np.array(d)) for s, d in _SHARED_STARTS]
-    trials = Noise(*(np.array([getattr(one, name) for one in starts]) for name in _NAMES))
-    costs = drive.costs(trials, found.heads)[:, 0]
-    best = int(np.argmin(costs))
-    if costs[best] > found.cost:
-        return found
-    shared = _Search(drive, starts[best], held, found.heads).best()
-    return shared if shared.cost < found.cost - math.log(len(drive.log.places)) else found
-
-
 class _Found(NamedTuple):
     """A most probable noise (numbers), its cost, its standard deviations on _SCALES by name, and
     the start heading (1,).
+
+    `improbability` is the negative logarithm of the evidence for its kind of noise, by Laplace's
+    method: a kind with more free numbers has to explain so much more.
     """
 
     noise: Noise
     cost: float
+    improbability: float
     stds: dict[str, float]
     heads: Array
 
@@ -267,7 +249,7 @@ class _Search:
     ) -> None:
         self._drive, self._heads = drive, heads
         self._free = [i for i, name in enumerate(_NAMES) if name not in held]
-        self._sigma = np.array([scale.std for scale in _SCALES.values()])[self._free]
+        self._sigma = _STDS[self._free]
         pairs = zip(_SCALES.values(), start, strict=True)
         self._origin = np.array([float(scale.to(np.asarray(v, float))) for scale, v in pairs])
 
@@ -284,9 +266,12 @@ class _Search:
         likelihood = self._drive.costs(self.noises(units), self._heads)
         return np.asarray(likelihood + (units**2).sum(1)[:, None] / 2)
 
-    def best(self) -> _Found:
-        """Search from the best of a few starts, with the likeliest heading."""
-        trials = self._starts()
+    def best(self, near: Noise | None = None) -> _Found:
+        """Search from the best of a few starts, with the likeliest heading.
+
+        `near`: a noise with white errors, to which shared ones are added.
+        """
+        trials = self._starts() if near is None else self._shared_starts(near)
         table = self.costs(trials)
         first, head = np.unravel_index(int(np.argmin(table)), table.shape)
         unit, self._heads = trials[first], self._heads[head : head + 1]
@@ -300,11 +285,13 @@ class _Search:
             costs = self.costs(along)[:, 0]
             if costs.min() > value - _ENOUGH:
                 break
-            unit = along[int(np.argmin(costs))]
+            unit, value = along[int(np.argmin(costs))], float(costs.min())
+        improbability = value + float(np.log(curvature).sum()) / 2
         stds = self._sigma * np.sqrt((axes**2 / curvature).sum(1))
         noise = Noise(*(np.asarray(values[0]) for values in self.noises(unit[None])))
         names = [_NAMES[i] for i in self._free]
-        return _Found(noise, value, dict(zip(names, stds.tolist(), strict=True)), self._heads)
+        known = dict(zip(names, stds.tolist(), strict=True))
+        return _Found(noise, value, improbability, known, self._heads)
 
     def _starts(self) -> Array:
         """Trials (C, F) over _GRID, as far as its numbers are free."""
@@ -313,6 +300,14 @@ class _Search:
             if _NAMES.index(name) in self._free:
                 trials[:, self._free.index(_NAMES.index(name))] = np.array(_GRID)[:, k]
         return np.unique(trials, axis=0)
+
+    def _shared_starts(self, near: Noise) -> Array:
+        """Trials (C, F) beside a noise, over _SHARED_STARTS."""
+        noises = [near._replace(share=np.array(share), distance_m=np.array(distance))
+                  for share, distance in _SHARED_STARTS]  # fmt: skip
+        pairs = zip(_SCALES.values(), zip(*noises, strict=True), strict=True)
+        moved = np.column_stack([scale.to(np.array(values, float)) for scale, values in pairs])
+        return np.asarray(((moved - self._origin) / _STDS)[:, self._free])
 
     def _derivatives(self, at: Array) -> tuple[float, Array, Array]:
         """Value, gradient (F,) and Hessian (F, F) by differences, all trials in one pass."""
