@@ -23,7 +23,15 @@ def received(times):
     return np.maximum.accumulate(times + late) + 1e-6 * np.arange(len(times))
 
 
-@pytest.mark.parametrize('stamped', [bursts, received])
+def stalled(times):
+    """Stamps s of odometry of which 0.4 s arrive together, 0.1 ms apart, every second."""
+    count = np.arange(len(times))
+    held = (times % 1.0) > 0.6
+    end = np.floor(times) + 1.0
+    return np.where(held, end - 1e-4 * (1 + 50 - count % 50), times)
+
+
+@pytest.mark.parametrize('stamped', [bursts, received, stalled])
 def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
     """The poses show how far it was, whatever the stamps; images come at 8 Hz in between."""
     drive, fused, errors = Drive(seconds=20, omega_std=0.01, v_std=0.02), PoseFilter(), []
@@ -43,3 +51,15 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
         if t > 8.0:
             assert fused.status.level is Level.LOCALISED
     assert max(errors) < 0.1
+
+
+def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
+    """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
+    drive, fused = Drive(seconds=10), PoseFilter()
+    times = stalled(np.arange(len(drive.stamps_ns)) / 50.0)
+    speeds = []
+    for t, pose in zip(times.tolist(), drive.reckoned, strict=True):
+        fused.add_odometry(START_NS + round(t * 1e9), 0.0, 0.0, (0.0, 0.0), pose)
+        belief = fused._history.newest
+        speeds.append(belief.twist.v)
+    assert max(speeds) < 2.5

@@ -139,6 +139,40 @@ def test_a_bag_that_loops_starts_the_filter_anew(seconds):
     assert looped.status.level is Level.LOCALISED
 
 
+@pytest.mark.parametrize('back_s', [0.83, 1.71, 2.303])
+def test_a_clock_that_goes_back_by_less_than_the_history_starts_the_filter_anew(back_s):
+    drive, fused = Drive(seconds=20), known()
+    sure = []
+    for stamp_ns, kind, index in drive.events():
+        after_s = (stamp_ns - START_NS) * 1e-9 - 10.0
+        if after_s >= 0:
+            stamp_ns -= round(back_s * 1e9)
+        if kind == 0:
+            fused.add_odometry(stamp_ns, *drive.read[index], drive.variances())
+        else:
+            fused.add_measurement(stamp_ns, drive.seen[index], drive.covariance(True))
+        if 0 <= after_s < 1 and fused.status.level is Level.LOCALISED:
+            sure.append(after_s)
+    assert max(sure) < 0.1
+    assert fused.counts['clock went back'] == 1
+    assert fused.status.level is Level.LOCALISED
+    assert drive.error(fused, -1)[0] < 0.05
+
+
+@pytest.mark.parametrize('held_s', [0.5, 2.0])
+def test_odometry_that_was_held_up_does_not_come_once_more(held_s):
+    drive, fused, ordered = Drive(seconds=12), known(), known()
+    held = [event for event in drive.events() if 0 <= (event[0] - START_NS) * 1e-9 - 6 < held_s]
+    prompt = [event for event in drive.events() if event not in held]
+    cut = next(i for i, event in enumerate(prompt) if event[0] > held[-1][0] + SECOND)
+    for event in prompt[:cut] + held + prompt[cut:]:
+        drive.give(fused, event)
+    for event in drive.events():
+        drive.give(ordered, event)
+    assert fused.counts['clock went back'] == 0
+    assert np.abs(ordered.state.mean - fused.state.mean).max() < 1e-9
+
+
 def test_one_stamp_far_ahead_does_no_harm():
     drive = Drive(seconds=4)
     fused = known()

@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +46,8 @@ AHEAD_COUNT = 3
 used where no odometry comes between them, which then has ended."""
 BACKWARD_COUNT = 5
 """Odometry messages in a row that are too late until the clock is taken to have gone back."""
+AGAIN_NS = 300_000_000
+"""Time that odometry has to cover once more until the clock is taken to have gone back."""
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
@@ -98,6 +101,7 @@ class PoseFilter:
         self._history = self._fresh(self._rules.recovery.blank(0))
         self._suspect_late(Arrivals())
         self._backward = 0
+        self._again = _NEVER
         self._ahead = (0, 0)
         self._apart = (0, 0)
         self._alone = 0
@@ -154,6 +158,7 @@ class PoseFilter:
         try:
             twist = read_twist(v, omega, variances, self.config)
             self._require_place(stamp_ns, _ODOMETRY)
+            self._notice_again(stamp_ns)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
@@ -329,6 +334,8 @@ class PoseFilter:
 
     def _apart_in_time(self) -> list[str]:
         """How images and odometry are apart in time, beyond what `CameraClock` measures."""
+        if self._again.among > 1:
+            return ['odometry is stamped with times that it had passed: did the clock go back?']
         count, apart_ns = self._apart
         if count >= AHEAD_COUNT:
             where = 'ahead of' if apart_ns > 0 else 'behind'
@@ -410,10 +417,42 @@ class PoseFilter:
             self._backward += 1
         if self._backward < BACKWARD_COUNT:
             raise DataError(reason)
+        self._go_back(stamp_ns)
+
+    def _notice_again(self, stamp_ns: int) -> None:
+        """Odometry that covers once more, in order, what other odometry covered before it, means
+        that the clock went back; what fills a hole, or comes out of order, was held up.
+        """
+        newest_ns, again = self._history.newest.odometry_ns, self._again
+        if newest_ns is None or stamp_ns > newest_ns:
+            self._again = _NEVER
+        elif stamp_ns < again.last_ns or again is _NEVER:
+            self._again = _Again(0, stamp_ns, stamp_ns)
+        else:
+            passed = (self._history.before(stamp_ns).odometry_ns or 0) > again.last_ns
+            self._again = _Again(again.among + passed, again.first_ns, stamp_ns)
+            if self._again.among >= BACKWARD_COUNT and stamp_ns - again.first_ns >= AGAIN_NS:
+                self._go_back(stamp_ns)
+
+    def _go_back(self, stamp_ns: int) -> None:
+        """Start anew, at a stamp, on a clock that went back."""
         self.counts['clock went back'] += 1
         self.reset()
         if self._waiting is not None:
             self._begin(stamp_ns)
+
+
+class _Again(NamedTuple):
+    """Odometry in a row that is no newer than what came before it: how many of its messages lie
+    among those, and the first and last stamp.
+    """
+
+    among: int
+    first_ns: int
+    last_ns: int
+
+
+_NEVER = _Again(0, 0, 0)
 
 
 def _finite(pose: Sequence[float] | Array | None) -> tuple[float, float, float] | None:

@@ -18,8 +18,9 @@ COAST_S = 2.0
 """Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
 _BRIDGED_S = 10.0
 """A longer silence is not bridged by the twist after it: most of it was spent somehow else."""
-_MOMENT_S = 0.05
-"""Motion that odometry's poses show between messages stamped almost together took about so long."""
+_STALL_S = 0.5
+"""Motion that odometry's poses show between messages stamped almost together, as after a stall of
+the network, took about so long at most."""
 _SUDDEN_V, _SUDDEN_OMEGA = 0.3, 0.3
 """A mean twist between two poses that differs from the reading by more than the reading itself and
 this, m/s and rad/s, was faster or slower only by its stamps."""
@@ -155,13 +156,15 @@ def _remaining(belief: Belief, event: OdometryEvent, whole: Twist, dt: float) ->
 
 def _lately(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> Twist:
     """The twist to go on with after an interval: messages stamped almost together, or long after
-    each other, show no speed.
+    each other, show no speed, but their readings do, unless they are not filled.
     """
     sudden_v = abs(whole.v - reading.v) > abs(reading.v) + _SUDDEN_V
     sudden_omega = abs(whole.omega - reading.omega) > abs(reading.omega) + _SUDDEN_OMEGA
     if not (sudden_v or sudden_omega):
         return whole
-    before, new = belief.twist, -math.expm1(-seconds / _MOMENT_S)
+    if reading.v or reading.omega:
+        return reading
+    before, new = belief.twist, -math.expm1(-seconds / _STALL_S)
     return whole._replace(
         v=before.v + new * (whole.v - before.v),
         omega=before.omega + new * (whole.omega - before.omega),
