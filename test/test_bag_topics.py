@@ -445,6 +445,33 @@ def test_a_pose_that_is_never_kept_is_summed_up_from_the_twist(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
+    ('askew', 'axle', 'found'),
+    [
+        (0.0, 0.0, ''),
+        (0.0, 0.4, ''),  # a frame that is not on the axle swings in turns
+        (math.pi, 0.0, ''),  # always backward
+        (0.5, 0.0, r'/odom: poses drive 4[0-9.]+ m sideways and 7[0-9.]+ m ahead: only'),
+        (math.pi / 2, 0.0, r'/odom: poses drive 8[0-9.]+ m sideways and [0-9.e-]+ m ahead: only'),
+    ],
+)
+def test_robots_that_drive_sideways_are_named(
+    askew: float, axle: float, found: str, tmp_path: Path
+) -> None:
+    """A circle of 2 m at 1 m/s, headed `askew` off the motion, seen `axle` m ahead of the axle."""
+
+    def pose(k: int) -> tuple[float, float, float]:
+        yaw = 0.5 * k * PERIOD * 1e-9
+        x, y = 2 * math.sin(yaw), 2 * (1 - math.cos(yaw))
+        return x + axle * math.cos(yaw), y + axle * math.sin(yaw), yaw + askew
+
+    path = drive_bag(tmp_path / 'bag', pose, (round(math.cos(askew), 3), 0.5))
+    with Bag(path) as bag:
+        bag.odometry()
+        assert len(bag.problems) == bool(found)
+        assert not found or re.match(found, bag.problems[0])
+
+
+@pytest.mark.parametrize(
     ('twist', 'pose_turns', 'found'),
     [
         ((1.0, 0.5), 1.0, ''),

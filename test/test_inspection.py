@@ -69,6 +69,12 @@ def line(share: float) -> tuple[float, float]:
     return 30 * share, 0.0
 
 
+def ahead(route: Route, share: float) -> float:
+    """The heading along a route, rad."""
+    moved = np.subtract(route(share + 1e-4), route(share))
+    return float(np.arctan2(moved[1], moved[0]))
+
+
 def write(
     path: Path,
     route: Route = star,
@@ -86,7 +92,9 @@ def write(
             picture = rng.integers(0, 2 * brightness + 1, (*shape, 3), np.uint8)
             bag.image('/panorama', at, picture, 'camera')
             if share <= odometry_until:
-                bag.odometry('/odom', at, (*route(share), 0.0), (speed, 0.0), (0.0, 0.0))
+                bag.odometry(
+                    '/odom', at, (*route(share), ahead(route, share)), (speed, 0.0), (0.0, 0.0)
+                )
     return path
 
 

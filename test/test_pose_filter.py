@@ -596,7 +596,9 @@ def test_malformed_odometry_is_counted_and_changes_nothing(v, omega, reason):
     assert fused.counts[f'odometry: {reason}'] == 1 and snapshot(fused) == before
 
 
-@pytest.mark.parametrize('variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e300)])
+@pytest.mark.parametrize(
+    'variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e300), (1e3, 1e3)]
+)
 def test_unusable_variances_give_way_to_the_configured_ones(variances):
     fused, plain = known(), known()
     drive = Drive(seconds=2)

@@ -24,6 +24,10 @@ _COMPARED_S, _COUNTED = 1.0, 0.05
 stands for long adds up noise."""
 _ENOUGH, _UNEQUAL = 3.0, 1.5
 """From such a sum on (m, rad) a larger factor between them is none of wheels or of sampling."""
+_SLIGHT_TURN_RAD = 1.0
+"""Where a robot turns by less between two poses, its chord shows where it was heading."""
+_ASIDE = 0.25
+"""So much of the way ahead no robot slips sideways, nor does one whose frame is not on its axle."""
 
 
 def _stamps(values: StampedValues) -> Stamps:
@@ -82,6 +86,21 @@ def disagreement(odometry: Odometry) -> str:
         least, most = sorted([by_pose, by_twist])
         if by_twist > 0 and most > _ENOUGH and most > _UNEQUAL * least:
             return f'poses {verb} {by_pose:.3g} {unit}, twists {by_twist:.3g} {unit}'
+    return ''
+
+
+def sideways(odometry: Odometry) -> str:
+    """How far poses drive sideways, in words; '' where they drive ahead or back, as wheels do."""
+    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
+    at = np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
+    step = relative(odometry.poses[at[:-1]], odometry.poses[at[1:]])
+    half = step[:, 2] / 2
+    chord = step[:, 0] + 1j * step[:, 1]
+    counted = (np.abs(chord) > _COUNTED) & (np.abs(half) < _SLIGHT_TURN_RAD / 2)
+    moved = (chord * np.exp(-1j * half))[counted]
+    ahead, aside = np.abs(moved.real).sum(), np.abs(moved.imag).sum()
+    if aside > _ENOUGH and aside > _ASIDE * ahead:
+        return f'poses drive {aside:.3g} m sideways and {ahead:.3g} m ahead'
     return ''
 
 

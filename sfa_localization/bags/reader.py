@@ -21,6 +21,7 @@ from sfa_localization.bags.motion_arrays import (
     StampedValues,
     disagreement,
     is_pose_constant,
+    sideways,
     to_odometry,
     to_trajectory,
     to_yaw_rate,
@@ -210,6 +211,9 @@ class Bag:
             odometry = replace(odometry, poses=poses)
         elif differing := disagreement(odometry):
             text = f'{stream.topic}: {differing}: are both in meters, radians and seconds?'
+            self.recording.problems.append(text)
+        elif aside := sideways(odometry):
+            text = f'{stream.topic}: {aside}: only motion ahead is used; is the heading right?'
             self.recording.problems.append(text)
         if resets:
             text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'

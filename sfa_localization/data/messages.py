@@ -20,6 +20,8 @@ _LARGEST = 1e9
 """No robot reaches this number of m, rad, m/s or rad/s: such a field was never set."""
 LARGEST_VARIANCE = 1e6
 """Drivers mark an unknown variance by numbers as large as this (SI units); so do the nodes."""
+LARGEST_TWIST_VARIANCE = 1e2
+"""The same of speeds and turn rates: nothing is known of one that may be off by 10 m/s or rad/s."""
 _SHORTEST_QUATERNION = 1e-3
 """A shorter quaternion has no direction; normalized ones have length 1."""
 
@@ -77,5 +79,5 @@ def require_sane(name: str, *numbers: float) -> None:
 
 
 def _variance(value: float) -> float:
-    """A variance, or 0 (unknown) where the message holds an impossible one."""
-    return float(value) if math.isfinite(value) and 0 < value < LARGEST_VARIANCE else 0.0
+    """A variance of a twist, or 0 (unknown) where the message holds an impossible one."""
+    return float(value) if math.isfinite(value) and 0 < value < LARGEST_TWIST_VARIANCE else 0.0

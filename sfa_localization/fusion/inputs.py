@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.messages import LARGEST_VARIANCE
+from sfa_localization.data.messages import LARGEST_TWIST_VARIANCE, LARGEST_VARIANCE
 from sfa_localization.fusion.motion import Twist
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -54,7 +54,7 @@ def read_twist(
 
 
 def _variance(claimed: float, factor: float, floor: float, default: float) -> float:
-    if not (math.isfinite(claimed) and 0 < claimed < LARGEST_VARIANCE):
+    if not (math.isfinite(claimed) and 0 < claimed < LARGEST_TWIST_VARIANCE):
         return default**2
     return max(factor * float(claimed), floor**2)
 
