@@ -66,6 +66,17 @@ def test_dead_reckoning_is_the_integral_of_the_odometry():
     assert np.allclose(fused.state.pose, drive.poses[-1], atol=1e-9)
 
 
+@pytest.mark.parametrize('askew', [0.0, math.pi / 2, -2.0])
+def test_odometry_whose_pose_is_headed_off_its_motion_gives_way_to_its_twist(askew):
+    """As of a pose in another frame than the twist, from the start or after a reset."""
+    drive, fused = Drive(seconds=10), known()
+    for i, stamp_ns in enumerate(drive.stamps_ns.tolist()):
+        x, y, yaw = drive.reckoned[i].tolist()
+        pose = (x, y, float(wrap_angle(yaw + askew)))
+        fused.add_odometry(stamp_ns, *drive.read[i], drive.variances(), pose)
+    assert np.allclose(fused.state.pose, drive.poses[-1], atol=1e-3)
+
+
 # Delay and order.
 
 

@@ -56,6 +56,7 @@ STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
 _JUMP_M, _JUMP_RAD = 0.3, 0.5  # a pose that moves this far beyond its twist was reset
+_ASKEW_M = 2e-3  # a pose moves less than this sideways by its rounding
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
 _DIAGONAL = np.arange(SIZE)
 
@@ -180,10 +181,29 @@ def twist_between(
 ) -> Twist:
     """The mean twist from pose to pose, with the variances of a reading."""
     turn = wrap(after[2] - before[2])
-    half, heading = turn / 2, before[2] + turn / 2
-    chord = (after[0] - before[0]) * math.cos(heading) + (after[1] - before[1]) * math.sin(heading)
+    half, (chord, _) = turn / 2, _chord(before, after)
     arc = chord * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
     return reading._replace(v=arc / seconds, omega=turn / seconds)
+
+
+def is_askew(
+    before: tuple[float, float, float],
+    after: tuple[float, float, float],
+    seconds: float,
+    reading: Twist,
+) -> bool:
+    """Whether a pose moved more sideways than ahead while its twist drove: its heading is off."""
+    ahead, aside = _chord(before, after)
+    return abs(aside) > max(abs(ahead), _ASKEW_M) and abs(reading.v) * seconds > abs(aside) / 2
+
+
+def _chord(
+    before: tuple[float, float, float], after: tuple[float, float, float]
+) -> tuple[float, float]:
+    """How far one pose lies ahead and to the left of another, by the mean of their headings."""
+    heading = before[2] + wrap(after[2] - before[2]) / 2
+    dx, dy, c, s = after[0] - before[0], after[1] - before[1], math.cos(heading), math.sin(heading)
+    return dx * c + dy * s, dy * c - dx * s
 
 
 def moved_on(

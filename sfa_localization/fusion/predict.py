@@ -136,9 +136,12 @@ class Prediction:
 
 def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist) -> Twist | None:
     """The mean twist since the last reading by the odometry's own poses, where it is possible."""
-    if belief.odometry_pose is None or event.pose is None:
+    before, after = belief.odometry_pose, event.pose
+    if before is None or after is None:
         return None
-    return motion.twist_from_poses(belief.odometry_pose, event.pose, seconds, fastest)
+    if seconds <= ODOMETRY_TIMEOUT_S and motion.is_askew(before, after, seconds, event.twist):
+        return None
+    return motion.twist_from_poses(before, after, seconds, fastest)
 
 
 def _remaining(belief: Belief, event: OdometryEvent, whole: Twist, dt: float) -> Twist:
