@@ -53,6 +53,22 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
     assert max(errors) < 0.1
 
 
+def test_images_stamped_with_the_odometry_after_a_stall_belong_where_they_came():
+    """A delay of 20 ms would put an image before all that came together, 0.4 m away."""
+    drive, fused = Drive(seconds=20, omega_std=0.01, v_std=0.02, every=7), PoseFilter()
+    errors = []
+    fused.expect_delay(0.02)
+    times = stalled(np.arange(len(drive.stamps_ns)) / 50.0)
+    for i, t in enumerate(times.tolist()):
+        stamp_ns = START_NS + round(t * 1e9)
+        fused.add_odometry(stamp_ns, *drive.read[i], drive.variances(), drive.reckoned[i])
+        if i in drive.pictures:
+            pose, covariance = drive.poses[i], np.diag([0.0025, 0.0025, 0.0004])
+            assert fused.add_measurement(stamp_ns + 50_000, pose, covariance).accepted
+            errors.append(math.hypot(*(fused.state.pose - pose)[:2]))
+    assert max(errors) < 0.1
+
+
 def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
     """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
     drive, fused = Drive(seconds=10), PoseFilter()

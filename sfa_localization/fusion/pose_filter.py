@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.fusion import motion
 from sfa_localization.fusion.arrivals import Arrivals
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
@@ -54,6 +55,8 @@ DELAY_LIMIT_NS = 500_000_000
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
 _EXPECTED_STD_S = 0.05
+# More motion than twice that of the speed, and this, is that of longer than the stamps say.
+_JUMP_M, _JUMP_RAD = 0.05, 0.05
 _ODOMETRY, _POSE, _MEASUREMENT = range(3)
 
 
@@ -252,7 +255,26 @@ class PoseFilter:
         delay_ns = self._camera.clock_at(stamp_ns).delay_ns
         if abs(delay_ns) > DELAY_LIMIT_NS:
             raise DataError('clocks of camera and odometry are more than 0.5 s apart')
-        return max(stamp_ns - delay_ns, 1)
+        taken_ns = max(stamp_ns - delay_ns, 1)
+        return stamp_ns if self._stalled_between(taken_ns, stamp_ns) else taken_ns
+
+    def _stalled_between(self, taken_ns: int, stamp_ns: int) -> bool:
+        """Whether the odometry of a delay shows far more motion than it takes, after a silence in
+        which it shows far less, as where a network that stalled hands over all at once: then the
+        order of the stamps says more than the delay.
+        """
+        a, b = self._history.before(taken_ns), self._history.before(stamp_ns)
+        if b.odometry_ns is None or b.odometry_ns <= taken_ns:
+            return False
+        delay_s, silent_s = (stamp_ns - taken_ns) * 1e-9, (taken_ns - a.stamp_ns) * 1e-9
+        moved = math.dist(a.dead_reckoned[:2], b.dead_reckoned[:2])
+        turned = abs(motion.wrap(b.dead_reckoned[2] - a.dead_reckoned[2]))
+        pairs = (moved, _JUMP_M, a.twist.v, b.twist.v), (turned, _JUMP_RAD, a.omega, b.omega)
+        return any(
+            way > 2 * max(abs(before), abs(after)) * delay_s + jump
+            or abs(before) * silent_s > way + jump
+            for way, jump, before, after in pairs
+        )
 
     def _time_noise(self, taken_ns: int, stamp_ns: int, value: Array) -> Array:
         """Covariance that a moving robot's pose has because the image's time is uncertain."""

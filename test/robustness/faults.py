@@ -179,6 +179,20 @@ def received(message, rng):
     return [dataclasses.replace(message, at_ns=at_ns, stamp_ns=at_ns)]
 
 
+def stalled(world, rng):
+    """All is stamped when it arrives over a network that now and then stalls, for up to 0.6 s."""
+    begins_s = np.cumsum(rng.uniform(0.6, 4.0, round(world.seconds(world.times_ns)[-1])))
+    ends_s = begins_s + rng.uniform(0.1, 0.6, len(begins_s))
+    last_s, sent = 0.0, []
+    for message in sorted(messages(world), key=lambda message: message.at_ns):
+        at_s = float(world.seconds(message.at_ns))
+        held_s = ends_s[(begins_s <= at_s) & (at_s < ends_s)]
+        last_s = max(at_s, last_s + 1e-4, *held_s)
+        at_ns = int(world.times_ns[0]) + round(last_s * SECOND_NS)
+        sent.append(dataclasses.replace(message, at_ns=at_ns, stamp_ns=at_ns))
+    return sent
+
+
 def doubled(message, _):
     return [message, dataclasses.replace(message, at_ns=message.at_ns + SECOND_NS // 10)]
 
@@ -201,6 +215,7 @@ enter_all({
 enter_all({
     'odometry sent in bundles': changed(Reading, bundled, 0.0, NEVER),
     'odometry stamped on reception': changed(Reading, received, 0.0, NEVER),
+    'all stamped on reception, with stalls': stalled,
 }, ends_s=NEVER)  # fmt: skip
 
 
@@ -351,6 +366,12 @@ enter_all({
 enter_all(
     {f'all clocks step {s:+g} s': stamped(s, (Picture, Reading), FROM_S) for s in (-100, -3, 3)},
     ends_s=FROM_S,
+)
+# Three messages pass before odometry of times that have passed is no accident.
+enter_all(
+    {'all clocks step -1.71 s': stamped(-1.71, (Picture, Reading), FROM_S)},
+    ends_s=FROM_S,
+    allowed_s=0.1,
 )
 
 
