@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, compose, invert, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, differences, integrate
@@ -73,8 +74,7 @@ def disagreement(odometry: Odometry) -> str:
 
     Twists may lag, and average over any time; one that is always 0 claims nothing.
     """
-    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
-    at = np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
+    seconds, at = _by_second(odometry)
     twisted = integrate(odometry.stamps_ns, odometry.twists)
     turned = np.cumsum(odometry.twists[1:, 1] * np.diff(seconds))
     turned = np.concatenate([[0.0], turned])[at]
@@ -89,10 +89,15 @@ def disagreement(odometry: Odometry) -> str:
     return ''
 
 
+def _by_second(odometry: Odometry) -> tuple[Array, NDArray[np.int64]]:
+    """Seconds (N,) since the first message, and indices of the first one in each _COMPARED_S."""
+    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
+    return seconds, np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
+
+
 def sideways(odometry: Odometry) -> str:
     """How far poses drive sideways, in words; '' where they drive ahead or back, as wheels do."""
-    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
-    at = np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
+    _, at = _by_second(odometry)
     step = relative(odometry.poses[at[:-1]], odometry.poses[at[1:]])
     half = step[:, 2] / 2
     chord = step[:, 0] + 1j * step[:, 1]

@@ -56,7 +56,7 @@ _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
 _EXPECTED_STD_S = 0.05
 # More motion than twice that of the speed, and this, is that of longer than the stamps say.
-_JUMP_M, _JUMP_RAD = 0.05, 0.05
+_STALL_M, _STALL_RAD = 0.05, 0.05
 _ODOMETRY, _POSE, _MEASUREMENT = range(3)
 
 
@@ -269,7 +269,7 @@ class PoseFilter:
         delay_s, silent_s = (stamp_ns - taken_ns) * 1e-9, (taken_ns - a.stamp_ns) * 1e-9
         moved = math.dist(a.dead_reckoned[:2], b.dead_reckoned[:2])
         turned = abs(motion.wrap(b.dead_reckoned[2] - a.dead_reckoned[2]))
-        pairs = (moved, _JUMP_M, a.twist.v, b.twist.v), (turned, _JUMP_RAD, a.omega, b.omega)
+        pairs = (moved, _STALL_M, a.twist.v, b.twist.v), (turned, _STALL_RAD, a.omega, b.omega)
         return any(
             way > 2 * max(abs(before), abs(after)) * delay_s + jump
             or abs(before) * silent_s > way + jump
