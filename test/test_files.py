@@ -251,6 +251,22 @@ def test_no_output_replaces_what_is_read(command, tmp_path, monkeypatch, capsys)
     assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == before
 
 
+@pytest.mark.parametrize(
+    'command',
+    ['inspect bag --report', 'evaluate none.npz bag --report', 'train bag --output a.npz --report'],
+)
+@pytest.mark.parametrize(
+    ('place', 'words'), [('bag', 'is a bag'), ('bag/metadata.yaml', 'is no folder')]
+)
+def test_no_report_is_written_into_a_bag(command, place, words, tmp_path, monkeypatch, capsys):
+    shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
+    before = sorted(tmp_path.rglob('*'))
+    monkeypatch.chdir(tmp_path)
+    assert main([*command.split(), place]) == 1
+    assert f'{place}: {words}' in capsys.readouterr().err
+    assert sorted(tmp_path.rglob('*')) == before
+
+
 def test_an_output_beside_the_files_of_a_bag_is_written(tmp_path):
     bag = shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
     for _ in range(2):

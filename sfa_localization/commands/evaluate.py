@@ -15,6 +15,7 @@ from sfa_localization.commands.options import (
     add_topics,
     recipe,
     require_read_only,
+    require_report,
     require_same_panorama,
     settings,
 )
@@ -64,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         read = arguments.model, arguments.bag, *arguments.align, arguments.config
         require_read_only([arguments.json], read)
+    require_report(arguments.report)
     model = PlaceModel.load(arguments.model)
     require_same_panorama(arguments.config, model.panorama)
     result = evaluation.evaluate(

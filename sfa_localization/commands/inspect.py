@@ -15,6 +15,7 @@ from sfa_localization.commands.options import (
     add_settings,
     add_topics,
     require_read_only,
+    require_report,
     settings,
 )
 from sfa_localization.data.errors import BagError
@@ -50,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
     if arguments.json:
         require_read_only([arguments.json], arguments.bags)
+    require_report(arguments.report)
     reports = []
     for path in arguments.bags:
         try:

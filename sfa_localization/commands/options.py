@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.config import SECTIONS, load_settings
-from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.files import require_outputs
 from sfa_localization.data.settings import Settings
 
@@ -34,6 +34,18 @@ def require_read_only(outputs: Iterable[Path], inputs: Iterable[Path | None]) ->
     from sfa_localization.bags.recording import recorded_files
 
     require_outputs(outputs, [file for path in inputs if path for file in recorded_files(path)])
+
+
+def require_report(folder: Path | None) -> None:
+    """Raise LocalizationError before the work where a report cannot have its folder."""
+    from sfa_localization.bags.recording import METADATA
+
+    if folder is None:
+        return
+    if folder.exists() and not folder.is_dir():
+        raise LocalizationError(f'{folder}: is no folder: give --report another name')
+    if (folder / METADATA).exists():
+        raise LocalizationError(f'{folder}: is a bag: give --report a folder of its own')
 
 
 def add_settings(

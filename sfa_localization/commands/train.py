@@ -16,6 +16,7 @@ from sfa_localization.commands.options import (
     given,
     recipe,
     require_read_only,
+    require_report,
     require_same_panorama,
     settings,
 )
@@ -62,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
     require_read_only([arguments.output], [*arguments.bags, arguments.config])
+    require_report(arguments.report)
     if arguments.update:
         return _update(arguments)
     from sfa_localization import training
