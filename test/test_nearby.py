@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.features.keyframes import normalized, spectrum
-from sfa_localization.features.nearby import place_among, turned
+from sfa_localization.features.nearby import Nearby, averaged, place_among, turned
 
 ROWS = 8
 SIZES = pytest.mark.parametrize('columns', [60, 61])
@@ -170,3 +170,16 @@ def test_a_place_beside_all_keyframes_is_seen_to_be():
         for at in ((0.0, 0.0), (0.5, 0.0), (1.5, 0.0))
     )
     assert inside < 0.2 and 0.5 < border < 0.9 and outside > 0.9
+
+
+@pytest.mark.parametrize('apart', [0.0, 0.4])
+def test_drives_that_put_an_image_apart_make_its_place_uncertain(apart):
+    """Along the axis on which they differ, and less where one of them is known to be poor."""
+    left = np.zeros((ROWS, 6), np.complex64)
+    noise = np.diag([0.01, 0.02])
+    parts = [Nearby(np.array([x, 1.0]), 0.0, 0.2, noise, 0.1, 0.0, left) for x in (0.0, apart)]
+    alike = averaged(parts, [2.0, 2.0])
+    assert np.allclose(alike.place, [apart / 2, 1.0])
+    assert np.allclose(alike.noise, noise + np.diag([(apart / 2) ** 2, 0.0]))
+    mostly = averaged(parts, [99.0, 1.0])
+    assert np.allclose(mostly.noise, noise + np.diag([0.0099 * apart**2, 0.0]))

@@ -233,7 +233,7 @@ def place_among(
 
 def averaged(parts: Sequence[Nearby], weights: Sequence[float]) -> Nearby:
     """The mean of what several drives say of one image, all with what is left of it, by weights
-    (N,).
+    (N,). Its noise grows by how far apart they put it: drives are shifted in a map they share.
     """
     share = np.array(weights) / np.sum(weights)
 
@@ -241,11 +241,13 @@ def averaged(parts: Sequence[Nearby], weights: Sequence[float]) -> Nearby:
         return np.tensordot(share, np.array(values), 1)
 
     left = [one.left for one in parts if one.left is not None]
+    place = mean([one.place for one in parts])
+    apart = np.array([one.place - place for one in parts])
     return Nearby(
-        mean([one.place for one in parts]),
+        place,
         float(mean([one.angle for one in parts])),
         float(mean([one.unlike for one in parts])),
-        mean([one.noise for one in parts]),
+        mean([one.noise for one in parts]) + (apart.T * share) @ apart,
         float(mean([one.variation for one in parts])),
         float(mean([one.aside for one in parts])),
         np.tensordot(share.astype(np.float32), np.array(left), 1),
