@@ -26,7 +26,7 @@ LAYERS = (
 ARCHITECTURE = Architecture(SIZE, SIZE, 'none', LAYERS)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Spheres:
     """Spheres at `places` (N, 2) m, of `heights` (N,) and `radii` (N,) m, `colors` (N, 3)."""
 
@@ -36,6 +36,7 @@ class Spheres:
     colors: np.ndarray
 
     @classmethod
+    @cache
     def about(cls, seed: int, count: int = 40, clear_m: float = 3.0) -> Spheres:
         rng = np.random.default_rng(seed)
         bearing, reach = rng.uniform(-np.pi, np.pi, count), rng.uniform(clear_m, 10.0, count)

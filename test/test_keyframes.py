@@ -3,6 +3,7 @@
 """Keyframes: found in any light, from any heading; unknown places are known to be unknown."""
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -49,6 +50,7 @@ def sunny(images: np.ndarray) -> np.ndarray:
     return (255 * (bright / 255) ** 1.6).astype(np.uint8)
 
 
+@cache
 def learnt(world: Spheres, config: PanoramaConfig = CONFIG) -> Keyframes:
     poses = drive()
     textures = np.stack([texture(image) for image in world.panoramas(poses, config)])

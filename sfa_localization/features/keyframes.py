@@ -453,6 +453,8 @@ class Keyframes:
         scatter = (offset * weight[:, None]).T @ offset
         covariance = np.zeros((3, 3))
         covariance[:2, :2] = self.noise.factor * (variance * np.eye(2) + found.noise + scatter)
+        # Left-out keyframes, which teach the factor, are in the light of a drive: it decides there.
+        covariance[:2, :2] += found.apart
         covariance[2, 2] = (self.noise.yaw_std * (1 + found.unlike)) ** 2 + float(weight @ apart)
         support = 0.0
         if guess is not None:

@@ -11,7 +11,7 @@ little to do with them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,7 @@ class Nearby:
     them is near, in any light. `aside` is how far the place is from the middle of them, of their
     mean distance: 0 among them, 0.64 at a straight border of theirs, 1 far beside all. `left`
     (rows, F) is the spectrum of what no place among them explains of the image; None unknown.
+    `apart` (2, 2) m^2 is how far apart several drives put it: in a map they are shifted.
     """
 
     place: Array
@@ -69,6 +70,7 @@ class Nearby:
     variation: float
     aside: float
     left: Spectra | None = None
+    apart: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
     @property
     def at_border(self) -> bool:
@@ -233,7 +235,7 @@ def place_among(
 
 def averaged(parts: Sequence[Nearby], weights: Sequence[float]) -> Nearby:
     """The mean of what several drives say of one image, all with what is left of it, by weights
-    (N,). Its noise grows by how far apart they put it: drives are shifted in a map they share.
+    (N,).
     """
     share = np.array(weights) / np.sum(weights)
 
@@ -247,10 +249,11 @@ def averaged(parts: Sequence[Nearby], weights: Sequence[float]) -> Nearby:
         place,
         float(mean([one.angle for one in parts])),
         float(mean([one.unlike for one in parts])),
-        mean([one.noise for one in parts]) + (apart.T * share) @ apart,
+        mean([one.noise for one in parts]),
         float(mean([one.variation for one in parts])),
         float(mean([one.aside for one in parts])),
         np.tensordot(share.astype(np.float32), np.array(left), 1),
+        (apart.T * share) @ apart,
     )
 
 
