@@ -14,12 +14,17 @@ from sfa_localization.fusion import consistency
 from sfa_localization.fusion.belief import COMPARED_IMAGES, Evidence, Trust
 from sfa_localization.fusion.consistency import (
     AGREEING_DISTANCE_M,
+    APART_M,
     FORGIVEN_M,
     LONGEST_M,
+    NOISIEST_TURNS,
     SPACING_M,
+    UNLIKE_M,
     WINDOW_M,
+    begun,
     contradiction,
     doubts,
+    hesitant,
     moved,
     pulled,
     watched,
@@ -325,6 +330,37 @@ def test_a_start_from_images_alone_is_confirmed_by_driving():
     assert {level for level, sure in zip(levels, confirmed, strict=True) if sure} == {
         Level.LOCALISED
     }
+
+
+@pytest.mark.parametrize('turn', [-0.4, 0.3])
+def test_images_of_a_robot_that_turned_otherwise_confirm_nothing_soon(turn):
+    """Both drive on, straight and as fast, for four meters more."""
+    own = np.tile([1.0, 0.0], (350, 1))
+    own[:150, 1] = turn
+    drive, other = Drive(twists=own, **NOISY), Drive(twists=np.tile([1.0, 0.0], (350, 1)), **NOISY)
+    drive.seen = other.seen + np.array([3.0, -2.0, 0.0])
+    assert all(status.level is not Level.LOCALISED for status, *_ in fed(drive))
+
+
+def test_contradictions_before_an_estimate_is_confirmed_put_that_off():
+    for trust, way_m in (
+        (compared(begun(10.0)), APART_M),
+        (compared(moved(Trust(), 10.0)), AGREEING_DISTANCE_M),
+    ):
+        assert hesitant(trust, 11.0, False, 1.0) == trust
+        trust = hesitant(trust, 11.0, True, 1.0)
+        assert doubts(trust, 11.0 + way_m - 0.1) != [] and doubts(trust, 11.0 + way_m) == []
+        assert hesitant(trust, 15.1, True, 1.0) == trust, 'confirmed before'
+
+
+def test_turns_that_no_wheels_explain_are_confirmed_over_a_longer_way_and_never_for_good():
+    trust = compared(moved(Trust(), 10.0))
+    unlike = hesitant(trust, 11.0, False, 1.1 * NOISIEST_TURNS)
+    assert doubts(unlike, 10.0 + UNLIKE_M - 0.1) != [] and doubts(unlike, 10.0 + UNLIKE_M) == []
+    again = hesitant(unlike, 30.0, True, 1.1 * NOISIEST_TURNS)
+    assert doubts(again, 30.0 + UNLIKE_M - 0.1) != []
+    moved_on = compared(moved(again, 31.0, 0.5, accepted_m=31.0))
+    assert doubts(moved_on, 31.0 + UNLIKE_M - 0.1) != []
 
 
 def test_a_start_that_was_given_needs_images_only():

@@ -38,7 +38,8 @@ class PoseEvent(NamedTuple):
 
 
 class MeasurementEvent(NamedTuple):
-    """A position (2,) or pose (3,) from an image, with its covariance.
+    """A position (2,) or pose (3,) from an image, with its covariance. `apart`: turns show another
+    time or robot.
 
     `jacobian` (2 or 3, 10) and `white`, the part of the noise that is this image's own, follow
     from the covariance: see update.measurement_event.
@@ -49,6 +50,7 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
+    apart: bool = False
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent
@@ -92,8 +94,9 @@ class Trust(NamedTuple):
 
     With a problem, `misfit` are the standard deviations (m, rad) by which they do. `moves` counts
     how often images moved the estimate elsewhere lately, `moved_m` is the distance traveled when
-    they did it last; until an image fits `confirming_m` later, `jump_m` is the standard deviation
-    of being wrong.
+    they did it last, and `contradicted_m` when they contradicted the motion since, before the
+    estimate was confirmed; until an image fits `confirming_m` later, `jump_m` is the standard
+    deviation of being wrong. `proven`: an estimate before the last move was confirmed.
     """
 
     recent: tuple[Evidence, ...] = ()
@@ -104,13 +107,20 @@ class Trust(NamedTuple):
     moved_m: float = 0.0
     confirming_m: float = 0.0
     jump_m: float = 0.0
+    contradicted_m: float = 0.0
+    proven: bool = False
+
+    @property
+    def since_m(self) -> float:
+        """The distance traveled from which on images confirm the estimate."""
+        return max(self.moved_m, self.contradicted_m)
 
     def unconfirmed(self, accepted_m: float) -> bool:
-        """Whether no image has fitted yet that far from where images moved the estimate, or those
-        since then could not be compared with the odometry's motion.
+        """Whether no image has fitted yet that far from where images moved the estimate, or
+        contradicted it, or those since then could not be compared with the odometry's motion.
         """
         unjudged = not self.judged and self.confirming_m > 0.0
-        return unjudged or accepted_m - self.moved_m < self.confirming_m
+        return unjudged or accepted_m - self.since_m < self.confirming_m
 
     def variances(self, accepted_m: float) -> tuple[float, float, float]:
         """Of x, y and yaw, on top, while the estimate is not trusted."""

@@ -45,6 +45,11 @@ twice what maps of noisy odometry show in places."""
 DOUBTED_STDS, YOUNG_M = 2.0, 4.0
 """The bar is lower once they did, and over this distance after a place has been confirmed: what
 images alone have shown so far may be wrong from the start."""
+APART_M = 2 * AGREEING_DISTANCE_M
+"""Distance that confirms an estimate for the first time after images that were apart in time."""
+NOISIEST_TURNS, UNLIKE_M = 6.0, 4 * AGREEING_DISTANCE_M
+"""Factor on the noise of turns that real wheels do not need, and the distance that confirms an
+estimate with such turns."""
 FORGIVEN_M, LONGEST_M = 30.0, 16.0
 """Distance after which an estimate that stayed counts as never moved, and the longest distance
 that must confirm one."""
@@ -87,6 +92,23 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
     return trust._replace(recent=recent, judged=judged, problem=problem, misfit=misfit, moves=moves)
 
 
+def hesitant(trust: Trust, traveled_m: float, apart: bool, turn_factor: float) -> Trust:
+    """The trust after another image: an estimate that is not confirmed yet is confirmed by what is
+    driven from where images contradict the motion no more; one that never was, after such as are
+    `apart` in time, over a longer way. It is longer still where turns of images and odometry differ
+    by a `turn_factor` times what is expected, more than wheels slip, and contradictions end any
+    confirmation then: images of another robot show such turns, and drive as straight as this one
+    for meters.
+    """
+    unlike = turn_factor > NOISIEST_TURNS
+    if not (unlike or trust.unconfirmed(traveled_m)):
+        return trust
+    if apart or trust.problem:
+        trust = trust._replace(contradicted_m=traveled_m)
+    longer_m = UNLIKE_M if unlike else APART_M if apart and not trust.proven else 0.0
+    return trust._replace(confirming_m=max(trust.confirming_m, longer_m))
+
+
 def moved(
     trust: Trust, traveled_m: float, jump_m: float = 0.0, accepted_m: float = math.inf
 ) -> Trust:
@@ -100,12 +122,14 @@ def moved(
     slipped = jump_m <= traveled_m - trust.moved_m + SLACK_M
     again = trust.moves == 0 or not (slipped and trust.unconfirmed(accepted_m))
     moves = trust.moves + int(again)
+    confirming_m = min(AGREEING_DISTANCE_M * 2.0 ** (moves - 1), LONGEST_M)
     return Trust(
         recent=trust.recent[-1:],
         moves=moves,
         moved_m=traveled_m,
-        confirming_m=min(AGREEING_DISTANCE_M * 2.0 ** (moves - 1), LONGEST_M),
+        confirming_m=confirming_m if again else max(confirming_m, trust.confirming_m),
         jump_m=min(WRONG_MOVE * jump_m, LARGEST_JUMP_M),
+        proven=trust.proven or not trust.unconfirmed(accepted_m),
     )
 
 
@@ -134,7 +158,7 @@ def doubts(trust: Trust, accepted_m: float, pull: Pull | None = None) -> list[st
     if pull is not None and pull.suspected:
         found.append(f'images lie {abs(pull.offset_m):.1f} m to one side of the estimate')
     if trust.unconfirmed(accepted_m):
-        since_m = accepted_m - trust.moved_m
+        since_m = max(accepted_m - trust.since_m, 0.0)
         times = f' {trust.moves} times in a row' if trust.moves > 1 else ''
         again = f' anew{times}' if trust.moves else ''
         found.append(f'placed{again}, confirmed over {since_m:.1f} m: driving on confirms it')

@@ -18,7 +18,7 @@ from sfa_localization.fusion.belief import (
     Pull,
     Update,
 )
-from sfa_localization.fusion.consistency import pulled, watched
+from sfa_localization.fusion.consistency import hesitant, pulled, watched
 from sfa_localization.fusion.evidence import (
     AGREEING_DISTANCE_M,
     FEW_IMAGES,
@@ -113,6 +113,8 @@ class Correction:
 
     def _fused(self, belief: Belief, event: MeasurementEvent) -> Belief:
         trust = watched(belief.memory.trust, evidence_of(belief, event, accepted=False))
+        apart = event.apart or (belief.lateness is not None and belief.lateness.suspected)
+        trust = hesitant(trust, belief.traveled_m, apart, belief.turn_factor)
         period_s = _period_s(belief.memory, event.stamp_ns)
         memory = belief.memory._replace(trust=trust, period_s=period_s)
         belief = belief._replace(memory=memory)

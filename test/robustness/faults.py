@@ -25,6 +25,8 @@ DOWN_S = 2.0
 """A node that was killed is back after so many seconds."""
 STANDING_HZ = 5
 """Rate of pictures where the robot stands."""
+LAP = 0.5
+"""Of the drive, which is two laps."""
 ONE_IMAGE_S = 0.25
 """By rounding, another machine may reject an image earlier or later."""
 SLIP_S, DARK_S = 8.0, 4.0
@@ -320,6 +322,20 @@ enter_all({
     f'images {name}, from the start': pictures_changed(PICTURES[name], 0.0)
     for name in ALSO_FROM_START
 })  # fmt: skip
+enter_all(
+    {
+        f'images of another robot, {part:g} of the lap ahead': pictures_changed(
+            lambda pictures, i, _, part=part: pictures[
+                (i + int(part * LAP * len(pictures))) % len(pictures)
+            ],
+            0.0,
+            NEVER,
+        )
+        for part in (0.3, 0.6)
+    },
+    ends_s=NEVER,
+    allowed_s=CONSISTENT_LIE_S,
+)
 enter_all({'images damaged': changed(Picture, damaged)})
 STANDING = {
     'camera frozen': (0.0,),
