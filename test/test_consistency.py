@@ -423,6 +423,17 @@ def test_a_kidnapped_robot_is_trusted_again_after_two_meters():
     assert wrong_and_sure(found) <= 2  # until a third image does not match
 
 
+@pytest.mark.parametrize(('wrong', 'doubted'), [(8, 5), (2, 0)])
+def test_after_images_that_did_not_match_one_that_does_is_not_enough(wrong, doubted):
+    drive = Drive(seconds=30, **NOISY)
+    drive.seen[150 : 150 + wrong, :2] += np.random.default_rng(0).uniform(1.5, 3.0, (wrong, 2))
+    levels = [status.level for status, *_ in fed(drive)][149 : 150 + wrong + 8]
+    assert levels[0] is Level.LOCALISED
+    after = levels[1 + wrong :]
+    assert set(after[: max(doubted - 1, 0)]) <= {Level.DEGRADED}
+    assert set(after[doubted:]) == {Level.LOCALISED}
+
+
 def test_a_start_that_was_wrong_is_trusted_again_after_two_meters():
     drive = Drive(seconds=20, **NOISY)
     drive.seen[0, :2] += 6.0

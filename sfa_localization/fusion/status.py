@@ -7,6 +7,7 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -107,7 +108,7 @@ def _weakness(state: State, config: FilterConfig) -> list[str]:
 
 def _rejections(belief: Belief) -> list[str]:
     """What the last images say, where they were not fused."""
-    reasons, images, update = [], belief.memory.rejected, belief.memory.update
+    reasons, images, update = [], _unmatched(belief), belief.memory.update
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
     if images >= _few(belief):
         one = 'an image did not match'
@@ -115,6 +116,20 @@ def _rejections(belief: Belief) -> list[str]:
     if update is not None and not update.accepted and update.d2 <= update.threshold:
         reasons.append('images lie far from the estimate: others must confirm them')
     return reasons
+
+
+def _unmatched(belief: Belief) -> int:
+    """How many images in a row did not match: lately or, where they were enough to overrule the
+    estimate, until as many in a row match again.
+    """
+    rejected = belief.memory.rejected
+    newest_first = groupby(item.accepted for item in reversed(belief.memory.evidence))
+    runs = [(fits, len([*images])) for fits, images in newest_first]
+    if runs and not runs[0][0]:
+        runs = runs[1:]
+    if len(runs) > 1 and runs[0][1] < ENOUGH_IMAGES <= runs[1][1]:
+        return max(rejected, runs[1][1])
+    return rejected
 
 
 def _missing(belief: Belief) -> str:
