@@ -194,9 +194,9 @@ class PoseFilter:
         if len(fused) == 3:
             self._watch.add_seen(Seen(stamp_ns, float(fused[2]), float(noise[2, 2])))
         noise = noise + self._time_noise(taken_ns, stamp_ns, fused)
-        event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         # What arrives late is suspected of its arrival alone: that contradicts no motion.
-        event = event._replace(apart=self._off and not self._arrivals.late_s)
+        apart = self._off and not self._arrivals.late_s
+        event = measurement_event(taken_ns, fused, noise, self.correlation.share, apart)
         update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
         assert update is not None
         if update.reason == 'restarted elsewhere':

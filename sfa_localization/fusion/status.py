@@ -124,12 +124,10 @@ def _unmatched(belief: Belief) -> int:
     """
     rejected = belief.memory.rejected
     newest_first = groupby(item.accepted for item in reversed(belief.memory.evidence))
-    runs = [(fits, len([*images])) for fits, images in newest_first]
-    if runs and not runs[0][0]:
-        runs = runs[1:]
-    if len(runs) > 1 and runs[0][1] < ENOUGH_IMAGES <= runs[1][1]:
-        return max(rejected, runs[1][1])
-    return rejected
+    runs = ((fits, len([*images])) for fits, images in newest_first)
+    matching = next((count for fits, count in runs if fits), 0)
+    _, before = next(runs, (False, 0))
+    return max(rejected, before) if matching < ENOUGH_IMAGES <= before else rejected
 
 
 def _missing(belief: Belief) -> str:

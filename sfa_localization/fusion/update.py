@@ -63,7 +63,7 @@ _NOT_SEEN_BY_POSITION = tuple(sorted({*range(SIZE)} - {*_SEEN_BY_POSITION}))
 
 
 def measurement_event(
-    stamp_ns: int, value: Array, covariance: Array, share: float
+    stamp_ns: int, value: Array, covariance: Array, share: float, apart: bool = False
 ) -> MeasurementEvent:
     """A position (2,) or pose (3,), its covariance split into what neighboring images share.
 
@@ -72,7 +72,7 @@ def measurement_event(
     size = len(value)
     jacobian = _OBSERVED[:size].copy()
     jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
-    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
+    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance, apart)
 
 
 class Correction:
