@@ -76,10 +76,22 @@ def status_of(
 
 
 def _few(belief: Belief) -> int:
-    """How many rejected images in a row are no outliers; of slow cameras the first counts."""
+    """How many rejected images in a row are no outliers; of slow cameras the first counts, and one
+    that lies so far off that the estimate would be LOST if it is right.
+    """
     memory = belief.memory
+    if _lies_far(belief):
+        return 1
     lately = _silent_s(belief, memory.accepted_ns) < NOTICED_S
     return FEW_IMAGES if memory.support >= FEW_IMAGES and lately else 1
+
+
+def _lies_far(belief: Belief) -> bool:
+    update = belief.memory.update
+    if update is None or update.innovation is None or belief.memory.gate_excess <= LOST_EXCESS:
+        return False
+    x, y, *yaw = update.innovation.tolist()
+    return math.hypot(x, y) > LOST_M or any(abs(turn) > LOST_RAD for turn in yaw)
 
 
 def uncertainty(state: State, config: FilterConfig) -> list[str]:
