@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, signal, stats
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.bags.reader import Bag
@@ -339,24 +339,42 @@ def calibration(
 ) -> dict[str, Any]:
     """Shares of the errors that regions of 95 % hold: `within_95` of the positions' ellipses,
     `yaw_within_95` of the headings' intervals; and `nees`, the normalized squared error of the
-    positions over its expectation: 1 where covariances are right.
+    positions over its expectation. `nees_right` [low, high] holds it on 95 % of drives with right
+    covariances: neighboring errors are alike, so that one drive shows few of them.
 
     `covariances` (N, 3, 3) of [x, y, yaw] are in the map, `turn` (2, 2) rotates it to the truth.
     """
     mask = known(truth, estimate.stamps_ns)
     if not mask.any():
-        return {'within_95': None, 'yaw_within_95': None, 'nees': None}
+        return dict.fromkeys(('within_95', 'yaw_within_95', 'nees', 'nees_right'))
     apart = estimate.poses[mask] - truth.at(estimate.stamps_ns[mask])
     offset, covariances = apart[:, :2] @ turn, covariances[mask]
-    solved = np.linalg.solve(covariances[:, :2, :2], offset[:, :, None])[:, :, 0]
-    squares = (offset * solved).sum(1)
+    roots = np.linalg.cholesky(covariances[:, :2, :2])
+    normalized = np.linalg.solve(roots, offset[:, :, None])[:, :, 0]
+    squares = (normalized**2).sum(1)
+    freedom = 2 * _independent(normalized)
     yaw = wrap_angle(apart[:, 2]) ** 2 / covariances[:, 2, 2]
     yaw = yaw[np.isfinite(yaw)]
     return {
         'within_95': float((squares <= stats.chi2.ppf(0.95, 2)).mean()),
         'yaw_within_95': float((yaw <= stats.chi2.ppf(0.95, 1)).mean()) if len(yaw) else None,
         'nees': float(squares.mean() / 2),
+        'nees_right': (stats.chi2.ppf((0.025, 0.975), freedom) / freedom).tolist(),
     }
+
+
+def _independent(normalized: Array) -> float:
+    """How many independent squares are worth those of errors (N, 2) that neighbors share.
+
+    A mean of squares of Gaussian errors with correlation r(lag) varies as that of
+    N / sum of r(lag)^2 independent ones; r counts as far as it is positive.
+    """
+    count = len(normalized)
+    lagged = (signal.correlate(one, one, method='fft')[count - 1 :] for one in normalized.T)
+    shared: Array = np.sum([*lagged], axis=0)
+    fades = np.flatnonzero(shared <= 0)
+    shared = shared[: fades[0]] if len(fades) else shared
+    return count / (1 + 2 * float(((shared[1:] / shared[0]) ** 2).sum())) if len(shared) else count
 
 
 def _false_localised_s(replay: _Replay, ekf: Trajectory) -> float:

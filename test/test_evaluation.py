@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from picture_readers import PictureReader, Recording
+from scipy import signal
 
 from sfa_localization import evaluation, tuning
 from sfa_localization.bags.settings import TopicNames
@@ -168,6 +169,34 @@ def test_regions_of_95_percent_hold_what_they_say_in_a_turned_map():
     assert sure['within_95'] < 0.4 and sure['yaw_within_95'] < 0.6 and sure['nees'] > 8
     unturned = evaluation.calibration(truth, estimate, rotation(0.0), claimed)
     assert unturned['within_95'] < 0.7
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.9, 0.98])
+def test_errors_that_neighbors_share_leave_the_squared_error_of_a_drive_uncertain(memory):
+    """The range holds 95 % of drives with right covariances, whose errors fade exponentially."""
+    drives, count, inside, widths = 300, 1000, 0, []
+    rng = np.random.default_rng(3)
+    fresh = np.sqrt(1 - memory**2) * rng.normal(size=(drives, count, 2))
+    fresh[:, 0] = rng.normal(size=(drives, 2))
+    errors = signal.lfilter([1.0], [1.0, -memory], fresh, axis=1)
+    stamps, still = np.arange(count) * 100_000_000, np.zeros((count, 3))
+    claimed = np.broadcast_to(np.eye(3), (count, 3, 3))
+    for error in errors:
+        estimate = Trajectory(stamps, np.column_stack([error, np.zeros(count)]))
+        found = evaluation.calibration(Trajectory(stamps, still), estimate, np.eye(2), claimed)
+        low, high = found['nees_right']
+        inside += low <= found['nees'] <= high
+        widths.append(high - low)
+    assert 0.88 < inside / drives < 0.99
+    shared = np.sum(memory ** (2 * np.abs(np.arange(-count, count)))) if memory else 1.0
+    assert np.median(widths) == pytest.approx(4 * np.sqrt(shared / count), rel=0.25)
+
+
+def test_exact_estimates_have_a_range_too():
+    truth = spread_out(4, np.zeros((2, 2)), count=50)[0]
+    claimed = np.broadcast_to(np.eye(3), (50, 3, 3))
+    low, high = evaluation.calibration(truth, truth, np.eye(2), claimed)['nees_right']
+    assert low < 1 < high
 
 
 def test_no_heading_and_no_truth_give_no_shares():

@@ -168,6 +168,12 @@ def trust_lines(scores: Scores) -> list[str]:
         shares = {'positions': one.get('within_95'), 'headings': one.get('yaw_within_95')}
         held = [f'{100 * share:.1f} % of {of}' for of, share in shares.items() if share]
         parts = [f'regions of 95 % hold {" and ".join(held)}'] if held else []
+        if one.get('nees') is not None:
+            low, high = one['nees_right']
+            parts.append(
+                f'squared errors are {one["nees"]:.2f} times the expected ones '
+                f'(on such a drive {low:.2f} to {high:.2f} where covariances are right)'
+            )
         best = one.get('similarity') or {}
         if best.get('mean') is not None:
             parts.append(f'scaled by {best["scale"]:.4f} it errs by {best["mean"]:.3f} m')
