@@ -25,9 +25,28 @@ for _number, _handler in (
         signal.signal(_number, _handler)
 
 
-def pytest_collection_modifyitems(items):
-    """Mark the tests that README.md names."""
+def pytest_addoption(parser):
+    """An option for environments in which the same tests run once more."""
+    parser.addoption(
+        '--one-each', action='store_true', help='run the first case only of tests with several'
+    )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(config, items):
+    """Mark the tests that README.md names; then, with --one-each, keep the first case of each test
+    that `-m` and `-k` have left.
+    """
     named = {test for tests in robustness_table().values() for test in tests}
     for item in items:
         if (item.path.name, getattr(item, 'originalname', item.name)) in named:
             item.add_marker(pytest.mark.robustness)
+    yield
+    if config.getoption('--one-each'):
+        first, others, seen = [], [], set()
+        for item in items:
+            test = item.nodeid.partition('[')[0]
+            (others if test in seen else first).append(item)
+            seen.add(test)
+        items[:] = first
+        config.hook.pytest_deselected(items=others)
