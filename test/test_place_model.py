@@ -260,6 +260,13 @@ class TestFile:
         saved.write_bytes(data[: int(len(data) * cut)])
         refused(saved, 'not a sfa_localization place model')
 
+    @pytest.mark.parametrize('part', [0.01, 0.5, 0.9])
+    def test_a_bit_is_wrong(self, saved, part):
+        data = bytearray(saved.read_bytes())
+        data[int(len(data) * part)] ^= 16
+        saved.write_bytes(data)
+        refused(saved, 'damaged.*: copy it again, or train it')
+
     @pytest.mark.parametrize(
         'name',
         [

@@ -73,6 +73,9 @@ def read_arrays(path: Path, kind: str, version: int, remedy: str) -> Arrays:
         intact = header.get(_CHECKSUM) == checksum(arrays, header)
     except _Unusable as error:
         raise ModelError(f'{path}: not a {kind} ({error}): {remedy}') from None
+    except zipfile.BadZipFile:  # a checksum of the zip, or its directory, is wrong
+        damaged = f'{path}: not a {kind}, or a damaged one: copy it again'
+        raise ModelError(f'{damaged}, or {remedy}') from None
     except Exception:  # zip, numpy and json fail in many ways on foreign bytes
         raise ModelError(f'{path}: not a {kind}: {remedy}') from None
     if found_kind != kind:
