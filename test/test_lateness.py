@@ -99,6 +99,68 @@ def test_a_delay_that_begins_is_measured_and_its_end_is_noticed(delay_s):
     assert all(late.apart < CLEARED for at_s, *_, late in found if at_s > 30.0)
 
 
+def from_rest(seconds, omega=0.4):
+    """Twists (N, 2) of a robot that stands for three seconds, then drives on a circle."""
+    v = np.clip((np.arange(seconds * HZ) / HZ - 3.0) / 2.0, 0.0, 1.0)
+    return np.column_stack([v, omega * v])
+
+
+@pytest.mark.parametrize('delay_s', [1.0, 2.0])
+@pytest.mark.parametrize('silent', [(0.0, 0.0), (0.5, 5.0)])
+def test_on_a_circle_a_delay_that_a_start_from_rest_has_shown_is_not_forgotten(delay_s, silent):
+    """A circle shows no delay, so it shows no end of one either. Repeated images are left out."""
+    drive = Drive(every=EVERY, twists=from_rest(90), **NOISY)
+    fused, found = PoseFilter(FilterConfig()), []
+    fused.add_measurement(START_NS, drive.poses[0], drive.covariance(True))
+    for event in drive.events():
+        at_s = (event[0] - START_NS) * 1e-9
+        if event[1] == 0:
+            drive.give(fused, event)
+        elif not silent[0] < at_s < silent[1]:
+            content = max(event[2] - round(delay_s * HZ / EVERY), 0)
+            fused.add_measurement(event[0], drive.seen[content], drive.covariance(True))
+            found.append((at_s, fused.status.level, fused._history.newest.lateness))
+    assert not any(level is Level.LOCALISED for *_, level, _ in found)
+    assert all(late.suspected for at_s, _, late in found if at_s > 6.0)
+
+
+def test_in_time_from_rest_on_a_circle_nothing_is_suspected():
+    _, found = driven(Drive(every=EVERY, twists=from_rest(90), **NOISY), lambda t: t)
+    assert not any(late.suspected for *_, late in found)
+    assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 10.0)
+
+
+def test_images_of_elsewhere_are_in_time_again_where_the_filter_did_not_jump():
+    """As after a camera that stood, of a robot so uncertain that any image is within the gate."""
+    knots, trail, late = path_of(0.3, 40.0), (), None
+    rng = np.random.default_rng(7)
+    for k, knot in enumerate(knots):
+        trail = extended(trail, knot)
+        if k % 4 == 0:
+            shown = knots[200] if 200 <= k < 400 else knot
+            pose = np.array(shown[1:]) + [8.0, -5.0, 0.0] + rng.normal(0, [0.1, 0.1, 0.02])
+            pose[2] = math.remainder(pose[2], math.tau)
+            late = followed(late, trail, knot, pose, COVARIANCE, False)
+            assert late.suspected or not 12.0 <= 0.05 * k < 20.0
+    assert late.apart < 0.1
+
+
+def test_odometry_covers_images_of_long_before():
+    """Nothing was seen for longer than the path is remembered: where the robot is is still known,
+    and images of where it was before are late.
+    """
+    knots, trail, late = path_of(0.3, 30.0), (), None
+    for k, knot in enumerate(knots):
+        trail = extended(trail, knot)
+        seconds = 0.05 * k
+        if k % 4 == 0 and not 5.0 < seconds < 20.0:
+            shown = knots[k] if seconds < 10.0 else knots[k - 60]
+            pose = np.array([*shown[1:3], math.remainder(shown[3], math.tau)])
+            late = followed(late, trail, knot, pose, COVARIANCE, False)
+            assert late.suspected or seconds < 21.0
+    assert late.error_s == pytest.approx(3.0, abs=0.3)
+
+
 @pytest.mark.parametrize(('v', 'small'), [(0.2, True), (1.0, False)])
 def test_a_second_is_a_small_delay_of_a_slow_robot(v, small):
     _, found = driven(drive_of(v * winding(60), v), lambda t: t - 1.0)

@@ -45,6 +45,9 @@ _SURPRISE = 1e-2
 _BREAK, _HEAL, _ELSEWHERE = 1e-4, 1e-3, 1e-4
 """Probabilities, per image, that images in time come to any other delay, that others come to be in
 time, and that any are of elsewhere from now on."""
+_ANEW = 0.05
+"""Share of the images of elsewhere that are in time, where the robot is in another place, though
+the filter has not moved it there at once."""
 _DRIFT, _MOST_DRIFT = 0.7, 1 / 3
 """Probability, per second, that a delay moves by a step; the most of it per image."""
 _ELSEWHERE_DENSITY = 1 / (100.0 * 2 * math.pi)
@@ -94,7 +97,7 @@ class Lateness(NamedTuple):
 
     A position p of the odometry's frame, x + iy, lies at turn p + shift, both (K,). `variance` (K,)
     is that of the place along each axis, at the point of `path` that the newest image, of
-    `stamp_ns`, shows.
+    `stamp_ns`, shows. `broken`: the odometry was silent since, and the transforms begin anew.
     """
 
     odds: Array
@@ -105,6 +108,7 @@ class Lateness(NamedTuple):
     path: Path
     stamp_ns: int
     suspected: bool = False
+    broken: bool = False
 
     @property
     def apart(self) -> float:
@@ -148,7 +152,6 @@ def followed(
 ) -> Lateness | None:
     """The odds after an image of a pose (3,) with covariance (3, 3), at the pose by odometry `now`.
 
-    Where the trail has begun after the image before, the transforms begin anew.
     `restarted`: the filter has taken it for the robot's new place.
     """
     variance, yaw_variance = _noise(covariance)
@@ -158,14 +161,17 @@ def followed(
     begun = _begun(path, now[0], pose, variance, yaw_variance)
     if late is None:
         return begun
-    if trail and trail[0][0] > late.stamp_ns:
+    if late.broken:
         return _judged(_anew(late, begun))
     if restarted or _moved(late.path, path):
         seconds = (now[0] - late.stamp_ns) * 1e-9
         late = _corrected(_predicted(late, path, seconds), pose, variance, yaw_variance)
         late = late._replace(stamp_ns=now[0])
+    in_time, elsewhere = float(late.odds[:-1][_NEAR].sum()), float(late.odds[-1])
     if restarted:
-        late = _replaced(late, begun)
+        late = _replaced(late, begun, 0.5)
+    elif _ANEW * elsewhere > in_time:
+        late = _replaced(late, begun, _ANEW)
     return _judged(late)
 
 
@@ -222,11 +228,11 @@ def _noise(covariance: Array) -> tuple[float, float]:
     return _CAUTION * place + _FLOOR_M**2, _CAUTION * float(covariance[2, 2]) + _FLOOR_RAD**2
 
 
-def _replaced(late: Lateness, begun: Lateness) -> Lateness:
-    """Images of elsewhere are perhaps in time: the robot is elsewhere."""
+def _replaced(late: Lateness, begun: Lateness, share: float) -> Lateness:
+    """A share of the images of elsewhere is in time: the robot is elsewhere."""
     odds = late.odds.copy()
-    odds[-1] /= 2
-    odds[:-1] += odds[-1] * _NEAR_SHARE
+    odds[:-1] += share * odds[-1] * _NEAR_SHARE
+    odds[-1] *= 1 - share
     turn, shift, variance, yaw_variance = (
         np.where(_NEAR, getattr(begun, name), getattr(late, name))
         for name in ('turn', 'shift', 'variance', 'yaw_variance')
@@ -268,8 +274,7 @@ def _came(odds: Array, drift: float) -> tuple[Array, Array]:
 
     And the shares (K,) of those that are in time.
     """
-    moves = np.full(_COUNT - 1, drift)
-    stay = 1 - np.append(moves, 0.0) - np.append(0.0, moves)
+    stay = 1 - 2 * drift
     near = np.where(_NEAR, odds, 0.0)
     in_time = float(near.sum())
     came = [

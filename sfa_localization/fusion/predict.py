@@ -65,7 +65,9 @@ class Prediction:
         driven = self._moved(belief, event.stamp_ns, step, event, whole.omega)
         if silence_s > ODOMETRY_TIMEOUT_S:
             # What the robot did meanwhile is unknown: its path begins anew.
-            driven = driven._replace(trail=((event.stamp_ns, *driven.dead_reckoned),))
+            late, trail = driven.lateness, ((event.stamp_ns, *driven.dead_reckoned),)
+            late = late and late._replace(broken=True)
+            driven = driven._replace(trail=trail, lateness=late)
         return driven
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
