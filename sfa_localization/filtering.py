@@ -192,13 +192,14 @@ def _resampled(states: list[State], lag_ns: int) -> list[State]:
 
 
 def halves(odometry: Table, positions: Table) -> list[tuple[Table, Table]]:
-    """Two logs of one, cut in the middle of the positions."""
+    """Two logs of one, cut in the middle of the positions; the one if a half has no odometry."""
     middle_ns = int(np.median(positions.stamps_ns)) if len(positions) else 0
-    return [
+    parts = [
         (_rows(odometry, (odometry.stamps_ns < middle_ns) == early),
          _rows(positions, (positions.stamps_ns < middle_ns) == early))
         for early in (True, False)
     ]  # fmt: skip
+    return parts if all(len(table) for part in parts for table in part) else [(odometry, positions)]
 
 
 def _rows(table: Table, kept: Array) -> Table:

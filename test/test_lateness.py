@@ -138,7 +138,7 @@ def test_images_of_elsewhere_are_in_time_again_where_the_filter_did_not_jump():
         trail = extended(trail, knot)
         if k % 4 == 0:
             shown = knots[200] if 200 <= k < 400 else knot
-            pose = np.array(shown[1:]) + [8.0, -5.0, 0.0] + rng.normal(0, [0.1, 0.1, 0.02])
+            pose = shown[1:] + rng.normal([8.0, -5.0, 0.0], [0.1, 0.1, 0.02])
             pose[2] = math.remainder(pose[2], math.tau)
             late = followed(late, trail, knot, pose, COVARIANCE, False)
             assert late.suspected or not 12.0 <= 0.05 * k < 20.0

@@ -53,6 +53,24 @@ BAD = {
 }
 
 
+@pytest.mark.parametrize('name', ['other version', 'other frame', 'two numbers', 'empty'])
+def test_a_pose_of_another_version_or_frame_is_written_over(tmp_path, name):
+    path = tmp_path / 'pose.json'
+    path.write_text(BAD[name])
+    save_pose(path, SAVED)
+    assert load_pose(path, 'map').stamp_ns == 7
+
+
+@pytest.mark.parametrize('name', ['binary', 'a list', 'nested', 'huge', 'no pose'])
+def test_a_file_that_holds_something_else_stays(tmp_path, name):
+    """As where the parameter names the model by mistake."""
+    path = tmp_path / 'model.npz'
+    path.write_text(BAD[name])
+    with pytest.raises(DataError, match=r'model\.npz: holds no saved pose, and stays'):
+        save_pose(path, SAVED)
+    assert path.read_text() == BAD[name]
+
+
 @pytest.mark.parametrize('text', BAD.values(), ids=BAD)
 def test_a_file_that_is_none_is_rejected_by_name(tmp_path, text):
     path = tmp_path / 'pose.json'

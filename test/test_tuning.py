@@ -3,6 +3,7 @@
 """Tuning: the likelihood finds the noise that is there, the grid the least error."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -167,6 +168,23 @@ def test_a_result_that_is_worse_on_other_logs_is_rejected(tmp_path, capsys):
     code = main(['tune', *paths, '--output', str(tmp_path / 'tuned.yaml')])
     assert code == 0 and 'the settings stay' in capsys.readouterr().out
     assert load_changes(tmp_path / 'tuned.yaml')['ekf_node']['measurement_factor'] == 1.0
+
+
+@pytest.mark.parametrize(('rows', 'later_s', 'problem'), [
+    ((1, 99), 0, 'odom.csv: 1 rows'), ((99, 3), 0, 'positions.csv: 3 rows'),
+    ((1300, 250), 1e6, 'the filter fused nothing'),
+])  # fmt: skip
+def test_logs_that_show_nothing_are_named_and_nothing_is_written(
+    tmp_path, capsys, rows, later_s, problem
+):
+    paths = [Path(path) for path in log_of(tmp_path, 'log', 0, 0.1)]
+    for path, count in zip(paths, rows, strict=True):
+        table = np.loadtxt(path, delimiter=',')[:count]
+        table[:, 0] += later_s if 'positions' in path.name else 0
+        np.savetxt(path, table, '%.9f', ',')
+    assert main(['tune', *map(str, paths), '--output', str(tmp_path / 'x.yaml')]) == 1
+    assert problem in capsys.readouterr().err
+    assert not (tmp_path / 'x.yaml').exists()
 
 
 @pytest.mark.parametrize('paths', [['a.csv'], ['a.csv', 'bag'], ['bag']])

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +41,8 @@ EXAMPLES = """\
 The default method needs no ground truth. Variances are in m^2, rad^2, (m/s)^2 and (rad/s)^2.
 Of several drives each is left out once, of one each half, to judge on it what was found on the
 others: where that is worse than before, the settings stay. CSV files are those of `filter`."""
+_LEAST_ROWS = 20
+"""Rows of a log, of which each half is filtered by itself."""
 _LEARNED = ('measurement_factor', 'speed_std', 'rate_std', 'yaw_per_radian')
 
 
@@ -69,6 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
         best, judged = _from_logs(arguments, config)
     else:
         best, judged = _from_bags(arguments, config)
+    if not math.isfinite(best.cost):
+        raise DataError('the filter fused nothing: give longer drives, of one clock')
     grid = settings(TuneConfig, arguments).method == 'grid'
     unit = 'm mean error' if grid else 'negative log-likelihood per component'
     print(_verdict(judged, unit))
@@ -131,6 +137,11 @@ def _from_logs(
         (filtering.read_odometry_table(odometry), filtering.read_position_table(positions))
         for odometry, positions in zip(*[iter(arguments.drives)] * 2, strict=True)
     ]
+    for path, table in zip(arguments.drives, chain(*pairs), strict=True):
+        if len(table) < _LEAST_ROWS:
+            raise DataError(
+                f'{path}: {len(table)} rows that can be used: tuning takes at least {_LEAST_ROWS}'
+            )
     best = _learned(pairs, config)
     parts = pairs if len(pairs) > 1 else filtering.halves(*pairs[0])
     drives = [_drive(*pair) for pair in parts]

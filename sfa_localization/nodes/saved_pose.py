@@ -39,7 +39,11 @@ class SavedPose(NamedTuple):
 
 
 def save_pose(path: Path, saved: SavedPose) -> None:
-    """Write the file, completely or not at all. Raises LocalizationError."""
+    """Write the file, completely or not at all. Raises LocalizationError, also where a file holds
+    something else than a pose: it stays.
+    """
+    if not _holds_pose(path):
+        raise DataError(f'{path}: holds no saved pose, and stays: remove it or choose another file')
     content = {
         'version': _VERSION,
         'stamp_ns': saved.stamp_ns,
@@ -49,6 +53,17 @@ def save_pose(path: Path, saved: SavedPose) -> None:
     }
     with atomic_write(path) as file:
         file.write((json.dumps(content) + '\n').encode())
+
+
+def _holds_pose(path: Path) -> bool:
+    """Whether a file may be written over: of any version and frame, empty, or not there yet."""
+    try:
+        text = read_regular(path, _LARGEST_FILE)
+        return not text or {'version', 'frame', 'pose'} <= set(json.loads(text))
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError, TypeError, RecursionError):
+        return False
 
 
 def load_pose(path: Path, frame: str) -> SavedPose | None:
