@@ -251,6 +251,34 @@ def test_no_output_replaces_what_is_read(command, tmp_path, monkeypatch, capsys)
     assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == before
 
 
+@pytest.mark.parametrize('command', [
+    'inspect bag --json diary.txt', 'evaluate model.npz bag --json diary.txt',
+    'train bag --output diary.txt', 'train bag --update model.npz --output diary.txt',
+    'tune bag --model model.npz --output diary.txt', 'config --output diary.txt',
+    'calibrate picture.png --output diary.txt', 'config --output model.npz',
+    'train bag --output localization.yaml',
+])  # fmt: skip
+def test_no_output_replaces_a_file_of_another_kind(command, tmp_path, monkeypatch, capsys):
+    shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
+    for name in ('model.npz', 'diary.txt', 'localization.yaml', 'picture.png'):
+        (tmp_path / name).write_text('# no data\n')
+    before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == 1
+    name = command.split()[-1]
+    assert f'{name}: is there and no .' in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == before
+
+
+def test_an_output_replaces_a_file_of_its_kind_or_an_empty_one(tmp_path):
+    for name, text in (('a.yaml', 'old: 1'), ('b.YML', 'old: 1'), ('c.txt', ''), ('d', None)):
+        path = tmp_path / name
+        if text is not None:
+            path.write_text(text)
+        assert main(['config', '--output', str(path)]) == 0
+        assert 'ekf_node' in path.read_text()
+
+
 @pytest.mark.parametrize(
     'command',
     ['inspect bag --report', 'evaluate none.npz bag --report', 'train bag --output a.npz --report'],

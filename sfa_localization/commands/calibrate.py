@@ -13,7 +13,13 @@ from sfa_localization.camera.settings import (
     LensCalibration,
     PanoramaConfig,
 )
-from sfa_localization.commands.options import add_settings, given, numbers, settings
+from sfa_localization.commands.options import (
+    add_settings,
+    given,
+    numbers,
+    require_kind,
+    settings,
+)
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import require_outputs
 
@@ -65,6 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     outputs = [path for path in (arguments.output, arguments.check) if path]
     require_outputs(outputs, [*arguments.images, arguments.calibration])
+    if arguments.output:
+        require_kind(arguments.output, '.yaml', '.yml')
     images = calibration.read_images(arguments.images)
     circles = None
     if arguments.center or arguments.radii:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sfa_localization.commands.options import require_kind
 from sfa_localization.config import render, write_config
 
 WRITES = 'the parameter file, or standard output'
@@ -21,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write or print every parameter with its default."""
     if arguments.output:
+        require_kind(arguments.output, '.yaml', '.yml')
         write_config(arguments.output)
     else:
         print(render(), end='')

@@ -36,6 +36,13 @@ def require_read_only(outputs: Iterable[Path], inputs: Iterable[Path | None]) ->
     require_outputs(outputs, [file for path in inputs if path for file in recorded_files(path)])
 
 
+def require_kind(output: Path, *suffixes: str) -> None:
+    """Raise LocalizationError where an output would replace a file of another kind, by its name."""
+    if output.is_file() and output.stat().st_size and output.suffix.lower() not in suffixes:
+        kinds = ' or '.join(suffixes)
+        raise LocalizationError(f'{output}: is there and no {kinds} file: give another name')
+
+
 def require_report(folder: Path | None) -> None:
     """Raise LocalizationError before the work where a report cannot have its folder."""
     from sfa_localization.bags.recording import METADATA

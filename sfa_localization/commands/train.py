@@ -15,6 +15,7 @@ from sfa_localization.commands.options import (
     add_topics,
     given,
     recipe,
+    require_kind,
     require_read_only,
     require_report,
     require_same_panorama,
@@ -63,6 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
     require_read_only([arguments.output], [*arguments.bags, arguments.config])
+    require_kind(arguments.output, '.npz')
     require_report(arguments.report)
     if arguments.update:
         return _update(arguments)
