@@ -296,6 +296,17 @@ def test_silence_makes_the_estimate_degraded(silences_s, level):
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
 
 
+@pytest.mark.parametrize(('moved_m', 'period_s', 'level'), [
+    (2.9, 0.3, Level.LOCALISED), (3.1, 0.3, Level.DEGRADED),  # SILENT_M
+    (3.1, 0.5, Level.LOCALISED),  # FEW_PERIODS
+])  # fmt: skip
+def test_of_a_fast_robot_images_are_missed_after_meters(moved_m, period_s, level):
+    images_ns = 4 * SECOND
+    belief = belief_at(accepted_ns=images_ns, precise_ns=images_ns, period_s=period_s)
+    belief = belief._replace(stamp_ns=5 * SECOND, odometry_ns=5 * SECOND, traveled_m=moved_m)
+    assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
+
+
 @pytest.mark.parametrize(('waited_s', 'level'), [(0.9, Level.LOCALISED), (1.1, Level.DEGRADED)])
 def test_of_a_slow_camera_the_first_image_that_contradicts_counts(waited_s, level):
     """NOTICED_S after the last one that fitted; sooner it may be an outlier."""

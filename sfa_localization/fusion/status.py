@@ -24,6 +24,9 @@ SILENT_IMAGES, LEAST_SILENCE_S = 6.0, 1.5
 """Images that stay away for so many of their usual periods are missed, but not before 1.5 s, in
 which a robot goes about as many meters, and after IMAGE_TIMEOUT_S at the latest: meanwhile the
 robot may be towed, held or carried away, and nothing shows it."""
+SILENT_M, FEW_PERIODS = 3.0, 2.5
+"""Of a fast robot they are missed after so many meters, if they have stayed away for so many of
+their periods."""
 NOTICED_S = 1.0
 """Images that contradict for so long are no outliers, however few: a jump is noticed by then."""
 DEGRADED_YAW_RAD = 0.2
@@ -159,9 +162,12 @@ def _contradictions(belief: Belief) -> list[str]:
     return [f'{memory.rejected} images in a row contradict the estimate']
 
 
-def silence_limit_s(period_s: float) -> float:
-    """Time without an accepted image after which it is missed, by the usual time between them."""
-    return min(max(SILENT_IMAGES * period_s, LEAST_SILENCE_S), IMAGE_TIMEOUT_S)
+def silence_limit_s(period_s: float, moved_m: float) -> float:
+    """Time without an accepted image after which it is missed, by the usual time between them and
+    the distance traveled since the last one.
+    """
+    patient_s = max(SILENT_IMAGES * period_s, LEAST_SILENCE_S)
+    return min(FEW_PERIODS * period_s if moved_m > SILENT_M else patient_s, IMAGE_TIMEOUT_S)
 
 
 def _silent_s(belief: Belief, last_ns: int | None) -> float:
@@ -171,7 +177,8 @@ def _silent_s(belief: Belief, last_ns: int | None) -> float:
 
 def _silences(belief: Belief, config: FilterConfig) -> list[str]:
     reasons, memory = [], belief.memory
-    limit_s, least_m = silence_limit_s(memory.period_s), config.degraded_std
+    moved_m = belief.traveled_m - memory.accepted_m
+    limit_s, least_m = silence_limit_s(memory.period_s, moved_m), config.degraded_std
     images_s, odometry_s = (
         _silent_s(belief, last_ns) for last_ns in (memory.accepted_ns, belief.odometry_ns)
     )
