@@ -130,6 +130,18 @@ def test_in_time_from_rest_on_a_circle_nothing_is_suspected():
     assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 10.0)
 
 
+def test_what_images_showed_before_the_odometry_began_makes_none_late():
+    """The robot was driving all the time; its odometry comes only after five seconds."""
+    drive = drive_of(winding(40))
+    fused = PoseFilter(FilterConfig())
+    for event in drive.events():
+        if event[1] == 1 or event[0] > START_NS + 5e9:
+            drive.give(fused, event, heading=True)
+            late = fused._history.newest.lateness
+            assert late is None or not late.suspected
+    assert fused.status.level is Level.LOCALISED
+
+
 def test_images_of_elsewhere_are_in_time_again_where_the_filter_did_not_jump():
     """As after a camera that stood, of a robot so uncertain that any image is within the gate."""
     knots, trail, late = path_of(0.3, 40.0), (), None

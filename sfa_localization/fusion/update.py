@@ -195,8 +195,9 @@ def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lat
     if event.value.size == 2:
         return belief.lateness
     now, trail = (belief.stamp_ns, *belief.dead_reckoned), belief.trail
-    silent_ns = 0 if belief.odometry_ns is None else belief.stamp_ns - belief.odometry_ns
-    if silent_ns > ODOMETRY_TIMEOUT_S * 1e9:
+    if belief.odometry_ns is None:
+        return followed(None, trail, now, event.value, event.covariance, False)
+    if belief.stamp_ns - belief.odometry_ns > ODOMETRY_TIMEOUT_S * 1e9:
         return unrelated(belief.lateness, trail, now, event.value, event.covariance)
     restarted = update is not None and update.reason == ELSEWHERE
     return followed(belief.lateness, trail, now, event.value, event.covariance, restarted)
