@@ -124,8 +124,11 @@ def test_on_a_circle_a_delay_that_a_start_from_rest_has_shown_is_not_forgotten(d
     assert all(late.suspected for at_s, _, late in found if at_s > 6.0)
 
 
-def test_in_time_from_rest_on_a_circle_nothing_is_suspected():
-    _, found = driven(Drive(every=EVERY, twists=from_rest(90), **NOISY), lambda t: t)
+@pytest.mark.parametrize('omega', [0.0, 0.3, 0.8])
+def test_in_time_from_rest_on_a_circle_or_a_line_nothing_is_suspected(omega):
+    """However long it is, and though nothing shows that images are still in time."""
+    drive = Drive(every=EVERY, twists=from_rest(240, omega), **NOISY)
+    _, found = driven(drive, lambda t: t)
     assert not any(late.suspected for *_, late in found)
     assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 10.0)
 

@@ -40,6 +40,14 @@ _LATEST_STEPS = 5
 """Of the path, whose speed is the present one."""
 _NEAR = _DELAYS <= TOLERATED_S + _MARGIN_S
 _NEAR_SHARE = _NEAR / _NEAR.sum()
+_EDGE = int(_NEAR.sum()) - 1
+_BARRIER = 0.35
+"""Share of the drifts that lead out of the delays of images in time, and back into them: where
+nothing shows a delay, as on a circle, neither side grows."""
+_UP, _DOWN = np.ones((2, _COUNT))
+# What cannot go one way goes the other: any delay that stays is as likely as any other one.
+_UP[0], _UP[_EDGE], _UP[_EDGE + 1], _UP[-1] = 2.0, _BARRIER, 2 - _BARRIER, 0.0
+_DOWN[0], _DOWN[_EDGE], _DOWN[_EDGE + 1], _DOWN[-1] = 0.0, 2 - _BARRIER, _BARRIER, 2.0
 _SURPRISE = 1e-2
 """Probability of larger delays at the start."""
 _BREAK, _HEAL, _ELSEWHERE = 1e-4, 1e-3, 1e-4
@@ -52,6 +60,8 @@ _DRIFT, _MOST_DRIFT = 0.7, 1 / 3
 """Probability, per second, that a delay moves by a step; the most of it per image."""
 _ELSEWHERE_DENSITY = 1 / (100.0 * 2 * math.pi)
 """Of poses anywhere in 100 m^2, 1/(m^2 rad)."""
+_EVIDENCE = 1.2
+"""Factor on the odds of images in time against late ones from which an image counts for either."""
 _OUTLIERS = 0.05
 """Share of the images that lie anywhere."""
 _FLOOR_M, _FLOOR_RAD, _CAUTION = 0.1, 0.015, 2.0
@@ -274,13 +284,13 @@ def _came(odds: Array, drift: float) -> tuple[Array, Array]:
 
     And the shares (K,) of those that are in time.
     """
-    stay = 1 - 2 * drift
+    up, down, stay = drift * _UP, drift * _DOWN, 1 - 2 * drift
     near = np.where(_NEAR, odds, 0.0)
     in_time = float(near.sum())
     came = [
-        np.append(0.0, drift * odds[:-1]),
+        np.append(0.0, (up * odds)[:-1]),
         stay * odds * np.where(_NEAR, 1 - _BREAK, 1 - _HEAL),
-        np.append(drift * odds[1:], 0.0),
+        np.append((down * odds)[1:], 0.0),
         np.full(_COUNT, _BREAK * in_time / _COUNT),
     ]
     return np.array(came), near / max(in_time, _TINY)
@@ -297,14 +307,28 @@ def _corrected(late: Lateness, pose: Array, variance: float, yaw_variance: float
     fits *= (1 - _OUTLIERS) * _DENSITY / (total * np.sqrt(yaw_total))
     fits = np.where(path.known, fits, 0.0)
     likely = fits + np.where(path.known, _OUTLIERS, 1.0) * _ELSEWHERE_DENSITY
-    odds = late.odds * np.append(likely, _ELSEWHERE_DENSITY)
+    odds = _weighed(late.odds, np.append(likely, _ELSEWHERE_DENSITY))
     gain = fits / likely * late.variance / total
     yaw_gain = fits / likely * late.yaw_variance / yaw_total
     turn = late.turn * np.exp(1j * yaw_gain * yaw_miss)
     return late._replace(
-        odds=odds / odds.sum(),
+        odds=odds,
         turn=turn,
         shift=place + gain * miss - turn * path.places,
         variance=late.variance * (1 - gain),
         yaw_variance=late.yaw_variance * (1 - yaw_gain),
     )
+
+
+def _weighed(odds: Array, likely: Array) -> Array:
+    """Odds (K + 1,) after an image so likely under each. What hardly distinguishes delays of images
+    in time from others is an error of the image, which the next ones repeat.
+    """
+    weighed = odds * likely
+    near, far = weighed[:-1][_NEAR], weighed[:-1][~_NEAR]
+    before = odds[:-1][_NEAR].sum() / max(odds[:-1][~_NEAR].sum(), _TINY)
+    shown = float(near.sum() / max(far.sum() * before, _TINY))
+    if 1 / _EVIDENCE < shown < _EVIDENCE:
+        weighed[:-1][_NEAR] = near / math.sqrt(shown)
+        weighed[:-1][~_NEAR] = far * math.sqrt(shown)
+    return np.asarray(weighed / weighed.sum())
