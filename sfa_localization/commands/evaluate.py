@@ -14,8 +14,7 @@ from sfa_localization.commands.options import (
     TOPIC_OPTIONS,
     add_topics,
     recipe,
-    require_kind,
-    require_read_only,
+    require_output,
     require_report,
     require_same_panorama,
     settings,
@@ -65,8 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.json:
         read = arguments.model, arguments.bag, *arguments.align, arguments.config
-        require_read_only([arguments.json], read)
-        require_kind(arguments.json, '.json')
+        require_output(arguments.json, read, '.json')
     require_report(arguments.report)
     model = PlaceModel.load(arguments.model)
     require_same_panorama(arguments.config, model.panorama)

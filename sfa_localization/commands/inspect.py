@@ -14,8 +14,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.commands.options import (
     add_settings,
     add_topics,
-    require_kind,
-    require_read_only,
+    require_output,
     require_report,
     settings,
 )
@@ -51,8 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Inspect all bags; an unreadable one is reported and does not stop the others."""
     topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
     if arguments.json:
-        require_read_only([arguments.json], arguments.bags)
-        require_kind(arguments.json, '.json')
+        require_output(arguments.json, arguments.bags, '.json')
     require_report(arguments.report)
     reports = []
     for path in arguments.bags:

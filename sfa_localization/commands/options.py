@@ -29,11 +29,14 @@ TOPIC_OPTIONS = {
 }
 
 
-def require_read_only(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
-    """Raise LocalizationError where an output would replace an input, or a file of an input bag."""
+def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) -> None:
+    """Raise LocalizationError where an output would replace an input, a file of an input bag, or a
+    file of another kind than these suffixes name.
+    """
     from sfa_localization.bags.recording import recorded_files
 
-    require_outputs(outputs, [file for path in inputs if path for file in recorded_files(path)])
+    require_outputs([output], [file for path in inputs if path for file in recorded_files(path)])
+    require_kind(output, *suffixes)
 
 
 def require_kind(output: Path, *suffixes: str) -> None:

@@ -15,8 +15,7 @@ from sfa_localization.commands.options import (
     add_topics,
     given,
     recipe,
-    require_kind,
-    require_read_only,
+    require_output,
     require_report,
     require_same_panorama,
     settings,
@@ -63,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
-    require_read_only([arguments.output], [*arguments.bags, arguments.config])
-    require_kind(arguments.output, '.npz')
+    require_output(arguments.output, [*arguments.bags, arguments.config], '.npz')
     require_report(arguments.report)
     if arguments.update:
         return _update(arguments)

@@ -17,8 +17,7 @@ from sfa_localization.commands.options import (
     add_settings,
     add_topics,
     recipe,
-    require_kind,
-    require_read_only,
+    require_output,
     require_same_panorama,
     settings,
 )
@@ -66,8 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Tune; write the file, print what changed and the cost."""
     config = settings(FilterConfig, arguments, arguments.config)
-    require_read_only([arguments.output], [*arguments.drives, arguments.model])
-    require_kind(arguments.output, '.yaml', '.yml')
+    require_output(arguments.output, [*arguments.drives, arguments.model], '.yaml', '.yml')
     tables = [path.suffix == '.csv' for path in arguments.drives]
     if any(tables):
         if not all(tables) or len(tables) % 2:

@@ -40,24 +40,24 @@ _LATEST_STEPS = 5
 """Of the path, whose speed is the present one."""
 _NEAR = _DELAYS <= TOLERATED_S + _MARGIN_S
 _NEAR_SHARE = _NEAR / _NEAR.sum()
-_EDGE = int(_NEAR.sum()) - 1
-_BARRIER = 0.35
-"""Share of the drifts that lead out of the delays of images in time, and back into them: where
-nothing shows a delay, as on a circle, neither side grows."""
-_UP, _DOWN = np.ones((2, _COUNT))
-# What cannot go one way goes the other: any delay that stays is as likely as any other one.
-_UP[0], _UP[_EDGE], _UP[_EDGE + 1], _UP[-1] = 2.0, _BARRIER, 2 - _BARRIER, 0.0
-_DOWN[0], _DOWN[_EDGE], _DOWN[_EDGE + 1], _DOWN[-1] = 0.0, 2 - _BARRIER, _BARRIER, 2.0
 _SURPRISE = 1e-2
 """Probability of larger delays at the start."""
 _BREAK, _HEAL, _ELSEWHERE = 1e-4, 1e-3, 1e-4
 """Probabilities, per image, that images in time come to any other delay, that others come to be in
 time, and that any are of elsewhere from now on."""
-_ANEW = 0.05
-"""Share of the images of elsewhere that are in time, where the robot is in another place, though
-the filter has not moved it there at once."""
+_RESTARTED, _ANEW = 0.5, 0.05
+"""Share of the images of elsewhere that are in time, because the robot is in another place: where
+the filter has just moved it there, and where it has not."""
 _DRIFT, _MOST_DRIFT = 0.7, 1 / 3
 """Probability, per second, that a delay moves by a step; the most of it per image."""
+_BARRIER = 0.35
+"""Share of the drifts that lead out of the delays of images in time, and back into them: where
+nothing shows a delay, as on a circle, neither side grows."""
+_EDGE = int(_NEAR.sum()) - 1
+_UP, _DOWN = np.ones((2, _COUNT))
+# What cannot go one way goes the other: any delay that stays is as likely as any other one.
+_UP[0], _UP[_EDGE], _UP[_EDGE + 1], _UP[-1] = 2.0, _BARRIER, 2 - _BARRIER, 0.0
+_DOWN[0], _DOWN[_EDGE], _DOWN[_EDGE + 1], _DOWN[-1] = 0.0, 2 - _BARRIER, _BARRIER, 2.0
 _ELSEWHERE_DENSITY = 1 / (100.0 * 2 * math.pi)
 """Of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _EVIDENCE = 1.2
@@ -178,10 +178,8 @@ def followed(
         late = _corrected(_predicted(late, path, seconds), pose, variance, yaw_variance)
         late = late._replace(stamp_ns=now[0])
     in_time, elsewhere = float(late.odds[:-1][_NEAR].sum()), float(late.odds[-1])
-    if restarted:
-        late = _replaced(late, begun, 0.5)
-    elif _ANEW * elsewhere > in_time:
-        late = _replaced(late, begun, _ANEW)
+    if restarted or _ANEW * elsewhere > in_time:
+        late = _replaced(late, begun, _RESTARTED if restarted else _ANEW)
     return _judged(late)
 
 
