@@ -23,6 +23,12 @@ def winding(seconds, rate_hz=50.0, speed=1.0, turn=0.5):
     return np.stack([np.full_like(t, speed), turn * np.sin(0.7 * t)], 1)
 
 
+def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
+    """Twists (N, 2) of a robot that stands at first, and drives as told when it is up to speed."""
+    t = np.arange(len(twists)) / rate_hz
+    return twists * np.clip((t - standing_s) / faster_s, 0.0, 1.0)[:, None]
+
+
 def true_path(stamps_ns, twists, start=(0.0, 0.0, 0.0)):
     """Poses (N, 3): each twist has been held since the stamp before."""
     return integrate(stamps_ns, twists, np.array(start, float))

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive
+from filter_drives import START_NS, Drive, from_rest
 from test_turn_watch import EVERY, HZ, NOISY, curve
 
 from sfa_localization.fusion.arrivals import Arrivals
@@ -19,12 +19,13 @@ def straight(seconds):
     return np.zeros(round(seconds * HZ))
 
 
-def driven(omega, held_s=lambda k: 0.0, ahead_s=lambda t: 0.0, useless_ns=()):
+def driven(omega, held_s=lambda k: 0.0, ahead_s=lambda t: 0.0, useless_ns=(), rested=False):
     """Time s, status and error m at each image of a filter that receives image k held_s(k) after
     it was taken, and odometry that is stamped ahead_s(t) too far ahead, as they come; after each
-    image come some with stamps `useless_ns`.
+    image come some with stamps `useless_ns`. A robot that has not `rested` is under way before.
     """
-    drive = Drive(every=EVERY, twists=np.column_stack([np.ones(len(omega)), omega]), **NOISY)
+    twists = np.column_stack([np.ones(len(omega)), omega])
+    drive = Drive(every=EVERY, twists=from_rest(twists, HZ) if rested else twists, **NOISY)
     coming = []
     for stamp_ns, kind, index in drive.events():
         t = (stamp_ns - START_NS) * 1e-9
@@ -75,7 +76,7 @@ def test_a_clock_of_the_odometry_that_steps_ahead_on_a_straight_line_is_noticed(
 
 @pytest.mark.parametrize('useless_ns', [(), (0, 0, 0)])
 def test_images_in_time_need_no_turn_whatever_unusable_ones_come(useless_ns):
-    found = driven(straight(20.0), held_s=lambda k: 0.2, useless_ns=useless_ns)
+    found = driven(straight(20.0), lambda k: 0.2, useless_ns=useless_ns, rested=True)
     assert localised(found, 4.0) == 1.0
 
 
@@ -93,5 +94,6 @@ def test_images_that_are_held_up_for_any_time_do_not_put_the_start_off():
 
 
 def test_images_that_are_no_longer_late_are_trusted_again_at_once():
-    arrived = driven(straight(20.0), ahead_s=lambda t: 0.8 if t < 8.0 else 0.0)
-    assert localised(arrived, 14.0) == 1.0
+    arrived = driven(straight(20.0), lambda k: 0.8 * (k < 8.0 * HZ / EVERY), rested=True)
+    during = [status.level for t, status, _ in arrived if 4.0 < t < 8.0]
+    assert Level.LOCALISED not in during and localised(arrived, 10.0) == 1.0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from filter_drives import Drive, winding
+from filter_drives import Drive, from_rest, winding
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import wrap_angle
@@ -364,7 +364,7 @@ def test_turns_that_no_wheels_explain_are_confirmed_over_a_longer_way_and_never_
 
 
 def test_a_start_that_was_given_needs_images_only():
-    drive = Drive(seconds=2, **NOISY)
+    drive = Drive(twists=from_rest(winding(3)), **NOISY)
     levels = [status.level for status, *_ in fed(drive, PoseFilter(FilterConfig(
         initial_pose=(0.0, 0.0, 0.0))))]  # fmt: skip
     assert levels[-1] is Level.LOCALISED and levels.count(Level.LOCALISED) > 0.9 * len(levels)
@@ -493,7 +493,7 @@ class Poor(Drive):
 
 @pytest.mark.parametrize('scale', [1 / 0.7, 1 / 0.6])
 def test_wheels_of_another_size_are_noticed_though_images_are_poor(scale, monkeypatch):
-    way = np.tile([1.0, 0.0], (50 * 40, 1))
+    way = from_rest(np.tile([1.0, 0.0], (50 * 40, 1)))
     drive = Poor(twists=way, scale=scale, position_std=0.2, yaw_std=0.03)
 
     def times_wrong():

@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive
+from filter_drives import START_NS, Drive, from_rest, winding
 from ros_domains import free_domain
 from transform_buffer import TransformBuffer
 
@@ -382,7 +382,7 @@ def test_malformed_messages_are_counted_and_change_nothing(bench):
 
 
 def test_diagnostics_hold_rates_latencies_and_counts(bench):
-    drive = Drive(seconds=1, **NOISY)
+    drive = Drive(twists=from_rest(winding(2)), **NOISY)
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
     heard = bench.listen(DiagnosticArray, '/diagnostics')
     assert until(lambda: any(m.status[0].level == DiagnosticStatus.WARN for m in heard))
@@ -391,16 +391,16 @@ def test_diagnostics_hold_rates_latencies_and_counts(bench):
     def told():
         return {v.key: v.value for v in heard[-1].status[0].values}
 
-    assert until(lambda: told().get('odometry: used') == '50')
+    assert until(lambda: told().get('odometry: used') == '100')
     values = told()
     assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localized'
-    assert values['/odom: received'] == '50' and float(values['/odom: rate [Hz]']) > 0
+    assert values['/odom: received'] == '100' and float(values['/odom: rate [Hz]']) > 0
     assert float(values['/odom: latency p99 [ms]']) >= float(values['/odom: latency p50 [ms]']) > 0
     assert 'measurement: accepted' in values and 'position std [m]' in values
 
 
 def test_silence_is_reported_without_any_clock_moving(bench):
-    drive = Drive(seconds=1, **NOISY)
+    drive = Drive(twists=from_rest(winding(2)), **NOISY)
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN, silence_timeout=0.2)
     states = bench.listen(String, 'ekf/state', latched_qos())
     play(bench, node, drive)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive
+from filter_drives import START_NS, Drive, from_rest
 
 from sfa_localization.fusion import lateness
 from sfa_localization.fusion.lateness import CLEARED, Lateness, extended, followed, unrelated
@@ -22,9 +22,10 @@ NOISY = {'v_std': 0.03, 'omega_std': 0.02, 'position_std': 0.08, 'yaw_std': 0.02
 COVARIANCE = np.diag([0.05**2, 0.05**2, 0.01**2])
 
 
-def drive_of(omega, v=1.0, **options):
-    """A noisy drive at a speed with turn rates (N,)."""
-    return Drive(every=EVERY, twists=np.column_stack([np.full(len(omega), v), omega]),
+def drive_of(omega, v=1.0, rested=False, **options):
+    """A noisy drive at a speed with turn rates (N,); one that has not `rested` was under way."""
+    twists = np.column_stack([np.full(len(omega), v), omega])
+    return Drive(every=EVERY, twists=from_rest(twists, HZ) if rested else twists,
                  **{**NOISY, **options})  # fmt: skip
 
 
@@ -67,7 +68,7 @@ def sure_and_wrong_s(found):
 @pytest.mark.parametrize('omega', [np.zeros(60 * HZ), np.full(60 * HZ, 0.3), winding(60)])
 @pytest.mark.parametrize('seed', [0, 1])
 def test_images_in_time_are_never_suspected(omega, seed):
-    _, found = driven(drive_of(omega, seed=seed), lambda t: t)
+    _, found = driven(drive_of(omega, seed=seed, rested=True), lambda t: t)
     assert max(late.apart for *_, late in found) < 0.3
     assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > CONFIRMED_S)
 
@@ -102,17 +103,17 @@ def test_a_delay_that_begins_is_measured_and_its_end_is_noticed(delay_s):
     assert all(late.apart < CLEARED for at_s, *_, late in found if at_s > 30.0)
 
 
-def from_rest(seconds, omega=0.4):
-    """Twists (N, 2) of a robot that stands for three seconds, then drives on a circle."""
-    v = np.clip((np.arange(seconds * HZ) / HZ - 3.0) / 2.0, 0.0, 1.0)
-    return np.column_stack([v, omega * v])
+def circle_from_rest(seconds, omega=0.4):
+    """A robot that stands for three seconds, then drives on a circle."""
+    twists = from_rest(np.tile([1.0, omega], (seconds * HZ, 1)), HZ, 3.0, 2.0)
+    return Drive(every=EVERY, twists=twists, **NOISY)
 
 
 @pytest.mark.parametrize('delay_s', [1.0, 2.0])
 @pytest.mark.parametrize('unseen', [(0.0, 0.0), (0.5, 5.0)])
 def test_on_a_circle_a_delay_that_a_start_from_rest_has_shown_is_not_forgotten(delay_s, unseen):
     """A circle shows no delay, so it shows no end of one either. Repeated images are left out."""
-    drive = Drive(every=EVERY, twists=from_rest(90), **NOISY)
+    drive = circle_from_rest(90)
     fused = PoseFilter(FilterConfig())
     fused.add_measurement(START_NS, drive.poses[0], drive.covariance(True))
     _, found = driven(drive, lambda t: t - delay_s, unseen=unseen, fused=fused)
@@ -123,10 +124,56 @@ def test_on_a_circle_a_delay_that_a_start_from_rest_has_shown_is_not_forgotten(d
 @pytest.mark.parametrize('omega', [0.0, 0.3, 0.8])
 def test_in_time_from_rest_on_a_circle_or_a_line_nothing_is_suspected(omega):
     """However long it is, and though nothing shows that images are still in time."""
-    drive = Drive(every=EVERY, twists=from_rest(240, omega), **NOISY)
-    _, found = driven(drive, lambda t: t)
+    _, found = driven(circle_from_rest(240, omega), lambda t: t)
     assert not any(late.suspected for *_, late in found)
     assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 10.0)
+
+
+OPEN = 'nothing has shown yet whether images are late'
+
+
+@pytest.mark.parametrize('delay_s', [0.0, 1.0, 2.0, 6.0])
+@pytest.mark.parametrize('omega', [0.0, 0.4])
+def test_of_a_robot_that_drove_steadily_all_the_time_images_may_be_late(omega, delay_s):
+    """On a line or a circle under way, nothing shows it until the robot turns otherwise."""
+    drive = drive_of(np.repeat([omega, -0.5], [30 * HZ, 20 * HZ]))
+    lag = round(delay_s * HZ / EVERY)
+    fused, found = PoseFilter(FilterConfig()), []
+    for stamp_ns, kind, index in drive.events():
+        at_s = (stamp_ns - START_NS) * 1e-9
+        if at_s < delay_s:  # its image shows a time before the recording
+            continue
+        if kind == 0:
+            drive.give(fused, (stamp_ns, kind, index))
+            continue
+        fused.add_measurement(stamp_ns, drive.seen[index - lag], drive.covariance(True))
+        found.append((at_s, fused.status))
+    before = [status for at_s, status in found if at_s < 30.0]
+    assert not any(status.level is Level.LOCALISED for status in before)
+    assert OPEN in ' '.join(before[-1].reasons)
+    after = [status.level is Level.LOCALISED for at_s, status in found if at_s > 34.0]
+    assert all(after) if delay_s == 0.0 else not any(after)
+
+
+def test_where_a_robot_stands_it_does_not_matter_whether_images_are_late():
+    """It drives steadily when it is first heard of, and stops."""
+    v = np.repeat([1.0, 0.0, 1.0], [6 * HZ, 6 * HZ, 30 * HZ])
+    drive = Drive(every=EVERY, twists=np.column_stack([v, 0 * v]), **NOISY)
+    _, found = driven(drive, lambda t: t)
+    level = {round(at_s, 1): level for at_s, level, *_ in found}
+    assert level[5.8] is Level.DEGRADED
+    assert all(level[at_s] is Level.LOCALISED for at_s in level if at_s > 8.0)
+
+
+def test_a_pose_that_is_set_says_nothing_about_the_time_of_images():
+    drive = drive_of(winding(30))
+    fused, _ = driven(drive, lambda t: t)
+    assert fused._history.newest.lateness.lasting is None
+    fused.set_pose(fused._history.newest_ns, drive.poses[-1], np.diag([0.01, 0.01, 0.01]))
+    assert fused._history.newest.lateness.lasting is None
+    late, _ = driven(drive_of(winding(30)), lambda t: t - 3.0 * (t > 15.0))
+    late.set_pose(late._history.newest_ns, drive.poses[-1], np.diag([0.01, 0.01, 0.01]))
+    assert late._history.newest.lateness.suspected
 
 
 def test_what_images_showed_before_the_odometry_began_makes_none_late():

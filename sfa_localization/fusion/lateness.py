@@ -10,6 +10,10 @@ not, and a video that loops, at its first images: hardly any robot is carried on
 decimeter. In a curve, slip is no delay, because it turns no heading; on a straight line, large slip
 looks like one. Images that lie elsewhere have an own hypothesis. `turn_watch` compares turns, which
 also show images that are early.
+
+Of a robot that drives steadily, on a line or a circle, from before it is first heard of, images may
+be late by anything, and nothing shows it until it turns or stops. So delays that last from the
+start are followed by themselves, as likely as none, until images have shown that they are in time.
 """
 
 from __future__ import annotations
@@ -73,6 +77,13 @@ _LEAST_M, _LEAST_RAD = 0.08, 0.05
 """An image after less motion shows nothing new."""
 _USELESS_VARIANCE = 4.0
 """m^2: images less certain than the robot moves in a few seconds show no delay."""
+_AS_BEFORE = 10
+"""Knots of the path whose motion is taken for that of before the odometry began."""
+_STRAIGHT_RAD = 1e-6
+_SHOWN = 0.05
+"""Images are in time where larger delays from the start are less likely."""
+_FAR_M, _FAR_RAD = 0.5, 0.3
+"""Where the robot has moved and turned less meanwhile, a delay does no harm."""
 _DENSITY = (2 * math.pi) ** -1.5
 _TINY = 1e-300  # keeps quotients of vanishing odds finite
 
@@ -101,6 +112,12 @@ class Path(NamedTuple):
         latest = float(steps[0, moving][:_LATEST_STEPS].mean())
         return tolerated_s(max(v, latest), omega) + _MARGIN_S >= _DELAYS
 
+    @property
+    def harmful(self) -> NDArray[np.bool_]:
+        """(K,): in which delays the robot has moved far."""
+        moved, turned = np.abs(self.places - self.places[0]), np.abs(self.yaws - self.yaws[0])
+        return np.asarray((moved > _FAR_M) | (turned > _FAR_RAD))
+
 
 class Lateness(NamedTuple):
     """The odds (K + 1,) of each delay and of elsewhere, and transforms from odometry to the map.
@@ -108,6 +125,7 @@ class Lateness(NamedTuple):
     A position p of the odometry's frame, x + iy, lies at turn p + shift, both (K,). `variance` (K,)
     is that of the place along each axis, at the point of `path` that the newest image, of
     `stamp_ns`, shows. `broken`: the odometry was silent since, and the transforms begin anew.
+    `lasting` are those of delays that last from the start, until images are known to be in time.
     """
 
     odds: Array
@@ -119,6 +137,7 @@ class Lateness(NamedTuple):
     stamp_ns: int
     suspected: bool = False
     broken: bool = False
+    lasting: Lateness | None = None
 
     @property
     def apart(self) -> float:
@@ -129,6 +148,14 @@ class Lateness(NamedTuple):
     def error_s(self) -> float:
         """Root mean square of the delay; those that are tolerated count nothing."""
         return math.sqrt(float(self.odds[:-1] @ np.where(self.path.tolerated, 0.0, _DELAYS**2)))
+
+    @property
+    def untested(self) -> bool:
+        """Whether images may be late from the start, and show another place then."""
+        lasting = self.lasting
+        if lasting is None or self.suspected:
+            return False
+        return bool(lasting.odds[:-1] @ lasting.path.harmful > _SHOWN)
 
     @property
     def problem(self) -> str:
@@ -167,20 +194,46 @@ def followed(
     variance, yaw_variance = _noise(covariance)
     if variance > _USELESS_VARIANCE:
         return late
-    path = _path(trail, now)
-    begun = _begun(path, now[0], pose, variance, yaw_variance)
+    path, stamp_ns = _path(trail, now), now[0]
+    begun = _begun(path, stamp_ns, pose, variance, yaw_variance)
+    steady = _begun(_steady(path, trail, now), stamp_ns, pose, variance, yaw_variance)
     if late is None:
-        return begun
+        return begun._replace(lasting=_even(steady))
+    lasting = late.lasting
+    if lasting is not None and restarted:
+        lasting = _even(steady)
+    elif lasting is not None and (late.broken or len(trail) < _AS_BEFORE):
+        lasting = steady._replace(odds=lasting.odds)
+    elif lasting is not None and _moved(lasting.path, steady.path).any():
+        lasting = _tested(lasting, steady, pose, variance, yaw_variance)
     if late.broken:
-        return _judged(_anew(late, begun))
-    if restarted or _moved(late.path, path):
-        seconds = (now[0] - late.stamp_ns) * 1e-9
+        return _judged(_anew(late, begun))._replace(lasting=lasting)
+    if restarted or _moved(late.path, path)[0]:
+        seconds = (stamp_ns - late.stamp_ns) * 1e-9
         late = _corrected(_predicted(late, path, seconds), pose, variance, yaw_variance)
-        late = late._replace(stamp_ns=now[0])
+        late = late._replace(stamp_ns=stamp_ns)
     in_time, elsewhere = float(late.odds[:-1][_NEAR].sum()), float(late.odds[-1])
     if restarted or _ANEW * elsewhere > in_time:
         late = _replaced(late, begun, _RESTARTED if restarted else _ANEW)
-    return _judged(late)
+    return _judged(late)._replace(lasting=lasting)
+
+
+def _even(steady: Lateness) -> Lateness:
+    """Images are in time, or late by anything, as likely as not."""
+    odds = np.append((_NEAR_SHARE + ~_NEAR / np.sum(~_NEAR)) / 2, _ELSEWHERE)
+    return steady._replace(odds=odds / odds.sum())
+
+
+def _tested(
+    lasting: Lateness, steady: Lateness, pose: Array, variance: float, yaw_variance: float
+) -> Lateness | None:
+    """Delays that last, after another image; None where images are in time."""
+    variances = _grown(lasting.variance, lasting.yaw_variance, lasting.path, steady.path)
+    driven = lasting._replace(variance=variances[0], yaw_variance=variances[1], path=steady.path)
+    seen = _corrected(driven, pose, variance, yaw_variance)
+    if seen.odds[-1] > SUSPECTED:  # images of elsewhere show nothing
+        return _even(steady)
+    return None if seen.apart < _SHOWN else seen
 
 
 def _path(trail: tuple[Knot, ...], now: Knot) -> Path:
@@ -190,6 +243,26 @@ def _path(trail: tuple[Knot, ...], now: Knot) -> Path:
     places = np.interp(-_DELAYS, seconds, x) + 1j * np.interp(-_DELAYS, seconds, y)
     known = seconds[0] - 1e-9 <= -_DELAYS
     return Path(places, np.interp(-_DELAYS, seconds, np.unwrap(yaw)), known)
+
+
+def _steady(path: Path, trail: tuple[Knot, ...], now: Knot) -> Path:
+    """The path of a robot that moved before the odometry began as it does where it begins."""
+    knots = (*trail, now)
+    before_s = np.minimum((now[0] - knots[0][0]) * 1e-9 - _DELAYS, 0.0)
+    way, turned = _continued(knots[0], knots[min(_AS_BEFORE - 1, len(trail))], before_s)
+    return Path(path.places + way, path.yaws + turned, np.ones(_COUNT, bool))
+
+
+def _continued(first: Knot, later: Knot, seconds: Array) -> tuple[_Complex, Array]:
+    """Way and turn (K,) of as many seconds from the first of two knots, as between both."""
+    between_s = (later[0] - first[0]) * 1e-9
+    if between_s <= 0:
+        return np.zeros(_COUNT, complex), np.zeros(_COUNT)
+    part, turn = seconds / between_s, float(wrap_angle(later[3] - first[3]))
+    chord = complex(later[1] - first[1], later[2] - first[2])
+    steady = abs(turn) < _STRAIGHT_RAD
+    arc = part if steady else np.expm1(1j * turn * part) / np.expm1(1j * turn)
+    return np.asarray(chord * arc, complex), turn * part
 
 
 def _begun(
@@ -204,9 +277,10 @@ def _begun(
     return Lateness(odds / odds.sum(), turn, shift, *stds, path, stamp_ns)
 
 
-def _moved(before: Path, path: Path) -> bool:
-    turned = abs(float(wrap_angle(path.yaws[0] - before.yaws[0])))
-    return bool(abs(path.places[0] - before.places[0]) >= _LEAST_M or turned >= _LEAST_RAD)
+def _moved(before: Path, path: Path) -> NDArray[np.bool_]:
+    """(K,): by which delays an image shows something new."""
+    turned = np.abs(wrap_angle(path.yaws - before.yaws))
+    return np.asarray((np.abs(path.places - before.places) >= _LEAST_M) | (turned >= _LEAST_RAD))
 
 
 def unrelated(
@@ -217,7 +291,7 @@ def unrelated(
     if late is None or variance > _USELESS_VARIANCE:
         return late
     begun = _begun(_path(trail, now), now[0], pose, variance, yaw_variance)
-    return _judged(_anew(late, begun))
+    return _judged(_anew(late, begun))._replace(lasting=late.lasting)
 
 
 def _anew(late: Lateness, begun: Lateness) -> Lateness:
@@ -262,12 +336,10 @@ def _predicted(late: Lateness, path: Path, seconds: float) -> Lateness:
     turn, places = (came * turns).sum(axis=0), turns * path.places + shifts
     place, length = (came * places).sum(axis=0), np.abs(turn)
     turn = turn / np.maximum(length, _TINY)
-    way, turned = np.abs(path.places - late.path.places), np.abs(path.yaws - late.path.yaws)
     # Directions that differ have a mean shorter than 1, by half their variance.
     yaw_variance = (came * yaw_variances).sum(axis=0) + 2 * np.maximum(1 - length, 0.0)
-    yaw_variance += _YAW_PER_RADIAN**2 * turned + _YAW_PER_METER**2 * way
     variance = (came * (variances + np.abs(places - place) ** 2 / 2)).sum(axis=0)
-    variance += _SLIP**2 * way + way**2 * yaw_variance
+    variance, yaw_variance = _grown(variance, yaw_variance, late.path, path)
     healed = _HEAL * (float(late.odds[:-1][~_NEAR].sum()) + float(late.odds[-1])) * _NEAR_SHARE
     elsewhere = (1 - _HEAL) * late.odds[-1] + _ELSEWHERE
     odds = np.append((1 - _ELSEWHERE) * (total + healed), elsewhere)
@@ -275,6 +347,13 @@ def _predicted(late: Lateness, path: Path, seconds: float) -> Lateness:
     return late._replace(
         odds=odds, turn=turn, shift=shift, variance=variance, yaw_variance=yaw_variance, path=path
     )
+
+
+def _grown(variance: Array, yaw_variance: Array, before: Path, path: Path) -> tuple[Array, Array]:
+    """Variances (K,) after the way from one path to the next."""
+    way, turned = np.abs(path.places - before.places), np.abs(path.yaws - before.yaws)
+    yaw_variance = yaw_variance + _YAW_PER_RADIAN**2 * turned + _YAW_PER_METER**2 * way
+    return variance + _SLIP**2 * way + way**2 * yaw_variance, yaw_variance
 
 
 def _came(odds: Array, drift: float) -> tuple[Array, Array]:

@@ -113,7 +113,8 @@ class Recovery:
         """The pose was set from outside: earlier images do not count any more."""
         memory = Memory(accepted_m=belief.traveled_m)
         placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-        return placed._replace(memory=memory, lateness=None)
+        late = belief.lateness and belief.lateness._replace(broken=True)
+        return placed._replace(memory=memory, lateness=late)
 
     def started(
         self, belief: Belief, event: MeasurementEvent, evidence: tuple[Evidence, ...]

@@ -68,6 +68,8 @@ def status_of(
     degraded += doubts(memory.trust, memory.accepted_m, memory.pull)
     if belief.mounting is not None and belief.mounting.suspected:
         degraded.append(belief.mounting.problem)
+    if belief.lateness is not None and belief.lateness.untested:
+        degraded.append('nothing has shown yet whether images are late: turn, or stop and start')
     degraded += _silences(belief, config)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'
