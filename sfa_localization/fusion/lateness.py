@@ -119,6 +119,16 @@ class Path(NamedTuple):
         return np.asarray((moved > _FAR_M) | (turned > _FAR_RAD))
 
 
+class Image(NamedTuple):
+    """Where an image shows the robot, x + iy, and variances m^2, along each axis, and rad^2."""
+
+    stamp_ns: int
+    place: complex
+    yaw: float
+    variance: float
+    yaw_variance: float
+
+
 class Lateness(NamedTuple):
     """The odds (K + 1,) of each delay and of elsewhere, and transforms from odometry to the map.
 
@@ -191,48 +201,44 @@ def followed(
 
     `restarted`: the filter has taken it for the robot's new place.
     """
-    variance, yaw_variance = _noise(covariance)
-    if variance > _USELESS_VARIANCE:
+    image = _image(now[0], pose, covariance)
+    if image.variance > _USELESS_VARIANCE:
         return late
-    path, stamp_ns = _path(trail, now), now[0]
-    begun = _begun(path, stamp_ns, pose, variance, yaw_variance)
-    steady = _begun(_steady(path, trail, now), stamp_ns, pose, variance, yaw_variance)
+    path = _path(trail, now)
+    begun = _begun(path, image)
+    lasting = _lasting(late, trail, _steady(path, trail, now), image, restarted)
     if late is None:
-        return begun._replace(lasting=_even(steady))
-    lasting = late.lasting
-    if lasting is not None and restarted:
-        lasting = _even(steady)
-    elif lasting is not None and (late.broken or len(trail) < _AS_BEFORE):
-        lasting = steady._replace(odds=lasting.odds)
-    elif lasting is not None and _moved(lasting.path, steady.path).any():
-        lasting = _tested(lasting, steady, pose, variance, yaw_variance)
+        return begun._replace(lasting=lasting)
     if late.broken:
         return _judged(_anew(late, begun))._replace(lasting=lasting)
     if restarted or _moved(late.path, path)[0]:
-        seconds = (stamp_ns - late.stamp_ns) * 1e-9
-        late = _corrected(_predicted(late, path, seconds), pose, variance, yaw_variance)
-        late = late._replace(stamp_ns=stamp_ns)
+        late = _corrected(_predicted(late, path, (now[0] - late.stamp_ns) * 1e-9), image)
     in_time, elsewhere = float(late.odds[:-1][_NEAR].sum()), float(late.odds[-1])
     if restarted or _ANEW * elsewhere > in_time:
         late = _replaced(late, begun, _RESTARTED if restarted else _ANEW)
     return _judged(late)._replace(lasting=lasting)
 
 
-def _even(steady: Lateness) -> Lateness:
-    """Images are in time, or late by anything, as likely as not."""
-    odds = np.append((_NEAR_SHARE + ~_NEAR / np.sum(~_NEAR)) / 2, _ELSEWHERE)
-    return steady._replace(odds=odds / odds.sum())
-
-
-def _tested(
-    lasting: Lateness, steady: Lateness, pose: Array, variance: float, yaw_variance: float
+def _lasting(
+    late: Lateness | None, trail: tuple[Knot, ...], path: Path, image: Image, restarted: bool
 ) -> Lateness | None:
-    """Delays that last, after another image; None where images are in time."""
-    variances = _grown(lasting.variance, lasting.yaw_variance, lasting.path, steady.path)
-    driven = lasting._replace(variance=variances[0], yaw_variance=variances[1], path=steady.path)
-    seen = _corrected(driven, pose, variance, yaw_variance)
+    """Delays that last from the start, after another image; None where images are in time."""
+    before = late and late.lasting
+    if late is not None and before is None:
+        return None
+    odds = np.append((_NEAR_SHARE + ~_NEAR / np.sum(~_NEAR)) / 2, _ELSEWHERE)
+    even = _begun(path, image)._replace(odds=odds / odds.sum())
+    if late is None or before is None or restarted:
+        return even
+    if late.broken or len(trail) < _AS_BEFORE:
+        return even._replace(odds=before.odds)
+    if not _moved(before.path, path).any():
+        return before
+    variances = _grown(before.variance, before.yaw_variance, before.path, path)
+    before = before._replace(variance=variances[0], yaw_variance=variances[1], path=path)
+    seen = _corrected(before, image)
     if seen.odds[-1] > SUSPECTED:  # images of elsewhere show nothing
-        return _even(steady)
+        return even
     return None if seen.apart < _SHOWN else seen
 
 
@@ -265,16 +271,14 @@ def _continued(first: Knot, later: Knot, seconds: Array) -> tuple[_Complex, Arra
     return np.asarray(chord * arc, complex), turn * part
 
 
-def _begun(
-    path: Path, stamp_ns: int, pose: Array, variance: float, yaw_variance: float
-) -> Lateness:
+def _begun(path: Path, image: Image) -> Lateness:
     """By each delay, the image shows where the robot was then."""
     odds = (1 - _SURPRISE) * _NEAR_SHARE + _SURPRISE / (_COUNT + 1)
     odds = np.append(odds, _SURPRISE / (_COUNT + 1))
-    turn = np.exp(1j * (float(pose[2]) - path.yaws))
-    shift = complex(pose[0], pose[1]) - turn * path.places
-    stds = np.full(_COUNT, variance), np.full(_COUNT, yaw_variance)
-    return Lateness(odds / odds.sum(), turn, shift, *stds, path, stamp_ns)
+    turn = np.exp(1j * (image.yaw - path.yaws))
+    shift = image.place - turn * path.places
+    variances = np.full(_COUNT, image.variance), np.full(_COUNT, image.yaw_variance)
+    return Lateness(odds / odds.sum(), turn, shift, *variances, path, image.stamp_ns)
 
 
 def _moved(before: Path, path: Path) -> NDArray[np.bool_]:
@@ -287,11 +291,10 @@ def unrelated(
     late: Lateness | None, trail: tuple[Knot, ...], now: Knot, pose: Array, covariance: Array
 ) -> Lateness | None:
     """After an image without odometry: the odds remain, the transforms begin anew."""
-    variance, yaw_variance = _noise(covariance)
-    if late is None or variance > _USELESS_VARIANCE:
+    image = _image(now[0], pose, covariance)
+    if late is None or image.variance > _USELESS_VARIANCE:
         return late
-    begun = _begun(_path(trail, now), now[0], pose, variance, yaw_variance)
-    return _judged(_anew(late, begun))._replace(lasting=late.lasting)
+    return _judged(_anew(late, _begun(_path(trail, now), image)))._replace(lasting=late.lasting)
 
 
 def _anew(late: Lateness, begun: Lateness) -> Lateness:
@@ -304,10 +307,11 @@ def _judged(late: Lateness) -> Lateness:
     return late._replace(suspected=late.apart > (CLEARED if late.suspected else SUSPECTED))
 
 
-def _noise(covariance: Array) -> tuple[float, float]:
-    """Variances of an image's place, along each axis, and heading."""
-    place = float(covariance[0, 0] + covariance[1, 1]) / 2
-    return _CAUTION * place + _FLOOR_M**2, _CAUTION * float(covariance[2, 2]) + _FLOOR_RAD**2
+def _image(stamp_ns: int, pose: Array, covariance: Array) -> Image:
+    x, y, yaw = pose.tolist()
+    along_x, along_y, yaw_variance = covariance.diagonal().tolist()
+    variance = _CAUTION * (along_x + along_y) / 2 + _FLOOR_M**2
+    return Image(stamp_ns, complex(x, y), yaw, variance, _CAUTION * yaw_variance + _FLOOR_RAD**2)
 
 
 def _replaced(late: Lateness, begun: Lateness, share: float) -> Lateness:
@@ -373,13 +377,13 @@ def _came(odds: Array, drift: float) -> tuple[Array, Array]:
     return np.array(came), near / max(in_time, _TINY)
 
 
-def _corrected(late: Lateness, pose: Array, variance: float, yaw_variance: float) -> Lateness:
+def _corrected(late: Lateness, image: Image) -> Lateness:
     """Bayes' rule, by each delay's Kalman filter, where the image is no outlier."""
     path = late.path
     place = late.turn * path.places + late.shift
-    miss = complex(pose[0], pose[1]) - place
-    yaw_miss = wrap_angle(float(pose[2]) - np.angle(late.turn) - path.yaws)
-    total, yaw_total = late.variance + variance, late.yaw_variance + yaw_variance
+    miss = image.place - place
+    yaw_miss = wrap_angle(image.yaw - np.angle(late.turn) - path.yaws)
+    total, yaw_total = late.variance + image.variance, late.yaw_variance + image.yaw_variance
     fits = np.exp(-0.5 * (np.abs(miss) ** 2 / total + yaw_miss**2 / yaw_total))
     fits *= (1 - _OUTLIERS) * _DENSITY / (total * np.sqrt(yaw_total))
     fits = np.where(path.known, fits, 0.0)
@@ -394,6 +398,7 @@ def _corrected(late: Lateness, pose: Array, variance: float, yaw_variance: float
         shift=place + gain * miss - turn * path.places,
         variance=late.variance * (1 - gain),
         yaw_variance=late.yaw_variance * (1 - yaw_gain),
+        stamp_ns=image.stamp_ns,
     )
 
 
