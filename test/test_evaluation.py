@@ -23,6 +23,7 @@ from sfa_localization.data.geometry import rotation
 from sfa_localization.data.run import PanoramaArray, Trajectory
 from sfa_localization.fusion import recover
 from sfa_localization.fusion.belief import Trust
+from sfa_localization.fusion.lateness import Lateness
 from sfa_localization.fusion.predict import COAST_S
 from sfa_localization.fusion.status import Level
 from sfa_localization.place_model import PlaceModel
@@ -136,7 +137,9 @@ def test_seconds_in_which_the_filter_was_sure_and_wrong_are_counted(
     assert evaluated(bag, tmp_path)['counts']['false_localised_s'] == 0.0
     assert 'an error of more than a meter' not in capsys.readouterr().out
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: Torn()))
-    monkeypatch.setattr(recover, 'begun', lambda traveled_m: Trust())  # driving would notice it
+    # Driving would notice it.
+    monkeypatch.setattr(recover, 'begun', lambda traveled_m: Trust())
+    monkeypatch.setattr(Lateness, 'untested', False)
     counts = evaluated(bag, tmp_path)['counts']
     wrong, localised = counts['false_localised_s'], counts['states_s']['LOCALISED']
     assert 0.5 * localised < wrong <= localised

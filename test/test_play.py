@@ -319,9 +319,16 @@ def test_it_starts_at_the_offset(context: Any, tmp_path: Path, messages: list[Me
     path = reliable(messages, tmp_path / 'bag')
     played = play(path, config=config, context=context)
     assert played.messages['/image_raw'] == IMAGES - 6
-    beyond = PlayConfig(start_offset=1e6, wait=0.0)
-    with pytest.raises(BagError, match='nothing to play after'):
-        play(path, config=beyond, context=context)
+
+
+@ROS
+def test_an_offset_beyond_the_end_is_named_before_any_wait(
+    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bag_player.Player, 'wait_for_subscribers', lambda *_: pytest.fail('waits'))
+    path = reliable(messages, tmp_path / 'bag')
+    with pytest.raises(BagError, match=r'nothing to play after 1e\+06 s'):
+        play(path, config=PlayConfig(start_offset=1e6), context=context)
 
 
 @ROS

@@ -134,6 +134,8 @@ class Player:
             raise BagError(f'{bag.path}: no topic can be played ({reasons or "it has none"})')
         self._ticker = Ticker(node, CLOCK_RATE_HZ) if clock else None
         self._start_ns = bag.recording.start_ns + int(config.start_offset * 1e9)
+        if next(bag.messages(self._publishers, self._start_ns), None) is None:
+            raise BagError(f'{bag.path}: nothing to play after {config.start_offset:g} s')
         self.pace = Pace(self._start_ns, config.rate)
         self._convert = Ros1Converter()
 
@@ -219,7 +221,6 @@ class Player:
 
     def _play_once(self) -> bool:
         """Publish the bag from its start; False when ROS was shut down."""
-        any_played = False
         for channel, receive_ns, data in self._bag.messages(self._publishers, self._start_ns):
             if not self._wait_until(receive_ns):
                 return False
@@ -227,9 +228,6 @@ class Player:
                 data = self._convert(data, channel.kind)
             self._publishers[channel.topic].publish(bytes(data))
             self.played.messages[channel.topic] += 1
-            any_played = True
-        if not any_played:
-            raise BagError(f'{self._bag.path}: nothing to play after {self._config.start_offset} s')
         return True
 
     def _wait_until(self, stamp_ns: int) -> bool:
