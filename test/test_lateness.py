@@ -155,6 +155,18 @@ def test_of_a_robot_that_drove_steadily_all_the_time_images_may_be_late(omega, d
     assert all(after) if delay_s == 0.0 else not any(after)
 
 
+def test_late_images_whose_estimate_wheels_that_spin_have_moved_show_their_time_anew():
+    """By the first turn: wheels that turn too fast make images look late that are in time."""
+    drive = drive_of(np.repeat([0.4, -0.4], [40 * HZ, 20 * HZ]), rested=True)
+    drive.read[12 * HZ : 18 * HZ, 0] *= 3.0
+    late, found = driven(drive, lambda t: t - 2.0 * (t > 11.0))
+    assert late.counts['measurement: restarted elsewhere'] > 0
+    assert not any(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 12.0)
+    in_time, found = driven(drive, lambda t: t)
+    assert in_time.counts['measurement: restarted elsewhere'] > 0
+    assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 45.0)
+
+
 def test_where_a_robot_stands_it_does_not_matter_whether_images_are_late():
     """It drives steadily when it is first heard of, and stops."""
     v = np.repeat([1.0, 0.0, 1.0], [6 * HZ, 6 * HZ, 30 * HZ])

@@ -17,7 +17,7 @@ from sfa_localization.fusion.motion import SIZE
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.recover import Recovery, displaced, outweighs, shows_heading
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.fusion.status import Level, status_of
+from sfa_localization.fusion.status import Level, silence_limit_s, status_of
 from sfa_localization.fusion.update import Correction, measurement_event
 
 SECOND = 1_000_000_000
@@ -287,13 +287,20 @@ def test_the_first_image_that_shows_the_robot_far_away_counts(innovation, gate_e
 
 
 @pytest.mark.parametrize(('silences_s', 'level'), [
-    ((2.9, 0.4), Level.LOCALISED), ((3.1, 0.4), Level.DEGRADED), ((2.9, 0.6), Level.DEGRADED),
+    ((1.9, 0.4), Level.LOCALISED), ((2.1, 0.4), Level.DEGRADED), ((1.9, 0.6), Level.DEGRADED),
 ])  # fmt: skip
 def test_silence_makes_the_estimate_degraded(silences_s, level):
     images_ns, odometry_ns = (round(5e9 - 1e9 * silence_s) for silence_s in silences_s)
     belief = belief_at(accepted_ns=images_ns, precise_ns=images_ns)
     belief = belief._replace(stamp_ns=5 * SECOND, odometry_ns=odometry_ns)
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
+
+
+@pytest.mark.parametrize(('period_s', 'limit_s'), [
+    (0.1, 1.5), (0.6, 1.5), (0.7, 1.75), (1.0, 2.0), (1.5, 2.0), (2.0, 2.5), (5.0, 3.0),
+])  # fmt: skip
+def test_images_are_missed_after_a_few_periods_and_soon(period_s, limit_s):
+    assert silence_limit_s(period_s, 1.0) == pytest.approx(limit_s)
 
 
 @pytest.mark.parametrize(('moved_m', 'period_s', 'level'), [
@@ -318,7 +325,7 @@ def test_of_a_slow_camera_the_first_image_that_contradicts_counts(waited_s, leve
 
 @pytest.mark.parametrize(
     ('precise_ns', 'level'),
-    [(None, Level.DEGRADED), (round(1.9e9), Level.DEGRADED), (round(2.1e9), Level.LOCALISED)],
+    [(None, Level.DEGRADED), (round(2.9e9), Level.DEGRADED), (round(3.1e9), Level.LOCALISED)],
 )
 def test_weak_images_make_the_estimate_degraded_as_silence_does(precise_ns, level):
     belief = belief_at(accepted_ns=5 * SECOND, precise_ns=precise_ns)

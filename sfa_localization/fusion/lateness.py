@@ -135,7 +135,8 @@ class Lateness(NamedTuple):
     A position p of the odometry's frame, x + iy, lies at turn p + shift, both (K,). `variance` (K,)
     is that of the place along each axis, at the point of `path` that the newest image, of
     `stamp_ns`, shows. `broken`: the odometry was silent since, and the transforms begin anew.
-    `lasting` are those of delays that last from the start, until images are known to be in time.
+    `lasting` are those of delays that last from the start, or from `since_ns`, until images are
+    known to be in time.
     """
 
     odds: Array
@@ -147,12 +148,18 @@ class Lateness(NamedTuple):
     stamp_ns: int
     suspected: bool = False
     broken: bool = False
+    since_ns: int = 0
     lasting: Lateness | None = None
 
     @property
     def apart(self) -> float:
         """Probability of images of another time or place."""
         return 1.0 - float(self.odds[:-1][self.path.tolerated].sum())
+
+    @property
+    def late(self) -> bool:
+        """Whether images are likely of another time, and not of another place."""
+        return self.suspected and float(self.odds[-1]) < SUSPECTED
 
     @property
     def error_s(self) -> float:
@@ -206,7 +213,7 @@ def followed(
         return late
     path = _path(trail, now)
     begun = _begun(path, image)
-    lasting = _lasting(late, trail, _steady(path, trail, now), image, restarted)
+    lasting = _lasting(late, trail, now, image, restarted)
     if late is None:
         return begun._replace(lasting=lasting)
     if late.broken:
@@ -220,14 +227,21 @@ def followed(
 
 
 def _lasting(
-    late: Lateness | None, trail: tuple[Knot, ...], path: Path, image: Image, restarted: bool
+    late: Lateness | None, trail: tuple[Knot, ...], now: Knot, image: Image, restarted: bool
 ) -> Lateness | None:
-    """Delays that last from the start, after another image; None where images are in time."""
+    """Delays that last from the start, after another image; None where images are in time.
+
+    Where images were late when the filter moved the estimate, odometry was wrong as well: they have
+    to show their time anew, by what is driven from there.
+    """
     before = late and late.lasting
-    if late is not None and before is None:
+    if late is not None and before is None and not (restarted and late.late):
         return None
+    since_ns = now[0] if restarted else before.since_ns if before else 0
+    trail = tuple(knot for knot in trail if knot[0] >= since_ns)
+    path = _steady(_path(trail, now), trail, now)
     odds = np.append((_NEAR_SHARE + ~_NEAR / np.sum(~_NEAR)) / 2, _ELSEWHERE)
-    even = _begun(path, image)._replace(odds=odds / odds.sum())
+    even = _begun(path, image)._replace(odds=odds / odds.sum(), since_ns=since_ns)
     if late is None or before is None or restarted:
         return even
     if late.broken or len(trail) < _AS_BEFORE:

@@ -20,13 +20,13 @@ from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.recover import DOUBT_STDS, IMAGE_TIMEOUT_S
 from sfa_localization.fusion.settings import FilterConfig
 
-SILENT_IMAGES, LEAST_SILENCE_S = 6.0, 1.5
+FEW_PERIODS, LEAST_SILENCE_S, SILENT_M = 2.5, 1.5, 3.0
 """Images that stay away for so many of their usual periods are missed, but not before 1.5 s, in
-which a robot goes about as many meters, and after IMAGE_TIMEOUT_S at the latest: meanwhile the
-robot may be towed, held or carried away, and nothing shows it."""
-SILENT_M, FEW_PERIODS = 3.0, 2.5
-"""Of a fast robot they are missed after so many meters, if they have stayed away for so many of
-their periods."""
+which a robot goes about as many meters, or a fast one 3 m: meanwhile the robot may be towed, held
+or carried away, and nothing shows it."""
+MOST_SILENCE_S, ONE_PERIOD = 2.0, 1.25
+"""They are missed after 2 s at the latest, those of a slow camera after a period and a quarter, and
+after IMAGE_TIMEOUT_S in any case."""
 NOTICED_S = 1.0
 """Images that contradict for so long are no outliers, however few: a jump is noticed by then."""
 DEGRADED_YAW_RAD = 0.2
@@ -168,8 +168,9 @@ def silence_limit_s(period_s: float, moved_m: float) -> float:
     """Time without an accepted image after which it is missed, by the usual time between them and
     the distance traveled since the last one.
     """
-    patient_s = max(SILENT_IMAGES * period_s, LEAST_SILENCE_S)
-    return min(FEW_PERIODS * period_s if moved_m > SILENT_M else patient_s, IMAGE_TIMEOUT_S)
+    few_s = FEW_PERIODS * period_s
+    patient_s = few_s if moved_m > SILENT_M else max(few_s, LEAST_SILENCE_S)
+    return min(max(min(patient_s, MOST_SILENCE_S), ONE_PERIOD * period_s), IMAGE_TIMEOUT_S)
 
 
 def _silent_s(belief: Belief, last_ns: int | None) -> float:
