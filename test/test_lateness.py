@@ -136,22 +136,15 @@ OPEN = 'nothing has shown yet whether images are late'
 @pytest.mark.parametrize('omega', [0.0, 0.4])
 def test_of_a_robot_that_drove_steadily_all_the_time_images_may_be_late(omega, delay_s):
     """On a line or a circle under way, nothing shows it until the robot turns otherwise."""
-    drive = drive_of(np.repeat([omega, -0.5], [30 * HZ, 20 * HZ]))
-    lag = round(delay_s * HZ / EVERY)
-    fused, found = PoseFilter(FilterConfig()), []
-    for stamp_ns, kind, index in drive.events():
-        at_s = (stamp_ns - START_NS) * 1e-9
-        if at_s < delay_s:  # its image shows a time before the recording
-            continue
-        if kind == 0:
-            drive.give(fused, (stamp_ns, kind, index))
-            continue
-        fused.add_measurement(stamp_ns, drive.seen[index - lag], drive.covariance(True))
-        found.append((at_s, fused.status))
-    before = [status for at_s, status in found if at_s < 30.0]
-    assert not any(status.level is Level.LOCALISED for status in before)
-    assert OPEN in ' '.join(before[-1].reasons)
-    after = [status.level is Level.LOCALISED for at_s, status in found if at_s > 34.0]
+    steady = np.full(30 * HZ, omega)
+    unheard = -1.0, delay_s  # until images show what is after the begin of the recording
+    fused, found = driven(drive_of(steady), lambda t: t - delay_s, silent=unheard)
+    assert not any(level is Level.LOCALISED for _, level, *_ in found)
+    assert OPEN in ' '.join(fused.status.reasons)
+    turning = drive_of(np.append(steady, np.full(20 * HZ, -0.5)))
+    _, found = driven(turning, lambda t: t - delay_s, silent=unheard)
+    assert not any(level is Level.LOCALISED for at_s, level, *_ in found if at_s < 30.0)
+    after = [level is Level.LOCALISED for at_s, level, *_ in found if at_s > 34.0]
     assert all(after) if delay_s == 0.0 else not any(after)
 
 
@@ -170,8 +163,7 @@ def test_late_images_whose_estimate_wheels_that_spin_have_moved_show_their_time_
 def test_where_a_robot_stands_it_does_not_matter_whether_images_are_late():
     """It drives steadily when it is first heard of, and stops."""
     v = np.repeat([1.0, 0.0, 1.0], [6 * HZ, 6 * HZ, 30 * HZ])
-    drive = Drive(every=EVERY, twists=np.column_stack([v, 0 * v]), **NOISY)
-    _, found = driven(drive, lambda t: t)
+    _, found = driven(drive_of(0.0 * v, v), lambda t: t)
     level = {round(at_s, 1): level for at_s, level, *_ in found}
     assert level[5.8] is Level.DEGRADED
     assert all(level[at_s] is Level.LOCALISED for at_s in level if at_s > 8.0)
