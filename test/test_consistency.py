@@ -363,6 +363,23 @@ def test_turns_that_no_wheels_explain_are_confirmed_over_a_longer_way_and_never_
     assert doubts(moved_on, 31.0 + UNLIKE_M - 0.1) != []
 
 
+@pytest.mark.parametrize(('contradicted_m', 'way_m'), [
+    (3.0, UNLIKE_M), (12.0, 12.0), (100.0, LONGEST_M),
+])  # fmt: skip
+@pytest.mark.parametrize('moves', [0, 1])
+def test_what_was_driven_under_contradictions_is_driven_as_far_without(
+    contradicted_m, way_m, moves
+):
+    """Where turns are unlike, and where images moved the estimate meanwhile."""
+    trust = compared(begun(10.0))
+    for part, traveled_m in enumerate(10.0 + np.linspace(0.0, contradicted_m, 41)):
+        if moves and part == 20:
+            trust = compared(moved(trust, traveled_m, 0.1, traveled_m))
+        trust = hesitant(trust, traveled_m, True, 1.1 * NOISIEST_TURNS)
+    assert doubts(trust, traveled_m + way_m - 0.1) != []
+    assert doubts(trust, traveled_m + way_m + 1e-9) == []
+
+
 def test_a_start_that_was_given_needs_images_only():
     drive = Drive(twists=from_rest(winding(3)), **NOISY)
     levels = [status.level for status, *_ in fed(drive, PoseFilter(FilterConfig(

@@ -73,10 +73,10 @@ def test_images_in_time_are_never_suspected(omega, seed):
     assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > CONFIRMED_S)
 
 
-@pytest.mark.parametrize('rate', [0.1, 0.15, 0.2])
+@pytest.mark.parametrize(('v', 'rate'), [(1.0, 0.1), (1.0, 0.15), (1.0, 0.2), (3.0, 0.03)])
 @pytest.mark.parametrize('omega', [0.3, 0.5])
-def test_on_a_circle_a_delay_that_grows_is_noticed_before_it_is_large(rate, omega):
-    drive = drive_of(np.full(50 * HZ, omega))
+def test_on_a_circle_a_delay_that_grows_is_noticed_before_it_is_large(v, rate, omega):
+    drive = drive_of(np.full(50 * HZ, omega), v, rested=True)
     _, found = driven(drive, lambda t: t - rate * max(t - 10.0, 0.0))
     assert sure_and_wrong_s(found) <= 2.0
     assert max(late.apart for at_s, *_, late in found if at_s < 10.0) < 0.1

@@ -95,8 +95,9 @@ class Trust(NamedTuple):
     With a problem, `misfit` are the standard deviations (m, rad) by which they do. `moves` counts
     how often images moved the estimate elsewhere lately, `moved_m` is the distance traveled when
     they did it last, and `contradicted_m` when they contradicted the motion since, before the
-    estimate was confirmed; until an image fits `confirming_m` later, `jump_m` is the standard
-    deviation of being wrong. `proven`: an estimate before the last move was confirmed.
+    estimate was confirmed, as they have from `doubted_m` on; until an image fits `confirming_m`
+    later, `jump_m` is the standard deviation of being wrong. `proven`: an estimate before the last
+    move was confirmed.
     """
 
     recent: tuple[Evidence, ...] = ()
@@ -108,6 +109,7 @@ class Trust(NamedTuple):
     confirming_m: float = 0.0
     jump_m: float = 0.0
     contradicted_m: float = 0.0
+    doubted_m: float = 0.0
     proven: bool = False
 
     @property

@@ -98,14 +98,18 @@ def hesitant(trust: Trust, traveled_m: float, apart: bool, turn_factor: float) -
     `apart` in time, over a longer way. It is longer still where turns of images and odometry differ
     by a `turn_factor` times what is expected, more than wheels slip, and contradictions end any
     confirmation then: images of another robot show such turns, and drive as straight as this one
-    for meters.
+    for meters, or in the same curves. So what was driven under contradictions has to be driven as
+    far without.
     """
-    unlike = turn_factor > NOISIEST_TURNS
-    if not (unlike or trust.unconfirmed(traveled_m)):
+    unlike, unconfirmed = turn_factor > NOISIEST_TURNS, trust.unconfirmed(traveled_m)
+    if not (unlike or unconfirmed):
         return trust
     if apart or trust.problem:
-        trust = trust._replace(contradicted_m=traveled_m)
-    longer_m = UNLIKE_M if unlike else APART_M if apart and not trust.proven else 0.0
+        doubted_m = trust.doubted_m if unconfirmed else traveled_m
+        trust = trust._replace(contradicted_m=traveled_m, doubted_m=doubted_m)
+    longer_m = APART_M if apart and not trust.proven else 0.0
+    if unlike:
+        longer_m = min(max(UNLIKE_M, trust.contradicted_m - trust.doubted_m), LONGEST_M)
     return trust._replace(confirming_m=max(trust.confirming_m, longer_m))
 
 
@@ -129,13 +133,14 @@ def moved(
         moved_m=traveled_m,
         confirming_m=confirming_m if again else max(confirming_m, trust.confirming_m),
         jump_m=min(WRONG_MOVE * jump_m, LARGEST_JUMP_M),
+        doubted_m=trust.doubted_m if trust.unconfirmed(accepted_m) else traveled_m,
         proven=trust.proven or not trust.unconfirmed(accepted_m),
     )
 
 
 def begun(traveled_m: float) -> Trust:
     """The trust in a start from an image alone: it may be of another place, or look elsewhere."""
-    return Trust(moved_m=traveled_m, confirming_m=AGREEING_DISTANCE_M)
+    return Trust(moved_m=traveled_m, confirming_m=AGREEING_DISTANCE_M, doubted_m=traveled_m)
 
 
 def pulled(pull: Pull | None, traveled_m: float, offset_m: complex, variance: float) -> Pull:

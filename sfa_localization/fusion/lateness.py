@@ -31,6 +31,9 @@ LATEST_S = 10.0
 """Delays that are distinguished; images that are later look like images of elsewhere."""
 _MARGIN_S = 0.1
 """Images err in places, so longer delays than those that turns show are no fault."""
+_WRONG_M, _LEAST_S = 1.0, 0.25
+"""No delay in which a robot drives so many meters is small, but one as short as this: cameras have
+such."""
 SUSPECTED, CLEARED = 0.5, 0.3
 """Probability of images of another time from which the estimate is not trusted, and below which it
 is again."""
@@ -109,8 +112,9 @@ class Path(NamedTuple):
         if not moving.any():
             return _NEAR
         v, omega = np.sqrt(np.mean(steps[:, moving] ** 2, axis=1)).tolist()
-        latest = float(steps[0, moving][:_LATEST_STEPS].mean())
-        return tolerated_s(max(v, latest), omega) + _MARGIN_S >= _DELAYS
+        v = max(v, float(steps[0, moving][:_LATEST_STEPS].mean()))
+        limit_s = max(_WRONG_M / max(v, STANDING), _LEAST_S)
+        return np.asarray(min(tolerated_s(v, omega) + _MARGIN_S, limit_s) >= _DELAYS)
 
     @property
     def harmful(self) -> NDArray[np.bool_]:
