@@ -256,18 +256,29 @@ def test_no_output_replaces_what_is_read(command, tmp_path, monkeypatch, capsys)
     'train bag --output diary.txt', 'train bag --update model.npz --output diary.txt',
     'tune bag --model model.npz --output diary.txt', 'config --output diary.txt',
     'calibrate picture.png --output diary.txt', 'config --output model.npz',
-    'train bag --output localization.yaml',
+    'train bag --output localization.yaml', 'calibrate picture.png --check model.npz',
+    'filter odom.csv positions.csv --output picture.png', 'train bag --output link.npz',
 ])  # fmt: skip
 def test_no_output_replaces_a_file_of_another_kind(command, tmp_path, monkeypatch, capsys):
     shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
     for name in ('model.npz', 'diary.txt', 'localization.yaml', 'picture.png'):
         (tmp_path / name).write_text('# no data\n')
+    (tmp_path / 'link.npz').symlink_to('diary.txt')
     before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
     monkeypatch.chdir(tmp_path)
     assert main(command.split()) == 1
     name = command.split()[-1]
     assert f'{name}: is there and no .' in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == before
+
+
+@pytest.mark.parametrize('command', ['config --output', 'calibrate picture.png --output'])
+def test_no_output_replaces_the_description_of_a_bag(command, tmp_path, capsys):
+    metadata = Path(shutil.copytree(BAGS / 'sample', tmp_path / 'bag')) / 'metadata.yaml'
+    before = metadata.read_bytes()
+    assert main([*command.split(), str(metadata)]) == 1
+    assert f'{metadata}: is the description of a bag' in capsys.readouterr().err
+    assert metadata.read_bytes() == before
 
 
 def test_an_output_replaces_a_file_of_its_kind_or_an_empty_one(tmp_path):

@@ -275,12 +275,14 @@ def test_contradictions_make_the_estimate_degraded_then_lost(memory, moved_m, le
 @pytest.mark.parametrize(('innovation', 'gate_excess', 'level'), [
     ((0.8, 0.8, 0.0), 4.1, Level.DEGRADED), ((0.6, -0.6, 0.0), 4.1, Level.LOCALISED),  # LOST_M
     ((0.0, 0.0, -0.4), 4.1, Level.DEGRADED), ((0.0, 0.0, 0.2), 4.1, Level.LOCALISED),  # LOST_RAD
-    ((9.0, 0.0), 4.1, Level.DEGRADED), ((9.0, 0.0), 3.9, Level.LOCALISED),  # LOST_EXCESS
+    ((0.8, 0.8, 0.0), 0.7, Level.DEGRADED), ((9.0, 0.0), 0.5, Level.LOCALISED),  # FAR_EXCESS
 ])  # fmt: skip
 def test_the_first_image_that_shows_the_robot_far_away_counts(innovation, gate_excess, level):
-    offset = np.array(innovation)
-    update = Update(SECOND, False, gate_excess, 1.0, 'outside the gate', offset)
-    memory = {'support': 9, 'rejected': 1, 'gate_excess': gate_excess, 'update': update}
+    """Also where it is so weak that it lies inside the gate, and is fused."""
+    offset, rejected = np.array(innovation), int(gate_excess > 1.0)
+    reason = 'outside the gate' if rejected else 'accepted'
+    update = Update(SECOND, not rejected, gate_excess, 1.0, reason, offset)
+    memory = {'support': 9, 'rejected': rejected, 'gate_excess': gate_excess, 'update': update}
     belief = belief_at(accepted_ns=SECOND, precise_ns=SECOND, **memory)
     belief = belief._replace(odometry_ns=SECOND)
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level

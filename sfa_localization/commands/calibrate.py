@@ -73,6 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
     require_outputs(outputs, [*arguments.images, arguments.calibration])
     if arguments.output:
         require_kind(arguments.output, '.yaml', '.yml')
+    if arguments.check:
+        require_kind(arguments.check, '.png')
     images = calibration.read_images(arguments.images)
     circles = None
     if arguments.center or arguments.radii:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfa_localization.commands.options import destination, settings
+from sfa_localization.commands.options import destination, require_output, settings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import require_outputs
 from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -61,9 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization import filtering
 
     read = arguments.odometry, arguments.positions, arguments.config, arguments.truth
-    require_outputs([arguments.output], read)
+    require_output(arguments.output, read, '.tum', '.txt')
     beside = arguments.output.with_suffix('.covariance.csv')
-    require_outputs([beside], read)
+    require_output(beside, read, '.csv')
     truth = filtering.read_truth(arguments.truth) if arguments.truth else None
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)

@@ -40,8 +40,17 @@ def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) 
 
 
 def require_kind(output: Path, *suffixes: str) -> None:
-    """Raise LocalizationError where an output would replace a file of another kind, by its name."""
-    if output.is_file() and output.stat().st_size and output.suffix.lower() not in suffixes:
+    """Raise LocalizationError where an output would replace a file of another kind, by its name, or
+    the description of a bag; of a link, what it names counts.
+    """
+    from sfa_localization.bags.recording import METADATA
+
+    replaced = output.resolve()
+    if not (replaced.is_file() and replaced.stat().st_size):
+        return
+    if replaced.name == METADATA:
+        raise LocalizationError(f'{output}: is the description of a bag: give another name')
+    if replaced.suffix.lower() not in suffixes:
         kinds = ' or '.join(suffixes)
         raise LocalizationError(f'{output}: is there and no {kinds} file: give another name')
 

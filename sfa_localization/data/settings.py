@@ -123,7 +123,7 @@ def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
         )
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return
-    if not math.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f'{where}: {value!r} is not a finite number')
     low, high = metadata['low'], metadata['high']
     if (low is not None and value < low) or (high is not None and value > high):

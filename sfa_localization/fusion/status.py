@@ -33,6 +33,9 @@ DEGRADED_YAW_RAD = 0.2
 """A heading with a larger standard deviation leads the robot a meter astray within a few."""
 LOST_M, LOST_RAD = 1.0, 0.3
 """Images that contradict by less leave the estimate near enough to find a way by."""
+FAR_EXCESS = 0.6
+"""An image that contradicts by more is not one of the usual ones beyond this factor on its gate:
+one in fifty would be by chance, if images erred by as much as they claim, and they err by less."""
 LOST_EXCESS, LOST_DISTANCE_M = 4.0, 0.5
 """ENOUGH_IMAGES in a row that contradict mean LOST where they lie outside the gate by this factor
 on d2, or the robot has moved so far: standing, it may see one place where the map is wrong."""
@@ -92,8 +95,9 @@ def _few(belief: Belief) -> int:
 
 
 def _lies_far(belief: Belief) -> bool:
+    """Whether the newest image shows the robot far away, even where the gate is as wide as that."""
     update = belief.memory.update
-    if update is None or update.innovation is None or belief.memory.gate_excess <= LOST_EXCESS:
+    if update is None or update.innovation is None or update.d2 <= FAR_EXCESS * update.threshold:
         return False
     x, y, *yaw = update.innovation.tolist()
     return math.hypot(x, y) > LOST_M or any(abs(turn) > LOST_RAD for turn in yaw)
@@ -125,7 +129,8 @@ def _weakness(state: State, config: FilterConfig) -> list[str]:
 
 def _rejections(belief: Belief) -> list[str]:
     """What the last images say, where they were not fused."""
-    reasons, images, update = [], _unmatched(belief), belief.memory.update
+    reasons, update = [], belief.memory.update
+    images = max(_unmatched(belief), int(_lies_far(belief)))
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
     if images >= _few(belief):
         one = 'an image did not match'
