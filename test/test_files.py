@@ -281,6 +281,12 @@ def test_no_output_replaces_the_description_of_a_bag(command, tmp_path, capsys):
     assert metadata.read_bytes() == before
 
 
+def test_an_output_that_is_a_loop_of_links_is_named(tmp_path, capsys):
+    (tmp_path / 'loop.yaml').symlink_to('loop.yaml')
+    assert main(['config', '--output', str(tmp_path / 'loop.yaml')]) == 1
+    assert 'loop.yaml' in capsys.readouterr().err
+
+
 def test_an_output_replaces_a_file_of_its_kind_or_an_empty_one(tmp_path):
     for name, text in (('a.yaml', 'old: 1'), ('b.YML', 'old: 1'), ('c.txt', ''), ('d', None)):
         path = tmp_path / name

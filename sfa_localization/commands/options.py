@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -45,7 +46,7 @@ def require_kind(output: Path, *suffixes: str) -> None:
     """
     from sfa_localization.bags.recording import METADATA
 
-    replaced = output.resolve()
+    replaced = Path(os.path.realpath(output))  # which raises for no loop of links
     if not (replaced.is_file() and replaced.stat().st_size):
         return
     if replaced.name == METADATA:
