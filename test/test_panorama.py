@@ -311,6 +311,13 @@ def test_wrong_pictures_are_refused(picture):
         Unwrapper(CameraConfig(), SMALL)(picture)
 
 
+@pytest.mark.parametrize('shape', [(20, 40_000, 3), (40_000, 20, 3)])
+@pytest.mark.parametrize('model', ['equirectangular', 'panorama'])
+def test_a_picture_that_no_table_can_map_is_refused_by_name(model, shape):
+    with pytest.raises(CameraError, match=f'{shape[1]} x {shape[0]} pixels is longer than'):
+        Unwrapper(CameraConfig(camera_model=model), SMALL)(np.zeros(shape, np.uint8))
+
+
 def test_an_empty_range_of_elevations_is_refused():
     with pytest.raises(ConfigError, match='elevation_min'):
         PanoramaConfig(elevation_min=10.0, elevation_max=10.0)
