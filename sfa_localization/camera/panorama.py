@@ -28,8 +28,7 @@ from sfa_localization.data.run import Image
 
 Mask = NDArray[np.bool_]
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
-LONGEST_SIDE = 32_000
-"""Rows or columns of an image; OpenCV maps hardly more."""
+_LONGEST_SIDE = 32_000  # rows or columns of an image; OpenCV maps hardly more
 _SIZES_KEPT = 4  # tables are kept for this many sizes of images
 
 
@@ -146,9 +145,9 @@ def _check(image: Any) -> None:
         raise CameraError('an image must be an array of uint8')
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise CameraError(f'an image must have shape (H, W, 3), not {image.shape}')
-    if max(image.shape) > LONGEST_SIDE:
+    if max(image.shape) > _LONGEST_SIDE:
         rows, columns, _ = image.shape
-        raise CameraError(f'an image of {columns} x {rows} pixels is longer than {LONGEST_SIDE}')
+        raise CameraError(f'an image of {columns} x {rows} pixels is longer than {_LONGEST_SIDE}')
 
 
 def build_tables(

@@ -84,18 +84,16 @@ def status_of(
 
 
 def _few(belief: Belief) -> int:
-    """How many rejected images in a row are no outliers; of slow cameras the first counts, and one
-    that lies so far off that the estimate would be LOST if it is right.
-    """
+    """How many rejected images in a row are no outliers; of slow cameras the first counts."""
     memory = belief.memory
-    if _lies_far(belief):
-        return 1
     lately = _silent_s(belief, memory.accepted_ns) < NOTICED_S
     return FEW_IMAGES if memory.support >= FEW_IMAGES and lately else 1
 
 
 def _lies_far(belief: Belief) -> bool:
-    """Whether the newest image shows the robot far away, even where the gate is as wide as that."""
+    """Whether the newest image, fused or not, lies so far off that the estimate would be LOST if it
+    is right.
+    """
     update = belief.memory.update
     if update is None or update.innovation is None or update.d2 <= FAR_EXCESS * update.threshold:
         return False
@@ -128,13 +126,12 @@ def _weakness(state: State, config: FilterConfig) -> list[str]:
 
 
 def _rejections(belief: Belief) -> list[str]:
-    """What the last images say, where they were not fused."""
-    reasons, update = [], belief.memory.update
-    images = max(_unmatched(belief), int(_lies_far(belief)))
+    """What the last images say, where they contradict the estimate or were not fused."""
+    reasons, images, update = [], _unmatched(belief), belief.memory.update
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
-    if images >= _few(belief):
+    if _lies_far(belief) or images >= _few(belief):
         one = 'an image did not match'
-        reasons.append(one if images == 1 else f'{images} images in a row did not match')
+        reasons.append(one if images <= 1 else f'{images} images in a row did not match')
     if update is not None and not update.accepted and update.d2 <= update.threshold:
         reasons.append('images lie far from the estimate: others must confirm them')
     return reasons
