@@ -29,6 +29,7 @@ from sfa_localization.fusion.consistency import (
     pulled,
     watched,
 )
+from sfa_localization.fusion.evidence import FEW_IMAGES
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level
@@ -347,17 +348,17 @@ def test_contradictions_before_an_estimate_is_confirmed_put_that_off():
         (compared(begun(10.0)), APART_M),
         (compared(moved(Trust(), 10.0)), AGREEING_DISTANCE_M),
     ):
-        assert hesitant(trust, 11.0, False, 1.0) == trust
-        trust = hesitant(trust, 11.0, True, 1.0)
+        assert hesitant(trust, 11.0, 0, False, 1.0) == trust
+        trust = hesitant(trust, 11.0, 0, True, 1.0)
         assert doubts(trust, 11.0 + way_m - 0.1) != [] and doubts(trust, 11.0 + way_m) == []
-        assert hesitant(trust, 15.1, True, 1.0) == trust, 'confirmed before'
+        assert hesitant(trust, 15.1, 0, True, 1.0) == trust, 'confirmed before'
 
 
 def test_turns_that_no_wheels_explain_are_confirmed_over_a_longer_way_and_never_for_good():
     trust = compared(moved(Trust(), 10.0))
-    unlike = hesitant(trust, 11.0, False, 1.1 * NOISIEST_TURNS)
+    unlike = hesitant(trust, 11.0, 0, False, 1.1 * NOISIEST_TURNS)
     assert doubts(unlike, 10.0 + UNLIKE_M - 0.1) != [] and doubts(unlike, 10.0 + UNLIKE_M) == []
-    again = hesitant(unlike, 30.0, True, 1.1 * NOISIEST_TURNS)
+    again = hesitant(unlike, 30.0, 0, True, 1.1 * NOISIEST_TURNS)
     assert doubts(again, 30.0 + UNLIKE_M - 0.1) != []
     moved_on = compared(moved(again, 31.0, 0.5, accepted_m=31.0))
     assert doubts(moved_on, 31.0 + UNLIKE_M - 0.1) != []
@@ -375,9 +376,32 @@ def test_what_was_driven_under_contradictions_is_driven_as_far_without(
     for part, traveled_m in enumerate(10.0 + np.linspace(0.0, contradicted_m, 41)):
         if moves and part == 20:
             trust = compared(moved(trust, traveled_m, 0.1, traveled_m))
-        trust = hesitant(trust, traveled_m, True, 1.1 * NOISIEST_TURNS)
+        trust = hesitant(trust, traveled_m, 0, True, 1.1 * NOISIEST_TURNS)
     assert doubts(trust, traveled_m + way_m - 0.1) != []
     assert doubts(trust, traveled_m + way_m + 1e-9) == []
+
+
+def test_images_that_were_rejected_for_long_before_they_moved_the_estimate_confirm_it_as_late():
+    trust = compared(moved(Trust(), 10.0))
+    for traveled_m in np.linspace(10.0, 15.0, 26):
+        trust = hesitant(trust, traveled_m, FEW_IMAGES, False, 1.0)
+    assert doubts(trust, 15.0 + AGREEING_DISTANCE_M - 0.1) != []
+    trust = compared(moved(trust, 15.0, 3.0, accepted_m=10.0))
+    assert doubts(trust, 19.9) != [] and doubts(trust, 20.0 + 1e-9) == []
+    outlying = compared(moved(Trust(), 10.0))
+    assert hesitant(outlying, 11.0, FEW_IMAGES - 1, False, 1.0) == outlying
+
+
+@pytest.mark.parametrize('jump', [1.8, 1.4j])
+def test_images_that_jump_aside_and_back_again_and_again_confirm_ever_less(jump):
+    """Each time as a robot does that was carried; each place holds for four seconds."""
+    drive = Drive(seconds=100, **NOISY)
+    aside = np.arange(len(drive.seen)) // 40 % 2 == 1
+    aside[:100] = aside[700:] = False
+    drive.seen[aside, :2] += [jump.real, jump.imag]
+    found = fed(drive)
+    assert wrong_and_sure(found) <= 5
+    assert found[-1][0].level is Level.LOCALISED
 
 
 def test_a_start_that_was_given_needs_images_only():

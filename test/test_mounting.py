@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that sits elsewhere on the robot than in the training shows by the first turns."""
 
+import math
+
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive, winding
+from filter_drives import START_NS, Drive, from_rest, winding
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.fusion.pose_filter import PoseFilter
@@ -91,6 +93,32 @@ def test_a_robot_that_was_carried_has_its_camera_where_it_was(shift, seed):
     drive.kidnap(200, shift)
     found = fed(drive)
     assert found[-1][2] < 0.5 and not any(suspected(found))
+
+
+MOVED = 'the robot was moved, or the camera on it: turn, to show which'
+
+
+@pytest.mark.parametrize('lever', [1.8, -1.6, 2.0j])
+def test_a_place_beside_the_robot_on_a_straight_line_is_not_trusted_before_it_turns(lever):
+    twists = from_rest(np.tile([0.8, 0.0], (2500, 1)))
+    drive = displaced(Drive(twists=twists, **NOISY, **ALIKE), lever, slice(150, None))
+    found = fed(drive)
+    assert found[140][1].level is Level.LOCALISED
+    assert all(status.level is not Level.LOCALISED for _, status, _ in found[155:])
+    assert MOVED in found[-1][1].reasons
+
+
+@pytest.mark.parametrize('shift', [(1.5, 1.0, 0.0), (8.0, -3.0, 0.0)])
+@pytest.mark.parametrize('turn', [0.0, 0.3])
+def test_a_robot_that_was_carried_is_trusted_once_it_has_turned_or_was_carried_far(shift, turn):
+    twists = from_rest(np.tile([0.8, 0.0], (2500, 1)))
+    twists[800:1000, 1] = 0.3
+    twists[1400:1600, 1] = turn
+    drive = Drive(twists=twists, **NOISY, **ALIKE)
+    drive.kidnap(240, shift)
+    _, status, error = fed(drive)[-1]
+    assert error < 0.3
+    assert (MOVED in status.reasons) == (turn == 0.0 and math.hypot(*shift[:2]) < 3.0)
 
 
 def test_after_the_robot_was_carried_the_lever_is_still_known():

@@ -92,19 +92,21 @@ def watched(trust: Trust, newest: Evidence) -> Trust:
     return trust._replace(recent=recent, judged=judged, problem=problem, misfit=misfit, moves=moves)
 
 
-def hesitant(trust: Trust, traveled_m: float, apart: bool, turn_factor: float) -> Trust:
+def hesitant(
+    trust: Trust, traveled_m: float, rejected: int, apart: bool, turn_factor: float
+) -> Trust:
     """The trust after another image: an estimate that is not confirmed yet is confirmed by what is
-    driven from where images contradict the motion no more; one that never was, after such as are
-    `apart` in time, over a longer way. It is longer still where turns of images and odometry differ
-    by a `turn_factor` times what is expected, more than wheels slip, and contradictions end any
-    confirmation then: images of another robot show such turns, and drive as straight as this one
-    for meters, or in the same curves. So what was driven under contradictions has to be driven as
-    far without.
+    driven from where images contradict the motion no more, nor several `rejected` in a row the
+    estimate; one that never was, after such as are `apart` in time, over a longer way. It is longer
+    still where turns of images and odometry differ by a `turn_factor` times what is expected, more
+    than wheels slip, and contradictions end any confirmation then: images of another robot show
+    such turns, and drive as straight as this one for meters, or in the same curves. So what was
+    driven under contradictions has to be driven as far without.
     """
     unlike, unconfirmed = turn_factor > NOISIEST_TURNS, trust.unconfirmed(traveled_m)
     if not (unlike or unconfirmed):
         return trust
-    if apart or trust.problem:
+    if apart or trust.problem or rejected >= FEW_IMAGES:
         doubted_m = trust.doubted_m if unconfirmed else traveled_m
         trust = trust._replace(contradicted_m=traveled_m, doubted_m=doubted_m)
     longer_m = APART_M if apart and not trust.proven else 0.0
@@ -124,17 +126,21 @@ def moved(
     when they end.
     """
     slipped = jump_m <= traveled_m - trust.moved_m + SLACK_M
-    again = trust.moves == 0 or not (slipped and trust.unconfirmed(accepted_m))
+    unconfirmed = trust.unconfirmed(accepted_m)
+    again = trust.moves == 0 or not (slipped and unconfirmed)
     moves = trust.moves + int(again)
-    confirming_m = min(AGREEING_DISTANCE_M * 2.0 ** (moves - 1), LONGEST_M)
+    doubted_m, longer_m = traveled_m, AGREEING_DISTANCE_M * 2.0 ** (moves - 1)
+    if unconfirmed:
+        doubted_m = trust.doubted_m
+        longer_m = max(longer_m, trust.confirming_m, traveled_m - doubted_m)
     return Trust(
         recent=trust.recent[-1:],
         moves=moves,
         moved_m=traveled_m,
-        confirming_m=confirming_m if again else max(confirming_m, trust.confirming_m),
+        confirming_m=min(longer_m, LONGEST_M),
         jump_m=min(WRONG_MOVE * jump_m, LARGEST_JUMP_M),
-        doubted_m=trust.doubted_m if trust.unconfirmed(accepted_m) else traveled_m,
-        proven=trust.proven or not trust.unconfirmed(accepted_m),
+        doubted_m=doubted_m,
+        proven=trust.proven or not unconfirmed,
     )
 
 

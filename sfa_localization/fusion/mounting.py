@@ -32,6 +32,8 @@ _DRIFT_M, _SLIP_M = 0.05, 0.14  # of the odometry: m per m of a bias, and per ro
 _LEAST_KNOWN_RAD = 0.3  # images less certain of the heading show no lever
 # Standard deviation of a lever that is still believed where the robot is found again.
 _KNOWN_M = 0.3
+# Standard deviation of a lever that is known to be none of a meter; none is longer than 3 sigma.
+_TESTED_M, _FARTHEST_STDS = 0.4, 3.0
 # An image beyond this d2 shows neither; so many in a row show that nothing is known any more.
 _OUTLIER_D2, _OUTLIERS = 9.0, 2
 
@@ -39,7 +41,8 @@ _OUTLIER_D2, _OUTLIERS = 9.0, 2
 class Mounting(NamedTuple):
     """The robot's place by images and odometry, and the `lever`, both x + i y in m; the lever's
     axes are ahead and left. With it the variances of both along each axis, m^2, and their
-    covariance, at the last image that counted, and how many `outliers` came since.
+    covariance, at the last image that counted, and how many `outliers` came since. `moved`: images
+    have moved the robot as far as an unknown lever may.
     """
 
     place: complex
@@ -52,11 +55,17 @@ class Mounting(NamedTuple):
     driven_variance: float
     outliers: int = 0
     suspected: bool = False
+    moved: bool = False
 
     @property
     def variance(self) -> float:
         """Of the position along each axis, on top, while the estimate is not trusted."""
         return abs(self.lever) ** 2 / 2 if self.suspected else 0.0
+
+    @property
+    def untested(self) -> bool:
+        """Whether a lever may explain why images moved the robot: it has not turned since."""
+        return self.moved and self.lever_variance > _TESTED_M**2
 
     @property
     def problem(self) -> str:
@@ -83,14 +92,18 @@ def mounted(last: Mounting | None, image: Evidence, driven_variance: float) -> M
     return _corrected(_driven(last, image, way_m, driven_variance), image)
 
 
-def elsewhere(last: Mounting | None, image: Evidence, driven_variance: float) -> Mounting | None:
-    """After the estimate was moved: the place is known anew, and the lever stays as it was, where
-    images that showed the robot elsewhere did not make it uncertain.
+def elsewhere(
+    last: Mounting | None, image: Evidence, driven_variance: float, jump_m: float
+) -> Mounting | None:
+    """After the estimate was moved, by `jump_m`: the place is known anew, and the lever stays as it
+    was, where images that showed the robot elsewhere did not make it uncertain, and no lever
+    explains them as well.
     """
     if last is None or not image.yaw_variance < _LEAST_KNOWN_RAD**2:
         return last
-    if last.lever_variance > _KNOWN_M**2:
-        return _unknown(image, driven_variance)
+    as_lever = last.untested or LEVER_STD_M < jump_m < _FARTHEST_STDS * LEVER_STD_M
+    if last.lever_variance > _KNOWN_M**2 or (as_lever and not last.suspected):
+        return _unknown(image, driven_variance)._replace(moved=as_lever)
     begun = _placed(last.lever, last.lever_variance, image, driven_variance)
     return begun._replace(suspected=last.suspected)
 
@@ -142,7 +155,7 @@ def _corrected(driven: Mounting, image: Evidence) -> Mounting:
     expected = (of_place + toward * of_lever).real + _DEPENDENCE * image.variance
     if abs(innovation) ** 2 > _OUTLIER_D2 * expected:
         if driven.outliers + 1 >= _OUTLIERS:
-            return _unknown(image, driven.driven_variance)
+            return _unknown(image, driven.driven_variance)._replace(moved=driven.moved)
         return driven._replace(outliers=driven.outliers + 1)
     place_gain, lever_gain = of_place / expected, of_lever / expected
     lever = driven.lever + lever_gain * innovation

@@ -71,6 +71,8 @@ def status_of(
     degraded += doubts(memory.trust, memory.accepted_m, memory.pull)
     if belief.mounting is not None and belief.mounting.suspected:
         degraded.append(belief.mounting.problem)
+    if belief.mounting is not None and belief.mounting.untested:
+        degraded.append('the robot was moved, or the camera on it: turn, to show which')
     if belief.lateness is not None and belief.lateness.untested:
         degraded.append('nothing has shown yet whether images are late: turn, or stop and start')
     degraded += _silences(belief, config)

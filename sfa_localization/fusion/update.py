@@ -85,11 +85,11 @@ class Correction:
 
     def fuse(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
+        before = belief.mean
         belief = self._fused(self._weighed(belief, event), event)
         update = belief.memory.update
-        belief = belief._replace(
-            lateness=_late(belief, event, update), mounting=_mounting(belief, event, update)
-        )
+        mounting = _mounting(belief, event, update, before)
+        belief = belief._replace(lateness=_late(belief, event, update), mounting=mounting)
         if belief.located and update is not None and update.reason in STARTS:
             return belief._replace(turns=self._begun(belief))
         return belief
@@ -114,7 +114,8 @@ class Correction:
     def _fused(self, belief: Belief, event: MeasurementEvent) -> Belief:
         trust = watched(belief.memory.trust, evidence_of(belief, event, accepted=False))
         apart = event.apart or (belief.lateness is not None and belief.lateness.suspected)
-        trust = hesitant(trust, belief.traveled_m, apart, belief.turn_factor)
+        rejected = belief.memory.rejected
+        trust = hesitant(trust, belief.traveled_m, rejected, apart, belief.turn_factor)
         period_s = _period_s(belief.memory, event.stamp_ns)
         memory = belief.memory._replace(trust=trust, period_s=period_s)
         belief = belief._replace(memory=memory)
@@ -203,13 +204,18 @@ def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lat
     return followed(belief.lateness, trail, now, event.value, event.covariance, restarted)
 
 
-def _mounting(belief: Belief, event: MeasurementEvent, update: Update | None) -> Mounting | None:
-    """Where images show the camera on the robot after another one; positions alone show nothing."""
+def _mounting(
+    belief: Belief, event: MeasurementEvent, update: Update | None, before: Array
+) -> Mounting | None:
+    """Where images show the camera on the robot after another one, which found the estimate at a
+    mean `before`; positions alone show nothing.
+    """
     if event.value.size == 2:
         return belief.mounting
     image, driven_variance = evidence_of(belief, event, accepted=False), belief.added[1]
     if update is not None and update.reason == ELSEWHERE:
-        return elsewhere(belief.mounting, image, driven_variance)
+        jump_m = math.hypot(*(belief.mean[:2] - before[:2]))
+        return elsewhere(belief.mounting, image, driven_variance, jump_m)
     return mounted(belief.mounting, image, driven_variance)
 
 
