@@ -4,12 +4,19 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
 
 from sfa_localization import cli
-from sfa_localization.camera.calibration import check_image, find_circles, given_circles
+from sfa_localization.camera.calibration import (
+    check_image,
+    find_circles,
+    given_circles,
+    read_images,
+)
 from sfa_localization.camera.calibration_files import read_calibration
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
@@ -72,6 +79,35 @@ def test_noise_without_a_mirror_is_rejected():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     with pytest.raises(CameraError, match='stands out'):
         find_circles([noise])
+
+
+@pytest.mark.parametrize('size', [(6000, 6001), (3, 9000)])
+def test_images_larger_than_the_search_takes(size):
+    middle, radii = (size[1] / 2, size[0] / 2), (700.3, 2600.7)
+    picture = np.full((*size, 3), 10, np.uint8)
+    for radius, level in zip(radii[::-1], (150, 10), strict=True):
+        cv2.circle(picture, (round(middle[0]), round(middle[1])), round(radius), (level,) * 3, -1)
+    if min(size) < 100:
+        with pytest.raises(CameraError, match='stands out'):
+            find_circles([picture])
+    else:
+        assert_found(find_circles([picture]), middle, radii, atol=2.0)
+
+
+def test_memory_does_not_grow_with_the_images(tmp_path):
+    """Of a few kB each, with 12 MB of pixels."""
+    paths = [tmp_path / f'{n}.png' for n in range(9)]
+    for n, path in enumerate(paths):
+        picture = np.full((2000, 2000, 3), 10, np.uint8)
+        cv2.circle(picture, (1000, 1000), 750, (100 + 10 * n,) * 3, -1)
+        cv2.imwrite(str(path), picture)
+    peaks = []
+    for count in (3, 9):
+        tracemalloc.start()
+        find_circles(read_images(paths[:count]))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 12e6
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ _TOLERANCE_PX = (
 )
 _TRIALS = 400  # random circles; enough to find the rim among two thirds of wrong edges
 _ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
+_SEARCHED_PX = 4096  # rows or columns; larger images are shrunk before circles are looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,17 +60,34 @@ class MirrorCircles:
     hole: Circle | None
 
 
-def read_images(paths: Sequence[Path]) -> list[Image]:
-    """Read images of one camera. Raises CameraError naming the file that is unusable."""
-    images = []
-    for path in paths:
+class _Files(Sequence[Image]):
+    """Image files, each read anew when it is asked for: some kB may hold 200 MB of pixels."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = paths
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def __getitem__(self, index: Any) -> Any:
+        path = self._paths[index]
         try:
-            images.append(decode_compressed(read_regular(path, LARGEST_FILE)))
+            return decode_compressed(read_regular(path, LARGEST_FILE))
         except OSError as error:
             raise CameraError(f'{path}: {error.strerror or error}') from None
         except CameraError as error:
             raise CameraError(f'{path}: {error}') from None
-        if images[-1].shape != images[0].shape:
+
+
+def read_images(paths: Sequence[Path]) -> Sequence[Image]:
+    """Images of one camera, of which one at a time is in memory.
+
+    Raises CameraError naming the file that is unusable.
+    """
+    images = _Files(paths)
+    shapes = list(map(np.shape, images))  # as no loop does, map drops an image before the next
+    for path, shape in zip(paths, shapes, strict=True):
+        if shape != shapes[0]:
             raise CameraError(f'{path} and {paths[0]} differ in size: give images of one camera')
     return images
 
@@ -81,7 +100,8 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     from the center. Raises CameraError when no circle stands out.
     """
     rng = np.random.default_rng(seed)
-    cues = [(cue, _threshold(cue)) for cue in _cues(images)]
+    shrink = -(-max(images[0].shape) // _SEARCHED_PX)
+    cues = [(cue, _threshold(cue)) for cue in _cues(images, shrink)]
     rims = [_find_rim(cue, threshold, rng) for cue, threshold in cues]
     rim = _best(rims)
     if rim is None:
@@ -89,8 +109,8 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
             'no mirror or fisheye stands out: take several images while driving in good light, '
             'or give --center and --radii'
         )
-    holes = [_find_hole(cue, rim, threshold, rng) for cue, threshold in cues]
-    return MirrorCircles(rim, _best(holes))
+    hole = _best([_find_hole(cue, rim, threshold, rng) for cue, threshold in cues])
+    return MirrorCircles(_enlarged(rim, shrink), hole and _enlarged(hole, shrink))
 
 
 def _best(circles: Sequence[Circle | None]) -> Circle | None:
@@ -98,16 +118,37 @@ def _best(circles: Sequence[Circle | None]) -> Circle | None:
     return max(found, key=lambda circle: circle.support, default=None)
 
 
-def _cues(images: Sequence[Image]) -> list[Array]:
-    """What distinguishes the mirror from its surroundings (H, W), 0..255: brightness, change."""
-    stack = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]
-    gray = np.stack([cv2.GaussianBlur(image, (0, 0), 1.0) for image in stack]).astype(float)
-    brightness = np.asarray(gray.mean(axis=0))
+def _enlarged(circle: Circle, factor: int) -> Circle:
+    """The circle of an image that was shrunk by a factor, in the image."""
+    shift = (factor - 1) / 2  # between the middles of the first pixels of both
+    column, row = circle.column * factor + shift, circle.row * factor + shift
+    return Circle(column, row, circle.radius * factor, circle.support)
+
+
+def _cues(images: Sequence[Image], shrink: int) -> list[Array]:
+    """What distinguishes the mirror from its surroundings (h, w), 0..255: brightness, change."""
+    shape = _shrunk(images[0], shrink).shape
+    brightness, squares = np.zeros(shape), np.zeros(shape)
+    for shrunk in map(partial(_shrunk, factor=shrink), images):
+        gray = cv2.GaussianBlur(shrunk, (0, 0), 1.0)
+        cv2.accumulate(gray, brightness)
+        cv2.accumulateSquare(gray, squares)
+    brightness /= len(images)
     if len(images) < _ENOUGH_FOR_MOTION:
         return [brightness]
-    change = cv2.GaussianBlur(gray.std(axis=0), (0, 0), 2.0)
-    scaled = np.clip(change * 255 / max(float(np.quantile(change, 0.95)), 1e-9), 0, 255)
+    variance = squares / len(images) - brightness**2
+    change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)
+    scale = 255 / max(float(np.quantile(change, 0.95)), 1e-9)
+    scaled = np.minimum(change * scale, 255)
     return [brightness, np.asarray(scaled)]
+
+
+def _shrunk(image: Image, factor: int) -> Image:
+    """The image in gray, each side of it divided by a factor."""
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    height, width = (max(side // factor, 1) for side in gray.shape)
+    whole = gray[: height * factor, : width * factor]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _threshold(cue: Array) -> float:
@@ -299,21 +340,22 @@ _CHECK_WIDTH = 1200  # px, at least; small images are framed, so that labels of 
 
 def check_image(image: Image, unwrapper: Unwrapper) -> Image:
     """The raw image with its directions and elevations drawn in, above its panorama."""
-    raw = _annotated(image, unwrapper)
-    unwrapped = unwrapper(image)
-    width = max(raw.shape[1], _CHECK_WIDTH)
+    (height, raw_width), unwrapped = image.shape[:2], unwrapper(image)
+    width = max(raw_width, _CHECK_WIDTH)
     size = (width, max(round(unwrapped.shape[0] * width / unwrapped.shape[1]), 1))
     strip = np.asarray(cv2.resize(unwrapped, size, interpolation=cv2.INTER_LINEAR), np.uint8)
     _label(strip, unwrapper.panorama)
-    left = (width - raw.shape[1]) // 2
-    right = width - raw.shape[1] - left
-    framed = cv2.copyMakeBorder(raw, 0, 0, left, right, cv2.BORDER_CONSTANT)
-    return np.vstack([np.asarray(framed, np.uint8), strip])
+    left = (width - raw_width) // 2
+    framed = np.zeros((height + len(strip), width, 3), np.uint8)
+    raw = framed[:height, left : left + raw_width]
+    raw[:], framed[height:] = image, strip
+    _annotate(raw, unwrapper)
+    return framed
 
 
-def _annotated(image: Image, unwrapper: Unwrapper) -> Image:
-    drawn, panorama = image.copy(), unwrapper.panorama
-    size = (image.shape[0], image.shape[1])
+def _annotate(drawn: Image, unwrapper: Unwrapper) -> None:
+    """Draw directions and elevations into a raw image."""
+    panorama, size = unwrapper.panorama, (drawn.shape[0], drawn.shape[1])
     model = make_camera(unwrapper.calibration, size, panorama, unwrapper.camera.mount_rpy)
     circle = np.radians(45.0 + np.arange(0, 361, 1.0))
     for elevation in (panorama.elevation_min, 0.0, panorama.elevation_max):
@@ -323,7 +365,6 @@ def _annotated(image: Image, unwrapper: Unwrapper) -> Image:
     for name, azimuth in (('FRONT', 0.0), ('LEFT', 90.0), ('BACK', 180.0), ('RIGHT', 270.0)):
         spoke = model.project(_rays(np.radians(azimuth), heights))
         _draw(drawn, spoke, _RED, name)
-    return drawn
 
 
 def _rays(azimuth: Any, elevation: Any) -> Array:
