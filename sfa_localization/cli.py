@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -48,6 +49,7 @@ OPTIONAL = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command or node named by the first argument; return the exit code."""
+    _print_any_name()
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
     if name in NODES and asks_for_help(words[1:]):
@@ -62,6 +64,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             return guarded(lambda: int(arguments.run(arguments)))
     _overview().parse_args(words)  # prints help, version or error, and exits
     return 2
+
+
+def _print_any_name() -> None:
+    """Let names of files that are not UTF-8 be printed, as \\udcff."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
 
 
 def executable() -> int:

@@ -389,6 +389,20 @@ def test_the_command_writes_json_and_figures(
     assert {file.name for file in report.iterdir()} == pictures | {'index.html'}
 
 
+@pytest.mark.parametrize('name', ['\udcff', 'a$x^$b'], ids=['not UTF-8', 'formula'])
+def test_a_bag_may_have_any_name(name, tmp_path, capsys):
+    bag, report = write(tmp_path / name), tmp_path / 'report'
+    words = ['--json', str(tmp_path / 'found.json'), '--report', str(report)]
+    assert main(['inspect', str(bag), *words]) == 0
+    shown = name.replace('\udcff', '\\udcff')
+    assert f'{tmp_path}/{shown}\n' in capsys.readouterr().out
+    assert f'{shown} is enough' in (report / 'index.html').read_text()
+    (found,) = json.loads((tmp_path / 'found.json').read_text())['bags']
+    assert found['path'] == str(bag)
+    figures = {f'{name}_pictures.png', f'{name}_path.png'}
+    assert {file.name for file in report.iterdir()} == figures | {'index.html'}
+
+
 def test_the_command_takes_topics_and_limits(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -454,6 +454,15 @@ def test_signals_end_it_cleanly(
 
 
 @ROS
+def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[Message]) -> None:
+    path = write_version(tmp_path / '\udcff', messages, 5)
+    command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--wait=0', '--rate=99']
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S)
+    assert (result.returncode, result.stderr) == (0, '')
+    assert result.stdout.count(' messages\n') == len(COUNTS)
+
+
+@ROS
 @pytest.mark.parametrize('place', ['', '.', 'folder'])
 def test_nothing_is_imported_from_the_folder_of_a_bag(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -50,6 +50,7 @@ from sfa_localization.commands.pace import (
     PlayConfig,
 )
 from sfa_localization.data.errors import BagError
+from sfa_localization.data.rejections import encodable
 
 DEPTH = 10  # of a publisher's queue, in messages
 LATCHED_DEPTH = 100  # of the queue that late subscribers receive, in messages
@@ -102,7 +103,8 @@ def _node(context: Context | None) -> Iterator[Node]:
     own = context is None
     context = context or Context()
     if own:
-        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.ALL)
+        # No arguments: among those of the command may be a name that is not UTF-8.
+        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.ALL)
     node = Node('bag_player', context=context, start_parameter_services=False)
     try:
         yield node
@@ -269,7 +271,7 @@ class Player:
             if played < expected:
                 problems.append(f'{name}: {played} of {expected} messages could be read')
         for problem in problems:
-            self._node.get_logger().warning(f'{self._bag.path}: {problem}')
+            self._node.get_logger().warning(encodable(f'{self._bag.path}: {problem}'))
 
     def _await_acknowledgement(self) -> None:
         """Let reliable subscribers receive what is still queued."""

@@ -34,6 +34,11 @@ def short_line(text: str) -> str:
     return line if len(line) <= LONGEST else line[: LONGEST - 3] + '...'
 
 
+def encodable(text: str) -> str:
+    """The text in UTF-8, which names of files may not be: their other bytes become \\udcff."""
+    return text.encode(errors='backslashreplace').decode()
+
+
 def listed(skipped: Mapping[str, int]) -> str:
     """Numbers with their reasons, '' for none."""
     return ', '.join(f'{number} {reason}' for reason, number in skipped.items())

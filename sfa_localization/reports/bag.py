@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.reports import page
-from sfa_localization.reports.evaluation import save
+from sfa_localization.reports.evaluation import as_title, save
 
 
 def write_contact_sheet(
@@ -30,7 +30,7 @@ def write_contact_sheet(
     inches = 10 / columns
     row = inches * height / width + (0.3 if captions else 0.0)
     figure = Figure((10, rows * row + 0.5), layout='constrained')
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(as_title(title), fontsize=10)
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
     for axis in axes:
         axis.set_axis_off()
@@ -53,7 +53,7 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     dots = axes.scatter(places[:, 0], places[:, 1], c=order, s=5, cmap='viridis', zorder=2)
     axes.plot(*poses[0, :2], 'o', color='#D55E00', markersize=7, label='start', zorder=3)
     axes.set_aspect('equal', adjustable='datalim')
-    axes.set(title=title, xlabel='x in m (odometry)', ylabel='y in m (odometry)')
+    axes.set(title=as_title(title), xlabel='x in m (odometry)', ylabel='y in m (odometry)')
     axes.title.set_fontsize(10)
     axes.legend(loc='upper right')
     figure.colorbar(dots, label='images, % of the drive', shrink=0.7)

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.rejections import encodable
 from sfa_localization.data.run import Stamps, Trajectory
 
 Estimates = Mapping[str, Trajectory]
@@ -325,6 +326,11 @@ def number(value: float | None, column: str) -> str:
     return f'{int(value)}' if column == 'n' else f'{value:.3f}'
 
 
+def as_title(text: str) -> str:
+    """A text with names of files or topics, as matplotlib draws it: a dollar starts no formula."""
+    return encodable(text).replace('$', r'\$')
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, completely or not at all. Raises LocalizationError."""
     with atomic_write(path) as file:
@@ -334,4 +340,4 @@ def save(figure: Figure, path: Path) -> None:
 def save_text(path: Path, text: str) -> None:
     """Write a text file, completely or not at all. Raises LocalizationError."""
     with atomic_write(path) as file:
-        file.write(text.encode())
+        file.write(encodable(text).encode())
