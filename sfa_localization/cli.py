@@ -55,15 +55,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name in NODES and asks_for_help(words[1:]):
         print(node_help(name, NODES[name]), end='')
         return 0
-    if name in NODES:  # a node reads its ROS arguments itself
-        node = importlib.import_module(f'sfa_localization.nodes.{name}')
-        return guarded(lambda: int(node.main(words)))
+    if name in NODES:
+        return guarded(lambda: _run_node(name, words))
     if name in COMMANDS:
-        arguments = command_parser(name).parse_intermixed_args(words[1:])
         with nullcontext() if name in ROS_COMMANDS else terminable():
-            return guarded(lambda: int(arguments.run(arguments)))
+            return guarded(lambda: _run_command(name, words[1:]))
     _overview().parse_args(words)  # prints help, version or error, and exits
     return 2
+
+
+def _run_node(name: str, words: Sequence[str]) -> int:
+    """Run a node, which reads its ROS arguments itself; the exit code."""
+    node = importlib.import_module(f'sfa_localization.nodes.{name}')
+    return int(node.main(words))
+
+
+def _run_command(name: str, words: Sequence[str]) -> int:
+    """Import and run a command; the exit code."""
+    arguments = command_parser(name).parse_intermixed_args(words)
+    return int(arguments.run(arguments))
 
 
 def _print_any_name() -> None:
@@ -136,6 +146,9 @@ def guarded(run: Callable[[], int]) -> int:
         reason = ' '.join(str(error).split()) or 'not enough memory'
         print(f'error: {_shortened(reason)}', file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError) as error:
+        # Of a C++ library that was interrupted while it was loaded it is the cause.
+        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            raise
         print('interrupted', file=sys.stderr)
         return 130

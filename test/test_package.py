@@ -436,6 +436,19 @@ def test_a_missing_optional_package_is_named_with_its_remedy(package, capsys):
     assert error.count('\n') == 1
 
 
+@pytest.mark.parametrize('cause', [None, KeyboardInterrupt()])
+def test_ctrl_c_while_a_command_is_imported_is_one_line(cause, monkeypatch, capsys):
+    """As pybind11 does it, with a cause: ImportError('initialization failed')."""
+
+    def import_module(name):
+        raise ImportError('initialization failed') from cause if cause else KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, 'import_module', import_module)
+    for words in (['config'], ['ekf_node']):
+        assert cli.main(words) == 130
+        assert capsys.readouterr().err == 'interrupted\n'
+
+
 def test_a_missing_part_of_the_package_is_no_users_error():
     def run():
         raise ModuleNotFoundError('No module named numpy', name='numpy')

@@ -454,6 +454,20 @@ def test_signals_end_it_cleanly(
 
 
 @ROS
+@pytest.mark.parametrize('step', ['Node', 'message_class'])
+def test_a_shutdown_while_it_starts_ends_it(
+    step: str, context: Any, tmp_path: Path, messages: list[Message], monkeypatch: Any
+) -> None:
+    def shut_down(*args: Any, **how: Any) -> Any:
+        rclpy.try_shutdown(context=context)
+        return original(*args, **how)
+
+    path, original = write_version(tmp_path / 'bag', messages, 5), getattr(bag_player, step)
+    monkeypatch.setattr(bag_player, step, shut_down)
+    assert not play(path, context=context).messages
+
+
+@ROS
 def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[Message]) -> None:
     path = write_version(tmp_path / '\udcff', messages, 5)
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--wait=0', '--rate=99']

@@ -22,7 +22,7 @@ import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidTopicNameException
+from rclpy.exceptions import InvalidTopicNameException, NotInitializedException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
@@ -86,32 +86,43 @@ def play(
     (none named: when images and odometry have some and the number is stable), or after the
     configured wait. `context` must be initialized; by default one is created. Raises BagError.
     """
-    with _node(context) as node, Bag(path, strict=strict) as bag, Keyboard() as keyboard:
-        player = Player(node, bag, config or PlayConfig(), keyboard, clock, topics)
+    played = Played()
+    with _initialized(context) as ros, Bag(path, strict=strict) as bag, Keyboard() as keyboard:
         try:
-            player.wait_for_subscribers(wait_for)
-            player.play(loop)
-        except RuntimeError:  # of rclpy, when publishing during shutdown
-            if node.context.ok():
+            with _node(ros) as node:
+                player = Player(node, bag, config or PlayConfig(), keyboard, clock, topics)
+                played = player.played
+                player.wait_for_subscribers(wait_for)
+                player.play(loop)
+        except (RuntimeError, NotInitializedException):  # of rclpy, while it is shut down
+            if ros.ok():
                 raise
-        return player.played
+    return played
 
 
 @contextmanager
-def _node(context: Context | None) -> Iterator[Node]:
-    """A node in the context, or in a new one that is shut down with it."""
-    own = context is None
-    context = context or Context()
-    if own:
-        # No arguments: among those of the command may be a name that is not UTF-8.
-        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.ALL)
+def _initialized(context: Context | None) -> Iterator[Context]:
+    """The context, or a new one that is shut down afterwards."""
+    if context is not None:
+        yield context
+        return
+    context = Context()
+    # No arguments: among those of the command may be a name that is not UTF-8.
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.ALL)
+    try:
+        yield context
+    finally:
+        rclpy.try_shutdown(context=context)
+
+
+@contextmanager
+def _node(context: Context) -> Iterator[Node]:
+    """A node, destroyed afterwards."""
     node = Node('bag_player', context=context, start_parameter_services=False)
     try:
         yield node
     finally:
         node.destroy_node()
-        if own:
-            rclpy.try_shutdown(context=context)
 
 
 class Player:
