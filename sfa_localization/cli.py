@@ -49,7 +49,7 @@ OPTIONAL = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command or node named by the first argument; return the exit code."""
-    _print_any_name()
+    _prepare_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
     if name in NODES and asks_for_help(words[1:]):
@@ -76,11 +76,24 @@ def _run_command(name: str, words: Sequence[str]) -> int:
     return int(arguments.run(arguments))
 
 
-def _print_any_name() -> None:
-    """Let names of files that are not UTF-8 be printed, as \\udcff."""
-    for stream in (sys.stdout, sys.stderr):
+def _prepare_streams() -> None:
+    """Open those that are closed; let names of files that are not UTF-8 be printed, as \\udcff."""
+    for name in ('stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), 'w'))
+        stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors='backslashreplace')
+
+
+def _unprintable() -> str:
+    """Why standard output takes no more lines, or ''; what it has not taken is given up."""
+    try:
+        print(flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return f'standard output: cannot be written: {error.strerror}'
+    return ''
 
 
 def executable() -> int:
@@ -127,9 +140,8 @@ def guarded(run: Callable[[], int]) -> int:
         code = run()
         sys.stdout.flush()
         return code
-    except BrokenPipeError:
-        # The reader, such as head, has closed the pipe; discard what is still buffered.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader, such as head, has closed the pipe
+        _unprintable()
         return 0
     except LocalizationError as error:
         print(f'error: {_shortened(str(error))}', file=sys.stderr)
@@ -143,7 +155,7 @@ def guarded(run: Callable[[], int]) -> int:
         return 1
     except (OSError, MemoryError) as error:
         # Of the machine: a full disk, too many open files.
-        reason = ' '.join(str(error).split()) or 'not enough memory'
+        reason = _unprintable() or ' '.join(str(error).split()) or 'not enough memory'
         print(f'error: {_shortened(reason)}', file=sys.stderr)
         return 1
     except (KeyboardInterrupt, ImportError) as error:

@@ -69,6 +69,7 @@ OTHERS = {
     'data/files': 'the one writer',
     'commands/processes': 'what a program prints, while it prints it',
     'bags/drives': 'the folder of decoded images, which it removes',
+    'cli': 'to /dev/null, what is printed to a closed stream',
 }
 
 
@@ -221,6 +222,27 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert writing.wait(60) == 0
     assert writing.stderr.read() == b''
     writing.stderr.close()
+
+
+@pytest.mark.parametrize('command', ['config', f'inspect {BAGS / "sample"}'])
+@pytest.mark.parametrize('unbuffered', ['', '1'])
+def test_a_standard_output_that_is_full_is_named(command, unbuffered):
+    done = subprocess.run(
+        f'{sys.executable} -m sfa_localization {command} > /dev/full',
+        shell=True, capture_output=True, text=True, timeout=120,
+        env={**os.environ, 'PYTHONUNBUFFERED': unbuffered},
+    )  # fmt: skip
+    reason = 'standard output: cannot be written: No space left on device'
+    assert (done.returncode, done.stderr) == (1, f'error: {reason}\n')
+
+
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '<&- >&- 2>&-'])
+def test_streams_may_be_closed(closed, tmp_path):
+    report, words = tmp_path / 'report', f'inspect {BAGS / "sample"}'
+    command = f'{sys.executable} -m sfa_localization {words} --report {report} {closed}'
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert (report / 'index.html').stat().st_size > 1000
 
 
 @pytest.mark.parametrize(
