@@ -21,7 +21,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
@@ -155,9 +155,8 @@ def _sections(path: Path) -> dict[str, dict[str, Any]]:
     As in ROS, `robot1: {ekf_node: ...}` and `/robot1/ekf_node: ...` are the same.
     """
     try:
-        # Of a pipe too: a shell makes one of `--config <(COMMAND)`.
-        with path.open(encoding='utf-8') as file:
-            document = load_yaml(file.read(LONGEST + 1))
+        # No pipe: it is empty when the next section is read.
+        document = load_yaml(read_regular(path, LONGEST).decode())
     except UnicodeDecodeError as error:
         raise ConfigError(f'{path}: cannot be read: {error.reason}') from None
     except OSError as error:

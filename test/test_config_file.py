@@ -3,6 +3,7 @@
 """The parameter file: written from the settings, read back to the same settings, strict."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 import pytest
@@ -213,6 +214,19 @@ def test_a_missing_file_and_an_unwritable_one_are_named(tmp_path):
     (tmp_path / 'file').touch()
     with pytest.raises(ConfigError, match='cannot be written'):
         write_config(tmp_path / 'file' / 'c.yaml')
+
+
+def test_a_pipe_is_no_parameter_file(tmp_path, capsys):
+    """It would be waited for; and one that a shell fills can be read once, but has sections."""
+    os.mkfifo(tmp_path / 'pipe')
+    reading, writing = os.pipe()
+    os.write(writing, b'ekf_node: {ros__parameters: {lost_std: 3.0}}\n')
+    os.close(writing)
+    for path in (tmp_path / 'pipe', f'/dev/fd/{reading}'):
+        words = ['train', 'no_bag', '--output', str(tmp_path / 'a.npz'), '--config', str(path)]
+        assert main(words) == 1
+        assert f'{path}: cannot be read: it is no regular file' in capsys.readouterr().err
+    os.close(reading)
 
 
 def test_the_command_prints_and_writes(tmp_path, capsys):
