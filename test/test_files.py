@@ -334,7 +334,34 @@ def test_no_report_is_written_into_a_bag(command, place, words, tmp_path, monkey
     assert sorted(tmp_path.rglob('*')) == before
 
 
+@pytest.mark.parametrize(
+    'command',
+    [
+        'evaluate none.npz bag --report=new --json=new/index.html',
+        'inspect bag --report=new --json=link/bag_path.png',
+        'train bag --output=new --report=./new',
+        'train bag --output=new/training.md --report=new',
+        'train bag --output=new --report=new/report',
+    ],
+)
+def test_no_output_replaces_a_part_of_the_report(command, tmp_path, monkeypatch, capsys):
+    shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
+    (tmp_path / 'link').symlink_to('new')
+    before = sorted(tmp_path.rglob('*'))
+    monkeypatch.chdir(tmp_path)
+    assert main(command.split()) == 1
+    assert 'named for two outputs: give each its own' in capsys.readouterr().err
+    assert sorted(tmp_path.rglob('*')) == before
+
+
 def test_an_output_beside_the_files_of_a_bag_is_written(tmp_path):
     bag = shutil.copytree(BAGS / 'sample', tmp_path / 'bag')
     for _ in range(2):
         assert main(['inspect', str(bag), '--json', str(bag / 'found.json')]) == 0
+
+
+def test_an_output_beside_the_files_of_a_report_is_written(tmp_path):
+    words = ['--report', str(tmp_path), '--json', str(tmp_path / 'found.json')]
+    for _ in range(2):
+        assert main(['inspect', str(BAGS / 'sample'), *words]) == 0
+    assert {file.suffix for file in tmp_path.iterdir()} == {'.html', '.json', '.png'}

@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         read = arguments.model, arguments.bag, *arguments.align, arguments.config
         require_output(arguments.json, read, '.json')
-    require_report(arguments.report)
+    require_report(arguments.report, arguments.json)
     model = PlaceModel.load(arguments.model)
     require_same_panorama(arguments.config, model.panorama)
     result = evaluation.evaluate(

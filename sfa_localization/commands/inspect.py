@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
     if arguments.json:
         require_output(arguments.json, arguments.bags, '.json')
-    require_report(arguments.report)
+    require_report(arguments.report, arguments.json)
     reports = []
     for path in arguments.bags:
         try:

@@ -29,6 +29,9 @@ TOPIC_OPTIONS = {
     'ground_truth': '--ground-truth-topic',
 }
 
+REPORT_FILES = ('.html', '.md', '.png')
+"""What a report writes into its folder."""
+
 
 def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) -> None:
     """Raise LocalizationError where an output would replace an input, a file of an input bag, or a
@@ -56,8 +59,10 @@ def require_kind(output: Path, *suffixes: str) -> None:
         raise LocalizationError(f'{output}: is there and no {kinds} file: give another name')
 
 
-def require_report(folder: Path | None) -> None:
-    """Raise LocalizationError before the work where a report cannot have its folder."""
+def require_report(folder: Path | None, other: Path | None) -> None:
+    """Raise LocalizationError before the work where a report cannot have its folder, or where it
+    would replace the other output.
+    """
     from sfa_localization.bags.recording import METADATA
 
     if folder is None:
@@ -66,6 +71,12 @@ def require_report(folder: Path | None) -> None:
         raise LocalizationError(f'{folder}: is no folder: give --report another name')
     if (folder / METADATA).exists():
         raise LocalizationError(f'{folder}: is a bag: give --report a folder of its own')
+    if other is None:
+        return
+    place, file = (Path(os.path.realpath(path)) for path in (folder, other))
+    in_report = file.parent == place and file.suffix.lower() in REPORT_FILES
+    if in_report or file in (place, *place.parents):
+        raise LocalizationError(f'{other}: named for two outputs: give each its own')
 
 
 def add_settings(

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
     require_output(arguments.output, [*arguments.bags, arguments.config], '.npz')
-    require_report(arguments.report)
+    require_report(arguments.report, arguments.output)
     if arguments.update:
         return _update(arguments)
     from sfa_localization import training
