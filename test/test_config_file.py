@@ -41,7 +41,7 @@ def key(section):
 
 
 def test_the_shipped_file_is_what_the_settings_say():
-    remedy = 'python -m sfa_localization config --output config/localization.yaml'
+    remedy = 'python -m sfa_localization config > config/localization.yaml'
     assert SHIPPED.read_text() == render(), f'regenerate it: {remedy}'
 
 

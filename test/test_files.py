@@ -12,9 +12,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from test_calibration import scene
 
 import sfa_localization
 from sfa_localization import config as config_file
@@ -310,12 +312,52 @@ def test_an_output_that_is_a_loop_of_links_is_named(tmp_path, capsys):
 
 
 def test_an_output_replaces_a_file_of_its_kind_or_an_empty_one(tmp_path):
-    for name, text in (('a.yaml', 'old: 1'), ('b.YML', 'old: 1'), ('c.txt', ''), ('d', None)):
+    for name, text in (
+        ('a.yaml', 'training:'),
+        ('b.YML', '/**/ekf_node:'),
+        ('c.txt', ''),
+        ('d', None),
+    ):
         path = tmp_path / name
         if text is not None:
             path.write_text(text)
         assert main(['config', '--output', str(path)]) == 0
         assert 'ekf_node' in path.read_text()
+
+
+def test_a_parameter_file_with_settings_of_the_user_stays(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mine, calibrated = tmp_path / 'mine.yaml', tmp_path / 'camera.yaml'
+    cv2.imwrite('picture.png', scene(1))
+    for _ in range(2):
+        assert main(['config', '--output', 'mine.yaml']) == 0
+        assert main(['calibrate', 'picture.png', '--output', 'camera.yaml']) == 0
+    mine.write_text(mine.read_text().replace('lost_std: 2.0', 'lost_std: 7.5'))
+    before = mine.read_bytes(), calibrated.read_bytes()
+    capsys.readouterr()
+    for command, why in {
+        'config --output mine.yaml': 'mine.yaml: holds more than defaults',
+        'config --output camera.yaml': 'camera.yaml: holds more than defaults',
+        'calibrate picture.png --output mine.yaml': 'mine.yaml: is no file of calibrate',
+    }.items():
+        assert main(command.split()) == 1
+        assert f'{why}: give another name, or remove it' in capsys.readouterr().err
+    assert before == (mine.read_bytes(), calibrated.read_bytes())
+
+
+@pytest.mark.parametrize('text', ['<!DOCTYPE html>\n<title>my home</title>\n', None])
+def test_a_report_replaces_its_own_page_only(text, tmp_path, capsys):
+    page, words = tmp_path / 'index.html', ['inspect', str(BAGS / 'sample'), '--report']
+    if text is None:
+        page.mkdir()
+    else:
+        page.write_text(text)
+    assert main([*words, str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert ('is no report: give --report another folder' if text else 'is a folder') in error
+    assert text is None or page.read_text() == text
+    for _ in range(2):
+        assert main([*words, str(tmp_path / 'own')]) == 0
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.camera.calibration_files import read_calibration
+from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
 from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed, encode_png
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
@@ -26,7 +26,7 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import atomic_write, read_regular
+from sfa_localization.data.files import atomic_write, first_bytes, read_regular
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -407,6 +407,13 @@ def _label(strip: Image, panorama: PanoramaConfig) -> None:
         column = quarter * width // 4
         cv2.line(strip, (column, 0), (column, height), _RED, 1)
         _write(strip, name, np.array([column + 4, height - 6]), _WHITE)
+
+
+def require_own(path: Path) -> None:
+    """Raise CameraError for a file that is there, and no calibration that was written here."""
+    start = first_bytes(path)
+    if start and not start.startswith(CALIBRATION_TITLE.encode()):
+        raise CameraError(f'{path}: is no file of calibrate: give another name, or remove it')
 
 
 def write_calibration(path: Path, text: str) -> None:

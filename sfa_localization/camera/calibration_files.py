@@ -41,10 +41,11 @@ _OF_MODEL = {
 }
 LARGEST_FILE = 1 << 20
 """Bytes of a calibration file: hundreds of times the largest."""
-_HEAD = """\
-# Calibration of an omnidirectional camera; parameters of omnicam_node that go with it:
+CALIBRATION_TITLE = '# Calibration of an omnidirectional camera'
+_HEAD = f"""\
+{CALIBRATION_TITLE}; parameters of omnicam_node that go with it:
 #   calibration_file: name of this file
-#   mount_rpy: {mount_rpy}
+#   mount_rpy: {{mount_rpy}}
 """
 
 

@@ -73,6 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
     require_outputs(outputs, [*arguments.images, arguments.calibration])
     if arguments.output:
         require_kind(arguments.output, '.yaml', '.yml')
+        calibration.require_own(arguments.output)
     if arguments.check:
         require_kind(arguments.check, '.png')
     images = calibration.read_images(arguments.images)

@@ -15,7 +15,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.config import SECTIONS, load_settings
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.files import require_outputs
+from sfa_localization.data.files import first_bytes, require_outputs
 from sfa_localization.data.settings import Settings
 
 if TYPE_CHECKING:
@@ -71,12 +71,24 @@ def require_report(folder: Path | None, other: Path | None) -> None:
         raise LocalizationError(f'{folder}: is no folder: give --report another name')
     if (folder / METADATA).exists():
         raise LocalizationError(f'{folder}: is a bag: give --report a folder of its own')
+    if folder.is_dir():
+        _require_own_page(folder)
     if other is None:
         return
     place, file = (Path(os.path.realpath(path)) for path in (folder, other))
     in_report = file.parent == place and file.suffix.lower() in REPORT_FILES
     if in_report or file in (place, *place.parents):
         raise LocalizationError(f'{other}: named for two outputs: give each its own')
+
+
+def _require_own_page(folder: Path) -> None:
+    """Raise LocalizationError where a folder holds a page that is none of these reports."""
+    from sfa_localization.reports.page import MARK, PAGE
+
+    require_outputs([folder / PAGE], [])
+    start = first_bytes(folder / PAGE)
+    if start and MARK.encode() not in start:
+        raise LocalizationError(f'{folder / PAGE}: is no report: give --report another folder')
 
 
 def add_settings(

@@ -16,6 +16,7 @@ from sfa_localization.data.errors import LocalizationError
 
 NEW_FILE_MODE = 0o644
 """Permissions of a file that was not there before."""
+_BEGINNING = 1000  # bytes, which show what wrote a file
 
 
 def is_regular(path: Path | str) -> bool:
@@ -44,6 +45,14 @@ def read_regular(path: Path | str, largest: int) -> bytes:
     if len(data) > largest:
         raise OSError(f'larger than {largest} bytes')
     return data
+
+
+def first_bytes(path: Path, most: int = _BEGINNING) -> bytes:
+    """The beginning of a regular file; nothing where there is none. Raises OSError."""
+    if not is_regular(path):
+        return b''
+    with path.open('rb') as file:
+        return file.read(most)
 
 
 @contextmanager

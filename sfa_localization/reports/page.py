@@ -14,6 +14,7 @@ from sfa_localization.reports.evaluation import save_text
 
 GOOD, WEAK, BAD = 'good', 'weak', 'bad'
 PAGE = 'index.html'
+MARK = '<meta name="generator" content="sfa_localization">'
 _STYLE = """
 :root { color-scheme: light; }
 * { box-sizing: border-box; }
@@ -94,6 +95,7 @@ def write_page(folder: Path, title: str, *parts: str) -> None:
     save_text(
         folder / PAGE,
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'{MARK}\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<title>{escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n'
         f'<body>\n<h1>{escape(title)}</h1>\n{body}\n</body>\n</html>\n',
