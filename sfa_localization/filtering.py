@@ -84,12 +84,13 @@ _TUM = {
 class Table:
     """Rows of a log in the order of time: stamps (N,) and named columns (N,), NaN where empty.
 
-    `skipped` counts the rows that could not be used, by reason.
+    `skipped` counts the rows that could not be used, by reason; `source` names the file.
     """
 
     stamps_ns: Stamps
     columns: dict[str, Array]
     skipped: Counter[str] = field(default_factory=Counter)
+    source: str = 'memory'
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -203,7 +204,8 @@ def halves(odometry: Table, positions: Table) -> list[tuple[Table, Table]]:
 
 
 def _rows(table: Table, kept: Array) -> Table:
-    return Table(table.stamps_ns[kept], {key: one[kept] for key, one in table.columns.items()})
+    columns = {key: one[kept] for key, one in table.columns.items()}
+    return Table(table.stamps_ns[kept], columns, source=table.source)
 
 
 def odometry_arrays(odometry: Table) -> tuple[Stamps, Array, Array]:
@@ -488,8 +490,8 @@ def _require_overlap(odometry: Table, positions: Table) -> None:
     if spans[0][0] > spans[1][1] or spans[1][0] > spans[0][1]:
         ranges = [f'{_seconds(a)} to {_seconds(b)} s' for a, b in spans]
         raise DataError(
-            f'odometry ({ranges[0]}) and positions ({ranges[1]}) have no time in common: '
-            'bring both to one clock'
+            f'odometry from {odometry.source} ({ranges[0]}) and positions from {positions.source} '
+            f'({ranges[1]}) have no time in common: bring both to one clock'
         )
 
 
@@ -583,6 +585,7 @@ def _table(path: Path, rows: list[list[str]], at: dict[str, int], needed: tuple[
         np.array(stamps, np.int64)[order],
         {name: data[:, k] for k, name in enumerate(columns)},
         skipped,
+        str(path),
     )
 
 

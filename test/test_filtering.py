@@ -355,6 +355,18 @@ def test_logs_that_cannot_be_used_are_named_in_one_line(tmp_path, capsys, odomet
     assert not (tmp_path / 'out.tum').exists() and len(list(tmp_path.iterdir())) == 2
 
 
+def test_both_logs_without_a_time_in_common_are_named(tmp_path, capsys):
+    paths = tmp_path / 'o.csv', tmp_path / 'p.csv'
+    for path, head, start in zip(paths, ('v_mps,omega_radps', 'x_m,y_m'), (0, 100), strict=True):
+        rows = ''.join(f'{start + n},1,0\n' for n in range(1, 30))
+        path.write_text(f'stamp_s,{head}\n{rows}')
+    assert main(['filter', *map(str, paths), '--output', str(tmp_path / 'out.tum')]) == 1
+    assert (
+        f'odometry from {paths[0]} (1.000000000 to 29.000000000 s) and positions from {paths[1]} '
+        '(101.000000000 to 129.000000000 s) have no time in common'
+    ) in capsys.readouterr().err
+
+
 def test_a_missing_or_binary_file_is_named(tmp_path, capsys):
     (tmp_path / 'b.csv').write_bytes(bytes(range(256)))
     for name in ('none.csv', 'b.csv'):
