@@ -33,6 +33,7 @@ COMMANDS = {
 }
 LONGEST_ERROR = 4000
 """Characters of an error: the last lines of a program that failed, or a list of topics."""
+_NO_ROOM = 'failed to map segment'  # of a library, where there is no memory for it
 ROS_COMMANDS = ('play',)
 """Commands that ROS ends at a signal; the others end at SIGTERM as at Ctrl-C, and clean up."""
 OPTIONAL = {
@@ -160,7 +161,10 @@ def guarded(run: Callable[[], int]) -> int:
         return 1
     except (KeyboardInterrupt, ImportError) as error:
         # Of a C++ library that was interrupted while it was loaded it is the cause.
-        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+        if isinstance(error.__cause__ or error, KeyboardInterrupt):
+            print('interrupted', file=sys.stderr)
+            return 130
+        if _NO_ROOM not in str(error):
             raise
-        print('interrupted', file=sys.stderr)
-        return 130
+        print('error: not enough memory', file=sys.stderr)
+        return 1

@@ -128,6 +128,10 @@ def test_an_output_that_cannot_be_replaced_is_rejected_before_the_training(tmp_p
     [
         (OSError(28, 'No space left on device'), 'error: [Errno 28] No space left on device\n'),
         (MemoryError(), 'error: not enough memory\n'),
+        (
+            ImportError('a.so: failed to map segment from shared object'),
+            'error: not enough memory\n',
+        ),
     ],
 )
 def test_a_full_machine_is_one_line(error, line, capsys):

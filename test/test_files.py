@@ -29,7 +29,7 @@ from sfa_localization.commands import inspect as inspect_command
 from sfa_localization.commands.demo import DemoConfig
 from sfa_localization.data import array_files, files
 from sfa_localization.data.errors import BagError, DataError, LocalizationError
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.inspection import BagReport
 from sfa_localization.reports import bag as report_bag
 from sfa_localization.reports import evaluation as report
@@ -407,3 +407,16 @@ def test_an_output_beside_the_files_of_a_report_is_written(tmp_path):
     for _ in range(2):
         assert main(['inspect', str(BAGS / 'sample'), *words]) == 0
     assert {file.suffix for file in tmp_path.iterdir()} == {'.html', '.json', '.png'}
+
+
+@pytest.mark.parametrize('command', ['inspect {}', 'evaluate {} bag', 'calibrate {}'])
+def test_files_of_the_system_that_may_never_end_are_not_read(command, tmp_path, capsys):
+    """They say that they are empty; `/proc/kmsg` waits for the next message."""
+    system = Path('/proc/version')
+    if not system.exists() or system.stat().st_size:
+        pytest.skip('no such file here')
+    link = tmp_path / 'link.mcap'
+    link.symlink_to(system)
+    assert main(command.format(link).split()) == 1
+    assert f'{link}: ' in capsys.readouterr().err
+    assert system.read_bytes() and read_regular(system, 1000) == b''

@@ -11,19 +11,25 @@ from sfa_localization.data.errors import CameraError
 
 MOST_PIXELS = 1 << 26
 """Pixels of an image: 8192 x 8192, four times the largest cameras; in color 192 MB."""
+MOST_SCANS = 64
+"""Parts of a JPEG that each cover the whole image: encoders write twelve at most. Decoding takes
+as long for each of them, however few bytes it has."""
 
 _PNG, _JPEG, _BMP = b'\x89PNG\r\n\x1a\n', b'\xff\xd8', b'BM'
 # Markers with which a JPEG frame of any coding begins; C4, C8 and CC are others.
 _FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _ALONE = {0x01, *range(0xD0, 0xD9)}
 _SCAN, _END = 0xDA, 0xD9
+_SCAN_MARK = bytes((0xFF, _SCAN))
 _PNM = re.compile(rb'P[1-6](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s')
 _TIFF_SIZES = {256: 0, 257: 1, 322: 2, 323: 3}
 """Tags of width, height, width of a tile, height of a tile."""
 
 
 def check_size(data: bytes) -> None:
-    """Require a known kind of file of at most MOST_PIXELS pixels. Raises CameraError.
+    """Require a known kind of file of at most MOST_PIXELS pixels, and of a JPEG at most MOST_SCANS.
+
+    Raises CameraError.
 
     Known are JPEG, PNG, BMP, PNM, TIFF and WebP.
     """
@@ -36,6 +42,9 @@ def check_size(data: bytes) -> None:
     width, height = size
     if width * height > MOST_PIXELS:
         raise CameraError(f'an image of {width} x {height} pixels exceeds {MOST_PIXELS}')
+    # FF is no byte of a scan itself, where a zero follows it.
+    if data.startswith(_JPEG) and data.count(_SCAN_MARK) > MOST_SCANS:
+        raise CameraError(f'a JPEG of more than {MOST_SCANS} scans')
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:

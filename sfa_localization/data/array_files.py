@@ -132,6 +132,8 @@ def _arrays(file: IO[bytes], size: int) -> Arrays:
 
 def _check_directory(file: IO[bytes], size: int) -> None:
     """Bound the zip directory, which is read as a whole, before it is read."""
+    if not size:
+        raise _Unusable('it is empty')
     if size > LARGEST_FILE:
         raise _Unusable(f'it has {size} bytes, more than {LARGEST_FILE}')
     file.seek(max(size - _END.size - _ZIP64_SIZE, 0))

@@ -34,14 +34,15 @@ def absence(path: Path | str) -> str:
 def read_regular(path: Path | str, largest: int) -> bytes:
     """The bytes of a regular file of at most `largest` bytes. Raises OSError.
 
-    A pipe or device is no regular file: reading it may never end.
+    A pipe or device is no regular file: reading it may never end. Neither may reading a file of the
+    system, as below /proc, which says that it holds nothing.
     """
     if '\0' in str(path):
         raise OSError('a path with a zero byte')
     if os.path.exists(path) and not is_regular(path):
         raise OSError('it is no regular file')
     with open(path, 'rb') as file:
-        data = file.read(largest + 1)
+        data = file.read(largest + 1) if os.fstat(file.fileno()).st_size else b''
     if len(data) > largest:
         raise OSError(f'larger than {largest} bytes')
     return data
@@ -52,7 +53,7 @@ def first_bytes(path: Path, most: int = _BEGINNING) -> bytes:
     if not is_regular(path):
         return b''
     with path.open('rb') as file:
-        return file.read(most)
+        return file.read(most) if os.fstat(file.fileno()).st_size else b''
 
 
 @contextmanager
