@@ -537,6 +537,8 @@ def test_wheels_of_another_size_are_noticed_though_images_are_poor(scale, monkey
     way = from_rest(np.tile([1.0, 0.0], (50 * 40, 1)))
     drive = Poor(twists=way, scale=scale, position_std=0.2, yaw_std=0.03)
 
+    monkeypatch.setattr(consistency, 'FAR_D2', np.inf)  # which alone notices them, too
+
     def times_wrong():
         """With limits that let weak images pass."""
         config = FilterConfig(degraded_std=1.0)

@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from filter_drives import Drive, winding
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.fusion import evidence, recover
 from sfa_localization.fusion.belief import LARGEST_STD_M, Evidence, PoseEvent, Update, capped
 from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.fusion.consistency import lies_far
 from sfa_localization.fusion.evidence import Relocation, consistent, relocate, remember
 from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.motion import SIZE
@@ -272,20 +274,54 @@ def test_contradictions_make_the_estimate_degraded_then_lost(memory, moved_m, le
     assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
 
 
-@pytest.mark.parametrize(('innovation', 'gate_excess', 'level'), [
-    ((0.8, 0.8, 0.0), 4.1, Level.DEGRADED), ((0.6, -0.6, 0.0), 4.1, Level.LOCALISED),  # LOST_M
-    ((0.0, 0.0, -0.4), 4.1, Level.DEGRADED), ((0.0, 0.0, 0.2), 4.1, Level.LOCALISED),  # LOST_RAD
-    ((0.8, 0.8, 0.0), 0.7, Level.DEGRADED), ((9.0, 0.0), 0.5, Level.LOCALISED),  # FAR_EXCESS
+@pytest.mark.parametrize(('offset', 'std', 'last', 'far'), [
+    ((0.8, 0.8, 0.0), 0.5, False, True), ((0.6, -0.6, 0.0), 0.1, False, False),  # LOST_M
+    ((0.6, -0.6, 0.0), 0.1, True, True), ((0.2, 0.4, 0.0), 0.1, True, False),  # RELEASED
+    ((0.0, 0.0, -0.4), 0.1, False, True), ((0.0, 0.0, 0.2), 0.1, False, False),  # LOST_RAD
+    ((9.0, 0.0), 5.0, False, False), ((9.0, 0.0), 4.9, False, True),  # FAR_D2
+    ((9.0, 0.0), 9.0, True, True), ((9.0, 0.0), 9.95, True, False),
 ])  # fmt: skip
-def test_the_first_image_that_shows_the_robot_far_away_counts(innovation, gate_excess, level):
+def test_an_image_far_off_puts_the_estimate_in_doubt_until_one_is_near(offset, std, last, far):
+    covariance = std**2 * np.eye(len(offset))
+    assert lies_far(np.array(offset), covariance, last) == far
+
+
+@pytest.mark.parametrize('accepted', [False, True])
+@pytest.mark.parametrize('far', [False, True])
+def test_the_first_image_that_shows_the_robot_far_away_counts(far, accepted):
     """Also where it is so weak that it lies inside the gate, and is fused."""
-    offset, rejected = np.array(innovation), int(gate_excess > 1.0)
-    reason = 'outside the gate' if rejected else 'accepted'
-    update = Update(SECOND, not rejected, gate_excess, 1.0, reason, offset)
-    memory = {'support': 9, 'rejected': rejected, 'gate_excess': gate_excess, 'update': update}
+    update = Update(SECOND, accepted, 0.5 if accepted else 4.1, 1.0, 'a reason', far=far)
+    memory = {'support': 9, 'rejected': int(not accepted), 'update': update}
     belief = belief_at(accepted_ns=SECOND, precise_ns=SECOND, **memory)
     belief = belief._replace(odometry_ns=SECOND)
-    assert status_of(belief, CameraClock(), FilterConfig(), SECOND).level is level
+    level = status_of(belief, CameraClock(), FilterConfig(), SECOND).level
+    assert level is (Level.DEGRADED if far else Level.LOCALISED)
+
+
+@pytest.mark.parametrize('speed', [0.0, 0.1])
+@pytest.mark.parametrize('std', [0.35, 0.45])
+@pytest.mark.parametrize('every', [10, 100])
+def test_a_robot_pushed_where_images_are_weak_is_never_localised_and_wrong(every, std, speed):
+    """They show the place well, but claim little: the estimate does not follow, nor reject them."""
+    twists = winding(90.0, speed=0.6)
+    twists[1500:, 0], twists[1500:, 1] = speed, 0.0
+    drive = Drive(twists=twists, every=every, position_std=0.1, yaw_std=0.02, share=0.7)
+    pushed = 2500 // every
+    drive.kidnap(pushed, (0.9, -1.1, 0.0))
+    fused = PoseFilter(FilterConfig(), ErrorCorrelation(0.7, 0.6))
+    levels = []
+    for event in drive.events():
+        covariance = np.square([0.1, 0.1, 0.02])
+        if event[1] == 1 and event[2] >= pushed:
+            covariance[:2] = std**2
+        if event[1] == 0:
+            drive.give(fused, event, True)
+            continue
+        fused.add_measurement(event[0], drive.seen[event[2]], np.diag(covariance))
+        error, _ = drive.error(fused, drive.pictures[event[2]])
+        levels.append((fused.status.level, error))
+    assert levels[pushed - 1][0] is Level.LOCALISED
+    assert all(level is not Level.LOCALISED or error < 1.0 for level, error in levels)
 
 
 @pytest.mark.parametrize(('silences_s', 'level'), [

@@ -61,6 +61,7 @@ class Update(NamedTuple):
 
     `d2` is the squared Mahalanobis distance of the full innovation, with `threshold` its gate;
     both NaN where there was nothing to compare with. `innovation` (2,) or (3,) with its covariance.
+    `far`: if the measurement is right, the estimate is LOST.
     """
 
     stamp_ns: int
@@ -70,6 +71,7 @@ class Update(NamedTuple):
     reason: str
     innovation: Array | None = None
     covariance: Array | None = None
+    far: bool = False
 
 
 class Evidence(NamedTuple):

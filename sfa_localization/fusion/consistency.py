@@ -57,6 +57,10 @@ WRONG_MOVE, LARGEST_JUMP_M = 0.22, 1.4
 """Standard deviation of an estimate that images have just moved, of the way by which they did: one
 in twenty such moves is wrong, by all of it; and its limit (m), because a robot that was carried far
 is not lost."""
+LOST_M, LOST_RAD = 1.0, 0.3
+"""Images that contradict by less leave the estimate near enough to find a way by."""
+FAR_D2 = 3.3
+"""One image that is farther off, by more than this squared distance, makes an estimate doubtful."""
 SLACK_M = 0.5
 """By so much an estimate may be moved beside what wheels that spun explain: images err."""
 PULLED_OVER_M = 5.0
@@ -159,6 +163,17 @@ def pulled(pull: Pull | None, traveled_m: float, offset_m: complex, variance: fl
     part = RELEASED if pull.suspected else 1.0
     suspected = abs(mean) > part * PULLED and abs(offset_m) > part * PULLED_M
     return Pull(mean, offset_m, traveled_m, suspected)
+
+
+def lies_far(offset: Array, covariance: Array, last: bool) -> bool:
+    """Whether an image at an offset (2,) or (3,) [m, m, rad] from the estimate, of this covariance,
+    shows that the estimate is LOST; after one that did (`last`), until one lies much nearer. That
+    it may err as the images before it does not excuse it: of a robot that is pushed while it
+    stands, all images after the first seem to repeat one error.
+    """
+    (x, y, *yaw), part = offset.tolist(), RELEASED if last else 1.0
+    far = math.hypot(x, y) > part * LOST_M or any(abs(turn) > part * LOST_RAD for turn in yaw)
+    return bool(far and offset @ np.linalg.solve(covariance, offset) > part**2 * FAR_D2)
 
 
 def doubts(trust: Trust, accepted_m: float, pull: Pull | None = None) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfa_localization.fusion.belief import Belief
 from sfa_localization.fusion.camera_clock import CameraClock
-from sfa_localization.fusion.consistency import doubts
+from sfa_localization.fusion.consistency import LOST_M, LOST_RAD, doubts
 from sfa_localization.fusion.evidence import ENOUGH_IMAGES, FEW_IMAGES
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
@@ -31,11 +31,6 @@ NOTICED_S = 1.0
 """Images that contradict for so long are no outliers, however few: a jump is noticed by then."""
 DEGRADED_YAW_RAD = 0.2
 """A heading with a larger standard deviation leads the robot a meter astray within a few."""
-LOST_M, LOST_RAD = 1.0, 0.3
-"""Images that contradict by less leave the estimate near enough to find a way by."""
-FAR_EXCESS = 0.6
-"""An image that contradicts by more is not one of the usual ones beyond this factor on its gate:
-one in fifty would be by chance, if images erred by as much as they claim, and they err by less."""
 LOST_EXCESS, LOST_DISTANCE_M = 4.0, 0.5
 """ENOUGH_IMAGES in a row that contradict mean LOST where they lie outside the gate by this factor
 on d2, or the robot has moved so far: standing, it may see one place where the map is wrong."""
@@ -92,17 +87,6 @@ def _few(belief: Belief) -> int:
     return FEW_IMAGES if memory.support >= FEW_IMAGES and lately else 1
 
 
-def _lies_far(belief: Belief) -> bool:
-    """Whether the newest image, fused or not, lies so far off that the estimate would be LOST if it
-    is right.
-    """
-    update = belief.memory.update
-    if update is None or update.innovation is None or update.d2 <= FAR_EXCESS * update.threshold:
-        return False
-    x, y, *yaw = update.innovation.tolist()
-    return math.hypot(x, y) > LOST_M or any(abs(turn) > LOST_RAD for turn in yaw)
-
-
 def uncertainty(state: State, config: FilterConfig) -> list[str]:
     """Why a state is LOST by its standard deviations alone."""
     reasons = []
@@ -131,7 +115,7 @@ def _rejections(belief: Belief) -> list[str]:
     """What the last images say, where they contradict the estimate or were not fused."""
     reasons, images, update = [], _unmatched(belief), belief.memory.update
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
-    if _lies_far(belief) or images >= _few(belief):
+    if (update is not None and update.far) or images >= _few(belief):
         one = 'an image did not match'
         reasons.append(one if images <= 1 else f'{images} images in a row did not match')
     if update is not None and not update.accepted and update.d2 <= update.threshold:

@@ -18,7 +18,7 @@ from sfa_localization.fusion.belief import (
     Pull,
     Update,
 )
-from sfa_localization.fusion.consistency import hesitant, pulled, watched
+from sfa_localization.fusion.consistency import hesitant, lies_far, pulled, watched
 from sfa_localization.fusion.evidence import (
     AGREEING_DISTANCE_M,
     FEW_IMAGES,
@@ -156,7 +156,8 @@ class Correction:
         """Accept what lies inside the gate, after an outage only when others confirm it."""
         mean, covariance, d2 = self._kalman.corrected(belief, belief.covariance, event)
         threshold, kalman = _GATES[event.value.size], self._kalman
-        update = Update(event.stamp_ns, True, d2, threshold, 'accepted', kalman.y, kalman.S)
+        far = _lies_far(belief, event)
+        update = Update(event.stamp_ns, True, d2, threshold, 'accepted', kalman.y, kalman.S, far)
         if d2 > threshold:
             rejected = update._replace(accepted=False, reason='outside the gate')
             return self._recovery.weighed(belief, event, rejected)
@@ -184,11 +185,30 @@ class Correction:
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
 
+def _lies_far(belief: Belief, event: MeasurementEvent) -> bool:
+    last = belief.memory.update
+    was_far = last is not None and last.far
+    return lies_far(_offset(belief, event), _apart(belief, event), was_far)
+
+
+def _offset(belief: Belief, event: MeasurementEvent) -> Array:
+    """Of a measurement (2,) or (3,) from the estimate, whatever errors images may share."""
+    offset = event.value - belief.mean[: event.value.size]
+    offset[YAW:] = wrap_angle(offset[YAW:])
+    return offset
+
+
+def _apart(belief: Belief, event: MeasurementEvent) -> Array:
+    """Covariance of that offset."""
+    size = event.value.size
+    return belief.covariance[:size, :size] + event.covariance
+
+
 def _pull(belief: Belief, event: MeasurementEvent) -> Pull:
     """With an image that was accepted."""
-    both = belief.covariance[:2, :2] + event.covariance[:2, :2]
-    offset_m = complex(*(event.value[:2] - belief.mean[:2]))
-    return pulled(belief.memory.pull, belief.traveled_m, offset_m, float(np.trace(both)) / 2)
+    offset_m = complex(*_offset(belief, event)[:2].tolist())
+    variance = float(np.trace(_apart(belief, event)[:2, :2])) / 2
+    return pulled(belief.memory.pull, belief.traveled_m, offset_m, variance)
 
 
 def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lateness | None:
@@ -251,8 +271,7 @@ def _doubted(belief: Belief, event: MeasurementEvent) -> Array:
     """The covariance of a pose from outside, before its first image: one that lies unlikely far
     off claims too much, and is as uncertain as it is off.
     """
-    covariance, offset = belief.covariance.copy(), event.value - belief.mean[: event.value.size]
-    offset[YAW:] = wrap_angle(offset[YAW:])
+    covariance, offset = belief.covariance.copy(), _offset(belief, event)
     for part in (slice(X, YAW), slice(YAW, event.value.size)):
         off, size = offset[part], len(offset[part])
         both = covariance[part, part] + event.covariance[part, part]
