@@ -184,7 +184,7 @@ FILES = {
     (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
     (['-r', 'odom'], "remap rule: '-r odom'"),
     (['-p', 'speed_std'], "override rule: '-p speed_std'"),
-    (['--nonsense'], '--nonsense'),
+    (['--nonsense'], '--nonsense'), (['-p', 'model:=\udcff'], r'not UTF-8: model:=\udcff'),
 ])  # fmt: skip
 def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arguments, why):
     for name, text in FILES.items():

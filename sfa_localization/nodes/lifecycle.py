@@ -29,7 +29,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.rejections import short_line
+from sfa_localization.data.rejections import encodable, short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
 from sfa_localization.nodes import parameters, signals
@@ -448,10 +448,13 @@ def _initialised(args: Sequence[str] | None) -> bool:
     """Initialize ROS; False, and why is logged, where its arguments or files cannot be used."""
     try:
         rclpy.init(args=None if args is None else list(args))
-    except RuntimeError as error:  # the base of all that rclpy raises here
+    except (RuntimeError, UnicodeEncodeError) as error:  # the first is the base of all of rclpy's
+        reason = encodable(str(error))
         # Of unknown arguments its text is their list, and no more.
-        unknown = isinstance(error, rclpy_implementation.UnknownROSArgsError)
-        reason = f'unknown arguments after --ros-args: {error}' if unknown else str(error)
+        if isinstance(error, rclpy_implementation.UnknownROSArgsError):
+            reason = f'unknown arguments after --ros-args: {reason}'
+        if isinstance(error, UnicodeEncodeError):
+            reason = f'an argument is not UTF-8: {encodable(error.object)}'
         rclpy.logging.get_logger('sfa_localization').fatal(reason)
         return False
     return True
