@@ -188,7 +188,7 @@ class Correction:
 def _lies_far(belief: Belief, event: MeasurementEvent) -> bool:
     last = belief.memory.update
     was_far = last is not None and last.far
-    return lies_far(_offset(belief, event), _apart(belief, event), was_far)
+    return lies_far(_offset(belief, event), _offset_covariance(belief, event), was_far)
 
 
 def _offset(belief: Belief, event: MeasurementEvent) -> Array:
@@ -198,7 +198,7 @@ def _offset(belief: Belief, event: MeasurementEvent) -> Array:
     return offset
 
 
-def _apart(belief: Belief, event: MeasurementEvent) -> Array:
+def _offset_covariance(belief: Belief, event: MeasurementEvent) -> Array:
     """Covariance of that offset."""
     size = event.value.size
     return belief.covariance[:size, :size] + event.covariance
@@ -207,7 +207,7 @@ def _apart(belief: Belief, event: MeasurementEvent) -> Array:
 def _pull(belief: Belief, event: MeasurementEvent) -> Pull:
     """With an image that was accepted."""
     offset_m = complex(*_offset(belief, event)[:2].tolist())
-    variance = float(np.trace(_apart(belief, event)[:2, :2])) / 2
+    variance = float(np.trace(_offset_covariance(belief, event)[:2, :2])) / 2
     return pulled(belief.memory.pull, belief.traveled_m, offset_m, variance)
 
 
