@@ -82,6 +82,20 @@ def test_on_a_circle_a_delay_that_grows_is_noticed_before_it_is_large(v, rate, o
     assert max(late.apart for at_s, *_, late in found if at_s < 10.0) < 0.1
 
 
+@pytest.mark.parametrize(('v', 'omega', 'rate', 'longest_s'), [
+    (0.8, 0.8, 0.16, 4.5), (1.0, 0.4, 0.2, 3.0), (0.7, 0.6, 0.1, 3.0),
+])  # fmt: skip
+def test_on_a_circle_a_queue_that_has_grown_is_not_forgotten(v, omega, rate, longest_s):
+    """Until the robot drives otherwise."""
+    drive = drive_of(np.append(np.full(80 * HZ, omega), winding(30)), v)
+    _, found = driven(drive, lambda t: t - min(rate * t, longest_s) * (t < 85.0))
+    first_s = next(at_s for at_s, *_, late in found if late.suspected)
+    assert first_s < 10.0
+    assert all(late.suspected for at_s, *_, late in found if first_s < at_s < 85.0)
+    assert sure_and_wrong_s(found) == 0.0
+    assert not found[-1][-1].suspected
+
+
 def test_a_video_that_loops_is_noticed_at_once_and_its_delay_is_named():
     fused, found = driven(
         drive_of(winding(22)), lambda t: t if t < 14.0 else 6.0 + (t - 14.0) % 8.0

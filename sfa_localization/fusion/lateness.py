@@ -83,6 +83,9 @@ _USELESS_VARIANCE = 4.0
 _AS_BEFORE = 10
 """Knots of the path whose motion is taken for that of before the odometry began."""
 _STRAIGHT_RAD = 1e-6
+_EVEN, _EVEN_RADPS = 0.2, 0.05
+"""Standard deviations of speed and turn rate on a line or a circle, as a part of the means, and of
+the turn rate at most, where it is small."""
 _SHOWN = 0.05
 """Images are in time where larger delays from the start are less likely."""
 _FAR_M, _FAR_RAD = 0.5, 0.3
@@ -115,6 +118,14 @@ class Path(NamedTuple):
         v = max(v, float(steps[0, moving][:_LATEST_STEPS].mean()))
         limit_s = max(_WRONG_M / max(v, STANDING), _LEAST_S)
         return np.asarray(min(tolerated_s(v, omega) + _MARGIN_S, limit_s) >= _DELAYS)
+
+    @property
+    def steady(self) -> bool:
+        """Whether it is a line or a circle at one speed, on which all delays look alike."""
+        v, omega = np.abs(np.diff(self.places)) / _STEP_S, np.diff(self.yaws) / _STEP_S
+        same_speed = v.std() < _EVEN * v.mean()
+        same_rate = omega.std() < max(_EVEN * abs(float(omega.mean())), _EVEN_RADPS)
+        return bool(self.known.all() and same_speed and same_rate)
 
     @property
     def harmful(self) -> NDArray[np.bool_]:
@@ -322,6 +333,9 @@ def _anew(late: Lateness, begun: Lateness) -> Lateness:
 
 
 def _judged(late: Lateness) -> Lateness:
+    """With what the odds say, but for late images of a steady drive, which shows no end of it."""
+    if late.late and late.path.steady:
+        return late
     return late._replace(suspected=late.apart > (CLEARED if late.suspected else SUSPECTED))
 
 
