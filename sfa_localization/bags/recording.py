@@ -35,7 +35,7 @@ from sfa_localization.bags.storage import (
     one_line,
 )
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.files import first_bytes, is_regular, read_regular
+from sfa_localization.data.files import is_regular, read_regular, start_of
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import short_line
 
@@ -201,7 +201,7 @@ class Recording:
         """The file itself, or a decompressed copy of it. Raises OSError, or BagError."""
         if path.exists() and not is_regular(path):
             raise BagError(f'{path}: is no regular file; copy it to one')
-        if not path.stat().st_size or first_bytes(path, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
+        if start_of(path, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
             return path
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix='bag-')
@@ -255,7 +255,7 @@ def open_storage(plain: Path, path: Path) -> Storage:
 
     Raises BagError, or OSError.
     """
-    start = first_bytes(plain, max(map(len, READERS)))
+    start = start_of(plain, max(map(len, READERS)))
     if not start:
         raise BagError(f'{path}: is empty (0 bytes); record it again')
     for magic, reader in READERS.items():

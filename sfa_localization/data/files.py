@@ -34,15 +34,13 @@ def absence(path: Path | str) -> str:
 def read_regular(path: Path | str, largest: int) -> bytes:
     """The bytes of a regular file of at most `largest` bytes. Raises OSError.
 
-    A pipe or device is no regular file: reading it may never end. Neither may reading a file of the
-    system, as below /proc, which says that it holds nothing.
+    A pipe or device is no regular file: reading it may never end.
     """
     if '\0' in str(path):
         raise OSError('a path with a zero byte')
     if os.path.exists(path) and not is_regular(path):
         raise OSError('it is no regular file')
-    with open(path, 'rb') as file:
-        data = file.read(largest + 1) if os.fstat(file.fileno()).st_size else b''
+    data = start_of(path, largest + 1)
     if len(data) > largest:
         raise OSError(f'larger than {largest} bytes')
     return data
@@ -50,9 +48,15 @@ def read_regular(path: Path | str, largest: int) -> bytes:
 
 def first_bytes(path: Path, most: int = _BEGINNING) -> bytes:
     """The beginning of a regular file; nothing where there is none. Raises OSError."""
-    if not is_regular(path):
-        return b''
-    with path.open('rb') as file:
+    return start_of(path, most) if is_regular(path) else b''
+
+
+def start_of(path: Path | str, most: int) -> bytes:
+    """The beginning of a file that is there. Raises OSError.
+
+    A file that says that it holds nothing is not read: below /proc, that may never end.
+    """
+    with open(path, 'rb') as file:
         return file.read(most) if os.fstat(file.fileno()).st_size else b''
 
 

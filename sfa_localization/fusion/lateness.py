@@ -108,9 +108,14 @@ class Path(NamedTuple):
     known: NDArray[np.bool_]
 
     @property
+    def rates(self) -> Array:
+        """Speed m/s and turn rate rad/s (2, K - 1) between one delay and the next."""
+        return np.array([np.abs(np.diff(self.places)), np.diff(self.yaws)]) / _STEP_S
+
+    @property
     def tolerated(self) -> NDArray[np.bool_]:
         """(K,): which delays are small for a robot as fast as on this path."""
-        steps = np.array([np.abs(np.diff(self.places)), np.abs(np.diff(self.yaws))]) / _STEP_S
+        steps = np.abs(self.rates)
         moving = self.known[1:] & (steps > STANDING).any(axis=0)
         if not moving.any():
             return _NEAR
@@ -122,7 +127,7 @@ class Path(NamedTuple):
     @property
     def steady(self) -> bool:
         """Whether it is a line or a circle at one speed, on which all delays look alike."""
-        v, omega = np.abs(np.diff(self.places)) / _STEP_S, np.diff(self.yaws) / _STEP_S
+        v, omega = self.rates
         same_speed = v.std() < _EVEN * v.mean()
         same_rate = omega.std() < max(_EVEN * abs(float(omega.mean())), _EVEN_RADPS)
         return bool(self.known.all() and same_speed and same_rate)

@@ -449,11 +449,11 @@ def _initialised(args: Sequence[str] | None) -> bool:
     try:
         rclpy.init(args=None if args is None else list(args))
     except (RuntimeError, UnicodeEncodeError) as error:  # the first is the base of all of rclpy's
-        reason = encodable(str(error))
+        reason = str(error)
         # Of unknown arguments its text is their list, and no more.
         if isinstance(error, rclpy_implementation.UnknownROSArgsError):
             reason = f'unknown arguments after --ros-args: {reason}'
-        if isinstance(error, UnicodeEncodeError):
+        elif isinstance(error, UnicodeEncodeError):
             reason = f'an argument is not UTF-8: {encodable(error.object)}'
         rclpy.logging.get_logger('sfa_localization').fatal(reason)
         return False
