@@ -73,7 +73,8 @@ def _run_node(name: str, words: Sequence[str]) -> int:
 
 def _run_command(name: str, words: Sequence[str]) -> int:
     """Import and run a command; the exit code."""
-    arguments = command_parser(name).parse_intermixed_args(words)
+    with terminable():  # also those of ROS_COMMANDS
+        arguments = command_parser(name).parse_intermixed_args(words)
     return int(arguments.run(arguments))
 
 

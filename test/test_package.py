@@ -449,6 +449,22 @@ def test_ctrl_c_while_a_command_is_imported_is_one_line(cause, monkeypatch, caps
         assert capsys.readouterr().err == 'interrupted\n'
 
 
+@pytest.mark.parametrize('module', ['play', 'bag_player'])
+def test_sigterm_while_play_is_imported_is_one_line(module):
+    code = f"""
+import os, signal, sys
+from sfa_localization import cli
+class Finder:
+    def find_spec(self, name, *_):
+        if name == 'sfa_localization.commands.{module}':
+            os.kill(os.getpid(), signal.SIGTERM)
+sys.meta_path.insert(0, Finder())
+sys.exit(cli.main(['play', 'bag']))
+"""
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, 'interrupted\n')
+
+
 def test_a_missing_part_of_the_package_is_no_users_error():
     def run():
         raise ModuleNotFoundError('No module named numpy', name='numpy')

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.commands.pace import PlayConfig
+from sfa_localization.commands.processes import terminable
 
 WRITES = 'no file: it publishes'
 EXAMPLES = """\
@@ -41,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay; print the number of messages by topic."""
-    from sfa_localization.commands.bag_player import play
+    with terminable():
+        from sfa_localization.commands.bag_player import play
 
     played = play(
         arguments.bag,
