@@ -6,6 +6,7 @@ import ast
 import errno
 import io
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -309,6 +310,19 @@ def test_an_output_that_is_a_loop_of_links_is_named(tmp_path, capsys):
     (tmp_path / 'loop.yaml').symlink_to('loop.yaml')
     assert main(['config', '--output', str(tmp_path / 'loop.yaml')]) == 1
     assert 'loop.yaml' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('command', [
+    'config --output a.yaml', 'inspect {bag} --json a.json', 'calibrate a.png --output a.yaml',
+    'train {bag} --output a.npz', 'filter a.csv b.csv --output c.tum', 'calibrate a.png',
+])  # fmt: skip
+def test_a_working_directory_that_was_removed_is_named(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    assert main(command.format(bag=BAGS / 'sample').split()) == 1
+    reason = 'the working directory was removed: go to another, or give an absolute path'
+    error = capsys.readouterr().err
+    assert re.fullmatch(rf'error: [ac]\.\w+: {reason}\n', error), error
 
 
 def test_an_output_replaces_a_file_of_its_kind_or_an_empty_one(tmp_path):

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -15,7 +14,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.config import SECTIONS, load_settings
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.files import first_bytes, require_outputs
+from sfa_localization.data.files import first_bytes, require_outputs, resolved
 from sfa_localization.data.settings import Settings
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ def require_kind(output: Path, *suffixes: str) -> None:
     """
     from sfa_localization.bags.recording import METADATA
 
-    replaced = Path(os.path.realpath(output))  # which raises for no loop of links
+    replaced = resolved(output)
     if not (replaced.is_file() and replaced.stat().st_size):
         return
     if replaced.name == METADATA:
@@ -75,7 +74,7 @@ def require_report(folder: Path | None, other: Path | None) -> None:
         _require_own_page(folder)
     if other is None:
         return
-    place, file = (Path(os.path.realpath(path)) for path in (folder, other))
+    place, file = resolved(folder), resolved(other)
     in_report = file.parent == place and file.suffix.lower() in REPORT_FILES
     if in_report or file in (place, *place.parents):
         raise LocalizationError(f'{other}: named for two outputs: give each its own')

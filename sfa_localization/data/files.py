@@ -60,6 +60,16 @@ def start_of(path: Path | str, most: int) -> bytes:
         return file.read(most) if os.fstat(file.fileno()).st_size else b''
 
 
+def resolved(path: Path) -> Path:
+    """Where a path leads through links; also of a loop of them. Raises LocalizationError."""
+    try:
+        return Path(os.path.realpath(path))
+    except FileNotFoundError:
+        raise LocalizationError(
+            f'{path}: the working directory was removed: go to another, or give an absolute path'
+        ) from None
+
+
 @contextmanager
 def atomic_write(
     path: Path, error: type[LocalizationError] = LocalizationError
@@ -102,9 +112,9 @@ def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> N
     """Raise LocalizationError before the work where atomic_write could not put its results, or
     they would replace each other or what is read.
     """
-    targets: set[str] = set()
+    targets: set[Path] = set()
     for path in outputs:
-        target = os.path.realpath(path)
+        target = resolved(path)
         if target in targets:
             raise LocalizationError(f'{path}: named for two outputs: give each its own')
         targets.add(target)
@@ -115,7 +125,7 @@ def require_outputs(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> N
                 f'{path}: cannot be written: {reason.strerror or reason}'
             ) from None
     for path in filter(None, inputs):
-        if os.path.realpath(path) in targets:
+        if resolved(path) in targets:
             raise LocalizationError(
                 f'{path}: would be replaced by an output: give that another name'
             )
