@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sfa_localization import __version__
 from sfa_localization.commands.processes import terminable
-from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.errors import LocalizationError, NodeError
 from sfa_localization.nodes.help import NODES, asks_for_help, node_help
 
 COMMANDS = {
@@ -136,6 +136,13 @@ def _shortened(text: str) -> str:
     return text if len(text) <= LONGEST_ERROR else f'{text[:half]} ... {text[-half:]}'
 
 
+def _in_one_line(error: LocalizationError) -> str:
+    """The text of an error, with newlines of names escaped; programs that failed keep theirs."""
+    if isinstance(error, NodeError):
+        return str(error)
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in str(error))
+
+
 def guarded(run: Callable[[], int]) -> int:
     """Turn expected errors into one line and exit code 1, Ctrl-C into 130."""
     try:
@@ -146,7 +153,7 @@ def guarded(run: Callable[[], int]) -> int:
         _unprintable()
         return 0
     except LocalizationError as error:
-        print(f'error: {_shortened(str(error))}', file=sys.stderr)
+        print(f'error: {_shortened(_in_one_line(error))}', file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]

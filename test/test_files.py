@@ -312,6 +312,14 @@ def test_an_output_that_is_a_loop_of_links_is_named(tmp_path, capsys):
     assert 'loop.yaml' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(('name', 'shown'), [('a\nb', 'a\\nb'), ('\x1b[1m', '\\x1b[1m')])
+def test_a_name_is_shown_in_one_line(name, shown, tmp_path, capsys):
+    (tmp_path / name).mkdir()
+    assert main(['config', '--output', str(tmp_path / name)]) == 1
+    error = capsys.readouterr().err
+    assert error == f'error: {tmp_path / shown}: cannot be written: it is a folder\n'
+
+
 @pytest.mark.parametrize('command', [
     'config --output a.yaml', 'inspect {bag} --json a.json', 'calibrate a.png --output a.yaml',
     'train {bag} --output a.npz', 'filter a.csv b.csv --output c.tum', 'calibrate a.png',
