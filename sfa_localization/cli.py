@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 from sfa_localization import __version__
 from sfa_localization.commands.processes import terminable
@@ -86,16 +87,29 @@ def _prepare_streams() -> None:
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors='backslashreplace')
+    if sys.stdout is sys.__stdout__ and isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout = io.TextIOWrapper(
+            io.BufferedWriter(_Output(sys.stdout.fileno(), 'w', closefd=False)),
+            sys.stdout.encoding,
+            sys.stdout.errors,
+            line_buffering=sys.stdout.line_buffering or sys.stdout.write_through,
+        )
 
 
-def _unprintable() -> str:
-    """Why standard output takes no more lines, or ''; what it has not taken is given up."""
-    try:
-        print(flush=True)
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return f'standard output: cannot be written: {error.strerror}'
-    return ''
+class _Output(io.FileIO):
+    """Standard output that names itself where it cannot be written, and is given up then."""
+
+    def write(self, data: Any) -> int:
+        """Raises BrokenPipeError or LocalizationError."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            if isinstance(error, BrokenPipeError):
+                raise
+            raise LocalizationError(
+                f'standard output: cannot be written: {error.strerror}'
+            ) from None
 
 
 def executable() -> int:
@@ -150,7 +164,6 @@ def guarded(run: Callable[[], int]) -> int:
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # the reader, such as head, has closed the pipe
-        _unprintable()
         return 0
     except LocalizationError as error:
         print(f'error: {_shortened(_in_one_line(error))}', file=sys.stderr)
@@ -164,7 +177,7 @@ def guarded(run: Callable[[], int]) -> int:
         return 1
     except (OSError, MemoryError) as error:
         # Of the machine: a full disk, too many open files.
-        reason = _unprintable() or ' '.join(str(error).split()) or 'not enough memory'
+        reason = ' '.join(str(error).split()) or 'not enough memory'
         print(f'error: {_shortened(reason)}', file=sys.stderr)
         return 1
     except (KeyboardInterrupt, ImportError) as error:

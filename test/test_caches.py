@@ -139,4 +139,4 @@ def test_a_full_machine_is_one_line(error, line, capsys):
         raise error
 
     assert cli.guarded(fail) == 1
-    assert capsys.readouterr().err == line
+    assert capsys.readouterr() == ('', line)
