@@ -54,28 +54,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     _prepare_streams()
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
+    with nullcontext() if name in (*NODES, *ROS_COMMANDS) else terminable():
+        return guarded(lambda: _run(name, words))
+
+
+def _run(name: str, words: Sequence[str]) -> int:
+    """Run a node, which reads its ROS arguments itself, or a command; the exit code."""
     if name in NODES and asks_for_help(words[1:]):
         print(node_help(name, NODES[name]), end='')
         return 0
     if name in NODES:
-        return guarded(lambda: _run_node(name, words))
-    if name in COMMANDS:
-        with nullcontext() if name in ROS_COMMANDS else terminable():
-            return guarded(lambda: _run_command(name, words[1:]))
-    _overview().parse_args(words)  # prints help, version or error, and exits
-    return 2
-
-
-def _run_node(name: str, words: Sequence[str]) -> int:
-    """Run a node, which reads its ROS arguments itself; the exit code."""
-    node = importlib.import_module(f'sfa_localization.nodes.{name}')
-    return int(node.main(words))
-
-
-def _run_command(name: str, words: Sequence[str]) -> int:
-    """Import and run a command; the exit code."""
+        node = importlib.import_module(f'sfa_localization.nodes.{name}')
+        return int(node.main(words))
+    if name not in COMMANDS:
+        _overview().parse_args(words)  # prints help, version or error, and exits
+        return 2
     with terminable():  # also those of ROS_COMMANDS
-        arguments = command_parser(name).parse_intermixed_args(words)
+        arguments = command_parser(name).parse_intermixed_args(words[1:])
     return int(arguments.run(arguments))
 
 
@@ -160,7 +155,11 @@ def _in_one_line(error: LocalizationError) -> str:
 def guarded(run: Callable[[], int]) -> int:
     """Turn expected errors into one line and exit code 1, Ctrl-C into 130."""
     try:
-        code = run()
+        try:
+            code = run()
+        except SystemExit:  # of argparse, which has printed help
+            sys.stdout.flush()
+            raise
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # the reader, such as head, has closed the pipe

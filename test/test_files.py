@@ -227,7 +227,10 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     writing.stderr.close()
 
 
-@pytest.mark.parametrize('command', ['config', f'inspect {BAGS / "sample"}'])
+@pytest.mark.parametrize(
+    'command',
+    ['config', f'inspect {BAGS / "sample"}', '--help', '--version', 'play --help', 'ekf_node -h'],
+)
 @pytest.mark.parametrize('unbuffered', ['', '1'])
 def test_a_standard_output_that_is_full_is_named(command, unbuffered):
     done = subprocess.run(
