@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -245,10 +245,17 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     return ''.join(parts)
 
 
-def require_defaults(path: Path) -> None:
-    """Raise ConfigError for a file with lines that are not those of defaults: a user's own."""
+def require_defaults(
+    path: Path,
+    changes: Mapping[str, Mapping[str, Any]] | None = None,
+    found: Collection[str] = (),
+) -> None:
+    """Raise ConfigError for a file with lines that are neither those of `render(changes)` nor
+    values of the parameters `found`: a user's own.
+    """
     lines = first_bytes(path, LONGEST).decode(errors='replace').splitlines()
-    if set(lines) - set(render().splitlines()):
+    own = set(lines) - set(render(changes).splitlines())
+    if any(line.strip().partition(':')[0] not in found for line in own):
         raise ConfigError(f'{path}: holds more than defaults: give another name, or remove it')
 
 

@@ -11,7 +11,7 @@ from filter_drives import Drive
 
 from sfa_localization import tuning
 from sfa_localization.cli import main
-from sfa_localization.config import load_changes
+from sfa_localization.config import load_changes, write_config
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import Odometry, Trajectory
@@ -168,6 +168,21 @@ def test_a_result_that_is_worse_on_other_logs_is_rejected(tmp_path, capsys):
     code = main(['tune', *paths, '--output', str(tmp_path / 'tuned.yaml')])
     assert code == 0 and 'the settings stay' in capsys.readouterr().out
     assert load_changes(tmp_path / 'tuned.yaml')['ekf_node']['measurement_factor'] == 1.0
+
+
+def test_settings_of_the_user_stay_where_it_would_write(tmp_path, capsys):
+    mine, again = tmp_path / 'mine.yaml', tmp_path / 'again.yaml'
+    write_config(mine, {'ekf_node': {'lost_std': 7.5}})
+    paths = log_of(tmp_path, 'log', 0, 0.1)
+    words = ['tune', *paths, '--config', str(mine), '--output']
+    assert [main([*words, str(again)]) for _ in range(2)] == [0, 0]
+    again.write_text(again.read_text().replace('lost_std: 7.5', 'lost_std: 6.5'))
+    before = again.read_bytes()
+    assert main([*words, str(again)]) == 1
+    assert main(['tune', *paths, '--output', str(mine)]) == 1
+    error = f'error: {mine}: holds more than defaults: give another name, or remove it\n'
+    assert capsys.readouterr().err.endswith(error)
+    assert again.read_bytes() == before and load_changes(mine)['ekf_node']['lost_std'] == 7.5
 
 
 @pytest.mark.parametrize(('rows', 'later_s', 'problem'), [

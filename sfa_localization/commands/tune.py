@@ -21,12 +21,12 @@ from sfa_localization.commands.options import (
     require_same_panorama,
     settings,
 )
-from sfa_localization.config import load_changes, write_config
+from sfa_localization.config import load_changes, require_defaults, write_config
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import Odometry, integrate
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.tuning import TuneConfig
+from sfa_localization.tuning import TUNED, TuneConfig
 
 if TYPE_CHECKING:
     from sfa_localization.filtering import Table
@@ -66,6 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Tune; write the file, print what changed and the cost."""
     config = settings(FilterConfig, arguments, arguments.config)
     require_output(arguments.output, [*arguments.drives, arguments.model], '.yaml', '.yml')
+    changes = load_changes(arguments.config) if arguments.config else {}
+    require_defaults(arguments.output, changes, {*TUNED, *_LEARNED})
     tables = [path.suffix == '.csv' for path in arguments.drives]
     if any(tables):
         if not all(tables) or len(tables) % 2:
@@ -82,7 +84,6 @@ def run(arguments: argparse.Namespace) -> int:
         best = dataclasses.replace(best, config=config)
     values = dataclasses.asdict(config), dataclasses.asdict(best.config)
     found = {name: value for name, value in values[1].items() if value != values[0][name]}
-    changes = load_changes(arguments.config) if arguments.config else {}
     changes['ekf_node'] = {**changes.get('ekf_node', {}), **found}
     write_config(arguments.output, changes)
     for name, value in found.items():
