@@ -370,17 +370,18 @@ def test_a_parameter_file_with_settings_of_the_user_stays(tmp_path, monkeypatch,
     assert before == (mine.read_bytes(), calibrated.read_bytes())
 
 
-@pytest.mark.parametrize('text', ['<!DOCTYPE html>\n<title>my home</title>\n', None])
-def test_a_report_replaces_its_own_page_only(text, tmp_path, capsys):
-    page, words = tmp_path / 'index.html', ['inspect', str(BAGS / 'sample'), '--report']
-    if text is None:
-        page.mkdir()
+@pytest.mark.parametrize('name', ['index.html', 'report.md', 'sample_path.png', 'index.html/'])
+def test_a_report_replaces_its_own_files_only(name, tmp_path, capsys):
+    mine, words = tmp_path / name, ['inspect', str(BAGS / 'sample'), '--report']
+    if name.endswith('/'):
+        mine.mkdir()
+        error = 'cannot be written: it is a folder'
     else:
-        page.write_text(text)
+        mine.write_text('<!DOCTYPE html>\n<title>my home</title>\n')
+        error = 'is no report: give --report another folder'
     assert main([*words, str(tmp_path)]) == 1
-    error = capsys.readouterr().err
-    assert ('is no report: give --report another folder' if text else 'is a folder') in error
-    assert text is None or page.read_text() == text
+    assert capsys.readouterr().err == f'error: {mine}: {error}\n'
+    assert mine.is_dir() or mine.read_text().endswith('<title>my home</title>\n')
     for _ in range(2):
         assert main([*words, str(tmp_path / 'own')]) == 0
 

@@ -81,13 +81,17 @@ def require_report(folder: Path | None, other: Path | None) -> None:
 
 
 def _require_own_page(folder: Path) -> None:
-    """Raise LocalizationError where a folder holds a page that is none of these reports."""
+    """Raise LocalizationError where a folder without a page of these reports holds files such as
+    they write.
+    """
     from sfa_localization.reports.page import MARK, PAGE
 
     require_outputs([folder / PAGE], [])
-    start = first_bytes(folder / PAGE)
-    if start and MARK.encode() not in start:
-        raise LocalizationError(f'{folder / PAGE}: is no report: give --report another folder')
+    if MARK.encode() in first_bytes(folder / PAGE):
+        return
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() in REPORT_FILES and first_bytes(file):
+            raise LocalizationError(f'{file}: is no report: give --report another folder')
 
 
 def add_settings(
