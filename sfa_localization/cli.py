@@ -52,6 +52,8 @@ OPTIONAL = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command or node named by the first argument; return the exit code."""
     _prepare_streams()
+    # Only SciPy's import of numpy.f2py would read it, and fail where it is no number.
+    os.environ.pop('SOURCE_DATE_EPOCH', None)
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
     with nullcontext() if name in (*NODES, *ROS_COMMANDS) else terminable():

@@ -3,6 +3,7 @@
 """The package as a whole: imports between rooms, one version, docstrings, executables."""
 
 import ast
+import os
 import re
 import runpy
 import statistics
@@ -423,6 +424,15 @@ def test_module_runs_as_a_program():
         [sys.executable, '-m', NAME, '--version'], cwd=ROOT, capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (0, f'{sfa_localization.__version__}\n')
+
+
+@pytest.mark.parametrize('date', ['abc', '99999999999999999'])
+def test_a_wrong_date_of_sources_is_ignored(date):
+    done = subprocess.run(
+        [sys.executable, '-m', NAME, 'filter', 'none.csv', 'none.csv', '--output', 'none.tum'],
+        cwd=ROOT, capture_output=True, text=True, env={**os.environ, 'SOURCE_DATE_EPOCH': date},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.count('\n')) == (1, 1) and 'none.csv' in done.stderr
 
 
 @pytest.mark.parametrize('package', ['trimesh', 'mdp', 'rclpy'])
