@@ -117,10 +117,10 @@ def test_a_delay_that_begins_is_measured_and_its_end_is_noticed(delay_s):
     assert all(late.apart < CLEARED for at_s, *_, late in found if at_s > 30.0)
 
 
-def circle_from_rest(seconds, omega=0.4):
+def circle_from_rest(seconds, omega=0.4, **options):
     """A robot that stands for three seconds, then drives on a circle."""
     twists = from_rest(np.tile([1.0, omega], (seconds * HZ, 1)), HZ, 3.0, 2.0)
-    return Drive(every=EVERY, twists=twists, **NOISY)
+    return Drive(every=EVERY, twists=twists, **NOISY, **options)
 
 
 @pytest.mark.parametrize('delay_s', [1.0, 2.0])
@@ -143,7 +143,26 @@ def test_in_time_from_rest_on_a_circle_or_a_line_nothing_is_suspected(omega):
     assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 10.0)
 
 
-OPEN = 'nothing has shown yet whether images are late'
+@pytest.mark.parametrize(('omega', 'rate'), [(0.4, 0.03), (0.8, 0.02), (-0.5, 0.06)])
+def test_on_a_circle_images_that_fall_behind_by_some_percent_are_doubted_in_time(omega, rate):
+    """They look like odometry that turns too far. Other driving shows their time again."""
+    circle = np.tile([1.0, omega], (120 * HZ, 1))
+    twists = np.append(circle, np.column_stack([np.ones(30 * HZ), winding(30)]), axis=0)
+    drive = Drive(every=EVERY, twists=from_rest(twists, HZ, 3.0, 2.0), **NOISY)
+    fused, found = driven(drive, lambda t: t - rate * max(t - 3.0, 0.0) * (t < 124.0))
+    assert sure_and_wrong_s(found) == 0.0
+    doubted = [late.untested or late.suspected for at_s, *_, late in found if 80.0 < at_s < 124.0]
+    assert all(doubted)
+    assert fused.status.level is Level.LOCALISED
+
+
+@pytest.mark.parametrize('bias', [-0.004, 0.004])
+def test_on_a_circle_the_errors_of_good_odometry_are_no_doubt(bias):
+    _, found = driven(circle_from_rest(120, 0.4, bias=bias), lambda t: t)
+    assert all(level is Level.LOCALISED for at_s, level, *_ in found if at_s > 10.0)
+
+
+OPEN = 'nothing shows whether images are late'
 
 
 @pytest.mark.parametrize('delay_s', [0.0, 1.0, 2.0, 6.0])
@@ -216,7 +235,7 @@ def test_images_of_elsewhere_are_in_time_again_where_the_filter_did_not_jump():
             shown = knots[200] if 200 <= k < 400 else knot
             pose = shown[1:] + rng.normal([8.0, -5.0, 0.0], [0.1, 0.1, 0.02])
             pose[2] = math.remainder(pose[2], math.tau)
-            late = followed(late, trail, knot, pose, COVARIANCE, False)
+            late = followed(late, trail, knot, pose, COVARIANCE, False, 0.0)
             assert late.suspected or not 12.0 <= 0.05 * k < 20.0
     assert late.apart < 0.1
 
@@ -232,7 +251,7 @@ def test_odometry_covers_images_of_long_before():
         if k % 4 == 0 and not 5.0 < seconds < 20.0:
             shown = knots[k] if seconds < 10.0 else knots[k - 60]
             pose = np.array([*shown[1:3], math.remainder(shown[3], math.tau)])
-            late = followed(late, trail, knot, pose, COVARIANCE, False)
+            late = followed(late, trail, knot, pose, COVARIANCE, False, 0.0)
             assert late.suspected or seconds < 21.0
     assert late.error_s == pytest.approx(3.0, abs=0.3)
 
@@ -316,18 +335,20 @@ def path_of(omega, seconds):
 
 def test_images_before_any_motion_change_nothing():
     knots = path_of(0.0, 1.0)
-    first = followed(None, (), knots[0], np.zeros(3), COVARIANCE, False)
-    again = followed(first, (knots[0],), knots[1], np.array([9.0, 9.0, 1.0]), COVARIANCE, False)
+    first = followed(None, (), knots[0], np.zeros(3), COVARIANCE, False, 0.0)
+    again = followed(
+        first, (knots[0],), knots[1], np.array([9.0, 9.0, 1.0]), COVARIANCE, False, 0.0
+    )
     np.testing.assert_array_equal(first.odds, again.odds)
     assert first.problem == '' and first.apart < 0.05
 
 
 def test_images_that_show_little_change_nothing():
     knots = path_of(0.0, 3.0)
-    first = followed(None, (), knots[0], np.zeros(3), COVARIANCE, False)
+    first = followed(None, (), knots[0], np.zeros(3), COVARIANCE, False, 0.0)
     vague = np.diag([100.0, 100.0, 0.1])
-    assert followed(first, tuple(knots), knots[-1], np.zeros(3), vague, False) is first
-    assert followed(None, (), knots[0], np.zeros(3), vague, False) is None
+    assert followed(first, tuple(knots), knots[-1], np.zeros(3), vague, False, 0.0) is first
+    assert followed(None, (), knots[0], np.zeros(3), vague, False, 0.0) is None
     assert unrelated(None, (), knots[0], np.zeros(3), COVARIANCE) is None
 
 
@@ -336,10 +357,8 @@ def test_odds_stay_probabilities_with_any_images():
     for k, knot in enumerate(path_of(0.2, 60.0)):
         trail = extended(trail, knot)
         if k % 4 == 0:
-            pose = rng.uniform(-20.0, 20.0, 3)
-            late = followed(
-                late, trail, knot, pose, COVARIANCE * 10 ** rng.uniform(-8, 3), k % 60 == 0
-            )
+            pose, covariance = rng.uniform(-20.0, 20.0, 3), COVARIANCE * 10 ** rng.uniform(-8, 3)
+            late = followed(late, trail, knot, pose, covariance, k % 60 == 0, rng.uniform(-1, 1))
             assert isinstance(late, Lateness)
             assert late.odds.min() >= 0 and late.odds.sum() == pytest.approx(1.0)
             assert np.isfinite(late.shift).all() and np.abs(late.turn) == pytest.approx(1.0)

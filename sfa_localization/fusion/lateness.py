@@ -90,6 +90,10 @@ _SHOWN = 0.05
 """Images are in time where larger delays from the start are less likely."""
 _FAR_M, _FAR_RAD = 0.5, 0.3
 """Where the robot has moved and turned less meanwhile, a delay does no harm."""
+_LATELY_S, _LEARNT_S = 3.0, 10.0
+"""A drive that is not steady for so long shows delays, and after so long the odometry's bias."""
+_SCALE_ERROR, _LEAST_SEEN_RAD = 0.01, 0.1
+"""Of the turns of good odometry; and what headings of images may have in error."""
 _DENSITY = (2 * math.pi) ** -1.5
 _TINY = 1e-300  # keeps quotients of vanishing odds finite
 
@@ -124,13 +128,13 @@ class Path(NamedTuple):
         limit_s = max(_WRONG_M / max(v, STANDING), _LEAST_S)
         return np.asarray(min(tolerated_s(v, omega) + _MARGIN_S, limit_s) >= _DELAYS)
 
-    @property
-    def steady(self) -> bool:
-        """Whether it is a line or a circle at one speed, on which all delays look alike."""
-        v, omega = self.rates
+    def steady(self, seconds: float = LATEST_S) -> bool:
+        """Whether it is a line or a circle at one speed lately, on which all delays look alike."""
+        count = round(seconds / _STEP_S)
+        v, omega = self.rates[:, :count]
         same_speed = v.std() < _EVEN * v.mean()
         same_rate = omega.std() < max(_EVEN * abs(float(omega.mean())), _EVEN_RADPS)
-        return bool(self.known.all() and same_speed and same_rate)
+        return bool(self.known[: count + 1].all() and same_speed and same_rate)
 
     @property
     def harmful(self) -> NDArray[np.bool_]:
@@ -149,6 +153,22 @@ class Image(NamedTuple):
     yaw_variance: float
 
 
+class Behind(NamedTuple):
+    """By which angle rad images have turned more than odometry since a steady drive began, beyond
+    what odometry errs (CUSUM: Page, Biometrika, 1954).
+
+    Odometry with the `bias` of its turn rate, rad/s, that other driving has shown: images that fall
+    behind look like another one. `seen` and `reckoned` are the headings rad of the newest image and
+    by odometry.
+    """
+
+    stamp_ns: int
+    seen: float
+    reckoned: float
+    bias: float
+    angle: float = 0.0
+
+
 class Lateness(NamedTuple):
     """The odds (K + 1,) of each delay and of elsewhere, and transforms from odometry to the map.
 
@@ -156,7 +176,7 @@ class Lateness(NamedTuple):
     is that of the place along each axis, at the point of `path` that the newest image, of
     `stamp_ns`, shows. `broken`: the odometry was silent since, and the transforms begin anew.
     `lasting` are those of delays that last from the start, or from `since_ns`, until images are
-    known to be in time.
+    known to be in time; anew where they are far `behind` on a circle.
     """
 
     odds: Array
@@ -170,6 +190,7 @@ class Lateness(NamedTuple):
     broken: bool = False
     since_ns: int = 0
     lasting: Lateness | None = None
+    behind: Behind | None = None
 
     @property
     def apart(self) -> float:
@@ -223,46 +244,80 @@ def followed(
     pose: Array,
     covariance: Array,
     restarted: bool,
+    bias: float,
 ) -> Lateness | None:
     """The odds after an image of a pose (3,) with covariance (3, 3), at the pose by odometry `now`.
 
-    `restarted`: the filter has taken it for the robot's new place.
+    `restarted`: the filter has taken it for the robot's new place. `bias`, rad/s, is taken off the
+    odometry's turn rate.
     """
     image = _image(now[0], pose, covariance)
     if image.variance > _USELESS_VARIANCE:
         return late
     path = _path(trail, now)
     begun = _begun(path, image)
-    lasting = _lasting(late, trail, now, image, restarted)
+    behind = _behind(late, path, image, bias, restarted)
+    lasting = _lasting(late, trail, now, image, restarted, _is_far(behind, path))
     if late is None:
-        return begun._replace(lasting=lasting)
+        return begun._replace(lasting=lasting, behind=behind)
     if late.broken:
-        return _judged(_anew(late, begun))._replace(lasting=lasting)
+        return _judged(_anew(late, begun))._replace(lasting=lasting, behind=behind)
     if restarted or _moved(late.path, path)[0]:
         late = _corrected(_predicted(late, path, (now[0] - late.stamp_ns) * 1e-9), image)
     in_time, elsewhere = float(late.odds[:-1][_NEAR].sum()), float(late.odds[-1])
     if restarted or _ANEW * elsewhere > in_time:
         late = _replaced(late, begun, _RESTARTED if restarted else _ANEW)
-    return _judged(late)._replace(lasting=lasting)
+    return _judged(late)._replace(lasting=lasting, behind=behind)
+
+
+def _behind(
+    late: Lateness | None, path: Path, image: Image, bias: float, restarted: bool
+) -> Behind:
+    """With another image; `bias` is that of the filter."""
+    now = Behind(image.stamp_ns, image.yaw, float(path.yaws[0]), 0.0)
+    if late is None or late.behind is None:
+        return now
+    last = late.behind
+    seconds, more = (now.stamp_ns - last.stamp_ns) * 1e-9, bias - last.bias
+    if restarted or late.broken or not path.steady(_LATELY_S):
+        return now._replace(bias=last.bias - math.expm1(-seconds / _LEARNT_S) * more)
+    turned = float(wrap_angle(now.reckoned - last.reckoned)) + seconds * more
+    angle = last.angle + float(wrap_angle(now.seen - last.seen - turned))
+    beyond = max(abs(angle) - _SCALE_ERROR * abs(turned), 0.0)
+    return now._replace(bias=last.bias, angle=math.copysign(beyond, angle))
+
+
+def _is_far(behind: Behind | None, path: Path) -> bool:
+    """Whether images may be so late by now that it does harm."""
+    if behind is None or not path.steady():
+        return False
+    v, omega = np.abs(path.rates.mean(axis=1)).tolist()
+    angle = abs(behind.angle) if omega > _EVEN_RADPS else 0.0
+    return angle > _FAR_RAD or (angle > _LEAST_SEEN_RAD and angle * v > _FAR_M * omega)
 
 
 def _lasting(
-    late: Lateness | None, trail: tuple[Knot, ...], now: Knot, image: Image, restarted: bool
+    late: Lateness | None,
+    trail: tuple[Knot, ...],
+    now: Knot,
+    image: Image,
+    restarted: bool,
+    far: bool,
 ) -> Lateness | None:
     """Delays that last from the start, after another image; None where images are in time.
 
     Where images were late when the filter moved the estimate, odometry was wrong as well: they have
-    to show their time anew, by what is driven from there.
+    to show their time anew, by what is driven from there; and where they may be `far` behind.
     """
     before = late and late.lasting
-    if late is not None and before is None and not (restarted and late.late):
+    if late is not None and before is None and not far and not (restarted and late.late):
         return None
     since_ns = now[0] if restarted else before.since_ns if before else 0
     trail = tuple(knot for knot in trail if knot[0] >= since_ns)
     path = _steady(_path(trail, now), trail, now)
     odds = np.append((_NEAR_SHARE + ~_NEAR / np.sum(~_NEAR)) / 2, _ELSEWHERE)
     even = _begun(path, image)._replace(odds=odds / odds.sum(), since_ns=since_ns)
-    if late is None or before is None or restarted:
+    if late is None or before is None or restarted or far:
         return even
     if late.broken or len(trail) < _AS_BEFORE:
         return even._replace(odds=before.odds)
@@ -328,7 +383,8 @@ def unrelated(
     image = _image(now[0], pose, covariance)
     if late is None or image.variance > _USELESS_VARIANCE:
         return late
-    return _judged(_anew(late, _begun(_path(trail, now), image)))._replace(lasting=late.lasting)
+    judged = _judged(_anew(late, _begun(_path(trail, now), image)))
+    return judged._replace(lasting=late.lasting, behind=late.behind)
 
 
 def _anew(late: Lateness, begun: Lateness) -> Lateness:
@@ -339,7 +395,7 @@ def _anew(late: Lateness, begun: Lateness) -> Lateness:
 
 def _judged(late: Lateness) -> Lateness:
     """With what the odds say, but for late images of a steady drive, which shows no end of it."""
-    if late.late and late.path.steady:
+    if late.late and late.path.steady():
         return late
     return late._replace(suspected=late.apart > (CLEARED if late.suspected else SUSPECTED))
 

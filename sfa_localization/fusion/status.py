@@ -69,7 +69,7 @@ def status_of(
     if belief.mounting is not None and belief.mounting.untested:
         degraded.append('the robot was moved, or the camera on it: turn, to show which')
     if belief.lateness is not None and belief.lateness.untested:
-        degraded.append('nothing has shown yet whether images are late: turn, or stop and start')
+        degraded.append('nothing shows whether images are late: turn, or stop and start')
     degraded += _silences(belief, config)
     if abs(clock.delay_ns) > delay_limit_ns:
         late = 'late' if clock.delay_s > 0 else 'early'

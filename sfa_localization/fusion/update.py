@@ -30,7 +30,7 @@ from sfa_localization.fusion.evidence import (
 from sfa_localization.fusion.inputs import lower_root
 from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.lateness import Lateness, followed, unrelated
-from sfa_localization.fusion.motion import ERROR, SIZE, YAW, X, Y
+from sfa_localization.fusion.motion import BIAS, ERROR, SIZE, YAW, X, Y
 from sfa_localization.fusion.mounting import Mounting, elsewhere, mounted
 from sfa_localization.fusion.predict import ODOMETRY_TIMEOUT_S
 from sfa_localization.fusion.recover import Recovery
@@ -217,11 +217,12 @@ def _late(belief: Belief, event: MeasurementEvent, update: Update | None) -> Lat
         return belief.lateness
     now, trail = (belief.stamp_ns, *belief.dead_reckoned), belief.trail
     if belief.odometry_ns is None:
-        return followed(None, trail, now, event.value, event.covariance, False)
+        return followed(None, trail, now, event.value, event.covariance, False, 0.0)
     if belief.stamp_ns - belief.odometry_ns > ODOMETRY_TIMEOUT_S * 1e9:
         return unrelated(belief.lateness, trail, now, event.value, event.covariance)
     restarted = update is not None and update.reason == ELSEWHERE
-    return followed(belief.lateness, trail, now, event.value, event.covariance, restarted)
+    bias = float(belief.mean[BIAS])
+    return followed(belief.lateness, trail, now, event.value, event.covariance, restarted, bias)
 
 
 def _mounting(
