@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from filter_drives import START_NS, Drive, from_rest
 
-from sfa_localization.fusion import lateness
-from sfa_localization.fusion.lateness import CLEARED, Lateness, extended, followed, unrelated
+from sfa_localization.fusion.driven_path import KNOT_NS, LATEST_S, extended
+from sfa_localization.fusion.lateness import CLEARED, Lateness, followed, unrelated
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level
@@ -371,9 +371,9 @@ def test_the_trail_holds_the_last_seconds_in_steps():
     for knot in path_of(0.0, 30.0):
         trail = extended(trail, knot)
         trail = extended(trail, (knot[0] + 1_000_000, *knot[1:]))
-    assert trail[-1][0] - trail[0][0] >= lateness.LATEST_S * 1e9
-    assert len(trail) <= lateness.LATEST_S / 0.05 + 3
-    assert all(b[0] - a[0] >= lateness.KNOT_NS for a, b in pairwise(trail))
+    assert trail[-1][0] - trail[0][0] >= LATEST_S * 1e9
+    assert len(trail) <= LATEST_S / 0.05 + 3
+    assert all(b[0] - a[0] >= KNOT_NS for a, b in pairwise(trail))
 
 
 def test_a_first_image_that_contradicts_a_young_estimate_is_a_doubt():

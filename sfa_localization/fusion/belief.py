@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.fusion.driven_path import Knot
 from sfa_localization.fusion.inputs import symmetric
-from sfa_localization.fusion.lateness import Knot, Lateness
+from sfa_localization.fusion.lateness import Lateness
 from sfa_localization.fusion.motion import SIZE, State, Twist
 from sfa_localization.fusion.mounting import Mounting
 from sfa_localization.fusion.turn_noise import TurnNoise

@@ -25,10 +25,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.fusion.driven_path import (
+    AS_BEFORE,
+    COUNT,
+    DELAYS,
+    Complex,
+    Knot,
+    Path,
+    continued,
+    path_to,
+)
 from sfa_localization.fusion.pace import STANDING, TOLERATED_S, tolerated_s
 
-LATEST_S = 10.0
-"""Delays that are distinguished; images that are later look like images of elsewhere."""
 _MARGIN_S = 0.1
 """Images err in places, so longer delays than those that turns show are no fault."""
 _WRONG_M, _LEAST_S = 1.0, 0.25
@@ -37,15 +45,9 @@ such."""
 SUSPECTED, CLEARED = 0.5, 0.3
 """Probability of images of another time from which the estimate is not trusted, and below which it
 is again."""
-KNOT_NS = 50_000_000
-"""The odometry's path is remembered at this distance in time: no robot turns far meanwhile."""
-TRAIL_NS = round(LATEST_S * 1e9) + KNOT_NS
-_STEP_S = 0.1
-_DELAYS: Array = _STEP_S * np.arange(LATEST_S / _STEP_S + 0.5)
-_COUNT = len(_DELAYS)
 _LATEST_STEPS = 5
 """Of the path, whose speed is the present one."""
-_NEAR = _DELAYS <= TOLERATED_S + _MARGIN_S
+_NEAR = DELAYS <= TOLERATED_S + _MARGIN_S
 _NEAR_SHARE = _NEAR / _NEAR.sum()
 _SURPRISE = 1e-2
 """Probability of larger delays at the start."""
@@ -61,7 +63,7 @@ _BARRIER = 0.35
 """Share of the drifts that lead out of the delays of images in time, and back into them: where
 nothing shows a delay, as on a circle, neither side grows."""
 _EDGE = int(_NEAR.sum()) - 1
-_UP, _DOWN = np.ones((2, _COUNT))
+_UP, _DOWN = np.ones((2, COUNT))
 # What cannot go one way goes the other: any delay that stays is as likely as any other one.
 _UP[0], _UP[_EDGE], _UP[_EDGE + 1], _UP[-1] = 2.0, _BARRIER, 2 - _BARRIER, 0.0
 _DOWN[0], _DOWN[_EDGE], _DOWN[_EDGE + 1], _DOWN[-1] = 0.0, 2 - _BARRIER, _BARRIER, 2.0
@@ -80,12 +82,6 @@ _LEAST_M, _LEAST_RAD = 0.08, 0.05
 """An image after less motion shows nothing new."""
 _USELESS_VARIANCE = 4.0
 """m^2: images less certain than the robot moves in a few seconds show no delay."""
-_AS_BEFORE = 10
-"""Knots of the path whose motion is taken for that of before the odometry began."""
-_STRAIGHT_RAD = 1e-6
-_EVEN, _EVEN_RADPS = 0.2, 0.05
-"""Standard deviations of speed and turn rate on a line or a circle, as a part of the means, and of
-the turn rate at most, where it is small."""
 _SHOWN = 0.05
 """Images are in time where larger delays from the start are less likely."""
 _FAR_M, _FAR_RAD = 0.5, 0.3
@@ -96,51 +92,6 @@ _SCALE_ERROR, _LEAST_SEEN_RAD = 0.01, 0.1
 """Of the turns of good odometry; and what headings of images may have in error."""
 _DENSITY = (2 * math.pi) ** -1.5
 _TINY = 1e-300  # keeps quotients of vanishing odds finite
-
-Knot = tuple[int, float, float, float]
-_Complex = NDArray[np.complex128]
-
-
-class Path(NamedTuple):
-    """Odometry's positions (K,), x + iy, and headings (K,) at each delay before a stamp.
-
-    `known` (K,): whether the odometry had begun.
-    """
-
-    places: _Complex
-    yaws: Array
-    known: NDArray[np.bool_]
-
-    @property
-    def rates(self) -> Array:
-        """Speed m/s and turn rate rad/s (2, K - 1) between one delay and the next."""
-        return np.array([np.abs(np.diff(self.places)), np.diff(self.yaws)]) / _STEP_S
-
-    @property
-    def tolerated(self) -> NDArray[np.bool_]:
-        """(K,): which delays are small for a robot as fast as on this path."""
-        steps = np.abs(self.rates)
-        moving = self.known[1:] & (steps > STANDING).any(axis=0)
-        if not moving.any():
-            return _NEAR
-        v, omega = np.sqrt(np.mean(steps[:, moving] ** 2, axis=1)).tolist()
-        v = max(v, float(steps[0, moving][:_LATEST_STEPS].mean()))
-        limit_s = max(_WRONG_M / max(v, STANDING), _LEAST_S)
-        return np.asarray(min(tolerated_s(v, omega) + _MARGIN_S, limit_s) >= _DELAYS)
-
-    def steady(self, seconds: float = LATEST_S) -> bool:
-        """Whether it is a line or a circle at one speed lately, on which all delays look alike."""
-        count = round(seconds / _STEP_S)
-        v, omega = self.rates[:, :count]
-        same_speed = v.std() < _EVEN * v.mean()
-        same_rate = omega.std() < max(_EVEN * abs(float(omega.mean())), _EVEN_RADPS)
-        return bool(self.known[: count + 1].all() and same_speed and same_rate)
-
-    @property
-    def harmful(self) -> NDArray[np.bool_]:
-        """(K,): in which delays the robot has moved far."""
-        moved, turned = np.abs(self.places - self.places[0]), np.abs(self.yaws - self.yaws[0])
-        return np.asarray((moved > _FAR_M) | (turned > _FAR_RAD))
 
 
 class Image(NamedTuple):
@@ -180,8 +131,8 @@ class Lateness(NamedTuple):
     """
 
     odds: Array
-    turn: _Complex
-    shift: _Complex
+    turn: Complex
+    shift: Complex
     variance: Array
     yaw_variance: Array
     path: Path
@@ -195,7 +146,7 @@ class Lateness(NamedTuple):
     @property
     def apart(self) -> float:
         """Probability of images of another time or place."""
-        return 1.0 - float(self.odds[:-1][self.path.tolerated].sum())
+        return 1.0 - float(self.odds[:-1][_tolerated(self.path)].sum())
 
     @property
     def late(self) -> bool:
@@ -205,7 +156,7 @@ class Lateness(NamedTuple):
     @property
     def error_s(self) -> float:
         """Root mean square of the delay; those that are tolerated count nothing."""
-        return math.sqrt(float(self.odds[:-1] @ np.where(self.path.tolerated, 0.0, _DELAYS**2)))
+        return math.sqrt(float(self.odds[:-1] @ np.where(_tolerated(self.path), 0.0, DELAYS**2)))
 
     @property
     def untested(self) -> bool:
@@ -213,28 +164,18 @@ class Lateness(NamedTuple):
         lasting = self.lasting
         if lasting is None or self.suspected:
             return False
-        return bool(lasting.odds[:-1] @ lasting.path.harmful > _SHOWN)
+        return bool(lasting.odds[:-1] @ _harmful(lasting.path) > _SHOWN)
 
     @property
     def problem(self) -> str:
         """What is most likely the matter; '' where nothing is suspected."""
         if not self.suspected:
             return ''
-        far = np.where(np.append(self.path.tolerated, False), 0.0, self.odds)
+        far = np.where(np.append(_tolerated(self.path), False), 0.0, self.odds)
         best = int(np.argmax(far))
-        if best == _COUNT:
+        if best == COUNT:
             return 'images and odometry show different motions'
-        return f'images are stamped {_DELAYS[best]:.1f} s late, or delayed: synchronize the clocks'
-
-
-def extended(trail: tuple[Knot, ...], knot: Knot) -> tuple[Knot, ...]:
-    """The odometry's path with another pose: stamp ns, x m, y m, yaw rad."""
-    if trail and 0 <= knot[0] - trail[-1][0] < KNOT_NS:
-        return trail
-    first = 0
-    while first + 1 < len(trail) and trail[first + 1][0] <= knot[0] - TRAIL_NS:
-        first += 1
-    return (*trail[first:], knot)
+        return f'images are stamped {DELAYS[best]:.1f} s late, or delayed: synchronize the clocks'
 
 
 def followed(
@@ -254,7 +195,7 @@ def followed(
     image = _image(now[0], pose, covariance)
     if image.variance > _USELESS_VARIANCE:
         return late
-    path = _path(trail, now)
+    path = path_to(now, trail)
     begun = _begun(path, image)
     behind = _behind(late, path, image, bias, restarted)
     lasting = _lasting(late, trail, now, image, restarted, _is_far(behind, path))
@@ -289,10 +230,9 @@ def _behind(
 
 def _is_far(behind: Behind | None, path: Path) -> bool:
     """Whether images may be so late by now that it does harm."""
-    if behind is None or not path.steady():
+    if behind is None or not path.circling:
         return False
-    v, omega = np.abs(path.rates.mean(axis=1)).tolist()
-    angle = abs(behind.angle) if omega > _EVEN_RADPS else 0.0
+    angle, (v, omega) = abs(behind.angle), np.abs(path.rates.mean(axis=1)).tolist()
     return angle > _FAR_RAD or (angle > _LEAST_SEEN_RAD and angle * v > _FAR_M * omega)
 
 
@@ -314,12 +254,12 @@ def _lasting(
         return None
     since_ns = now[0] if restarted else before.since_ns if before else 0
     trail = tuple(knot for knot in trail if knot[0] >= since_ns)
-    path = _steady(_path(trail, now), trail, now)
+    path = continued(path_to(now, trail), trail, now)
     odds = np.append((_NEAR_SHARE + ~_NEAR / np.sum(~_NEAR)) / 2, _ELSEWHERE)
     even = _begun(path, image)._replace(odds=odds / odds.sum(), since_ns=since_ns)
     if late is None or before is None or restarted or far:
         return even
-    if late.broken or len(trail) < _AS_BEFORE:
+    if late.broken or len(trail) < AS_BEFORE:
         return even._replace(odds=before.odds)
     if not _moved(before.path, path).any():
         return before
@@ -331,42 +271,13 @@ def _lasting(
     return None if seen.apart < _SHOWN else seen
 
 
-def _path(trail: tuple[Knot, ...], now: Knot) -> Path:
-    knots = (*trail, now)
-    seconds = np.array([(knot[0] - now[0]) * 1e-9 for knot in knots])
-    x, y, yaw = np.array([knot[1:] for knot in knots]).T
-    places = np.interp(-_DELAYS, seconds, x) + 1j * np.interp(-_DELAYS, seconds, y)
-    known = seconds[0] - 1e-9 <= -_DELAYS
-    return Path(places, np.interp(-_DELAYS, seconds, np.unwrap(yaw)), known)
-
-
-def _steady(path: Path, trail: tuple[Knot, ...], now: Knot) -> Path:
-    """The path of a robot that moved before the odometry began as it does where it begins."""
-    knots = (*trail, now)
-    before_s = np.minimum((now[0] - knots[0][0]) * 1e-9 - _DELAYS, 0.0)
-    way, turned = _continued(knots[0], knots[min(_AS_BEFORE - 1, len(trail))], before_s)
-    return Path(path.places + way, path.yaws + turned, np.ones(_COUNT, bool))
-
-
-def _continued(first: Knot, later: Knot, seconds: Array) -> tuple[_Complex, Array]:
-    """Way and turn (K,) of as many seconds from the first of two knots, as between both."""
-    between_s = (later[0] - first[0]) * 1e-9
-    if between_s <= 0:
-        return np.zeros(_COUNT, complex), np.zeros(_COUNT)
-    part, turn = seconds / between_s, float(wrap_angle(later[3] - first[3]))
-    chord = complex(later[1] - first[1], later[2] - first[2])
-    steady = abs(turn) < _STRAIGHT_RAD
-    arc = part if steady else np.expm1(1j * turn * part) / np.expm1(1j * turn)
-    return np.asarray(chord * arc, complex), turn * part
-
-
 def _begun(path: Path, image: Image) -> Lateness:
     """By each delay, the image shows where the robot was then."""
-    odds = (1 - _SURPRISE) * _NEAR_SHARE + _SURPRISE / (_COUNT + 1)
-    odds = np.append(odds, _SURPRISE / (_COUNT + 1))
+    odds = (1 - _SURPRISE) * _NEAR_SHARE + _SURPRISE / (COUNT + 1)
+    odds = np.append(odds, _SURPRISE / (COUNT + 1))
     turn = np.exp(1j * (image.yaw - path.yaws))
     shift = image.place - turn * path.places
-    variances = np.full(_COUNT, image.variance), np.full(_COUNT, image.yaw_variance)
+    variances = np.full(COUNT, image.variance), np.full(COUNT, image.yaw_variance)
     return Lateness(odds / odds.sum(), turn, shift, *variances, path, image.stamp_ns)
 
 
@@ -383,7 +294,7 @@ def unrelated(
     image = _image(now[0], pose, covariance)
     if late is None or image.variance > _USELESS_VARIANCE:
         return late
-    judged = _judged(_anew(late, _begun(_path(trail, now), image)))
+    judged = _judged(_anew(late, _begun(path_to(now, trail), image)))
     return judged._replace(lasting=late.lasting, behind=late.behind)
 
 
@@ -391,6 +302,24 @@ def _anew(late: Lateness, begun: Lateness) -> Lateness:
     """With the odds of before; what was elsewhere is perhaps in time."""
     odds = np.append(late.odds[:-1] + late.odds[-1] * _NEAR_SHARE, 0.0)
     return begun._replace(odds=odds, suspected=late.suspected)
+
+
+def _tolerated(path: Path) -> NDArray[np.bool_]:
+    """(K,): which delays are small for a robot as fast as on a path."""
+    steps = np.abs(path.rates)
+    moving = path.known[1:] & (steps > STANDING).any(axis=0)
+    if not moving.any():
+        return _NEAR
+    v, omega = np.sqrt(np.mean(steps[:, moving] ** 2, axis=1)).tolist()
+    v = max(v, float(steps[0, moving][:_LATEST_STEPS].mean()))
+    limit_s = max(_WRONG_M / max(v, STANDING), _LEAST_S)
+    return np.asarray(min(tolerated_s(v, omega) + _MARGIN_S, limit_s) >= DELAYS)
+
+
+def _harmful(path: Path) -> NDArray[np.bool_]:
+    """(K,): in which delays the robot has moved far."""
+    moved, turned = np.abs(path.places - path.places[0]), np.abs(path.yaws - path.yaws[0])
+    return np.asarray((moved > _FAR_M) | (turned > _FAR_RAD))
 
 
 def _judged(late: Lateness) -> Lateness:
@@ -427,7 +356,7 @@ def _predicted(late: Lateness, path: Path, seconds: float) -> Lateness:
     total = came.sum(axis=0)
     came /= np.maximum(total, _TINY)
     turns, shifts, variances, yaw_variances = (
-        np.array([np.roll(each, 1), each, np.roll(each, -1), np.full(_COUNT, near @ each)])
+        np.array([np.roll(each, 1), each, np.roll(each, -1), np.full(COUNT, near @ each)])
         for each in (late.turn, late.shift, late.variance, late.yaw_variance)
     )
     turn, places = (came * turns).sum(axis=0), turns * path.places + shifts
@@ -465,7 +394,7 @@ def _came(odds: Array, drift: float) -> tuple[Array, Array]:
         np.append(0.0, (up * odds)[:-1]),
         stay * odds * np.where(_NEAR, 1 - _BREAK, 1 - _HEAL),
         np.append((down * odds)[1:], 0.0),
-        np.full(_COUNT, _BREAK * in_time / _COUNT),
+        np.full(COUNT, _BREAK * in_time / COUNT),
     ]
     return np.array(came), near / max(in_time, _TINY)
 

@@ -8,8 +8,8 @@ import math
 
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import Belief, OdometryEvent, capped
+from sfa_localization.fusion.driven_path import extended
 from sfa_localization.fusion.kalman import Kalman
-from sfa_localization.fusion.lateness import extended
 from sfa_localization.fusion.motion import SIZE, MotionNoise, Step, Twist
 
 ODOMETRY_TIMEOUT_S = 0.5
