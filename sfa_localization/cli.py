@@ -52,8 +52,9 @@ OPTIONAL = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command or node named by the first argument; return the exit code."""
     _prepare_streams()
-    # Only SciPy's import of numpy.f2py would read it, and fail where it is no number.
-    os.environ.pop('SOURCE_DATE_EPOCH', None)
+    # Only imports would read these, of numpy.f2py and matplotlib, and fail where they are wrong.
+    for name in ('SOURCE_DATE_EPOCH', 'MPLBACKEND'):
+        os.environ.pop(name, None)
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
     with nullcontext() if name in (*NODES, *ROS_COMMANDS) else terminable():

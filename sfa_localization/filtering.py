@@ -30,6 +30,7 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 
 _NS = Decimal(1_000_000_000)
+_LARGEST_EXPONENT = 20  # of stamps, whose nanoseconds are below 2^62
 _SECOND_NS = 1_000_000_000
 LARGEST_LOG = 1 << 30
 """Bytes of a log: more than a year of odometry at 1 Hz, or three days at 100 Hz."""
@@ -607,10 +608,11 @@ def _stamp(row: list[str], at: dict[str, int]) -> int | str:
     number = _number(row[at[name]]) if at[name] < len(row) else None
     if number is None:
         return 'no stamp'
+    far = f'{name} of the far future: in another unit? Columns are stamp_s or stamp_ns'
+    if number.adjusted() > _LARGEST_EXPONENT:
+        return far
     stamp_ns = int(number if name == 'stamp_ns' else (number * _NS).to_integral_value())
-    if abs(stamp_ns) < 2**62:
-        return stamp_ns
-    return f'{name} of the far future: in another unit? Columns are stamp_s or stamp_ns'
+    return stamp_ns if abs(stamp_ns) < 2**62 else far
 
 
 def _number(cell: str) -> Decimal | None:

@@ -25,7 +25,12 @@ REASONS = {
     'fusion/consistency.py': ('doubts', 'compared', 'stood', '_turned'),
     'fusion/mounting.py': ('problem',),
     'fusion/turn_watch.py': ('problem',),
-    'fusion/pose_filter.py': ('_apart_in_time', '_require_place', '_require_others_ahead'),
+    'fusion/pose_filter.py': (
+        'status',
+        '_apart_in_time',
+        '_require_place',
+        '_require_others_ahead',
+    ),
     'fusion/update.py': ('_fused', '_followed', '_gated'),
     'fusion/recover.py': ('weighed',),
     'camera/watch.py': ('judge', 'judge_novelty'),

@@ -386,6 +386,20 @@ def test_a_report_replaces_its_own_files_only(name, tmp_path, capsys):
         assert main([*words, str(tmp_path / 'own')]) == 0
 
 
+def test_a_report_that_was_interrupted_is_replaced_by_the_next(tmp_path, monkeypatch, capsys):
+    words = ['inspect', str(BAGS / 'sample'), '--report', str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr('sfa_localization.reports.bag.write_path', interrupt)
+        assert main(words) == 130
+    assert 'Unfinished report' in (tmp_path / 'index.html').read_text()
+    assert main(words) == 0
+    assert 'Unfinished report' not in (tmp_path / 'index.html').read_text()
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize(
     'command',
     ['inspect bag --report', 'evaluate none.npz bag --report', 'train bag --output a.npz --report'],

@@ -232,6 +232,15 @@ def test_masks_are_taken_away_again(bench):
     assert run.node.settings(CameraConfig).blind_sectors == ()
 
 
+def test_a_parameter_cannot_be_removed(bench):
+    run = bench(blind_sectors=[10.0, 20.0])
+    assert run.node.start()
+    (answer,) = run.node.set_parameters([Parameter('blind_sectors', Parameter.Type.NOT_SET)])
+    assert not answer.successful
+    assert answer.reason == "parameter 'blind_sectors' cannot be removed: give it a value"
+    assert run.set(blind_sectors=[30.0, 40.0]).successful
+
+
 def test_sectors_are_set_by_message(bench):
     """As `ros2 param set` does: numbers arrive as array.array, or as integers."""
     run = bench()

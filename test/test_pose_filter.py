@@ -835,6 +835,34 @@ def test_parameters_are_checked_together(values, why):
         FilterConfig(**values)
 
 
+def test_unusable_images_in_a_row_are_noticed_before_they_are_missed():
+    """A dark image shows at once that nothing is seen; one alone may be a flicker."""
+    drive = Drive(seconds=20, **NOISY)
+    fused = PoseFilter(FilterConfig())
+    drive.feed(fused, heading=True)
+    last_ns, nothing = int(drive.stamps_ns[-1]), np.diag([1e6, 1e6, 1e6])
+    dark = [
+        fused.add_measurement(last_ns + k, np.zeros(3), nothing) and fused.status for k in (1, 2)
+    ]
+    assert [status.level for status in dark] == [Level.LOCALISED, Level.DEGRADED]
+    assert dark[1].reasons == ('2 images in a row are unusable',)
+    assert fused.add_measurement(last_ns + 3, drive.poses[-1], drive.covariance(True)).accepted
+    assert fused.status.level is Level.LOCALISED
+
+
+@pytest.mark.parametrize('v', [5e-324, 1e-302, -1e-200, 1e-30])
+@pytest.mark.parametrize('omega', [0.0, 5e-324, 0.1])
+def test_the_smallest_speeds_are_numbers_like_others(v, omega):
+    drive = Drive(seconds=5, twists=np.tile([v, omega], (250, 1)), **NOISY)
+    drive.read = drive.twists
+    fused = PoseFilter(FilterConfig())
+    for stamp_ns, kind, index in drive.events():
+        drive.give(fused, (stamp_ns, kind, index), heading=True)
+        if kind == 1:
+            fused.add_turned(stamp_ns, float(drive.poses[drive.pictures[index], 2]))
+    assert np.isfinite(fused.state.covariance).all()
+
+
 def test_unusable_images_show_how_long_the_odometry_has_been_silent():
     drive = Drive(seconds=20, **NOISY)
     fused = PoseFilter(FilterConfig())
@@ -846,6 +874,7 @@ def test_unusable_images_show_how_long_the_odometry_has_been_silent():
         fused.add_measurement(last_ns + round(late_s * 1e9), np.zeros(3), nothing)
         levels.append(fused.status.level)
     # A minute is no silence, but another clock.
-    assert levels == [Level.LOCALISED, Level.DEGRADED, Level.LOST, Level.LOST, Level.LOCALISED]
+    assert levels == [Level.LOCALISED, Level.DEGRADED, Level.LOST, Level.LOST, Level.DEGRADED]
+    assert fused.status.reasons == ('5 images in a row are unusable',)
     assert fused.add_odometry(last_ns + 20_000_000, *drive.read[-1]) == ''
-    assert fused.status.level is Level.LOCALISED
+    assert fused.status.reasons == ('5 images in a row are unusable',)

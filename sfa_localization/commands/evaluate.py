@@ -61,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization import evaluation
     from sfa_localization.place_model import PlaceModel
     from sfa_localization.reports.evaluation import heading_table, table, trust_lines, write_report
+    from sfa_localization.reports.page import begin_page
 
     if arguments.json:
         read = arguments.model, arguments.bag, *arguments.align, arguments.config
@@ -85,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         places = result.estimates['sfa'].poses[:, :2]
         results = result.truth, result.estimates, result.scores, places, result.features
+        begin_page(arguments.report)
         write_report(arguments.report, *results)
         _write_page(arguments, result)
     if arguments.json:

@@ -52,6 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         require_output(arguments.json, arguments.bags, '.json')
     require_report(arguments.report, arguments.json)
+    from sfa_localization.reports.page import begin_page
+
     reports = []
     for path in arguments.bags:
         try:
@@ -61,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         write_json(arguments.json, reports)
     if arguments.report:
+        begin_page(arguments.report)
         for number, report in enumerate(reports):
             prefix = f'{number}_' if len(reports) > 1 else ''
             _write_figures(report, arguments.report, prefix)

@@ -119,7 +119,7 @@ def _update(arguments: argparse.Namespace) -> int:
 def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Recipe) -> None:
     """Write figures and the page, with the worst images read from the bags once more."""
     from sfa_localization.bags.drives import images_at
-    from sfa_localization.reports.page import PAGE
+    from sfa_localization.reports.page import PAGE, begin_page
     from sfa_localization.reports.training import worst_images, write_training_report
 
     worst = worst_images(trained)
@@ -129,5 +129,6 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
         if any(one.run == run for one in worst)
     }
     samples = {one: read[one.run][one.stamp_ns] for one in worst if one.stamp_ns in read[one.run]}
+    begin_page(folder)
     write_training_report(folder, trained, samples)
     print(f'{folder / PAGE}: written')

@@ -45,6 +45,8 @@ TIME_JUMP_S = 60.0
 AHEAD_COUNT = 3
 """So many images in a row beyond the history are no accident: their clock is another one. They are
 used where no odometry comes between them, which then has ended."""
+_BLIND = 2
+"""So many unusable images in a row are no flicker: the camera is covered, or in the dark."""
 BACKWARD_COUNT = 5
 """Odometry messages in a row that are too late until the clock is taken to have gone back."""
 AGAIN_NS = 300_000_000
@@ -108,7 +110,7 @@ class PoseFilter:
         self._ahead = (0, 0)
         self._apart = (0, 0)
         self._alone = 0
-        self._unusable_ns = 0
+        self._unusable_ns = self._unusable = 0
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
             self._waiting = np.array(self.config.initial_pose), self._initial_covariance()
@@ -191,6 +193,7 @@ class PoseFilter:
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
+        self._unusable = 0
         if len(fused) == 3:
             self._watch.add_seen(Seen(stamp_ns, float(fused[2]), float(noise[2, 2])))
         noise = noise + self._time_noise(taken_ns, stamp_ns, fused)
@@ -248,6 +251,7 @@ class PoseFilter:
             return read_measurement(value, covariance, self.config.measurement_factor)
         except DataError:
             self._unusable_ns = max(stamp_ns, self._unusable_ns)
+            self._unusable += 1
             raise
 
     def _taken(self, stamp_ns: int) -> int:
@@ -351,6 +355,8 @@ class PoseFilter:
             newest = self._rules.prediction.coast(newest, self._unusable_ns)
         status = status_of(newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
         reasons = [why for why in self._apart_in_time() if why not in status.reasons]
+        if self._unusable >= _BLIND:
+            reasons.append(f'{self._unusable} images in a row are unusable')
         if not reasons:
             return status
         level = Level.DEGRADED if status.level is Level.LOCALISED else status.level

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.fusion.pace import TOLERATED_S, Pace
+from sfa_localization.fusion.pace import STANDING, TOLERATED_S, Pace
 
 EARLIEST_S, LATEST_S = -1.5, 6.0
 """Delays that are distinguished; those beyond look like images without relation to the odometry."""
@@ -210,8 +210,7 @@ class TurnWatch:
     @property
     def _apart_ns(self) -> int:
         """The time between images from which their turn is that of the headings in the map."""
-        v = self._pace.v
-        return min(_APART_NS, round(_APART_M / v * 1e9)) if v else _APART_NS
+        return min(_APART_NS, round(_APART_M / max(self._pace.v, STANDING) * 1e9))
 
     def _weigh(self, now_ns: int) -> None:
         """The odds by now: from pairs for good, and from those that are not complete yet."""

@@ -48,6 +48,10 @@ def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) 
     """
 
     def check(changes: list[Parameter]) -> SetParametersResult:
+        for change in changes:
+            if change.type_ is Parameter.Type.NOT_SET:
+                reason = f'parameter {change.name!r} cannot be removed: give it a value'
+                return SetParametersResult(successful=False, reason=reason)
         try:
             changed(current(), changes)
         except ConfigError as error:

@@ -89,6 +89,13 @@ def section(title: str, *parts: str) -> str:
     return f'<section>\n<h2>{escape(title)}</h2>\n{body}\n</section>' if body else ''
 
 
+def begin_page(folder: Path) -> None:
+    """Mark a folder as that of a report before its figures are written: one that is interrupted is
+    replaced by the next.
+    """
+    write_page(folder, 'Unfinished report', paragraph('It was interrupted: run the command again.'))
+
+
 def write_page(folder: Path, title: str, *parts: str) -> None:
     """Write `folder`/index.html, completely or not at all. Raises LocalizationError."""
     body = '\n'.join(part for part in parts if part)
