@@ -76,7 +76,9 @@ def load_pose(path: Path, frame: str) -> SavedPose | None:
         return SavedPose(int(content['stamp_ns']), frame, pose, covariance)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
+    except OSError as error:
         raise DataError(f'{path}: holds no saved pose: {error}') from None
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
+        raise DataError(f'{path}: holds no saved pose: remove it or choose another file') from None
     except DataError as error:
         raise DataError(f'{path}: cannot be used: {error}') from None
