@@ -49,7 +49,7 @@ def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) 
 
     def check(changes: list[Parameter]) -> SetParametersResult:
         for change in changes:
-            if change.type_ is Parameter.Type.NOT_SET:
+            if change.type_ is Parameter.Type.NOT_SET and node.has_parameter(change.name):
                 reason = f'parameter {change.name!r} cannot be removed: give it a value'
                 return SetParametersResult(successful=False, reason=reason)
         try:
