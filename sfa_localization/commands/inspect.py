@@ -52,8 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         require_output(arguments.json, arguments.bags, '.json')
     require_report(arguments.report, arguments.json)
-    from sfa_localization.reports.page import begin_page
-
     reports = []
     for path in arguments.bags:
         try:
@@ -63,11 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         write_json(arguments.json, reports)
     if arguments.report:
-        begin_page(arguments.report)
-        for number, report in enumerate(reports):
-            prefix = f'{number}_' if len(reports) > 1 else ''
-            _write_figures(report, arguments.report, prefix)
-        _write_page(arguments.report, reports)
+        _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
     return 1 if any(map(_unreadable, reports)) else 0
@@ -83,6 +77,17 @@ def write_json(path: Path, reports: Sequence[BagReport]) -> None:
     text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
     with atomic_write(path, BagError) as file:
         file.write(f'{text}\n'.encode())
+
+
+def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
+    """Write figures and the page of all bags."""
+    from sfa_localization.reports.page import begin_page
+
+    begin_page(folder)
+    for number, report in enumerate(reports):
+        prefix = f'{number}_' if len(reports) > 1 else ''
+        _write_figures(report, folder, prefix)
+    _write_page(folder, reports)
 
 
 def _write_page(folder: Path, reports: Sequence[BagReport]) -> None:

@@ -228,12 +228,13 @@ def _behind(
     return now._replace(bias=last.bias, angle=math.copysign(beyond, angle))
 
 
-def _is_far(behind: Behind | None, path: Path) -> bool:
+def _is_far(behind: Behind, path: Path) -> bool:
     """Whether images may be so late by now that it does harm."""
-    if behind is None or not path.circling:
+    angle = abs(behind.angle)
+    if angle <= _LEAST_SEEN_RAD or not path.circling:
         return False
-    angle, (v, omega) = abs(behind.angle), np.abs(path.rates.mean(axis=1)).tolist()
-    return angle > _FAR_RAD or (angle > _LEAST_SEEN_RAD and angle * v > _FAR_M * omega)
+    v, omega = np.abs(path.rates.mean(axis=1)).tolist()
+    return bool(angle > _FAR_RAD or angle * v > _FAR_M * omega)
 
 
 def _lasting(
