@@ -322,6 +322,15 @@ def test_the_overview_of_the_commands_imports_none_of_them():
     assert done.stdout.splitlines()[-1] == '[]', done.stderr
 
 
+def test_an_inspection_without_a_report_imports_no_figures():
+    code = (
+        'import sys\nfrom sfa_localization import cli\ncli.main(["inspect", "bags/sample"])\n'
+        'print("matplotlib" in sys.modules)'
+    )
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == 'False', done.stderr
+
+
 @pytest.mark.parametrize('words', [[], ['trian'], ['--', 'train']])
 def test_a_wrong_command_ends_with_exit_code_2(words):
     with pytest.raises(SystemExit) as raised:
