@@ -54,6 +54,12 @@ class Bench:
         self.executor.add_node(node)
         return node
 
+    def end(self, node):
+        """End a node between two callbacks, as its own process would."""
+        self.executor.remove_node(node)
+        self.nodes.remove(node)
+        assert until(self.executor.create_task(node.destroy_node).done)
+
     def listen(self, kind, topic, qos=None):
         heard = self.heard.setdefault(topic, [])
         self.node.create_subscription(kind, topic, heard.append, qos or QoSProfile(depth=1000))

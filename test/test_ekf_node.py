@@ -631,8 +631,7 @@ def test_after_a_restart_it_looks_where_it_was_first(bench, tmp_path):
     last = node._filter.state
     assert until(lambda: node._sure is not None and node._sure.stamp_ns == last.stamp_ns)
     assert not pose_file.exists(), 'the period has not passed'
-    bench.executor.remove_node(node)
-    node.destroy_node()
+    bench.end(node)
     assert pose_file.exists()
     again = bench.run(EkfNode, **patient)
     heard = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')

@@ -171,10 +171,8 @@ def replay(bench, drive, events, together):
             assert until(lambda: [count.received for count in counts] == sent), sent
     assert until(lambda: len(heard) == sent[0])
     bench.node.destroy_subscription(listener)
-    bench.executor.remove_node(node)
-    bench.nodes.remove(node)
+    bench.end(node)
     state = node._filter.state
-    node.destroy_node()
     bench._publishers.clear()
     return state, heard
 

@@ -19,7 +19,6 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -69,6 +68,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def __init__(self, name: str, kinds: Sequence[type[Settings]], **options: Any) -> None:
         self.monitors: dict[str, Monitor] = {}
+        self._ended = False
         super().__init__(name, **options)
         # rclpy makes this one without `create_service`.
         change = self._service_change_state
@@ -202,9 +202,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
                 return callback(request, response)
             except LocalizationError as error:
                 response.success, response.message = False, str(error)
-            except InvalidHandle:
-                raise
             except Exception as error:
+                if not self._running():
+                    raise
                 response.success, response.message = False, self._defect(name, error)
             return response
 
@@ -260,14 +260,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             callback()
         except LocalizationError as error:
             self.refuse(name, str(error))
-        except InvalidHandle:
-            raise
         except Exception as error:
-            if self.context.ok():  # after a signal nothing can be published
+            if self._running():
                 self._defect(name, error)  # a node must outlive any message
         else:
             return True
         return False
+
+    def _running(self) -> bool:
+        """False after a signal, and once the node is destroyed, perhaps by another thread while a
+        callback runs: nothing can be published or answered any more, and that is no defect."""
+        return bool(self.context.ok()) and not self._ended
 
     # What rclpy itself makes: the services of parameters and of the life cycle, and /clock.
 
@@ -286,10 +289,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         def receive(message: Any) -> None:
             try:
                 callback(message)
-            except InvalidHandle:
-                raise
             except Exception as error:
-                if self.context.ok():
+                if self._running():
                     self.refuse(topic, f'{type(error).__name__}: {error}')
 
         return super().create_subscription(msg_type, topic, receive, *more, **options)
@@ -302,10 +303,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         def answer(request: Any, response: Any) -> Any:
             try:
                 return callback(request, response)
-            except InvalidHandle:
-                raise
             except Exception as error:
-                if not self.context.ok():  # after a signal nothing can be answered
+                if not self._running():
                     raise
                 reason = f'request refused: {type(error).__name__}: {short_line(str(error))}'
                 self.refuse(name, reason)
@@ -363,8 +362,10 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """End the node, and leave ROS at once.
 
         rclpy's state machine would keep the node until the garbage collection; where that comes
-        while others start, the middleware may wait for itself.
+        while others start, the middleware may wait for itself. A callback that runs meanwhile in
+        another thread ends without a word, and other nodes of its executor go on.
         """
+        self._ended = True
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 

@@ -73,9 +73,7 @@ class Chain:
         """End a node without a word to the others."""
         node = self.nodes.pop(name)
         self.last = None if name == 'ekf_node' else self.last
-        self.bench.executor.remove_node(node)
-        self.bench.nodes.remove(node)
-        node.destroy_node()
+        self.bench.end(node)
 
     def connected(self):
         """Whether what one sends reaches the next, also the latched correlation of errors."""
