@@ -17,7 +17,7 @@ from sensor_msgs.msg import Image
 from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 SMALL = {'width': 120, 'height': 12}
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 

@@ -152,7 +152,7 @@ sys.exit = lambda code: (send(), leave(code))
 @pytest.mark.parametrize('moment', MOMENTS)
 def test_a_signal_at_any_moment_ends_with_exit_code_0(start, moment, name):
     process = start('ekf_node', before=SEND.format(name) + MOMENTS[moment])
-    _, told = process.communicate(timeout=30)
+    _, told = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, told
     assert 'Traceback' not in told and 'internal error' not in told and 'refused' not in told
 
@@ -167,7 +167,7 @@ def test_a_signal_at_any_moment_ends_with_exit_code_0(start, moment, name):
 ])  # fmt: skip
 def test_a_wrong_parameter_ends_the_node_with_its_name(start, node, parameter, why):
     process = start(node, parameter)
-    _, told = process.communicate(timeout=30)
+    _, told = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 1
     assert why in told and 'Traceback' not in told
 
@@ -192,7 +192,7 @@ def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arg
     folder = f'{tmp_path}/'
     arguments = [folder + word if word.endswith('.yaml') else word for word in arguments]
     process = start('ekf_node', arguments=arguments)
-    _, told = process.communicate(timeout=30)
+    _, told = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 1
     assert why in told and 'Traceback' not in told
 
@@ -209,7 +209,7 @@ def test_a_parameter_file_for_another_namespace_is_warned_of(start, tmp_path, ke
     arguments = ['--params-file', str(path), '-r', '__ns:=/robot1']
     before = SEND.format('SIGINT') + MOMENTS['made']
     process = start('ekf_node', arguments=arguments, before=before)
-    _, told = process.communicate(timeout=30)
+    _, told = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, told
     warned = f'{path}: nothing of {key} is used: this node is /robot1/ekf_node'
     assert (warned in told) == ignored and ('/**/ekf_node:' in told) == ignored
@@ -219,7 +219,7 @@ def test_an_impossible_transition_does_not_end_the_node(bench, start):
     process = start('ekf_node')
     assert running(bench)
     client = bench.node.create_client(ChangeState, 'ekf_node/change_state')
-    assert client.wait_for_service(15.0)
+    assert client.wait_for_service(DEADLINE_S)
     wrong = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
     client.call_async(wrong)
     right = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))

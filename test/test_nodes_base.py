@@ -264,7 +264,7 @@ def test_a_node_that_ends_leaves_ros_without_waiting_for_the_garbage_collection(
         node = running.run(EkfNode)
         assert until(lambda: 'ekf_node' in watching.node.get_node_names())
         running.end(node)
-        assert until(lambda: 'ekf_node' not in watching.node.get_node_names(), 10.0)
+        assert until(lambda: 'ekf_node' not in watching.node.get_node_names())
         node.destroy_node()
     finally:
         gc.enable()

@@ -44,7 +44,7 @@ from sfa_localization.data.errors import BagError
 
 ROOT = Path(__file__).parents[1]
 
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 DOMAIN = free_domain()
 FAST = PlayConfig(rate=20.0, wait=20.0)
 

@@ -14,7 +14,7 @@ import pytest
 from sfa_localization.commands.processes import Processes, terminable
 from sfa_localization.data.errors import NodeError
 
-DEADLINE_S = 20
+DEADLINE_S = 60
 WAIT = 'import time; print("ready", flush=True); time.sleep(60)'
 STUBBORN = 'import signal; [signal.signal(s, signal.SIG_IGN) for s in (2, 15)]; ' + WAIT
 

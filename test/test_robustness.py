@@ -44,7 +44,7 @@ from filter_drives import Drive  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
-from ros_bench import Bench, until  # noqa: E402
+from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Empty, String  # noqa: E402
 
@@ -82,7 +82,7 @@ class ReadsPixels(InTwoSteps):
 
     def locate(self, image):
         self.entered.set()
-        assert self.free.wait(15.0)
+        assert self.free.wait(DEADLINE_S)
         spread = np.diag([0.04, 0.04, 0.0025])
         return Estimate(np.arange(1.0, 9.0), image[0, 0, :2].astype(float), 0.25, spread, 0.5)
 
@@ -221,7 +221,7 @@ def test_of_panoramas_that_come_too_fast_the_newest_is_located(bench, model):
     model.entered.clear()
     model.free.clear()
     bench.publish('panorama', picture(0, START_NS))
-    assert model.entered.wait(15.0)
+    assert model.entered.wait(DEADLINE_S)
     for number in range(1, 30):
         bench.publish('panorama', picture(number, START_NS + number))
     model.free.set()
@@ -252,11 +252,11 @@ def held_up(bench):
 
     def wait(_):
         entered.set()
-        free.wait(15.0)
+        free.wait(DEADLINE_S)
 
     bench.node.create_subscription(Empty, 'hold', wait, 1)
     bench.publish('hold', Empty())
-    assert entered.wait(15.0)
+    assert entered.wait(DEADLINE_S)
     try:
         yield
     finally:
