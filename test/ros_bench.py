@@ -38,12 +38,14 @@ class Bench:
         self.node = rclpy.create_node('bench', context=self.context)
         self.nodes, self.heard, self._publishers = [], {}, {}
         self.executor.add_node(self.node)
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
     def _spin(self):
         with contextlib.suppress(ExternalShutdownException):
-            self.executor.spin()
+            while not self._closing.is_set():
+                self.executor.spin_once()
 
     def run(self, kind, start=True, *, options=None, **overrides):
         values = [Parameter(name, value=value) for name, value in overrides.items()]
@@ -83,8 +85,10 @@ class Bench:
         return future.result()
 
     def close(self):
-        self.executor.shutdown()
+        self._closing.set()
+        self.executor.create_task(lambda: None)  # which it may be waiting for
         self._thread.join(DEADLINE_S)
+        self.executor.shutdown()
         for node in [*self.nodes, self.node]:
             node.destroy_node()
         rclpy.try_shutdown(context=self.context)
