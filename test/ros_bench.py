@@ -24,6 +24,26 @@ def until(condition, deadline_s=DEADLINE_S):
     return bool(condition())
 
 
+class Spinner(SingleThreadedExecutor):
+    """Spins in a thread of its own, and ends that first: rclpy destroys what it may wait for."""
+
+    def __init__(self, context):
+        super().__init__(context=context)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        with contextlib.suppress(ExternalShutdownException):
+            while not self._over.is_set():
+                self.spin_once()
+
+    def shutdown(self, timeout_sec=DEADLINE_S):
+        self.create_task(self._over.set)
+        self._thread.join(timeout_sec)
+        return super().shutdown(timeout_sec)
+
+
 class Bench:
     """Runs nodes, publishes to them and records what they publish."""
 
@@ -34,18 +54,10 @@ class Bench:
             domain_id=domain_id,
             signal_handler_options=rclpy.signals.SignalHandlerOptions.NO,
         )
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = Spinner(self.context)
         self.node = rclpy.create_node('bench', context=self.context)
         self.nodes, self.heard, self._publishers = [], {}, {}
         self.executor.add_node(self.node)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
-
-    def _spin(self):
-        with contextlib.suppress(ExternalShutdownException):
-            while not self._closing.is_set():
-                self.executor.spin_once()
 
     def run(self, kind, start=True, *, options=None, **overrides):
         values = [Parameter(name, value=value) for name, value in overrides.items()]
@@ -85,9 +97,6 @@ class Bench:
         return future.result()
 
     def close(self):
-        self._closing.set()
-        self.executor.create_task(lambda: None)  # which it may be waiting for
-        self._thread.join(DEADLINE_S)
         self.executor.shutdown()
         for node in [*self.nodes, self.node]:
             node.destroy_node()

@@ -151,8 +151,8 @@ def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -
 
 rclpy = pytest.importorskip('rclpy')
 from nav_msgs.msg import Odometry  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from ros_bench import Spinner  # noqa: E402
 from rosbags.interfaces import (  # noqa: E402
     Qos,
     QosDurability,
@@ -253,17 +253,14 @@ class Listener:
         self.heard: dict[str, list[Any]] = {topic: [] for topic in topics}
         for topic, kind in topics.items():
             self.node.create_subscription(kind, topic, self.heard[topic].append, 500)
-        self._executor = SingleThreadedExecutor(context=context)
+        self._executor = Spinner(context)
         self._executor.add_node(self.node)
-        self._thread = threading.Thread(target=self._executor.spin)
 
     def __enter__(self) -> 'Listener':
-        self._thread.start()
         return self
 
     def __exit__(self, *error: object) -> None:
         self._executor.shutdown()
-        self._thread.join()
         self.node.destroy_node()
 
     def stamps(self, topic: str) -> list[int]:

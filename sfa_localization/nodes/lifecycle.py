@@ -203,9 +203,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             except LocalizationError as error:
                 response.success, response.message = False, str(error)
             except Exception as error:
-                if not self._running():
-                    raise
-                response.success, response.message = False, self._defect(name, error)
+                if self._running():
+                    response.success, response.message = False, self._defect(name, error)
             return response
 
         self._entities.append((self.destroy_service, self.create_service(kind, name, answer)))

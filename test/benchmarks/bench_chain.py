@@ -11,14 +11,12 @@ the machine and the domain, each in its namespace.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -35,6 +33,7 @@ from sensor_msgs.msg import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from ros_bench import Spinner
 from ros_domains import free_domain
 
 from sfa_localization.data.messages import read_stamp
@@ -92,7 +91,7 @@ class Driver:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node('bench', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = Spinner(self.context)
         self.executor.add_node(self.node)
         self.sent: dict[int, float] = {}
         self.latencies: list[float] = []
@@ -102,13 +101,6 @@ class Driver:
         self.odometry = {name: make(Odometry, name, 10) for name in ('odom', 'relay/odom')}
         for topic in ('ekf/pose', 'relay/stage_3'):
             listen(PoseWithCovarianceStamped, topic, self.hear, 10)
-        self.thread = threading.Thread(target=self.spin, daemon=True)
-        self.thread.start()
-
-    def spin(self) -> None:
-        """Run the executor until the end."""
-        with contextlib.suppress(ExternalShutdownException):
-            self.executor.spin()
 
     def hear(self, message: PoseWithCovarianceStamped) -> None:
         """Note the time from sending to receiving."""
@@ -163,7 +155,6 @@ class Driver:
     def close(self) -> None:
         """End the node and its thread."""
         self.executor.shutdown()
-        self.thread.join(5.0)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 

@@ -11,7 +11,6 @@ or answers later; in the end each node is restarted once, and has to answer agai
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import math
 import os
@@ -31,13 +30,13 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe
+from ros_bench import Spinner
 from ros_domains import free_domain
 
 from sfa_localization.data.messages import read_stamp
@@ -83,7 +82,7 @@ class Robot:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node('robot', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = Spinner(self.context)
         self.executor.add_node(self.node)
         self.pictures = self.node.create_publisher(Image, 'image_raw', 10)
         self.odometry = self.node.create_publisher(Odometry, 'odom', 1000)
@@ -99,13 +98,6 @@ class Robot:
         listen(Odometry, 'ekf/odometry', self.hear_odometry, 1)
         listen(String, 'ekf/state', self.hear_state, latched_qos())
         listen(DiagnosticArray, '/diagnostics', self.hear_health, 10)
-        self.thread = threading.Thread(target=self.spin, daemon=True)
-        self.thread.start()
-
-    def spin(self) -> None:
-        """Run the executor until the end."""
-        with contextlib.suppress(ExternalShutdownException):
-            self.executor.spin()
 
     def hear(self, message: PoseWithCovarianceStamped) -> None:
         """Note the answer to a picture."""
@@ -166,7 +158,6 @@ class Robot:
     def close(self) -> None:
         """End the node and its thread."""
         self.executor.shutdown()
-        self.thread.join(5.0)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
