@@ -29,23 +29,28 @@ class Output:
     yaw_deg: float
     std_m: float
     yaw_std_deg: float
+    reasons: tuple = ()
 
     @property
     def wrong(self):
         return self.error_m > WRONG_M or self.yaw_deg > WRONG_DEG
 
 
-def output(second, level, pose, covariance, true):
-    """Compare a pose (3,) in the map, with covariance (3, 3), with the truth (3,)."""
-    x, y = to_truth().apply(np.array(pose[:2])[None])[0]
-    yaw = float(to_truth().apply_yaw(np.array(pose[2])))
+def output(second, status, pose, covariance, true, transform=None):
+    """Compare a pose (3,) in the map, with covariance (3, 3), with the truth (3,), to which a
+    transform leads: that of the recorded drives by default.
+    """
+    transform = transform or to_truth()
+    x, y = transform.apply(np.array(pose[:2])[None])[0]
+    yaw = float(transform.apply_yaw(np.array(pose[2])))
     return Output(
         second,
-        level,
+        status.level.name,
         math.hypot(x - true[0], y - true[1]),
         math.degrees(abs(wrap_angle(yaw - true[2]))),
         math.sqrt(max(covariance[0, 0], covariance[1, 1])),
         math.degrees(math.sqrt(covariance[2, 2])),
+        status.reasons,
     )
 
 

@@ -132,8 +132,8 @@ class Chain:
         place = [pose.position.x, pose.position.y, read_yaw(pose.orientation)]
         second = (message.at_ns - self.start_ns) * 1e-9
         spread = covariance[np.ix_(_PLANAR, _PLANAR)]
-        level = ekf._status().level.name
-        self.outputs.append(output(second, level, place, spread, message.true))
+        status = ekf._status()
+        self.outputs.append(output(second, status, place, spread, message.true))
 
     def wait(self, condition):
         """Wait for a moment; what does not happen is counted as lost."""

@@ -49,7 +49,7 @@ class Robot:
         state = state or localizer.state
         if state is not None:
             self.outputs.append(output(
-                (message.at_ns - self.start_ns) * 1e-9, localizer.status.level.name,
+                (message.at_ns - self.start_ns) * 1e-9, localizer.status,
                 state.pose, state.pose_covariance, message.true,
             ))  # fmt: skip
 
