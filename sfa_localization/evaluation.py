@@ -42,8 +42,8 @@ from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import State
+from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.predict import COAST_S
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The belief of the filter, its estimate and record, and the events that change it: immutable."""
+"""What the filter believes and remembers, and the events that change it: all immutable."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.driven_path import Knot
 from sfa_localization.fusion.inputs import symmetric
-from sfa_localization.fusion.lateness import Lateness
 from sfa_localization.fusion.motion import SIZE, State, Twist
-from sfa_localization.fusion.mounting import Mounting
+from sfa_localization.fusion.track import Image, Pose, Track
 from sfa_localization.fusion.turn_noise import TurnNoise
 
 LARGEST_STD_M = 100.0
 """The standard deviation of the position never exceeds this: larger than the places mapped."""
-_NO_DOUBT = (0.0, 0.0, 0.0)
+DOUBT_STDS = 2.0
+"""While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
 
 
 class OdometryEvent(NamedTuple):
@@ -27,7 +26,7 @@ class OdometryEvent(NamedTuple):
 
     stamp_ns: int
     twist: Twist
-    pose: tuple[float, float, float] | None = None
+    pose: Pose | None = None
 
 
 class PoseEvent(NamedTuple):
@@ -39,11 +38,10 @@ class PoseEvent(NamedTuple):
 
 
 class MeasurementEvent(NamedTuple):
-    """A position (2,) or pose (3,) from an image, with its covariance. `apart`: turns show another
-    time or robot.
+    """A position (2,) or pose (3,) from an image, with its covariance.
 
-    `jacobian` (2 or 3, 10) and `white`, the part of the noise that is this image's own, follow
-    from the covariance: see update.measurement_event.
+    `jacobian` (2 or 3, 11) and `white`, the part of the noise that is this image's own, follow
+    from the covariance: see ekf.measurement_event.
     """
 
     stamp_ns: int
@@ -51,7 +49,6 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
-    apart: bool = False
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent
@@ -75,91 +72,15 @@ class Update(NamedTuple):
     far: bool = False
 
 
-class Evidence(NamedTuple):
-    """A measurement beside the dead-reckoned pose at its stamp; yaw is NaN where unknown."""
-
-    dead_reckoned: tuple[float, float, float]
-    traveled_m: float
-    position: tuple[float, float]
-    yaw: float
-    variance: float
-    yaw_variance: float
-    accepted: bool
-
-
-COMPARED_IMAGES = 5
-"""Images that show whether they move as the odometry does, and look in that direction."""
-
-
-class Trust(NamedTuple):
-    """Images over the last meters, and how they contradict the odometry's motion, '' if not;
-    `judged` are those enough to do so.
-
-    With a problem, `misfit` are the standard deviations (m, rad) by which they do. `moves` counts
-    how often images moved the estimate elsewhere lately, `moved_m` is the distance traveled when
-    they did it last, and `contradicted_m` when they contradicted the motion since, before the
-    estimate was confirmed, as they have from `doubted_m` on; until an image fits `confirming_m`
-    later, `jump_m` is the standard deviation of being wrong. `proven`: an estimate before the last
-    move was confirmed.
-    """
-
-    recent: tuple[Evidence, ...] = ()
-    judged: bool = False
-    problem: str = ''
-    misfit: tuple[float, float] = (0.0, 0.0)
-    moves: int = 0
-    moved_m: float = 0.0
-    confirming_m: float = 0.0
-    jump_m: float = 0.0
-    contradicted_m: float = 0.0
-    doubted_m: float = 0.0
-    proven: bool = False
-
-    @property
-    def since_m(self) -> float:
-        """The distance traveled from which on images confirm the estimate."""
-        return max(self.moved_m, self.contradicted_m)
-
-    def unconfirmed(self, accepted_m: float) -> bool:
-        """Whether no image has fitted yet that far from where images moved the estimate, or
-        contradicted it, or those since then could not be compared with the odometry's motion.
-        """
-        unjudged = not self.judged and self.confirming_m > 0.0
-        return unjudged or accepted_m - self.since_m < self.confirming_m
-
-    def variances(self, accepted_m: float) -> tuple[float, float, float]:
-        """Of x, y and yaw, on top, while the estimate is not trusted."""
-        off_m, off_rad = self.misfit if self.problem else (0.0, 0.0)
-        position = off_m**2 + (self.jump_m**2 if self.unconfirmed(accepted_m) else 0.0)
-        return position, position, off_rad**2
-
-
-class Pull(NamedTuple):
-    """On which side of the estimate accepted images have lain over the last meters, until
-    `traveled_m`: the mean x + i y of their innovations, in standard deviations, and in m
-    (`offset_m`). `suspected`: it is no chance.
-    """
-
-    mean: complex
-    offset_m: complex
-    traveled_m: float
-    suspected: bool = False
-
-    @property
-    def variance(self) -> float:
-        """Of the position along each axis, on top, while the estimate is not trusted."""
-        return abs(self.offset_m) ** 2 / 2 if self.suspected else 0.0
-
-
 class Memory(NamedTuple):
-    """The record of measurements: accepted ones, those rejected in a row, and where they lay.
+    """The record of measurements since the last start.
 
-    `support` counts accepted images since the last start, and `precise_ns` is the stamp of the last
-    that shows the place well by itself; `rejected` those outside the gate in a
-    row, `gate_excess` is d2 / threshold of the last. `outage`: they followed a long time without
-    images. `doubt` are variances (x, y, yaw) that the published covariance has on top. `trust`,
-    `scatter`, the usual squared distance of images over that expected, and `period_s`, the usual
-    time between images, outlive restarts; `pull` does not.
+    `support` counts accepted images, `rejected` those outside the gate in a row, of which the last
+    has a d2 / threshold of `gate_excess`. `accepted_ns` and `accepted_m` are stamp and distance
+    traveled at the last accepted image, `precise_ns` is the stamp of the last that shows the place
+    well by itself. `outage`: those rejected followed a long time without images. `images` are the
+    latest. `scatter`, the usual squared distance of images over that expected, and `period_s`, the
+    usual time between images, outlive restarts.
     """
 
     support: int = 0
@@ -168,63 +89,63 @@ class Memory(NamedTuple):
     accepted_ns: int | None = None
     accepted_m: float = 0.0
     precise_ns: int | None = None
-    outage: bool = False
-    doubt: tuple[float, float, float] = _NO_DOUBT
-    evidence: tuple[Evidence, ...] = ()
+    images: tuple[Image, ...] = ()
     update: Update | None = None
-    trust: Trust = Trust()
     scatter: float = 1.0
     period_s: float = 1.0
-    pull: Pull | None = None
 
 
 class Belief(NamedTuple):
     """Everything that the next event changes. `located` is False before the first pose.
 
     `added` are the variances that driving has added so far, to the heading (as expected, without
-    the factor of `turns`) and to the position along each axis. `trail` is the dead-reckoned path of
-    the last seconds, `lateness` what images beside it show about their time, and `mounting` where
-    they show the camera on the robot. `omega` rad/s is the mean turn rate, as odometry shows it,
-    over the time before its last message.
+    the factor of `turns`) and to the position along each axis. `omega` rad/s is the mean turn rate,
+    as odometry shows it, over the time before its last message. `track` is what `health` judges.
     """
 
     stamp_ns: int
     mean: Array
     covariance: Array
     located: bool
-    dead_reckoned: tuple[float, float, float]
+    dead_reckoned: Pose
     traveled_m: float
     twist: Twist
     odometry_ns: int | None
     memory: Memory
-    odometry_pose: tuple[float, float, float] | None = None
+    odometry_pose: Pose | None = None
     added: tuple[float, float] = (0.0, 0.0)
     turns: TurnNoise | None = None
-    turn_factor: float = 1.0
-    trail: tuple[Knot, ...] = ()
-    lateness: Lateness | None = None
-    mounting: Mounting | None = None
+    track: Track = Track()
     omega: float = 0.0
 
     @property
-    def state(self) -> State | None:
-        """The estimate, if there is any.
+    def turn_factor(self) -> float:
+        """By how much turns are noisier than expected, on the standard deviation."""
+        return self.turns.factor if self.turns else 1.0
 
-        Doubt and distrust widen what is published, not the gate: wrong images must not open it.
+    @property
+    def contradicted(self) -> Array | None:
+        """The innovation (2,) or (3,) of the newest image, where those in a row were rejected."""
+        update = self.memory.update
+        return update.innovation if update and self.memory.rejected >= ENOUGH_IMAGES else None
+
+    @property
+    def state(self) -> State | None:
+        """The estimate, if there is any. While lost, it is as uncertain as images differ from it;
+        the gate is not: wrong images must not open it.
         """
         if not self.located:
             return None
-        covariance = symmetric(self.covariance)
-        if self.memory.doubt is not _NO_DOUBT:
-            covariance[:3, :3] += np.diag(self.memory.doubt)
-        trust = self.memory.trust
-        if trust.problem or trust.confirming_m:
-            covariance[:3, :3] += np.diag(trust.variances(self.memory.accepted_m))
-        if self.memory.pull is not None:
-            covariance[:2, :2] += self.memory.pull.variance * np.eye(2)
-        if self.mounting is not None and self.mounting.suspected:
-            covariance[:2, :2] += self.mounting.variance * np.eye(2)
+        covariance, off = symmetric(self.covariance), self.contradicted
+        if off is not None:
+            x, y, *yaw = off.tolist()
+            place, turned = (x * x + y * y) / DOUBT_STDS**2, sum(turn**2 for turn in yaw)
+            covariance[:3, :3] += np.diag([place, place, turned / DOUBT_STDS**2])
         return State(self.stamp_ns, self.mean, covariance)
+
+
+ENOUGH_IMAGES = 5
+"""Images in a row that overrule an established estimate: half a second to a second of a camera."""
 
 
 def capped(covariance: Array) -> Array:

@@ -4,7 +4,7 @@
 
 Section 5 of the paper names the model (CTRV, its reference [17]) and prints no equation of it, so
 the formulas stand here. With h = omega dt / 2 and the chord c = v dt sin(h) / h, a motion at
-constant v and omega leads from (x, y, yaw) to (`_arc`)
+constant v and omega leads from (x, y, yaw) to (`arc`)
 
     x' = x + c cos(yaw + h)    y' = y + c sin(yaw + h)    yaw' = yaw + omega dt
 
@@ -42,21 +42,21 @@ YAW_PER_METER = 0.005
 """Heading error that grows with the distance, rad per sqrt(m): turns the wheels do not show."""
 ODOMETRY_CORRELATION_S = 0.1
 """Time for which odometry readings err alike: about the time constant of a wheel controller."""
-BIAS_WALK = 1e-4
-"""Random walk of the turn-rate bias, rad/s per sqrt(s): that of a cheap warm gyroscope."""
-SCALE_WALK = 1e-3
-"""Random walk of the wheel scale, 1/sqrt(m): a percent over 100 m, as load and ground change."""
-LOSS_WALK = 1e-3
-"""Random walk of the way lost in turns, m/rad per sqrt(rad): 0.01 m/rad over 100 rad."""
-ACCELERATION, ANGULAR_ACCELERATION = 1.0, 1.0
-"""Change of speed (m/s per sqrt(s)) and turn rate (rad/s per sqrt(s)) without new odometry."""
+BIAS_WALK, SCALE_WALK, LOSS_WALK = 1e-4, 1e-3, 1e-3
+"""Random walks: of the turn-rate bias, rad/s per sqrt(s), that of a cheap warm gyroscope; of the
+wheel scale, 1/sqrt(m), a percent over 100 m, as load and ground change; of the way lost in turns,
+m/rad per sqrt(rad)."""
+ACCELERATION = 1.0
+"""Change of speed (m/s) and turn rate (rad/s) per sqrt(s) without new odometry."""
 UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
 """Speed (m/s) and turning (rad per sqrt(s)) of a robot whose odometry is silent for long."""
 STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
+CALIBRATION_STDS = (0.01, 0.03, 0.05)
+"""Standard deviations of turn-rate bias (rad/s), wheel scale and way lost in turns (m/rad) before
+any is learned: data sheets of cheap gyroscopes, the tolerance of a tire's diameter, and a third of
+the half track of a small robot."""
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
-_JUMP_M, _JUMP_RAD = 0.3, 0.5  # a pose that moves this far beyond its twist was reset
-_ASKEW_M = 2e-3  # a pose moves less than this sideways by its rounding
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
 _DIAGONAL = np.arange(SIZE)
 
@@ -152,69 +152,7 @@ class Twist(NamedTuple):
         return abs(self.v) < STANDSTILL_SPEED and abs(self.omega) < STANDSTILL_RATE
 
 
-def twist_from_poses(
-    before: tuple[float, float, float],
-    after: tuple[float, float, float],
-    seconds: float,
-    fastest: Twist,
-) -> Twist | None:
-    """The mean twist by which the odometry's own pose moved, with the variances of `fastest`.
-
-    Publishers differ in the time over which they average their twist; their pose is unambiguous.
-    None where it moved beyond `fastest`, or not at all: then it was reset, or is not filled.
-    """
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    turn, distance = wrap(after[2] - before[2]), math.hypot(dx, dy)
-    reach_m = abs(fastest.v) * seconds + _JUMP_M
-    reach_rad = abs(fastest.omega) * seconds + _JUMP_RAD
-    reset = distance > reach_m or abs(turn) > reach_rad
-    if seconds <= 0 or reset or reach_rad > math.pi or (distance == 0.0 and turn == 0.0):
-        return None
-    return twist_between(before, after, seconds, fastest)
-
-
-def twist_between(
-    before: tuple[float, float, float],
-    after: tuple[float, float, float],
-    seconds: float,
-    reading: Twist,
-) -> Twist:
-    """The mean twist from pose to pose, with the variances of a reading."""
-    turn = wrap(after[2] - before[2])
-    half, (chord, _) = turn / 2, _chord(before, after)
-    arc = chord * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
-    return reading._replace(v=arc / seconds, omega=turn / seconds)
-
-
-def is_askew(
-    before: tuple[float, float, float],
-    after: tuple[float, float, float],
-    seconds: float,
-    reading: Twist,
-) -> bool:
-    """Whether a pose moved more sideways than ahead while its twist drove: its heading is off."""
-    ahead, aside = _chord(before, after)
-    return abs(aside) > max(abs(ahead), _ASKEW_M) and abs(reading.v) * seconds > abs(aside) / 2
-
-
-def _chord(
-    before: tuple[float, float, float], after: tuple[float, float, float]
-) -> tuple[float, float]:
-    """How far one pose lies ahead and to the left of another, by the mean of their headings."""
-    heading = before[2] + wrap(after[2] - before[2]) / 2
-    dx, dy, c, s = after[0] - before[0], after[1] - before[1], math.cos(heading), math.sin(heading)
-    return dx * c + dy * s, dy * c - dx * s
-
-
-def moved_on(
-    pose: tuple[float, float, float], twist: Twist, seconds: float
-) -> tuple[float, float, float]:
-    """The pose after so long at a constant twist."""
-    arc = _arc(pose[2], twist.v, twist.omega, seconds)
-    return pose[0] + arc.dx, pose[1] + arc.dy, pose[2] + arc.dyaw
-
-
-class _Arc(NamedTuple):
+class Arc(NamedTuple):
     """A motion over dt at constant v and omega, and its derivatives."""
 
     dx: float
@@ -226,7 +164,7 @@ class _Arc(NamedTuple):
     dy_domega: float
 
 
-def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
+def arc(yaw: float, v: float, omega: float, dt: float) -> Arc:
     """The motion of the module's formulas; with s = sin(h) / h its derivatives are
 
     dx/dv = dt s cos(yaw + h)
@@ -242,7 +180,7 @@ def _arc(yaw: float, v: float, omega: float, dt: float) -> _Arc:
         slope = (math.cos(half) - sinc) / half
     c, s = math.cos(yaw + half), math.sin(yaw + half)
     reach, bend, chord = dt * sinc, v * dt * slope * dt / 2, v * dt * sinc
-    return _Arc(
+    return Arc(
         dx=chord * c,
         dy=chord * s,
         dyaw=omega * dt,
@@ -300,7 +238,7 @@ def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
     standing = v == 0.0 and omega == 0.0
     step = _stand(mean) if standing else _advance(mean, v, omega, twist, dt, noise)
     step.noise[V, V] += ACCELERATION**2 * dt
-    step.noise[OMEGA, OMEGA] += ANGULAR_ACCELERATION**2 * dt
+    step.noise[OMEGA, OMEGA] += ACCELERATION**2 * dt
     return step
 
 
@@ -347,17 +285,17 @@ def _advance(
 ) -> Step:
     """CTRV at v and omega over dt: mean, full Jacobian, and the noise that driving itself adds."""
     x, y, yaw, _, _, bias, scale, loss, *errors = mean.tolist()
-    arc = _arc(yaw, v, omega, dt)
+    way = arc(yaw, v, omega, dt)
     fade = math.exp(-(abs(v) * dt + TURN_RADIUS_M * abs(omega) * dt) / noise.decorrelation_m)
     after = np.array(
-        [x + arc.dx, y + arc.dy, wrap(yaw + arc.dyaw), v, omega, bias, scale, loss]
+        [x + way.dx, y + way.dy, wrap(yaw + way.dyaw), v, omega, bias, scale, loss]
         + [fade * error for error in errors]
     )
     jacobian = np.zeros((SIZE, SIZE))
     jacobian[_DIAGONAL, _DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
-    jacobian[X, YAW], jacobian[Y, YAW] = -arc.dy, arc.dx
-    jacobian[X, V], jacobian[Y, V] = arc.dx_dv, arc.dy_dv
-    jacobian[X, OMEGA], jacobian[Y, OMEGA] = arc.dx_domega, arc.dy_domega
+    jacobian[X, YAW], jacobian[Y, YAW] = -way.dy, way.dx
+    jacobian[X, V], jacobian[Y, V] = way.dx_dv, way.dy_dv
+    jacobian[X, OMEGA], jacobian[Y, OMEGA] = way.dx_domega, way.dy_domega
     jacobian[YAW, OMEGA] = dt
     added = _lasting_noise(jacobian[:3, V : OMEGA + 1], twist, dt)
     _add_drift(added, abs(v) * dt, abs(omega) * dt, dt, fade, noise)

@@ -4,7 +4,7 @@
 
 One class serves the live node, the command line and the evaluation. What it believes after any
 set of messages depends on their stamps, not on the order or the pace in which they came, as long
-as none is older than HISTORY_S.
+as none is older than HISTORY_NS.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,45 +20,37 @@ from numpy.typing import ArrayLike
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion import motion
-from sfa_localization.fusion.arrivals import Arrivals
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
+from sfa_localization.fusion.ekf import Ekf, measurement_event
+from sfa_localization.fusion.health import Health, health_of
 from sfa_localization.fusion.history import History
-from sfa_localization.fusion.inputs import read_measurement, read_pose, read_twist
-from sfa_localization.fusion.lateness import CLEARED, SUSPECTED
-from sfa_localization.fusion.motion import BIAS, State, V
-from sfa_localization.fusion.predict import COAST_S, ODOMETRY_TIMEOUT_S
-from sfa_localization.fusion.rules import Rules
+from sfa_localization.fusion.inputs import OpenLoop, read_measurement, read_pose, read_twist
+from sfa_localization.fusion.motion import State
+from sfa_localization.fusion.odometry import COAST_S, ODOMETRY_TIMEOUT_S, stalled
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
-from sfa_localization.fusion.turn_watch import Seen, TurnWatch
-from sfa_localization.fusion.update import measurement_event
+from sfa_localization.fusion.timeline import (
+    HISTORY_NS,
+    JUMP_NS,
+    MEASUREMENT,
+    ODOMETRY,
+    POSE,
+    ClockWentBack,
+    Timeline,
+)
+from sfa_localization.fusion.track import Image, Placing
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
-HISTORY_S = 5.0
-"""How late a measurement may come: many times what any camera, network and model take."""
-TIME_JUMP_S = 60.0
-"""A stamp this far ahead needs AHEAD_COUNT like it: one alone is a damaged message."""
-AHEAD_COUNT = 3
-"""So many images in a row beyond the history are no accident: their clock is another one. They are
-used where no odometry comes between them, which then has ended."""
-_BLIND = 2
-"""So many unusable images in a row are no flicker: the camera is covered, or in the dark."""
-BACKWARD_COUNT = 5
-"""Odometry messages in a row that are too late until the clock is taken to have gone back."""
-AGAIN_NS = 300_000_000
-"""Time that odometry has to cover once more until the clock is taken to have gone back."""
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
+_BLIND = 2
+"""So many unusable images in a row are no flicker: the camera is covered, or in the dark."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
 _EXPECTED_STD_S = 0.05
-# More motion than twice that of the speed, and this, is that of longer than the stamps say.
-_STALL_M, _STALL_RAD = 0.05, 0.05
-_ODOMETRY, _POSE, _MEASUREMENT = range(3)
 
 
 class PoseFilter:
@@ -77,10 +68,7 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
-        self._watch, self._off = TurnWatch(), False
-        self._arrivals = Arrivals()
-        self._rules = Rules(self.config, self.correlation)
-        self._history = self._fresh(self._rules.recovery.blank(0))
+        self._ekf = Ekf(self.config, self.correlation)
         self._forget()
 
     def reset(self) -> None:
@@ -96,27 +84,22 @@ class PoseFilter:
         self.config, self.correlation = config or self.config, correlation or self.correlation
         if (self.config, self.correlation) != before:
             belief, newest_ns = self._history.newest, self._history.newest_ns
-            self._rules = Rules(self.config, self.correlation)
+            self._ekf = Ekf(self.config, self.correlation)
             self._history = self._fresh(belief, newest_ns)
 
     def _forget(self) -> None:
         # Stamps may start anew; the camera's delay stays what it was.
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
-        self._watch.forget_time()
-        self._history = self._fresh(self._rules.recovery.blank(0))
-        self._suspect_late(Arrivals())
-        self._backward = 0
-        self._again = _NEVER
-        self._ahead = (0, 0)
-        self._apart = (0, 0)
-        self._alone = 0
+        self._history = self._fresh(self._ekf.blank(0))
+        self._timeline, self._open_loop = Timeline(), OpenLoop()
         self._unusable_ns = self._unusable = 0
+        self._judged: tuple[tuple[Image, ...], tuple[Placing, ...], Health] | None = None
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
             self._waiting = np.array(self.config.initial_pose), self._initial_covariance()
 
     def _fresh(self, start: Belief, start_ns: int | None = None) -> History[Event, Belief]:
-        return History(round(HISTORY_S * 1e9), start, self._rules.step, start_ns)
+        return History(HISTORY_NS, start, self._ekf.step, start_ns)
 
     def _initial_covariance(self) -> Array:
         position, yaw = self.config.initial_position_std, self.config.initial_yaw_std
@@ -143,7 +126,7 @@ class PoseFilter:
         self._place_pose(int(stamp_ns), value, checked)
 
     def _place_pose(self, stamp_ns: int, pose: Array, covariance: Array) -> None:
-        self._history.add((stamp_ns, _POSE), PoseEvent(stamp_ns, pose, covariance))
+        self._history.add((stamp_ns, POSE), PoseEvent(stamp_ns, pose, covariance))
 
     def add_odometry(
         self,
@@ -161,20 +144,19 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         try:
-            twist = read_twist(v, omega, variances, self.config)
-            self._require_place(stamp_ns, _ODOMETRY)
-            self._notice_again(stamp_ns)
+            twist = read_twist(v, omega, variances, self.config, self._open_loop.found)
+            self._require_place(stamp_ns, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
-        self._alone = self._unusable_ns = 0
-        event = OdometryEvent(stamp_ns, twist, _finite(pose))
-        driven = self._history.add((stamp_ns, _ODOMETRY), event)
+        self._unusable_ns = 0
+        self._open_loop.add(twist.v, twist.omega)
+        known = pose is not None and all(map(math.isfinite, pose))
+        at = tuple(map(float, pose)) if pose is not None and known else None
+        event = OdometryEvent(stamp_ns, twist, at)  # type: ignore[arg-type]
+        driven = self._history.add((stamp_ns, ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.omega)
-        speed, bias = driven.mean[[V, BIAS]].tolist()
-        self._watch.add_odometry(stamp_ns, speed, driven.omega - bias)
-        self._judge_time()
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -187,24 +169,15 @@ class PoseFilter:
         try:
             fused, noise = self._read(stamp_ns, value, covariance)
             taken_ns = self._taken(stamp_ns)
-            self._note_apart(taken_ns)
-            self._require_place(taken_ns, _MEASUREMENT)
-            self._note_arrival(taken_ns)
+            self._require_place(taken_ns, MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
         self._unusable = 0
-        if len(fused) == 3:
-            self._watch.add_seen(Seen(stamp_ns, float(fused[2]), float(noise[2, 2])))
         noise = noise + self._time_noise(taken_ns, stamp_ns, fused)
-        # What arrives late is suspected of its arrival alone: that contradicts no motion.
-        apart = self._off and not self._arrivals.late_s
-        event = measurement_event(taken_ns, fused, noise, self.correlation.share, apart)
-        update = self._history.add((taken_ns, _MEASUREMENT), event).memory.update
+        event = measurement_event(taken_ns, fused, noise, self.correlation.share)
+        update = self._history.add((taken_ns, MEASUREMENT), event).memory.update
         assert update is not None
-        if update.reason == 'restarted elsewhere':
-            self._watch.doubt()
-            self._judge_time()
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
@@ -218,33 +191,11 @@ class PoseFilter:
         """
         if stamp_ns > 0 and math.isfinite(yaw_rad):
             self._camera.add_heading(int(stamp_ns), yaw_rad)
-            self._watch.add_heading(int(stamp_ns), yaw_rad)
 
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
-
-    def _note_arrival(self, taken_ns: int) -> None:
-        """Suspect images that arrive late, by the odometry, of being stamped early."""
-        odometry_ns, arrivals = self._history.newest.odometry_ns, self._arrivals
-        if odometry_ns is not None:
-            self._suspect_late(arrivals.after((odometry_ns - taken_ns) * 1e-9))
-
-    def _suspect_late(self, arrivals: Arrivals) -> None:
-        before_s, self._arrivals = self._arrivals.late_s, arrivals
-        if arrivals.late_s == before_s:
-            return
-        if before_s > 0:
-            self._watch.acquit(-before_s)
-        if arrivals.late_s > 0:
-            self._watch.suspect(-arrivals.late_s)
-        self._judge_time()
-
-    def _judge_time(self) -> None:
-        """Whether images are likely of another time; once they were, until that is unlikely."""
-        limit = CLEARED if self._off else SUSPECTED
-        self._off = self._watch.apart(self._compensated_s) > limit
 
     def _read(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         try:
@@ -255,32 +206,20 @@ class PoseFilter:
             raise
 
     def _taken(self, stamp_ns: int) -> int:
-        """When an image was taken, on the clock of the odometry."""
+        """When an image was taken, on the clock of the odometry. Where that shows far more motion
+        in the delay than it takes, as after a network's stall, the order of the stamps says more.
+        """
         if stamp_ns <= 0:
             return stamp_ns
         delay_ns = self._camera.clock_at(stamp_ns).delay_ns
         if abs(delay_ns) > DELAY_LIMIT_NS:
             raise DataError('clocks of camera and odometry are more than 0.5 s apart')
         taken_ns = max(stamp_ns - delay_ns, 1)
-        return stamp_ns if self._stalled_between(taken_ns, stamp_ns) else taken_ns
-
-    def _stalled_between(self, taken_ns: int, stamp_ns: int) -> bool:
-        """Whether the odometry of a delay shows far more motion than it takes, after a silence in
-        which it shows far less, as where a network that stalled hands over all at once: then the
-        order of the stamps says more than the delay.
-        """
-        a, b = self._history.before(taken_ns), self._history.before(stamp_ns)
-        if b.odometry_ns is None or b.odometry_ns <= taken_ns:
-            return False
-        delay_s, silent_s = (stamp_ns - taken_ns) * 1e-9, (taken_ns - a.stamp_ns) * 1e-9
-        moved = math.dist(a.dead_reckoned[:2], b.dead_reckoned[:2])
-        turned = abs(motion.wrap(b.dead_reckoned[2] - a.dead_reckoned[2]))
-        pairs = (moved, _STALL_M, a.twist.v, b.twist.v), (turned, _STALL_RAD, a.omega, b.omega)
-        return any(
-            way > 2 * max(abs(before), abs(after)) * delay_s + jump
-            or abs(before) * silent_s > way + jump
-            for way, jump, before, after in pairs
-        )
+        if stalled(
+            self._history.before(taken_ns), self._history.before(stamp_ns), taken_ns, stamp_ns
+        ):
+            return stamp_ns
+        return taken_ns
 
     def _time_noise(self, taken_ns: int, stamp_ns: int, value: Array) -> Array:
         """Covariance that a moving robot's pose has because the image's time is uncertain."""
@@ -294,12 +233,39 @@ class PoseFilter:
         moved = np.array([twist.v * math.cos(yaw), twist.v * math.sin(yaw), twist.omega])
         return np.outer(moved, moved) * std_s**2
 
+    def _require_place(self, stamp_ns: int, kind: int) -> None:
+        """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
+        if self._waiting is not None and stamp_ns > 0:
+            self._begin(stamp_ns)
+        try:
+            self._timeline.require_place(stamp_ns, kind, self._history)
+        except ClockWentBack:
+            self.counts['clock went back'] += 1
+            self.reset()
+            if self._waiting is not None:
+                self._begin(stamp_ns)
+
+    def _begin(self, stamp_ns: int) -> None:
+        """Place a waiting pose at the time of the first message."""
+        assert self._waiting is not None
+        given_ns = self._history.newest_ns
+        if given_ns is None or not 0 <= stamp_ns - given_ns <= ODOMETRY_TIMEOUT_S * 1e9:
+            self._history = self._fresh(self._ekf.blank(0))
+            self._place_pose(stamp_ns, *self._waiting)
+        self._waiting = None
+
     # Outputs.
 
     @property
     def camera_clock(self) -> CameraClock:
         """By how much images are stamped late, as far as turns have shown it."""
         return self._camera.clock
+
+    @property
+    def _compensated_s(self) -> float:
+        """By how much images are fused before their stamps."""
+        delay_ns = self._camera.clock.delay_ns
+        return delay_ns * 1e-9 if abs(delay_ns) <= DELAY_LIMIT_NS else 0.0
 
     @property
     def nis(self) -> float:
@@ -312,7 +278,7 @@ class PoseFilter:
     @property
     def state(self) -> State | None:
         """The estimate at the newest message; None before there is any."""
-        return self._spread(self._history.newest)
+        return self._at(self._history.newest.stamp_ns)
 
     def at(self, stamp_ns: int) -> State | None:
         """The estimate at a stamp: predicted beyond the newest message, recalled within history.
@@ -322,27 +288,32 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         if self._history.newest_ns is None or not self._history.reaches(stamp_ns):
             return self.state if stamp_ns == self._history.newest.stamp_ns else None
-        before = self._history.before(stamp_ns)
-        return self._spread(self._rules.prediction.coast(before, stamp_ns))
+        return self._at(stamp_ns)
 
-    def _spread(self, belief: Belief) -> State | None:
-        """The estimate, less certain by how far the robot moves while images may be off in time."""
-        state, late = belief.state, belief.lateness
-        off_s = self._watch.error_s(self._compensated_s) if self._off else 0.0
-        if late is not None and late.suspected:
-            off_s = max(off_s, late.error_s)
-        if state is None or off_s == 0.0:
-            return state
-        v, omega = state.twist.tolist()
-        covariance = state.covariance.copy()
-        covariance[:3, :3] += np.diag(np.square([v * off_s, v * off_s, omega * off_s]))
-        return replace(state, covariance=covariance)
+    def _at(self, stamp_ns: int) -> State | None:
+        """A robot that is commanded is where its odometry was a delay ago, and its images right."""
+        delay_ns = round(self._compensated_s * 1e9) if self._open_loop.found else 0
+        robot_ns = stamp_ns - delay_ns if self._history.reaches(stamp_ns - delay_ns) else stamp_ns
+        state = self._widened(self._ekf.coast(self._history.before(robot_ns), robot_ns))
+        return state and replace(state, stamp_ns=stamp_ns)
 
     @property
-    def _compensated_s(self) -> float:
-        """The delay by which stamps of images are corrected."""
-        delay_ns = self._camera.clock.delay_ns
-        return delay_ns * 1e-9 if abs(delay_ns) <= DELAY_LIMIT_NS else 0.0
+    def health(self) -> Health:
+        """What the last images show of the estimate."""
+        track = self._history.newest.track
+        images, placings = track.images, track.placings
+        if self._judged is None or self._judged[0] is not images or self._judged[1] is not placings:
+            self._judged = images, placings, health_of(track)
+        return self._judged[2]
+
+    def _widened(self, belief: Belief) -> State | None:
+        """The estimate, less certain by what may be the matter."""
+        state, health = belief.state, self.health
+        if state is None or not any(health.variances):
+            return state
+        covariance = state.covariance.copy()
+        covariance[:3, :3] += np.diag(health.variances)
+        return replace(state, covariance=covariance)
 
     @property
     def status(self) -> Status:
@@ -351,143 +322,13 @@ class PoseFilter:
         While the odometry is silent, images that cannot be used show how time goes on.
         """
         newest = self._history.newest
-        if 0 < self._unusable_ns - newest.stamp_ns <= TIME_JUMP_S * 1e9:
-            newest = self._rules.prediction.coast(newest, self._unusable_ns)
-        status = status_of(newest, self._camera.clock, self.config, DELAY_LIMIT_NS)
-        reasons = [why for why in self._apart_in_time() if why not in status.reasons]
-        if self._unusable >= _BLIND:
-            reasons.append(f'{self._unusable} images in a row are unusable')
-        if not reasons:
-            return status
-        level = Level.DEGRADED if status.level is Level.LOCALISED else status.level
-        return Status(level, (*status.reasons, *reasons))
-
-    def _apart_in_time(self) -> list[str]:
-        """How images and odometry are apart in time, beyond what `CameraClock` measures."""
-        if self._again.among > 1:
-            return ['odometry is stamped with times that it had passed: did the clock go back?']
-        count, apart_ns = self._apart
-        if count >= AHEAD_COUNT:
-            where = 'ahead of' if apart_ns > 0 else 'behind'
-            apart = f'{abs(apart_ns) * 1e-9:.0f} s'
-            return [
-                f'images are stamped {apart} {where} the odometry: are the clocks synchronized?'
-            ]
+        if 0 < self._unusable_ns - newest.stamp_ns <= JUMP_NS:
+            newest = self._ekf.coast(newest, self._unusable_ns)
+        status = status_of(newest, self._widened(newest), self.health, self.config)
+        doubts, delay_s = self._timeline.problems, self._camera.clock.delay_s
         if abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS:
-            return []
-        late = self._history.newest.lateness
-        if late is not None and late.suspected:
-            return [late.problem]
-        return [self._watch.problem(self._compensated_s)] if self._off else []
-
-    # Whether a message can be placed in time.
-
-    def _require_place(self, stamp_ns: int, rank: int) -> None:
-        """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
-        if stamp_ns <= 0:
-            raise DataError('zero or negative stamp')
-        if self._waiting is not None:
-            self._begin(stamp_ns)
-        newest = self._history.newest_ns
-        if newest is None:
-            return
-        if stamp_ns > newest + TIME_JUMP_S * 1e9:
-            self._require_others_ahead(stamp_ns)
-        elif self._keeps_time(rank):
-            self._ahead = (0, 0)
-        if rank == _MEASUREMENT and self._history.newest.odometry_ns is not None:
-            self._require_same_clock(stamp_ns, newest)
-        if stamp_ns <= newest and not self._history.reaches(stamp_ns):
-            self._behind('too old', stamp_ns, rank)
-        elif stamp_ns <= newest and self._history.holds((stamp_ns, rank)):
-            self._behind('duplicate stamp', stamp_ns, rank)
-        elif self._keeps_time(rank):
-            self._backward = 0
-
-    def _keeps_time(self, rank: int) -> bool:
-        """Whether messages of this rank show what time it is: odometry, where there is any."""
-        return rank == _ODOMETRY or self._history.newest.odometry_ns is None
-
-    def _begin(self, stamp_ns: int) -> None:
-        """Place a waiting pose at the time of the first message."""
-        assert self._waiting is not None
-        given = self._history.newest_ns
-        if given is None or not 0 <= stamp_ns - given <= ODOMETRY_TIMEOUT_S * 1e9:
-            self._history = self._fresh(self._rules.recovery.blank(0))
-            self._place_pose(stamp_ns, *self._waiting)
-        self._waiting = None
-
-    def _require_others_ahead(self, stamp_ns: int) -> None:
-        """One stamp far ahead is an error; several in a row that agree are a pause."""
-        last, count = self._ahead
-        near = abs(stamp_ns - last) <= TIME_JUMP_S * 1e9
-        self._ahead = (stamp_ns, count + 1 if near else 1)
-        if self._ahead[1] < AHEAD_COUNT:
-            raise DataError('stamp far ahead')
-        self._ahead = (0, 0)
-        self.counts['gap in time'] += 1
-
-    def _require_same_clock(self, stamp_ns: int, newest_ns: int) -> None:
-        """An image far ahead, of another clock, would make all odometry that follows too old."""
-        if stamp_ns > newest_ns + HISTORY_S * 1e9:
-            self._alone += 1
-            if self._alone < AHEAD_COUNT:
-                raise DataError('stamp ahead of the odometry')
-
-    def _note_apart(self, stamp_ns: int) -> None:
-        """Count images in a row beyond the history, and note how far from the newest message."""
-        newest = self._history.newest_ns
-        apart_ns = 0 if newest is None or stamp_ns <= 0 else stamp_ns - newest
-        beyond = abs(apart_ns) > HISTORY_S * 1e9
-        self._apart = (self._apart[0] + 1, apart_ns) if beyond else (0, 0)
-
-    def _behind(self, reason: str, stamp_ns: int, rank: int) -> None:
-        """Odometry that comes late time and again means that the clock went back: start anew."""
-        if self._keeps_time(rank):
-            self._backward += 1
-        if self._backward < BACKWARD_COUNT:
-            raise DataError(reason)
-        self._go_back(stamp_ns)
-
-    def _notice_again(self, stamp_ns: int) -> None:
-        """Odometry that covers once more, in order, what other odometry covered before it, means
-        that the clock went back; what fills a hole, or comes out of order, was held up.
-        """
-        newest_ns, again = self._history.newest.odometry_ns, self._again
-        if newest_ns is None or stamp_ns > newest_ns:
-            self._again = _NEVER
-        elif stamp_ns < again.last_ns or again is _NEVER:
-            self._again = _Again(0, stamp_ns, stamp_ns)
-        else:
-            passed = (self._history.before(stamp_ns).odometry_ns or 0) > again.last_ns
-            self._again = _Again(again.among + passed, again.first_ns, stamp_ns)
-            if self._again.among >= BACKWARD_COUNT and stamp_ns - again.first_ns >= AGAIN_NS:
-                self._go_back(stamp_ns)
-
-    def _go_back(self, stamp_ns: int) -> None:
-        """Start anew, at a stamp, on a clock that went back."""
-        self.counts['clock went back'] += 1
-        self.reset()
-        if self._waiting is not None:
-            self._begin(stamp_ns)
-
-
-class _Again(NamedTuple):
-    """Odometry in a row that is no newer than what came before it: how many of its messages lie
-    among those, and the first and last stamp.
-    """
-
-    among: int
-    first_ns: int
-    last_ns: int
-
-
-_NEVER = _Again(0, 0, 0)
-
-
-def _finite(pose: Sequence[float] | Array | None) -> tuple[float, float, float] | None:
-    """A pose in plain numbers, if there is a usable one."""
-    if pose is None or not all(map(math.isfinite, pose)):
-        return None
-    x, y, yaw = map(float, pose)
-    return x, y, yaw
+            late = 'late' if delay_s > 0 else 'early'
+            doubts.append(f'images are stamped {abs(delay_s):.1f} s {late}: synchronize the clocks')
+        if self._unusable >= _BLIND:
+            doubts.append(f'{self._unusable} images in a row are unusable')
+        return status.with_reasons([], doubts)

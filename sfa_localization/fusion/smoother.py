@@ -20,14 +20,13 @@ import numpy as np
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.belief import Belief, Event, MeasurementEvent, OdometryEvent
+from sfa_localization.fusion.ekf import STARTS, Ekf, Kalman
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import symmetric
-from sfa_localization.fusion.kalman import Kalman
 from sfa_localization.fusion.motion import YAW, State, Step, wrap
-from sfa_localization.fusion.pose_filter import HISTORY_S, PoseFilter
-from sfa_localization.fusion.rules import Rules
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.fusion.update import STARTS
+from sfa_localization.fusion.timeline import HISTORY_NS
 
 # Keeps the inverse of a covariance of unit diagonal finite.
 _RIDGE = 1e-12
@@ -81,8 +80,8 @@ class Smoother(PoseFilter):
         super().__init__(config, correlation)
 
     def _fresh(self, start: Belief, start_ns: int | None = None) -> History[Event, Belief]:
-        span_ns, archive = round(HISTORY_S * 1e9), list[Event]()
-        history = History(span_ns, start, self._rules.step, start_ns, archive)
+        archive = list[Event]()
+        history = History(HISTORY_NS, start, self._ekf.step, start_ns, archive)
         self._pieces.append((start, history))
         return history
 
@@ -96,10 +95,10 @@ class Smoother(PoseFilter):
     def _replayed(self, belief: Belief, events: list[Event]) -> list[_Stage]:
         """The stages of a drive whose messages are all in their places."""
         kalman, stages = _Recording(), list[_Stage]()
-        rules = Rules(self.config, self.correlation, kalman)
+        ekf = Ekf(self.config, self.correlation, kalman)
         for event in events:
             kalman.links.clear()
-            belief = rules.step(belief, event)
+            belief = ekf.step(belief, event)
             stages.append(_Stage(event, belief, tuple(kalman.links), _follows(event, belief)))
         return stages
 

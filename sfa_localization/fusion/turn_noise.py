@@ -46,19 +46,16 @@ class Driven(NamedTuple):
 
 
 class TurnNoise(NamedTuple):
-    """The filters (K, 6), (K, 6, 6) at the last measurement, and their evidence (K,)."""
+    """The filters (K, 6), (K, 6, 6) at the last measurement, and their evidence (K,).
+
+    `factor` on the standard deviation of turns is the root of the mean variance.
+    """
 
     driven: Driven
     mean: Array
     covariance: Array
     evidence: Array
-
-    @property
-    def factor(self) -> float:
-        """On the standard deviation of turns: the root of the mean variance."""
-        score = self.evidence + _PRIOR
-        weight = np.exp(score - score.max())
-        return math.sqrt(float(weight @ FACTORS**2) / float(weight.sum()))
+    factor: float
 
 
 def begun(driven: Driven, mean: Array, covariance: Array, before: TurnNoise | None) -> TurnNoise:
@@ -66,12 +63,20 @@ def begun(driven: Driven, mean: Array, covariance: Array, before: TurnNoise | No
     evidence from `before`.
     """
     count = len(FACTORS)
+    evidence = np.zeros(count) if before is None else before.evidence
     return TurnNoise(
         driven,
         np.tile(mean[list(_STATE)], (count, 1)),
         np.tile(covariance[np.ix_(_STATE, _STATE)], (count, 1, 1)),
-        np.zeros(count) if before is None else before.evidence,
+        evidence,
+        _factor(evidence),
     )
+
+
+def _factor(evidence: Array) -> float:
+    score = evidence + _PRIOR
+    weight = np.exp(score - score.max())
+    return math.sqrt(float(weight @ FACTORS**2) / float(weight.sum()))
 
 
 def weighed(
@@ -95,7 +100,7 @@ def weighed(
     covariance = covariance - gain @ cross.transpose(0, 2, 1)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     evidence = _FORGETTING * noise.evidence + evidence - evidence[0]
-    return TurnNoise(driven, mean, covariance, evidence)
+    return TurnNoise(driven, mean, covariance, evidence, _factor(evidence))
 
 
 def _predicted(noise: TurnNoise, driven: Driven) -> tuple[Array, Array]:

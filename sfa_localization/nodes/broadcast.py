@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.pose_filter import HISTORY_S
+from sfa_localization.fusion.timeline import HISTORY_NS
 
 Dated = tuple[int, Array]
 """A stamp in ns, and map -> odom (3,) at it: x m, y m, yaw rad."""
@@ -34,7 +34,7 @@ class Broadcast:
         A stamp before others is late; beyond the filter's history the clock has gone back.
         """
         if self._newest is not None and stamp_ns < self._newest[0]:
-            if stamp_ns >= self._newest[0] - round(HISTORY_S * 1e9):
+            if stamp_ns >= self._newest[0] - HISTORY_NS:
                 return [(stamp_ns, map_to_odom)]
             self.reset()
         sent = [*self._corrections(stamp_ns), (stamp_ns, map_to_odom)]

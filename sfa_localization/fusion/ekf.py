@@ -1,0 +1,428 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""How the belief follows from the one before and an event: predict, update, or start anew.
+
+Each is a pure function, so that late events can be placed where they belong: see `history`. The
+equations of prediction and update are filterpy's.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from scipy.stats import chi2
+
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.fusion import motion
+from sfa_localization.fusion.belief import (
+    Belief,
+    Event,
+    MeasurementEvent,
+    Memory,
+    OdometryEvent,
+    PoseEvent,
+    Update,
+    capped,
+)
+from sfa_localization.fusion.inputs import lower_root, symmetric
+from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
+from sfa_localization.fusion.odometry import COAST_S, interval
+from sfa_localization.fusion.relocation import (
+    FEW_IMAGES,
+    Relocation,
+    relocate,
+    remembered,
+)
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.track import Image
+from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, begun, weighed
+
+ELSEWHERE = 'restarted elsewhere'
+STARTS = ('started', ELSEWHERE)
+"""Reasons of updates that take a pose from measurements alone."""
+WIDENING, OF_STANDING = 1.3, 0.1
+"""In doubt, the pose's variance grows by this factor per new place that contradicts it: the
+standard deviation doubles within five, while one or two wrong images do little. It grows by a tenth
+of that where the robot has not moved: the same image is hardly new evidence."""
+ALIKE_SHARE = 0.2
+"""Where neighbors share less of their errors, positions are those of a sensor with white errors."""
+FAR_M, FAR_RAD = 1.0, 0.3
+"""One image that lies farther off than this, and than 80 % of right ones do, makes an estimate
+doubtful: images that contradict by less leave it near enough to find a way by."""
+_LEARNING = 0.1
+"""Relative change per image of the usual distance and period: learned over about twenty."""
+_LEAST_SCATTER = 0.05
+_GATE, _OUTLYING, _MEDIAN = (
+    {size: float(chi2.ppf(share, size)) for size in (2, 3)} for share in (0.999, 0.8, 0.5)
+)
+"""Of squared distances of right measurements: one in a thousand is rejected. Errors of images have
+heavy tails, so the outlying fifth loses weight."""
+_OBSERVED = np.eye(3, SIZE)
+
+
+def measurement_event(
+    stamp_ns: int, value: Array, covariance: Array, share: float
+) -> MeasurementEvent:
+    """A position (2,) or pose (3,), its covariance split into what neighboring images share.
+
+    z = value + sqrt(share) L ERROR + white, with L L^T the covariance and (1 - share) of it white.
+    """
+    size = len(value)
+    jacobian = _OBSERVED[:size].copy()
+    jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
+    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
+
+
+class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
+    """filterpy's equations as pure functions; only the last innovation is kept between calls."""
+
+    def __init__(self) -> None:
+        super().__init__(SIZE, 3)
+        self._next_mean: Array = np.zeros(SIZE)
+
+    def predicted(self, belief: Belief, step: Step) -> Array:
+        """Covariance (11, 11) after a prediction: F P F^T + Q."""
+        self.x, self.P, self._next_mean = belief.mean, belief.covariance, step.mean
+        self.F, self.Q = step.jacobian, step.noise
+        self.predict()
+        return np.asarray(self.P)
+
+    def predict_x(self, u: object = 0) -> None:
+        """filterpy's hook: the motion model is nonlinear."""
+        self.x = self._next_mean
+
+    def corrected(self, belief: Belief, event: MeasurementEvent) -> tuple[Array, Array, float]:
+        """Mean (11,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
+        which stays in `y`, its covariance in `S`.
+        """
+        self.x, self.P = belief.mean, belief.covariance
+        # Array.dot throughout: on arrays this small, @ takes twice as long.
+        jacobian = event.jacobian
+        self.update(event.value, lambda _: jacobian, jacobian.dot, event.white, residual=_residual)
+        self.x[YAW] = wrap(float(self.x[YAW]))
+        return self.x, symmetric(self.P), float(self.y.dot(self.SI).dot(self.y))
+
+
+def _residual(z: Array, predicted: Array) -> Array:
+    """Innovation, its angle wrapped."""
+    difference = z - predicted
+    difference[YAW:] = wrap_angle(difference[YAW:])
+    return difference
+
+
+class Ekf:
+    """The filter's step under some settings."""
+
+    def __init__(
+        self, config: FilterConfig, correlation: ErrorCorrelation, kalman: Kalman | None = None
+    ) -> None:
+        self._config, self._correlation = config, correlation
+        self._noise = MotionNoise(
+            config.slip_per_metre, config.yaw_per_radian, correlation.distance_m
+        )
+        self._kalman = kalman or Kalman()
+        self._alike = correlation.share >= ALIKE_SHARE
+
+    def blank(self, stamp_ns: int) -> Belief:
+        """The belief before the first message, without a pose."""
+        speed_std, rate_std = self._config.speed_std, self._config.rate_std
+        stds = [1, 1, 1, speed_std, rate_std, *motion.CALIBRATION_STDS, 1, 1, 1]
+        covariance = np.diag(np.square(stds))
+        twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
+        nowhere = (0.0, 0.0, 0.0)
+        return Belief(
+            stamp_ns, np.zeros(SIZE), covariance, False, nowhere, 0.0, twist, None, Memory()
+        )
+
+    def step(self, belief: Belief, event: Event) -> Belief:
+        """The belief after an event no earlier than it."""
+        if isinstance(event, OdometryEvent):
+            return self._driven(belief, event)
+        belief = self.coast(belief, event.stamp_ns)
+        if isinstance(event, PoseEvent):
+            placed = _at_pose(belief, event.pose, event.covariance, 0.0)
+            memory = Memory(accepted_m=belief.traveled_m)
+            return placed._replace(memory=memory, track=belief.track.trusted())
+        return self._measured(belief, event)
+
+    # Predict.
+
+    def _driven(self, belief: Belief, event: OdometryEvent) -> Belief:
+        """The belief after an odometry reading, which held since the one before it."""
+        if belief.odometry_ns is None and belief.stamp_ns == 0:
+            return belief._replace(
+                stamp_ns=event.stamp_ns,
+                twist=event.twist,
+                odometry_ns=event.stamp_ns,
+                odometry_pose=event.pose,
+            )
+        held = interval(belief, event)
+        if not held.bridged:  # most of so long a silence was spent somehow else
+            belief = self.coast(belief, event.stamp_ns)
+        dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
+        factor, noise, twist = belief.turn_factor, self._noise, held.twist
+        if factor != 1.0:
+            twist = twist._replace(omega_variance=twist.omega_variance * factor**2)
+            noise = noise._replace(yaw_per_radian=noise.yaw_per_radian * factor)
+        step = motion.drive(belief.mean, twist, dt, noise, held.now)
+        if held.unknown_s > 0:
+            motion.add_unknown_motion(step.noise, twist, min(dt, held.unknown_s))
+        event = event._replace(twist=held.now or event.twist)
+        return self._moved(belief, event.stamp_ns, step, event, held.omega)
+
+    def coast(self, belief: Belief, stamp_ns: int) -> Belief:
+        """The belief at a later stamp without new odometry: at the last speed, then unknown."""
+        if belief.stamp_ns == 0:
+            return belief._replace(stamp_ns=stamp_ns)
+        coasted_ns = belief.stamp_ns
+        if belief.odometry_ns is not None:
+            coasted_ns = max(coasted_ns, belief.odometry_ns + round(COAST_S * 1e9))
+        for end_ns, move in ((min(stamp_ns, coasted_ns), motion.coast), (stamp_ns, motion.halt)):
+            if end_ns > belief.stamp_ns:
+                dt = (end_ns - belief.stamp_ns) * 1e-9
+                step = move(belief.mean, belief.twist, dt, self._noise)
+                belief = self._moved(belief, end_ns, step)
+                if move is motion.halt:
+                    belief = belief._replace(covariance=capped(belief.covariance))
+        return belief
+
+    def _moved(
+        self,
+        belief: Belief,
+        stamp_ns: int,
+        step: Step,
+        event: OdometryEvent | None = None,
+        omega: float = 0.0,
+    ) -> Belief:
+        """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
+        before_x, before_y, before_yaw = belief.mean[:3].tolist()
+        after_x, after_y, after_yaw = step.mean[:3].tolist()
+        dx, dy = after_x - before_x, after_y - before_y
+        x, y, yaw = belief.dead_reckoned
+        c, s = math.cos(yaw - before_yaw), math.sin(yaw - before_yaw)
+        turned = wrap(yaw + after_yaw - before_yaw)
+        reckoned = (x + c * dx - s * dy, y + s * dx + c * dy, turned)
+        located = belief.located
+        # Positional, and not _replace, which would cost half as much as the arithmetic above.
+        return Belief(
+            stamp_ns,
+            step.mean,
+            self._kalman.predicted(belief, step) if located else belief.covariance,
+            located,
+            reckoned,
+            belief.traveled_m + math.hypot(dx, dy),
+            event.twist if event else belief.twist,
+            event.stamp_ns if event else belief.odometry_ns,
+            belief.memory,
+            event.pose if event else belief.odometry_pose,
+            _added(belief, step),
+            belief.turns,
+            belief.track.driven(stamp_ns, reckoned),
+            omega if event else belief.omega,
+        )
+
+    # Update.
+
+    def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
+        """The belief, predicted to the event's stamp before, after a measurement."""
+        image = _image(belief, event)
+        belief = self._fused(self._turns_weighed(belief, event), event, image)
+        update, track = (
+            belief.memory.update,
+            belief.track.driven(event.stamp_ns, image.dead_reckoned),
+        )
+        if update and update.reason == ELSEWHERE:
+            track = track.placed(event.stamp_ns, belief.traveled_m)
+        belief = belief._replace(track=track.seen(image))
+        if update and update.reason in STARTS:
+            return belief._replace(turns=self._turns_begun(belief))
+        return belief
+
+    def _turns_begun(self, belief: Belief) -> TurnNoise:
+        """What is known about the noise of turns, from another pose on."""
+        faded = belief.traveled_m / self._correlation.distance_m
+        driven = Driven(belief.stamp_ns, belief.dead_reckoned, faded, *belief.added)
+        return begun(driven, belief.mean, belief.covariance, belief.turns)
+
+    def _turns_weighed(self, belief: Belief, event: MeasurementEvent) -> Belief:
+        """The belief with what a measurement shows about the noise of turns."""
+        if not belief.located or self._heading_lost(belief):
+            return belief
+        last = belief.turns
+        if last is not None and belief.stamp_ns < last.driven.stamp_ns + SPACING_NS:
+            return belief
+        now = self._turns_begun(belief)
+        turns = weighed(last or now, now.driven, event.value, event.jacobian, event.white)
+        return belief._replace(turns=turns)
+
+    def _heading_lost(self, belief: Belief) -> bool:
+        return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
+
+    def _fused(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+        period_s = _period_s(belief.memory, event.stamp_ns)
+        belief = belief._replace(memory=belief.memory._replace(period_s=period_s))
+        if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
+            return self._gated(belief, event, image)
+        images = remembered(belief.memory.images, image)
+        started = self._started(belief, event, images)
+        if started is not None:
+            return started
+        reason = 'heading unknown yet' if event.value.size == 2 else 'too uncertain to start from'
+        update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
+        return belief._replace(memory=belief.memory._replace(images=images, update=update))
+
+    def _gated(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+        """Accept what lies inside the gate, after an outage only when others confirm it."""
+        mean, covariance, d2 = self._kalman.corrected(belief, event)
+        size, kalman = event.value.size, self._kalman
+        far = _lies_far(belief, event)
+        update = Update(event.stamp_ns, True, d2, _GATE[size], 'accepted', kalman.y, kalman.S, far)
+        if d2 > _GATE[size]:
+            rejected = update._replace(accepted=False, reason='outside the gate')
+            return self._rejected(belief, event, image, rejected)
+        scatter = belief.memory.scatter
+        outlying = d2 / (scatter * _OUTLYING[size])
+        if outlying > 1 and self._alike:
+            lighter = event._replace(white=event.white * outlying**2)
+            mean, covariance, _ = kalman.corrected(belief, lighter)
+        memory = Memory(
+            support=belief.memory.support + 1,
+            images=remembered(belief.memory.images, image._replace(accepted=True)),
+            update=update,
+            # At most 1: an image that claims too little is not believed more than it claims.
+            scatter=min(max(_nearer(scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0),
+            period_s=belief.memory.period_s,
+        )
+        memory = self._with_accepted(memory, belief, event)
+        return belief._replace(mean=mean, covariance=covariance, memory=memory)
+
+    def _with_accepted(self, memory: Memory, belief: Belief, event: MeasurementEvent) -> Memory:
+        """With an image that was accepted; what makes weak ones weak is the same for all."""
+        std_m = motion.largest_std(event.covariance)
+        weak = self._alike and std_m > self._config.degraded_std
+        return memory._replace(
+            accepted_ns=event.stamp_ns,
+            accepted_m=belief.traveled_m,
+            precise_ns=belief.memory.precise_ns if weak else event.stamp_ns,
+        )
+
+    # Start, and start anew.
+
+    def _started(
+        self, belief: Belief, event: MeasurementEvent, images: tuple[Image, ...]
+    ) -> Belief | None:
+        """Start from one image with heading, or from the path along which several lie; None yet."""
+        if event.value.size == 3:
+            x, y, yaw = event.covariance.diagonal().tolist()
+            config = self._config
+            lost = max(x, y) > config.lost_std**2 or yaw > config.lost_yaw_std**2
+            return None if lost else self._restarted(belief, event, None, 'started')
+        found = relocate(images, self._correlation.distance_m)
+        if found is None or not found.shows_heading(len(images)):
+            return None
+        return self._restarted(belief, event, found, 'started')
+
+    def _rejected(
+        self, belief: Belief, event: MeasurementEvent, image: Image, update: Update
+    ) -> Belief:
+        """After a rejected image: restarted where those rejected outweigh the estimate."""
+        memory, outside = belief.memory, update.d2 > update.threshold
+        images = remembered(memory.images, image)
+        found = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
+        if found is not None and found.outweighs(belief):
+            return self._restarted(belief, event, found, ELSEWHERE)
+        memory = memory._replace(
+            rejected=memory.rejected + int(outside),
+            gate_excess=update.d2 / update.threshold,
+            images=images,
+            update=update,
+        )
+        belief = belief._replace(memory=memory)
+        return self._widened(belief) if outside and memory.rejected >= FEW_IMAGES else belief
+
+    def _restarted(
+        self, belief: Belief, event: MeasurementEvent, found: Relocation | None, reason: str
+    ) -> Belief:
+        """At the pose that several images show, or at the event's own."""
+        pose, covariance = found[:2] if found else event[1:3]
+        update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
+        scatter, period_s = belief.memory.scatter, belief.memory.period_s
+        memory = Memory(support=1, update=update, scatter=scatter, period_s=period_s)
+        placed = _at_pose(belief, pose, covariance, self._correlation.share)
+        return placed._replace(memory=self._with_accepted(memory, belief, event))
+
+    def _widened(self, belief: Belief) -> Belief:
+        """In doubt, the pose becomes less certain with every new place that contradicts it."""
+        moved_m = belief.traveled_m - belief.memory.images[-2:][0].traveled_m
+        fresh = 1 - math.exp(-moved_m / self._correlation.distance_m)
+        factor = np.ones(SIZE)
+        factor[:3] = math.sqrt(1 + (WIDENING - 1) * max(fresh, OF_STANDING))
+        return belief._replace(covariance=capped(belief.covariance * np.outer(factor, factor)))
+
+
+def _added(belief: Belief, step: Step) -> tuple[float, float]:
+    """Without the motion that a turn of the heading adds to the position: it is small."""
+    yaw, variance = belief.added
+    noise = step.noise
+    x, y, turned = noise.item(0), noise.item(SIZE + 1), noise.item(2 * SIZE + 2)
+    return yaw + turned / belief.turn_factor**2, variance + (x + y) / 2
+
+
+def _image(belief: Belief, event: MeasurementEvent) -> Image:
+    """A measurement beside the pose by dead reckoning."""
+    variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
+    return Image(
+        event.stamp_ns,
+        complex(x, y),
+        yaw[0] if yaw else math.nan,
+        (variances[0] + variances[1]) / 2,
+        variances[2] if yaw else math.inf,
+        belief.dead_reckoned,
+        belief.traveled_m,
+    )
+
+
+def is_far(offset: Array) -> bool:
+    """Whether an image at an offset (2,) or (3,) from the estimate would make it LOST."""
+    x, y, *yaw = offset.tolist()
+    return math.hypot(x, y) > FAR_M or any(abs(turn) > FAR_RAD for turn in yaw)
+
+
+def _lies_far(belief: Belief, event: MeasurementEvent) -> bool:
+    """Whether one image shows that the estimate is LOST, whatever errors it may share."""
+    size = event.value.size
+    offset = _residual(event.value, belief.mean[:size])
+    if not is_far(offset):
+        return False
+    both = belief.covariance[:size, :size] + event.covariance
+    return bool(offset @ np.linalg.solve(both, offset) > _OUTLYING[size])
+
+
+def _nearer(usual: float, now: float) -> float:
+    """The running median of a positive number."""
+    return usual * math.exp(_LEARNING if now > usual else -_LEARNING)
+
+
+def _period_s(memory: Memory, stamp_ns: int) -> float:
+    """The usual time between images, accepted or not."""
+    if memory.update is None:
+        return memory.period_s
+    return _nearer(memory.period_s, (stamp_ns - memory.update.stamp_ns) * 1e-9)
+
+
+def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Belief:
+    """The belief at another pose (3,), with what is known of twist, bias, scale and loss.
+
+    `share` of the pose's variance is the error that the next images will repeat.
+    """
+    mean = belief.mean.copy()
+    mean[:3], mean[ERROR:] = pose, 0.0
+    mean[YAW] = wrap(float(mean[YAW]))
+    full, kept = np.eye(SIZE), slice(V, ERROR)
+    full[:3, :3], full[kept, kept] = covariance, belief.covariance[kept, kept]
+    shared = -math.sqrt(share) * np.linalg.cholesky(covariance)
+    full[:3, ERROR:], full[ERROR:, :3] = shared, shared.T
+    return belief._replace(mean=mean, covariance=full, located=True)

@@ -1,0 +1,148 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What two odometry messages show of the motion between them.
+
+Publishers differ in the time over which they average their twist, bundle messages, or fall silent;
+the pose in the message is unambiguous, unless it was reset or is not filled.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from sfa_localization.fusion import motion
+from sfa_localization.fusion.belief import Belief, OdometryEvent
+from sfa_localization.fusion.motion import Twist
+from sfa_localization.fusion.track import Pose
+
+ODOMETRY_TIMEOUT_S = 0.5
+"""Odometry silent for longer is a gap: many times the period of any odometry."""
+COAST_S = 2.0
+"""Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
+_BRIDGED_S = 10.0
+"""A longer silence is not bridged by the twist after it: most of it was spent somehow else."""
+_RESET = 0.4
+"""A pose that moves this far, m or rad, beyond its twist was reset."""
+_ROUNDED_M = 2e-3
+"""A pose moves less than this sideways by its rounding."""
+_JUMP = 0.05
+"""More motion than twice that of the speed, and this, m or rad, is that of longer than stamps say."""
+
+
+class Interval(NamedTuple):
+    """The mean `twist` since the belief, the twist to go on with `now` if it is another, and the
+    mean turn rate `omega` since the last message. Of `unknown_s` nothing is known.
+    """
+
+    twist: Twist
+    now: Twist | None
+    omega: float
+    unknown_s: float = 0.0
+    bridged: bool = True
+
+
+def interval(belief: Belief, event: OdometryEvent) -> Interval:
+    """The motion that led to an odometry message."""
+    silence_s = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
+    if belief.odometry_ns is not None and silence_s > ODOMETRY_TIMEOUT_S:
+        twist, shown = _over_gap(belief, event, silence_s)
+        now, omega = None, event.twist.omega
+    else:
+        whole = _shown(belief, event, silence_s, event.twist) or event.twist
+        twist, shown = _remaining(belief, event, whole), False
+        now, omega = event.twist if event.twist.v or event.twist.omega else whole, whole.omega
+    unknown_s = 0.0 if shown else max(silence_s - COAST_S, 0.0)
+    return Interval(twist, now, omega, unknown_s, silence_s <= _BRIDGED_S)
+
+
+def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist) -> Twist | None:
+    """The mean twist since the last reading by the odometry's own poses, with the variances of
+    `fastest`; None where they moved beyond that, which is a reset, or not at all, or more sideways
+    than ahead: then position or heading are not filled.
+    """
+    before, after = belief.odometry_pose, event.pose
+    if before is None or after is None or before == after or seconds <= 0:
+        return None
+    turn, ahead, aside = _moved(before, after)
+    reach_m, reach_rad = abs(fastest.v) * seconds + _RESET, abs(fastest.omega) * seconds + _RESET
+    if math.hypot(ahead, aside) > reach_m or abs(turn) > reach_rad or reach_rad > math.pi:
+        return None
+    drives = abs(event.twist.v) * seconds > abs(aside) / 2
+    if seconds <= ODOMETRY_TIMEOUT_S and drives and abs(aside) > max(abs(ahead), _ROUNDED_M):
+        return None
+    return _twist(turn, ahead, seconds, fastest)
+
+
+def _remaining(belief: Belief, event: OdometryEvent, whole: Twist) -> Twist:
+    """The mean twist by the odometry's poses since the belief: images have claimed the begin of the
+    interval, and were fused where the last twist led.
+    """
+    if whole is event.twist or belief.odometry_pose is None or event.pose is None:
+        return whole
+    coasted_s = (belief.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
+    left_s = (event.stamp_ns - belief.stamp_ns) * 1e-9
+    if coasted_s <= 0 or left_s <= 0:
+        return whole
+    x, y, yaw = belief.odometry_pose
+    way = motion.arc(yaw, belief.twist.v, belief.twist.omega, coasted_s)
+    turn, ahead, _ = _moved((x + way.dx, y + way.dy, yaw + way.dyaw), event.pose)
+    return _twist(turn, ahead, left_s, whole)
+
+
+def _moved(before: Pose, after: Pose) -> tuple[float, float, float]:
+    """How far a pose turned, and lies ahead and to the left, by the mean of both headings."""
+    turn = motion.wrap(after[2] - before[2])
+    c, s = math.cos(before[2] + turn / 2), math.sin(before[2] + turn / 2)
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    return turn, dx * c + dy * s, dy * c - dx * s
+
+
+def _twist(turn: float, chord: float, seconds: float, reading: Twist) -> Twist:
+    """The mean twist of a motion, with the variances of a reading."""
+    half = turn / 2
+    arc = chord * (half / math.sin(half) if half else 1.0)
+    return reading._replace(v=arc / seconds, omega=turn / seconds)
+
+
+def _over_gap(belief: Belief, event: OdometryEvent, seconds: float) -> tuple[Twist, bool]:
+    """The mean motion over a gap, and whether the odometry's own poses show it.
+
+    Else nothing but both ends of it is known. The variance of a uniform distribution between them
+    is their difference squared over 12; that of the mean of the random walk that joins them,
+    CTRV's, is a twelfth of the walk's.
+    """
+    a, b = belief.twist, event.twist
+    variances = max(a.v_variance, b.v_variance), max(a.omega_variance, b.omega_variance)
+    mean = Twist((a.v + b.v) / 2, (a.omega + b.omega) / 2, *variances)
+    v = max(abs(a.v), abs(b.v), motion.UNKNOWN_SPEED)
+    omega = max(abs(a.omega), abs(b.omega), motion.UNKNOWN_RATE)
+    shown = _shown(belief, event, seconds, Twist(v, omega, *variances))
+    if shown is not None:
+        # What the readings do not expect may be a reset of the pose.
+        surprise = (shown.v - mean.v) / 2, (shown.omega - mean.omega) / 2
+        return _wider(shown, surprise[0] ** 2, surprise[1] ** 2), True
+    v_variance = (a.v - b.v) ** 2 + motion.ACCELERATION**2 * seconds
+    omega_variance = (a.omega - b.omega) ** 2 + motion.ACCELERATION**2 * seconds
+    return _wider(mean, v_variance / 12, omega_variance / 12), False
+
+
+def _wider(twist: Twist, v_variance: float, omega_variance: float) -> Twist:
+    return twist._replace(v_variance=twist.v_variance + v_variance,
+                          omega_variance=twist.omega_variance + omega_variance)  # fmt: skip
+
+
+def stalled(before: Belief, after: Belief, taken_ns: int, stamp_ns: int) -> bool:
+    """Whether the odometry between two stamps shows far more motion than it takes, after a silence
+    in which it shows far less, as where a network that stalled hands over all at once.
+    """
+    if after.odometry_ns is None or after.odometry_ns <= taken_ns:
+        return False
+    seconds, silent_s = (stamp_ns - taken_ns) * 1e-9, (taken_ns - before.stamp_ns) * 1e-9
+    moved = math.dist(before.dead_reckoned[:2], after.dead_reckoned[:2])
+    turned = abs(motion.wrap(after.dead_reckoned[2] - before.dead_reckoned[2]))
+    pairs = (moved, before.twist.v, after.twist.v), (turned, before.omega, after.omega)
+    return any(
+        way > 2 * max(abs(a), abs(b)) * seconds + _JUMP or abs(a) * silent_s > way + _JUMP
+        for way, a, b in pairs
+    )
