@@ -8,7 +8,7 @@ import csv
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -18,13 +18,12 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write, read_regular
-from sfa_localization.data.geometry import Array, align
+from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import listed, short_line
-from sfa_localization.data.run import Stamps, Trajectory, integrate
-from sfa_localization.fusion.inputs import POSITION_STD, read_twist
-from sfa_localization.fusion.log_noise import EXPECTED, Learned, Log, Noise, learn
+from sfa_localization.data.run import Stamps, Trajectory
+from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
@@ -34,26 +33,8 @@ _LARGEST_EXPONENT = 20  # of stamps, whose nanoseconds are below 2^62
 _SECOND_NS = 1_000_000_000
 LARGEST_LOG = 1 << 30
 """Bytes of a log: more than a year of odometry at 1 Hz, or three days at 100 Hz."""
-_STRETCH = 20
-"""Positions that are aligned with odometry together: so few that odometry hardly drifts."""
-ENOUGH_POSITIONS = 5 * _STRETCH
-"""With fewer, chance decides on what would be learned from a log."""
 _LEAST_STD_M = 1e-4
 """Of a position: no smaller one is stated in earnest."""
-_UNTRUE = 2.0
-"""A standard deviation that is too small by more than this factor is replaced."""
-_MEDIAN_OF_RAYLEIGH = 1.1774
-"""Median length of a planar vector with unit variance per axis: sqrt(2 ln 2)."""
-# Parameters of the user, each with the noise that it sets.
-_USERS = (
-    ('measurement_factor', 'position'),
-    ('speed_std', 'speed'),
-    ('slip_per_metre', 'slip'),
-    ('rate_std', 'turn'),
-    ('yaw_per_radian', 'turn'),
-    ('odometry_factor', 'speed'),
-    ('odometry_factor', 'turn'),
-)
 # Usual names of the columns, in lower case; the first is the one in the documentation.
 _STAMP = ('stamp_s', 'stamp', 't', 'time', 'time_s', 'timestamp', 'timestamp_s', 'sec', 'seconds')
 _STAMP_NS = ('stamp_ns', 'timestamp_ns', 't_ns', 'time_ns')
@@ -139,26 +120,20 @@ def run_filter(
     config: FilterConfig,
     progress: bool = False,
     smooth: bool = False,
-    correlation: ErrorCorrelation | None = None,
-    lag_ns: int = 0,
 ) -> Filtered:
-    """Fuse two tables as a live filter would, by earlier rows only; `smooth`: by all rows.
+    """Fuse two tables as the live filter does, by earlier rows only; `smooth`: by all rows.
 
-    `correlation` is that of the positions' errors; the robot moves `lag_ns` after the stamps of
-    the odometry. Raises DataError when the tables do not overlap.
+    The errors of positions are white, as those of a sensor. Raises DataError when the tables do not
+    overlap.
     """
     _require_overlap(odometry, positions)
-    shift = _shift(odometry, positions, abs(lag_ns))
-    fused = (Smoother if smooth else PoseFilter)(config, correlation)
-    odometry = replace(odometry, stamps_ns=odometry.stamps_ns + lag_ns)
+    shift, white = _shift(odometry, positions), ErrorCorrelation(share=0.0)
+    fused = (Smoother if smooth else PoseFilter)(config, white)
     answers, updates = list[State | None](), list[Update]()
     feed = _feed(fused, odometry, positions, shift, updates)
     for stamp_ns in progress_over(feed, 'filter', len(odometry), 'rows', shown=progress):
-        state = fused.at(stamp_ns - lag_ns)
-        answers.append(state and replace(state, stamp_ns=stamp_ns - lag_ns))
-    states = [state for state in answers if state]
-    if isinstance(fused, Smoother):
-        states = _resampled(fused.smoothed(), lag_ns)
+        answers.append(fused.at(stamp_ns))
+    states = fused.smoothed() if isinstance(fused, Smoother) else [one for one in answers if one]
     return Filtered(
         np.array([state.stamp_ns - shift for state in states], np.int64),
         np.reshape([state.pose for state in states], (-1, 3)),
@@ -171,221 +146,15 @@ def run_filter(
     )
 
 
-def _shift(odometry: Table, positions: Table, margin_ns: int) -> int:
+def _shift(odometry: Table, positions: Table) -> int:
     """What makes all stamps positive: logs may count from zero, but zero means no stamp."""
     first = min(int(table.stamps_ns[0]) for table in (odometry, positions) if len(table))
-    return max(0, _SECOND_NS + margin_ns - first) if first <= margin_ns else 0
-
-
-def _resampled(states: list[State], lag_ns: int) -> list[State]:
-    """The states at stamps earlier by a lag, as far as they reach; covariances of the nearest."""
-    if not lag_ns or not states:
-        return states
-    track = Trajectory(np.array([one.stamp_ns for one in states]),
-                       np.array([one.pose for one in states]))  # fmt: skip
-    stamps = track.stamps_ns - lag_ns
-    stamps = stamps[track.covers(stamps)]
-    nearest = np.minimum(np.searchsorted(track.stamps_ns, stamps), len(states) - 1)
-    found = []
-    for stamp_ns, pose, i in zip(stamps.tolist(), track.at(stamps), nearest, strict=True):
-        mean = np.append(pose, states[i].mean[len(pose) :])
-        found.append(State(stamp_ns, mean, states[i].covariance))
-    return found
-
-
-def halves(odometry: Table, positions: Table) -> list[tuple[Table, Table]]:
-    """Two logs of one, cut in the middle of the positions; the one if a half has no odometry."""
-    middle_ns = int(np.median(positions.stamps_ns)) if len(positions) else 0
-    parts = [
-        (_rows(odometry, (odometry.stamps_ns < middle_ns) == early),
-         _rows(positions, (positions.stamps_ns < middle_ns) == early))
-        for early in (True, False)
-    ]  # fmt: skip
-    return parts if all(len(table) for part in parts for table in part) else [(odometry, positions)]
-
-
-def _rows(table: Table, kept: Array) -> Table:
-    columns = {key: one[kept] for key, one in table.columns.items()}
-    return Table(table.stamps_ns[kept], columns, source=table.source)
-
-
-def odometry_arrays(odometry: Table) -> tuple[Stamps, Array, Array]:
-    """Stamps (N,), twists (N, 2) and stated variances (N, 2), 0 where there are none."""
-    given = [_twist(odometry.columns, i) for i in range(len(odometry))]
-    return odometry.stamps_ns, _twists(odometry), np.array([variances for *_, variances in given])
-
-
-def position_arrays(positions: Table) -> tuple[Array, Array]:
-    """Poses (M, 3) and covariances (M, 3, 3); a yaw that is not given is NaN, not certain."""
-    poses = np.full((len(positions), 3), np.nan)
-    covariances = np.zeros((len(positions), 3, 3))
-    covariances[:, 2, 2] = np.inf
-    for i in range(len(positions)):
-        value, covariance = _measurement(positions.columns, i)
-        poses[i, : len(value)] = value
-        covariances[i, : len(value), : len(value)] = covariance
-    return poses, covariances
-
-
-def without_positions(positions: Table) -> Table:
-    """The table without its rows."""
-    return Table(positions.stamps_ns[:0], {key: one[:0] for key, one in positions.columns.items()})
-
-
-@dataclass(frozen=True, slots=True)
-class Fitted:
-    """The settings and the odometry that fit a log, with `remarks` on what was learned.
-
-    The robot moves `lag_ns` after the stamps of the odometry. `fits` is False where odometry and
-    positions do not belong together; then nothing was learned.
-    """
-
-    config: FilterConfig
-    correlation: ErrorCorrelation
-    odometry: Table
-    lag_ns: int = 0
-    remarks: tuple[str, ...] = ()
-    fits: bool = True
-
-
-def fitted(odometry: Table, positions: Table, config: FilterConfig) -> Fitted:
-    """Learn the noise of a log from itself: see `fusion.log_noise`.
-
-    Parameters that differ from their defaults are the user's, and stay. So do all, where the
-    log has too few positions.
-    """
-    inside = (positions.stamps_ns > odometry.stamps_ns[0]) & (
-        positions.stamps_ns < odometry.stamps_ns[-1]
-    )
-    if np.count_nonzero(inside) < ENOUGH_POSITIONS:
-        return Fitted(config, ErrorCorrelation(), odometry)
-    columns = positions.columns
-    measured = np.column_stack([columns['x'], columns['y']])[inside]
-    spreads, start = _spreads(positions)[inside], EXPECTED
-    held = frozenset(noise for name, noise in _USERS if _changed(config, name))
-    ratio = position_std_of(odometry, positions) / math.sqrt(float(np.median(spreads)))
-    if _changed(config, 'measurement_factor'):
-        start = start._replace(position=np.array(math.sqrt(config.measurement_factor)))
-    elif _stated_variance(positions) == 0 or ratio > _UNTRUE:
-        start = start._replace(position=np.array(ratio))
-    log = Log(odometry.stamps_ns, _twists(odometry), _twist_variances(odometry, config),
-              positions.stamps_ns[inside], measured, spreads)  # fmt: skip
-    found = learn(log, config, start, held)
-    noise = found.noise
-    if not found.fits:
-        crude = EXPECTED._replace(position=np.maximum(start.position, ratio))
-        return Fitted(_scaled(config, crude), ErrorCorrelation(), odometry, fits=False)
-    config = _scaled(config, noise)
-    remarks = _remarks(found, math.sqrt(config.measurement_factor * float(np.median(spreads))))
-    correlation = ErrorCorrelation(float(noise.share), float(noise.distance_m))
-    lag_ns = round(float(noise.lag_s) * 1e9)
-    return Fitted(config, correlation, _corrected(odometry, found), lag_ns, remarks)
-
-
-def _changed(config: FilterConfig, name: str) -> bool:
-    return bool(getattr(config, name) != getattr(FilterConfig(), name))
-
-
-def _scaled(config: FilterConfig, noise: Noise) -> FilterConfig:
-    """The settings with the factors of a noise, kept inside their ranges."""
-    ranges = {item.name: item.metadata for item in fields(config)}
-    values = {
-        'rate_std': config.rate_std * noise.turn,
-        'yaw_per_radian': config.yaw_per_radian * noise.turn,
-        'speed_std': config.speed_std * noise.speed,
-        'slip_per_metre': config.slip_per_metre * noise.slip,
-        'measurement_factor': noise.position**2,
-    }
-    for name, value in values.items():
-        low, high = ranges[name]['low'], ranges[name]['high']
-        config = replace(config, **{name: float(np.clip(value, low, high))})  # type: ignore[arg-type]
-    return config
-
-
-def _corrected(odometry: Table, found: Learned) -> Table:
-    """The odometry with readings held backward, and stated variances with the factors learned."""
-    noise, columns = found.noise, dict(odometry.columns)
-    for name, factor in (('var_v', noise.speed), ('var_omega', noise.turn)):
-        if name in columns:
-            columns[name] = columns[name] * factor**2
-    if found.forward:
-        columns = {name: np.append(one[:1], one[:-1]) for name, one in columns.items()}
-    return replace(odometry, columns=columns)
-
-
-def _remarks(found: Learned, position_std: float) -> tuple[str, ...]:
-    noise = found.noise
-    share = f', {noise.share:.0%} of the variance alike over {noise.distance_m:.1f} m'
-    said = [
-        f'learned from the log: positions err by {position_std:.2f} m'
-        + (share if float(noise.share) > 0 else ''),
-        f'noise of the odometry: speed {noise.speed:.2g}, slip {noise.slip:.2g}, '
-        f'turn {noise.turn:.2g} of the expected',
-    ]
-    if found.forward:
-        said.append('readings of the odometry hold until the next one')
-    if noise.lag_s:
-        late = 'late' if noise.lag_s > 0 else 'early'
-        said.append(f'the robot moves {abs(float(noise.lag_s)):.2f} s {late} by its odometry')
-    return tuple(said)
-
-
-def _twists(odometry: Table) -> Array:
-    return np.column_stack([odometry.columns['v'], odometry.columns['omega']])
-
-
-def _twist_variances(odometry: Table, config: FilterConfig) -> Array:
-    """The variances (N, 2) with which the filter takes readings: see inputs.read_twist."""
-    count = range(len(odometry))
-    twists = (read_twist(*_twist(odometry.columns, i), config) for i in count)
-    return np.array([(one.v_variance, one.omega_variance) for one in twists])
-
-
-def _spreads(positions: Table) -> Array:
-    """Variances (M, 2) of the positions; the filter's own where none is stated."""
-    empty = np.full(len(positions), np.nan)
-    x, y = (positions.columns.get(name, empty) for name in ('var_x', 'var_y'))
-    x, y = (np.where(np.isfinite(one) & (one > 0), one, other) for one, other in ((x, y), (y, x)))
-    both = _in_earnest(np.column_stack([x, y]))
-    return np.where(np.isfinite(both) & (both > 0), both, POSITION_STD**2)
+    return max(0, _SECOND_NS - first) if first <= 0 else 0
 
 
 def _in_earnest(variances: Array) -> Array:
     """Variances m^2 of positions, none that is known smaller than what is stated in earnest."""
     return np.where(variances > 0, np.maximum(variances, _LEAST_STD_M**2), variances)
-
-
-def position_std_of(odometry: Table, positions: Table) -> float:
-    """Standard deviation of positions, roughly: their residuals beside dead reckoning.
-
-    Each _STRETCH of them is aligned with it on its own, without those farthest off.
-    """
-    path = integrate(odometry.stamps_ns, _twists(odometry))
-    inside = (positions.stamps_ns >= odometry.stamps_ns[0]) & (
-        positions.stamps_ns <= odometry.stamps_ns[-1]
-    )
-    driven = Trajectory(odometry.stamps_ns, path).at(positions.stamps_ns[inside])[:, :2]
-    measured = np.column_stack([positions.columns['x'], positions.columns['y']])[inside]
-    starts = range(0, len(measured) - _STRETCH + 1, _STRETCH)
-    parts = [slice(start, start + _STRETCH) for start in starts]
-    residuals = [_median_residual(driven[part], measured[part]) for part in parts]
-    return float(np.median(residuals)) / _MEDIAN_OF_RAYLEIGH
-
-
-def _median_residual(driven: Array, measured: Array) -> float:
-    """Median distance (m) of positions (K, 2) from the path (K, 2) laid on most of them."""
-    kept = np.argsort(np.hypot(*(measured - np.median(measured, 0)).T))[: -_STRETCH // 10]
-    for _ in range(3):
-        off = np.hypot(*(align(driven[kept], measured[kept]).apply(driven) - measured).T)
-        kept = off <= 3 * np.median(off)
-    return float(np.median(off))
-
-
-def _stated_variance(positions: Table) -> float:
-    """Median of the variances in the table; 0 without any."""
-    variances = positions.columns.get('var_x', np.zeros(0))
-    variances = variances[np.isfinite(variances) & (variances > 0)]
-    return float(np.median(variances)) if len(variances) else 0.0
 
 
 def write_tum(path: Path | str, stamps_ns: Stamps, poses: Array) -> None:

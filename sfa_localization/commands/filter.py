@@ -67,20 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
     odometry = filtering.read_odometry_table(arguments.odometry)
     positions = filtering.read_position_table(arguments.positions)
     config = settings(FilterConfig, arguments, arguments.config)
-    fit = filtering.fitted(odometry, positions, config)
-    for remark in fit.remarks:
-        print(remark)
-    if not fit.fits:
-        print('odometry and positions do not belong together: ' + _consequence(config))
-        positions = filtering.without_positions(positions) if config.initial_pose else positions
     result = filtering.run_filter(
-        fit.odometry,
-        positions,
-        fit.config,
-        progress=True,
-        smooth=arguments.smooth,
-        correlation=fit.correlation,
-        lag_ns=fit.lag_ns,
+        odometry, positions, config, progress=True, smooth=arguments.smooth
     )
     _print_counts(odometry, positions, result)
     if len(result.poses) == 0:
@@ -120,9 +108,3 @@ def _judgement(truth: Trajectory, result: Filtered) -> str:
         f'inside 95 % regions: {shares["within_95"]:.1%} of the positions, '
         f'{shares["yaw_within_95"]:.1%} of the headings; NIS {result.nis:.2f}'
     )
-
-
-def _consequence(config: FilterConfig) -> str:
-    if config.initial_pose:
-        return 'positions are left out'
-    return 'check clocks and units, or give --initial-pose X Y YAW to use the odometry alone'
