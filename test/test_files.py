@@ -33,7 +33,7 @@ from sfa_localization.data.errors import BagError, DataError, LocalizationError
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.inspection import BagReport
 from sfa_localization.reports import bag as report_bag
-from sfa_localization.reports import evaluation as report
+from sfa_localization.reports import figures
 
 BAGS = Path(__file__).parents[1] / 'bags'
 FULL = OSError(errno.ENOSPC, 'No space left on device')
@@ -58,9 +58,9 @@ WRITERS = {
     'figures of an evaluation': lambda p: evaluation.write_json(p, {'ekf': 1}),
     'path of the filter': lambda p: filtering.write_tum(p, np.arange(5), PLACES),
     'what was inspected': lambda p: inspect_command.write_json(p, [BagReport('bag')]),
-    'figure': lambda p: report.save(Figure(), p),
-    'text of a report': lambda p: report.save_text(p, 'text'),
-    'contact sheet': lambda p: report_bag.write_contact_sheet([PICTURE], 'bag', p),
+    'figure': lambda p: figures.save(Figure(), p),
+    'text of a report': lambda p: figures.save_text(p, 'text'),
+    'contact sheet': lambda p: figures.write_contact_sheet([PICTURE], 'bag', p),
     'path of a bag': lambda p: report_bag.write_path(PLACES, PLACES, 'bag', p),
     'marker of the demo': mark_a_demo,
 }

@@ -97,12 +97,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_page(arguments: argparse.Namespace, result: Evaluation) -> None:
     """Write the page, with the worst images read from the bag once more."""
     from sfa_localization.bags.drives import images_at
-    from sfa_localization.reports.evaluation_page import worst_images, write_evaluation_page
+    from sfa_localization.reports.evaluation import worst_of, write_evaluation_page
     from sfa_localization.reports.page import PAGE
 
     late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
-    worst = worst_images(result.truth, result.estimates['sfa'])
-    stamps = {one: one.stamp_ns + late_ns for one in worst}
+    worst = worst_of(result.truth, result.estimates['sfa'])
+    stamps = {one: stamp + late_ns for one, stamp in worst.items()}
     read = images_at(arguments.bag, stamps.values(), recipe(arguments))
     samples = {one: read[stamp] for one, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'

@@ -118,7 +118,8 @@ def _facts(report: BagReport) -> list[str]:
 
 
 def _write_figures(report: BagReport, folder: Path, prefix: str) -> None:
-    from sfa_localization.reports.bag import write_contact_sheet, write_path
+    from sfa_localization.reports.bag import write_path
+    from sfa_localization.reports.figures import write_contact_sheet
 
     name = Path(report.path).stem
     images, drive = report.images, report.drive

@@ -261,27 +261,38 @@ def simulate(
     panorama: PanoramaConfig | None = None,
     camera: CameraModel | None = None,
     progress: bool = False,
-    given: Drive | None = None,
 ) -> Drive:
-    """Record a drive to the bag `out`; `progress` shows a bar. Returns what was recorded.
+    """Drive through the garden of `config` and `record` it. Returns what was recorded."""
+    garden = Garden(config.world, config)
+    driven = drive(garden, config)
+    record(driven, garden, config, out, panorama, camera, progress)
+    return driven
 
-    A `given` drive is recorded instead of one of `config`; no tree on the lawn is in its way.
+
+def record(
+    driven: Drive,
+    garden: Garden,
+    config: SimulationConfig,
+    out: Path,
+    panorama: PanoramaConfig | None = None,
+    camera: CameraModel | None = None,
+    progress: bool = False,
+) -> None:
+    """Record a drive to the bag `out`; `progress` shows a bar.
+
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
-    garden = Garden(config.world, config, given is not None)
-    recorded = given or drive(garden, config)
     if config.images == 'panorama':
         view = panorama_view(panorama or PanoramaConfig())
     else:
         camera = camera or make_camera(LensCalibration(), RAW_SIZE)
         view = raw_view(camera.unproject, camera.size)
     with BagWriter(out, config.storage) as bag:
-        noisy = render_images(garden, recorded, config, view)
-        count = len(recorded.image_stamps_ns)
+        noisy = render_images(garden, driven, config, view)
+        count = len(driven.image_stamps_ns)
         shown = progress_over(noisy, f'render the images of {out.name}', count, shown=progress)
-        _write(bag, recorded, shown, config)
-    return recorded
+        _write(bag, driven, shown, config)
 
 
 def _write(bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig) -> None:

@@ -3,7 +3,7 @@
 """Table and figure of a year: errors by month of a frozen, an updated and a retrained model.
 
 A cell is a mapping with `model`, `month`, `light` and `season`, and the scores that
-`commands/year.py` gives; a score that does not exist is None or missing.
+`year` gives; a score that does not exist is None or missing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sfa_localization.reports.evaluation import save
+from sfa_localization.reports.figures import save
 
 Cells = Sequence[Mapping[str, Any]]
 MEASURES = {
