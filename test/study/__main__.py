@@ -36,6 +36,12 @@ STUDIES = {
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run what the first word names; the exit code."""
+    arguments = study_parser().parse_args(words)
+    return guarded(lambda: int(arguments.run(arguments)))
+
+
+def study_parser() -> argparse.ArgumentParser:
+    """The parser of all studies."""
     parser = argparse.ArgumentParser(
         prog='study', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -43,8 +49,7 @@ def main(words: Sequence[str] | None = None) -> int:
     for name, summary in STUDIES.items():
         add_arguments(commands.add_parser(name, help=summary), name)
     half_real.add_arguments(commands.add_parser('half_real', help=half_real.SUMMARY))
-    arguments = parser.parse_args(words)
-    return guarded(lambda: int(arguments.run(arguments)))
+    return parser
 
 
 def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
