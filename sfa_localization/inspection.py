@@ -32,12 +32,9 @@ from sfa_localization.metric.sufficiency import ROUTE, is_one_route
 
 PANORAMA, OMNIDIRECTIONAL, FISHEYE = 'panorama', 'omnidirectional', 'fisheye'
 DUAL_FISHEYE, ORDINARY = 'dual fisheye', 'ordinary camera'
-SECTORS = 6
-"""Line directions that are distinguished, of 30 degrees each."""
-MIN_DIRECTIONS = 3
-"""Directions a drive needs: with fewer the shape of the map remains ambiguous."""
-MIN_SHARE = 0.05
-"""Share of the path along a direction that counts as driven."""
+SECTORS, MIN_SHARE, MIN_DIRECTIONS = 6, 0.05, 3
+"""Line directions that are distinguished, of 30 degrees each; the share of the path along one that
+counts as driven; and how many a drive needs: with fewer the shape of the map remains ambiguous."""
 MIN_COVERED = 0.65
 """Share of the area that must be covered: below it whole regions are extrapolated."""
 MAX_LOST = 0.1
@@ -46,10 +43,8 @@ MAX_GAP_S = 2.0
 """Longest pause of a topic (s) that is not reported."""
 EVEN, EVEN_SHARE = 3.0, 0.9
 """A topic keeps time where this share of its intervals is no longer than this many usual ones."""
-SAMPLES = 16
-"""Images on the contact sheet: as many as can be seen at once."""
-SAMPLE_SIDE = 640
-"""Longer side of an image on the contact sheet (pixels)."""
+SAMPLES, SAMPLE_SIDE = 16, 640
+"""Images on the contact sheet, and their longer side (pixels)."""
 REPEATED = 0.05
 """Share of images that repeat the one before that is worth a word."""
 STANDING_M = 0.02
@@ -81,7 +76,7 @@ class InspectionConfig(Settings):
 class TopicReport:
     """One topic: `problems` are sentences; stamps are those of the sender where it set them.
 
-    `recorded` is the count of the bag's metadata or index.
+    `recorded` is the count of the bag's metadata or index; `count` what can be read of it.
     """
 
     name: str
@@ -92,7 +87,6 @@ class TopicReport:
 
     @property
     def count(self) -> int:
-        """Messages that can be read."""
         return len(self.stamps_ns)
 
     @property
@@ -110,14 +104,12 @@ class TopicReport:
     @property
     def rate_hz(self) -> float:
         """Messages per second, by the median of their intervals; 0 for fewer than two."""
-        if len(self.stamps_ns) < 2:
-            return 0.0
-        return float(1e9 / max(np.median(np.diff(self.stamps_ns)), 1))
+        return float(1e9 / max(np.median(np.diff(self.stamps_ns)), 1)) if self.count > 1 else 0.0
 
     @property
     def largest_gap_s(self) -> float:
         """Longest time between two messages."""
-        return float(np.diff(self.stamps_ns).max() * 1e-9) if len(self.stamps_ns) > 1 else 0.0
+        return float(np.diff(self.stamps_ns).max() * 1e-9) if self.count > 1 else 0.0
 
     def as_text(self) -> str:
         """Lines for a terminal."""
@@ -126,13 +118,13 @@ class TopicReport:
         return '\n'.join([line, *(f'    problem: {problem}' for problem in self.problems)])
 
     def as_dict(self) -> dict[str, Any]:
-        known = len(self.stamps_ns) > 0
+        ends = (int(self.stamps_ns[0]), int(self.stamps_ns[-1])) if self.count else (None, None)
         return {
             'type': self.kind,
             'count': self.count,
             'recorded': self.recorded,
-            'first_stamp_ns': int(self.stamps_ns[0]) if known else None,
-            'last_stamp_ns': int(self.stamps_ns[-1]) if known else None,
+            'first_stamp_ns': ends[0],
+            'last_stamp_ns': ends[1],
             'rate_hz': round(self.rate_hz, 3),
             'largest_gap_s': round(self.largest_gap_s, 3),
             'problems': self.problems,
@@ -150,33 +142,30 @@ class ImageTopic:
     geometry: str
     samples: list[Image]
 
+    def as_text(self) -> str:
+        return f'{self.width}x{self.height}, {self.geometry}'
+
     def as_dict(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ('topic', 'width', 'height', 'geometry')}
 
 
 @dataclass
 class DrivenPath:
-    """The path of the robot by its odometry, and the poses at which images were taken."""
+    """The path of the robot by its odometry, and the poses (M, 3) of images with odometry.
+
+    `clock` says by how much images are stamped late, as far as turns show it.
+    """
 
     topic: str
     odometry: Odometry
     places: Array
-    """Poses (M, 3) of the images that have odometry."""
-    clock: CameraClock = field(default_factory=CameraClock)
-    """By how much the images are stamped late, as far as turns show it."""
-
-    def as_text(self) -> str:
-        """Lines for a terminal."""
-        clock = self.clock_text()
-        return '\n'.join([self.path_text(), *([f'  clocks: {clock}'] if clock else [])])
+    clock: CameraClock
 
     def clock_text(self) -> str:
         """What turns show about the clocks; '' where they show nothing."""
-        if not self.clock.known:
-            return ''
-        delay_s = self.clock.delay_ns * 1e-9
-        if abs(delay_s) < DELAY_SHOWN_S:
-            return 'images and odometry agree'
+        delay_s = self.clock.delay_s
+        if not self.clock.known or abs(delay_s) < DELAY_SHOWN_S:
+            return 'images and odometry agree' if self.clock.known else ''
         late = 'late' if delay_s > 0 else 'early'
         corrected = abs(self.clock.delay_ns) <= DELAY_LIMIT_NS
         remedy = 'train and the filter correct it' if corrected else 'synchronize the clocks'
@@ -186,7 +175,7 @@ class DrivenPath:
         """A line about the path."""
         found = self.as_dict()
         return (
-            f'  drive: {found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images '
+            f'drive: {found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images '
             f'over {found["area_m2"]:.0f} m2, {found["spacing_m"]:.2f} m apart, '
             f'along {found["directions"]} of {SECTORS} directions'
         )
@@ -219,6 +208,15 @@ class BagReport:
     drive: DrivenPath | None = None
     lacks: list[str] = field(default_factory=list)
 
+    @property
+    def facts(self) -> list[str]:
+        """Camera, drive and clocks, in words."""
+        facts = [f'images: {self.images.as_text()}'] if self.images else []
+        if self.drive is not None:
+            clock = self.drive.clock_text()
+            facts += [self.drive.path_text(), *([f'clocks: {clock}'] if clock else [])]
+        return facts
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
@@ -238,11 +236,7 @@ class BagReport:
         if self.error:
             return f'error: {self.error}'
         lines = [self.path, *(topic.as_text() for topic in self.topics)]
-        if self.images is not None:
-            size = f'{self.images.width}x{self.images.height}'
-            lines.append(f'  images: {size}, {self.images.geometry}')
-        if self.drive is not None:
-            lines.append(self.drive.as_text())
+        lines += [f'  {fact}' for fact in self.facts]
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
@@ -266,10 +260,9 @@ def inspect(
             for kind, name in (('image', topics.image), ('odometry', topics.odometry))
         )
         survey = _Survey(bag, image, odometry)
-        survey.read()
-        report.topics = survey.topics()
+        report.topics = [survey.topic(stream) for stream in survey.streams]
         report.images = survey.images()
-        report.drive = survey.drive(report.images)
+        report.drive = survey.drive()
         report.problems, report.notes = bag.problems, bag.recording.notes
     if report.drive is not None and _one_route(report.drive.places):
         report.notes.append(ROUTE)
@@ -292,27 +285,26 @@ class _Survey:
     def __init__(self, bag: Bag, image: str, odometry: str) -> None:
         # Empty where there is none: damaged bags also have topics without a name.
         self._bag, self._image, self._odometry = bag, image, odometry
-        self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
         self._motion: list[tuple[int, Any]] = []
         self._turned: list[tuple[int, float]] = []
         self._gyro, self._frozen, self._repeats = VisualGyro(), FrozenWatch(), 0
         self._sizes: dict[tuple[int, ...], int] = {}
         self._samples: list[Image] = []
-        self._streams: list[Stream] = []
-        count = bag.topics[image].count if image else 0
-        self._every = max(count // SAMPLES, 1)
-
-    def read(self) -> None:
-        self._streams = [self._stream(name) for name in self._bag.topics]
-        for stream, stamp_ns, value in self._bag.read(self._streams):
+        self._every = max(bag.topics[image].count // SAMPLES, 1) if image else 1
+        self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
+        self.streams = [self._stream(name) for name in bag.topics]
+        for stream, stamp_ns, value in bag.read(self.streams):
             self._stamps[stream.topic].append(stamp_ns)
-            if self._odometry and stream.topic == self._odometry.partition(':')[0]:
+            if self._drives(stream.topic):
                 self._motion.append((stamp_ns, value))
-            elif self._image and stream.topic == self._image:
+            elif image and stream.topic == image:
                 self._turned.append((stamp_ns, value))
 
+    def _drives(self, name: str) -> bool:
+        return bool(self._odometry) and name == self._odometry.partition(':')[0]
+
     def _stream(self, name: str) -> Stream:
-        if self._odometry and name == self._odometry.partition(':')[0]:
+        if self._drives(name):
             stream = self._bag.stream(self._odometry, decoding.odometry_of)
             stream.required = False
             return stream
@@ -335,15 +327,12 @@ class _Survey:
             self._samples.append(_small(image))
         return self._gyro.add(_unrolled(image))
 
-    def topics(self) -> list[TopicReport]:
-        reports = []
-        for stream in self._streams:
-            topic = self._bag.topics[stream.topic]
-            stamps = np.array(self._stamps[topic.name], np.int64)
-            report = TopicReport(topic.name, topic.kind, topic.count, stamps)
-            report.problems = list(self._problems(stream, report))
-            reports.append(report)
-        return reports
+    def topic(self, stream: Stream) -> TopicReport:
+        topic = self._bag.topics[stream.topic]
+        stamps = np.array(self._stamps[topic.name], np.int64)
+        report = TopicReport(topic.name, topic.kind, topic.count, stamps)
+        report.problems = list(self._problems(stream, report))
+        return report
 
     def _problems(self, stream: Stream, report: TopicReport) -> Iterator[str]:
         for reason, number in stream.tally.count.skipped.items():
@@ -353,10 +342,11 @@ class _Survey:
         longest = max(MAX_GAP_S, 5 / max(report.rate_hz, 1e-9))
         if report.largest_gap_s > longest and report.keeps_time:
             yield f'pause of {report.largest_gap_s:.1f} s'
-        if self._image and stream.topic == self._image and len(self._sizes) > 1:
-            sizes = ', '.join(f'{w}x{h}' for h, w in self._sizes)
-            yield f'images of several sizes: {sizes}'
-        if stream.topic == self._image and self._repeats > REPEATED * report.recorded:
+        if not self._image or stream.topic != self._image:
+            return
+        if len(self._sizes) > 1:
+            yield f'images of several sizes: {", ".join(f"{w}x{h}" for h, w in self._sizes)}'
+        if self._repeats > REPEATED * report.recorded:
             yield f'{self._repeats} of {report.recorded} images repeat the one before'
 
     def images(self) -> ImageTopic | None:
@@ -367,23 +357,18 @@ class _Survey:
         stamps = np.array(self._stamps[self._image], np.int64)
         return ImageTopic(self._image, stamps, width, height, guess_geometry(same), self._samples)
 
-    def drive(self, images: ImageTopic | None) -> DrivenPath | None:
+    def drive(self) -> DrivenPath | None:
+        """The path, and the delay of the camera's clock at images in the order of their stamps."""
         if not self._motion:
             return None
-        stream = next(s for s in self._streams if s.topic == self._odometry.partition(':')[0])
+        stream = next(one for one in self.streams if self._drives(one.topic))
         odometry = self._bag.to_odometry(stream, self._motion)
-        stamps = images.stamps_ns if images else np.zeros(0, np.int64)
-        tolerance = int(ODOMETRY_TOLERANCE_S * 1e9)
-        near = stamps[odometry.trajectory.covers(stamps, tolerance)]
-        return DrivenPath(
-            self._odometry, odometry, odometry.trajectory.at(near), self._clock(odometry)
-        )
-
-    def _clock(self, odometry: Odometry) -> CameraClock:
-        """The delay of the camera's clock, at images in the order of their stamps."""
         turned = sorted(self._turned)
         stamps = np.array([stamp for stamp, _ in turned], np.int64)
-        return camera_clock(odometry, stamps, [yaw for _, yaw in turned])
+        clock = camera_clock(odometry, stamps, [yaw for _, yaw in turned])
+        recorded = np.array(self._stamps.get(self._image, ()), np.int64)
+        near = recorded[odometry.trajectory.covers(recorded, int(ODOMETRY_TOLERANCE_S * 1e9))]
+        return DrivenPath(self._odometry, odometry, odometry.trajectory.at(near), clock)
 
 
 def _small(image: Image) -> Image:
@@ -482,13 +467,11 @@ def lacks(report: BagReport, config: InspectionConfig) -> list[str]:
         parts = ('images', report.images), ('odometry', report.drive)
         missing = ' and no '.join(name for name, part in parts if part is None)
         return [] if report.lacks else [f'no {missing} could be read']
-    places = report.drive.places
-    apart = abs(report.drive.clock.delay_ns) > DELAY_LIMIT_NS
-    return [
-        *([report.drive.clock_text()] if apart else []),
-        *_lacks_of_images(report.images, len(places), config),
-        *(_lacks_of_drive(places, config) if len(places) > 1 else ()),
-    ]
+    drive = report.drive
+    apart = abs(drive.clock.delay_ns) > DELAY_LIMIT_NS
+    found = [drive.clock_text()] if apart else []
+    found += _lacks_of_images(report.images, len(drive.places), config)
+    return [*found, *(_lacks_of_drive(drive.places, config) if len(drive.places) > 1 else ())]
 
 
 def _lacks_of_images(images: ImageTopic, used: int, config: InspectionConfig) -> Iterator[str]:

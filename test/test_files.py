@@ -264,7 +264,6 @@ def test_streams_may_be_closed(closed, tmp_path):
         'train bag --output bag/sample.mcap',
         'train bag --update model.npz --output bag/sample.mcap',
         'tune bag --model model.npz --output model.npz',
-        'tune odom.csv positions.csv --output odom.csv',
     ],
 )
 def test_no_output_replaces_what_is_read(command, tmp_path, monkeypatch, capsys):

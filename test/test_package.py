@@ -63,7 +63,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
     'training': (CORE | {'place_model'}, {'numpy'}),
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
-    'tuning': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
+    'tuning': (CORE | {'place_model', 'localizer', 'training', 'evaluation'}, NUMERIC),
     'updating': (CORE - {'metric'} | {'place_model', 'localizer'}, NUMERIC),
     'inspection': ({'data', 'camera', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
