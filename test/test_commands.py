@@ -457,7 +457,8 @@ def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
 
 def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
-    from sfa_localization.commands import demonstration
+    from sfa_localization import training
+    from sfa_localization.commands import demo, live_nodes
 
     def run_live(programs, logs, on_end):
         notes.extend(pair for words in programs.values() for pair in pairwise(words))
@@ -465,11 +466,11 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     def simulated(settings, out, progress):
         notes.extend([('world', settings.world), ('seed', settings.seed)])
 
-    patch.setattr(demonstration, 'simulate', simulated)
-    patch.setattr(demonstration, 'train', lambda *_args, **_named: None)
-    patch.setattr(demonstration, 'run_live', run_live)
-    patch.setattr(demonstration, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
-    patch.setattr(demonstration, '_write_results', lambda *_args: None)
+    patch.setattr(simulation, 'simulate', simulated)
+    patch.setattr(training, 'train', lambda *_args, **_named: None)
+    patch.setattr(live_nodes, 'run_live', run_live)
+    patch.setattr(demo, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
+    patch.setattr(demo, '_write_results', lambda *_args: None)
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:

@@ -43,11 +43,11 @@ PLACES = np.zeros((5, 3))
 
 def mark_a_demo(path: Path) -> None:
     pytest.importorskip('rclpy')
-    from sfa_localization.commands import demonstration
+    from sfa_localization.commands import demo
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demonstration, 'MARKER', path.name)
-        demonstration.prepare_folder(path.parent, DemoConfig())
+        patch.setattr(demo, 'MARKER', path.name)
+        demo.prepare_folder(path.parent, DemoConfig())
 
 
 WRITERS = {
