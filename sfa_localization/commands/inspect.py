@@ -88,14 +88,14 @@ def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
         file = f'{number}_{stem}' if len(reports) > 1 else stem
         if report.drive is not None:
             target, drive = folder / f'{file}_path.png', report.drive
-            title = f'{stem}:{drive.path_text().partition(":")[2]}'.replace(', along', ',\nalong')
+            title = f'{stem}: {report.facts["drive"]}'.replace(', along', ',\nalong')
             write_path(drive.odometry.poses, drive.places, title, target)
             shown[target] = 'The path by odometry, with the images'
         if report.images is not None:
             target, images = folder / f'{file}_pictures.png', report.images
-            title = f'{stem}: {images.topic}, {images.as_text()}'
+            title = f'{stem}: {images.topic}, {report.facts["images"]}'
             write_contact_sheet(images.samples, title, target)
             shown[target] = 'Images from all over the drive'
-        sections += bag_sections(report.as_dict(), report.facts, shown)
+        sections += bag_sections(report.as_dict(), [*map(': '.join, report.facts.items())], shown)
     write_page(folder, 'What is in the recording', *sections)
     print(f'{folder / PAGE}: written')
