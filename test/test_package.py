@@ -262,6 +262,18 @@ def test_no_module_imports_itself_through_others():
     assert circles == []
 
 
+STUDY_LINES = 4500
+"""Of all studies, at most."""
+
+
+def test_studies_stay_outside_of_the_package():
+    """They are not installed, and small; what is installed knows none (see ROOMS)."""
+    assert not [name for name in setup_arguments()['packages'] if 'study' in name]
+    files = list((ROOT / 'test/study').glob('*.py'))
+    assert 0 < sum(len(path.read_text('utf-8').splitlines()) for path in files) <= STUDY_LINES
+    assert wrong_imports(f'{NAME}.cli', ['study.tables.Work']) == {'study.tables.Work'}
+
+
 def test_one_version():
     manifest = ET.parse(ROOT / 'package.xml').getroot()
     assert manifest.findtext('version') == setup_arguments()['version']

@@ -71,8 +71,8 @@ def experiment(site: Site, results: Results, name: str, seed: int, figures: Path
         if name == 'simulator':
             descent = _random_start(study, features, seed, columns)
         if figures is not None:
-            firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
             if descent:
+                firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
                 report.panels_figure(figures / 'figure_4.png', {"paper's descent": descent})
             _figures(figures, name, study, paths)
         drift = mean_distance(odometry_from_start(study.truth, study.test), study.truth)

@@ -29,7 +29,7 @@ from study.results import (
     settings_of,
     usual_drift,
 )
-from study.year_report import table, year_figure
+from study.year_report import table
 
 RESULTS = 'year.json'
 FIRST = ('day', 'summer')
@@ -119,7 +119,7 @@ class _Work:
 def judge_year(
     out: Path, config: StudyConfig, plan: YearPlan, *, progress: bool = False
 ) -> list[Cell]:
-    """Judge all models in all months; write JSON, table and figure below `out`. Returns the cells:
+    """Judge all models in all months; write JSON and table below `out`. Returns the cells:
     `model`, `month`, `light`, `season`, and the scores that `_judged` names.
 
     Raises LocalizationError, also for a folder with anything else.
@@ -130,8 +130,7 @@ def judge_year(
     report.say(f'this takes about {plan.minutes} minutes on two cores')
     _fill(_Work(out, config, plan, report), results)
     save_text(out / 'year.md', table(results.cells) + '\n')
-    year_figure(out / 'year.png', results.cells)
-    report.say(f'see {out / "year.png"}')
+    report.say(f'see {out / "year.md"}')
     return results.cells
 
 
