@@ -18,7 +18,7 @@ from sfa_localization.commands.options import add_settings, numbers, settings
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, integrate
-from sfa_localization.filtering import odometry_arrays, read_odometry_table, read_truth
+from sfa_localization.filtering import read_odometry_table, read_truth
 from sfa_localization.simulation.drive import START_NS, Drive, record
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig
@@ -77,6 +77,17 @@ def _image_stamps(truth: Trajectory, config: SimulationConfig) -> Stamps:
     return np.asarray(truth.stamps_ns[chosen])
 
 
+def measured(log: Path) -> Odometry:
+    """What a log says; its poses are zero, and variances that it does not state."""
+    table = read_odometry_table(log)
+    columns = [
+        np.nan_to_num(table.columns.get(name, np.zeros(len(table))))
+        for name in ('v', 'omega', 'var_v', 'var_omega')
+    ]
+    stamps, values = table.stamps_ns, np.column_stack(columns)
+    return Odometry(stamps, np.zeros((len(stamps), 3)), values[:, :2], values[:, 2:])
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the bag, both logs, and what they leave open."""
     parser.description, parser.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
@@ -96,8 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.size:
         width, height = map(int, arguments.size)
         panorama = PanoramaConfig(width=width, height=height)
-    stamps, twists, variances = odometry_arrays(read_odometry_table(arguments.odometry))
-    odometry = Odometry(stamps, np.zeros((len(stamps), 3)), twists, variances)
+    odometry = measured(arguments.odometry)
     made = given_drive(read_truth(arguments.poses), odometry, config)
     # No tree stands in the way of a robot that did not know of it.
     garden = Garden(config.world, config, open_lawn=True)
