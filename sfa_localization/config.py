@@ -226,9 +226,7 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
 
 
 def require_defaults(
-    path: Path,
-    changes: Mapping[str, Mapping[str, Any]] | None = None,
-    found: Collection[str] = (),
+    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None, found: Collection[str] = ()
 ) -> None:
     """Raise ConfigError for a file with lines that are neither those of `render(changes)` nor
     values of the parameters `found`: a user's own.

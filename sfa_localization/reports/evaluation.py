@@ -228,9 +228,7 @@ def overview_figure(
     positions: Array,
     features: Array,
 ) -> None:
-    """Draw paths, position error and four firing maps of `features` (N, K) at `positions` (N, 2) m:
-    the figure of the README.
-    """
+    """Draw paths, errors and firing maps of `features` (N, K) at `positions` (N, 2) m in one."""
     figure = Figure(figsize=(13.0, 6.2), layout='constrained')
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
     _draw_paths(left.add_subplot(), truth, estimates, scores)

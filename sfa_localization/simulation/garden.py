@@ -20,14 +20,7 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.simulation.daylight import LIGHTS
-from sfa_localization.simulation.rendering import (
-    Light,
-    Scene,
-    Shape,
-    View,
-    panorama_view,
-    raw_view,
-)
+from sfa_localization.simulation.rendering import Light, Scene, Shape, View, panorama_view, raw_view
 from sfa_localization.simulation.seasons import in_season
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.simulation.textures import Floats

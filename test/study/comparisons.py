@@ -22,11 +22,7 @@ from sfa_localization.features.network import (
     Layer,
     standard_architecture,
 )
-from sfa_localization.features.network_training import (
-    LIGHT_STD,
-    ImageSequence,
-    train_network,
-)
+from sfa_localization.features.network_training import LIGHT_STD, ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -36,16 +32,7 @@ from study.results import BATCH, Cell, Results
 from study.retrieval import ImageRetrieval
 from study.signatures import FourierSignature, TurnedComponents
 from study.sites import Site, learned
-from study.trials import (
-    MONOMIALS,
-    STRAIGHT,
-    Features,
-    Study,
-    Trial,
-    mean_error,
-    slow_of,
-    turned_of,
-)
+from study.trials import MONOMIALS, STRAIGHT, Features, Study, Trial, mean_error, slow_of, turned_of
 
 BASELINES: dict[str, Callable[[Study, PlaceModel], Features]] = {
     'principal components of all rotations': (

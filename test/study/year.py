@@ -20,15 +20,7 @@ from sfa_localization.reports.figures import save_text
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import train
 from sfa_localization.updating import update
-from study.results import (
-    Cell,
-    Progress,
-    Results,
-    StudyConfig,
-    recorded,
-    settings_of,
-    usual_drift,
-)
+from study.results import Cell, Progress, Results, StudyConfig, recorded, settings_of, usual_drift
 from study.year_report import table
 
 RESULTS = 'year.json'
