@@ -182,13 +182,16 @@ def _of_any_robot(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[s
     general: dict[str, Any] = {}
     own: dict[str, Any] = {}
     for namespace, values in robots.items():
-        (general if '*' in namespace else {}).update(values)
-        for name, value in values.items() if '*' not in namespace else ():
-            if own.setdefault(name, value) != value:
+        if '*' in namespace:
+            general.update(values)
+            continue
+        for name, value in values.items():
+            if name in own and own[name] != value:
                 raise ConfigError(
                     f'{where}: {name} is {quoted(own[name])} for one robot and {quoted(value)} '
                     f'for another: give commands a file of one robot'
                 )
+        own.update(values)
     return {**general, **own}
 
 
