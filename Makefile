@@ -12,7 +12,7 @@ PY := $(VENV)/bin/python
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo reproduce test robustness animation fuzz soak bench lint format colcon matrix clean
+.PHONY: help env demo reproduce study test robustness animation fuzz soak bench lint format colcon matrix clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -26,7 +26,10 @@ demo: $(READY)  ## simulate, train, run the three nodes live, print the errors (
 	$(PY) -m sfa_localization demo $(ARGS)
 
 reproduce: $(READY)  ## the tables and figures of test/EVALUATION.md: hours, which go on where they ended (ARGS=--quick)
-	$(PY) -m sfa_localization reproduce all $(ARGS)
+	PYTHONPATH=.:test $(PY) -m study all $(ARGS)
+
+study: $(READY)  ## one of these studies, a year, or half-real bags (ARGS='baselines --quick'; ARGS=--help)
+	PYTHONPATH=.:test $(PY) -m study $(ARGS)
 
 test: $(READY)  ## run all tests, several files at once (ARGS='-k bag' for some of them)
 	$(PY) -m pytest $(PARALLEL) $(ARGS)

@@ -22,7 +22,6 @@ COMMANDS = (
     'tune',
     'config',
     'demo',
-    'reproduce',
 )
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 # colcon runs `setup.py install` or `develop`, and setup.cfg puts its executables into

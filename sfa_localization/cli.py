@@ -30,7 +30,6 @@ COMMANDS = {
     'tune': "Find the filter's noise parameters from bags; write them into a parameter file.",
     'config': 'Write the parameter file of nodes and trainer: every parameter, explained.',
     'demo': 'Simulate, train, run the three nodes live, and print their errors (about 5 minutes).',
-    'reproduce': "Reproduce the paper's tables and figures; compare baselines, ablations, light.",
 }
 LONGEST_ERROR = 4000
 """Characters of an error: the last lines of a program that failed, or a list of topics."""

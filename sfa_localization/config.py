@@ -37,22 +37,10 @@ from sfa_localization.nodes.settings import (
 
 S = TypeVar('S', bound=Settings)
 SECTIONS: dict[str, tuple[type[Settings], ...]] = {
-    'omnicam_node': (
-        NodeConfig,
-        OmnicamNodeConfig,
-        CaptureConfig,
-        CameraConfig,
-        PanoramaConfig,
-    ),
+    'omnicam_node': (NodeConfig, OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig),
     'sfa_node': (NodeConfig, SfaNodeConfig, WatchConfig),
     'ekf_node': (NodeConfig, EkfNodeConfig, FilterConfig),
-    'training': (
-        TopicNames,
-        BagConfig,
-        NetworkConfig,
-        SegmentConfig,
-        MetricConfig,
-    ),
+    'training': (TopicNames, BagConfig, NetworkConfig, SegmentConfig, MetricConfig),
 }
 """The settings of each section; the trainer reads camera and panorama from omnicam_node."""
 _KEY = 'ros__parameters'
@@ -86,18 +74,22 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
     Parameters of ROS, such as `use_sim_time`, are kept. Raises ConfigError, also for sections of
     several namespaces that differ: a command cannot choose between robots.
     """
-    known = {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
-    anywhere = {item.name for kinds in SECTIONS.values() for kind in kinds
-                for item in dataclasses.fields(kind)}  # fmt: skip
+    known = _items(section)
+    anywhere = {name for other in SECTIONS for name in _items(other)}
     shared: dict[str, Any] = {}
     robots: dict[str, dict[str, Any]] = {}
-    for key, values in _known_sections(path).items():
+    for key, values in _sections(path).items():
         namespace, _, node = key.strip('/').rpartition('/')
+        if node not in (*SECTIONS, *_WILDCARDS):
+            raise ConfigError(
+                f'{path}: unknown section {quoted(key)}; known are {", ".join(SECTIONS)}, also in '
+                f'a namespace, and /**'
+            )
         if node in _WILDCARDS:
             _require_known(values, anywhere, f'{path}: {key}')
             shared.update(values)
         elif node == section:
-            _require_known(values, set(known), f'{path}: {section}')
+            _require_known(values, known, f'{path}: {section}')
             robots.setdefault(namespace, {}).update(values)
     given = {**shared, **_of_any_robot(robots, f'{path}: {section}')}
     return {
@@ -105,6 +97,11 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
         for name, value in given.items()
         if name in known or _is_of_ros(name)
     }
+
+
+def _items(section: str) -> dict[str, dataclasses.Field[Any]]:
+    """The settings of a section by name."""
+    return {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
 
 
 def _is_of_ros(name: str) -> bool:
@@ -122,8 +119,7 @@ def ignored_sections(path: Path | str, node: str) -> list[str]:
 
     `node` is the full name, such as /robot1/ekf_node. Raises ConfigError for an unreadable file.
     """
-    name = _node_of(node)
-    keys = [key for key in _sections(Path(path)) if _node_of(key) == name]
+    keys = [key for key in _sections(Path(path)) if _node_of(key) == _node_of(node)]
     return [] if any(_matches(key, node) for key in keys) else keys
 
 
@@ -137,18 +133,6 @@ def _matches(key: str, node: str) -> bool:
     return re.fullmatch(''.join(parts), node) is not None
 
 
-def _known_sections(path: Path) -> dict[str, dict[str, Any]]:
-    """Return `_sections` of a file that holds no others than those of this package."""
-    sections = _sections(path)
-    for key in sections:
-        if _node_of(key) not in (*SECTIONS, *_WILDCARDS):
-            raise ConfigError(
-                f'{path}: unknown section {quoted(key)}; known are {", ".join(SECTIONS)}, also in '
-                f'a namespace, and /**'
-            )
-    return sections
-
-
 def _sections(path: Path) -> dict[str, dict[str, Any]]:
     """Return the parameters of each section by its key; namespaces are joined by slashes.
 
@@ -157,10 +141,9 @@ def _sections(path: Path) -> dict[str, dict[str, Any]]:
     try:
         # No pipe: it is empty when the next section is read.
         document = load_yaml(read_regular(path, LONGEST).decode())
-    except UnicodeDecodeError as error:
-        raise ConfigError(f'{path}: cannot be read: {error.reason}') from None
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read: {error.strerror or error}') from None
+    except (UnicodeDecodeError, OSError) as error:
+        reason = error.strerror or error if isinstance(error, OSError) else error.reason
+        raise ConfigError(f'{path}: cannot be read: {reason}') from None
     except ValueError as error:
         raise ConfigError(f'{path}: {error}') from None
     if document is None:
@@ -212,7 +195,7 @@ def _of_any_robot(robots: Mapping[str, Mapping[str, Any]], where: str) -> dict[s
     return {**general, **own}
 
 
-def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> None:
+def _require_known(values: Mapping[str, Any], known: Collection[str], where: str) -> None:
     for name in values:
         if name not in known and not _is_of_ros(name):
             raise ConfigError(f'{where}: unknown parameter {quoted(name)}{nearest(name, known)}')
@@ -246,9 +229,7 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
 
 
 def require_defaults(
-    path: Path,
-    changes: Mapping[str, Mapping[str, Any]] | None = None,
-    found: Collection[str] = (),
+    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None, found: Collection[str] = ()
 ) -> None:
     """Raise ConfigError for a file with lines that are neither those of `render(changes)` nor
     values of the parameters `found`: a user's own.
@@ -298,21 +279,12 @@ def _described(item: dataclasses.Field[Any]) -> str:
 
 
 def _text(value: Any) -> str:
+    """Return a value as YAML 1.1 has it: a float with a decimal point, since 1e-3 is a string."""
     if isinstance(value, (tuple, list)):
         return '[' + ', '.join(_text(entry) for entry in value) + ']'
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, float):
-        return _float(value)
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
-    return str(value)
-
-
-def _float(value: float) -> str:
-    """Return a float with a decimal point: for YAML 1.1, 1e-3 is a string."""
-    text = repr(value)
-    if 'e' in text:
-        digits, exponent = text.split('e')
-        return f'{digits if "." in digits else digits + ".0"}e{exponent}'
-    return text
+    digits, e, exponent = str(value).partition('e')
+    return f'{digits}{".0" if e and "." not in digits else ""}{e}{exponent}'

@@ -12,8 +12,8 @@ import json
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from sfa_localization.data.geometry import (
     rotation,
     wrap_angle,
 )
-from sfa_localization.data.progress import progress_bar
+from sfa_localization.data.progress import progress_bar, progress_over
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import State
@@ -205,17 +205,25 @@ def _scores(
     return scores
 
 
+@contextmanager
+def observed(
+    bag: Path, observer: Observer, recipe: Recipe, progress: bool, want_truth: bool = True
+) -> Iterator[tuple[Run, list[Observation]]]:
+    """A drive, and what the model makes of its images as the nodes see them; `recipe` is live.
+
+    Its images are there until the end. Raises BagError or DataError, also without a wanted truth.
+    """
+    with _cache() as cache:
+        run = _read(bag, cache, recipe, progress, want_truth)
+        title, images = _title(run), len(run.panoramas)
+        yield run, [*progress_over(observer.observe_run(run), title, images, shown=progress)]
+
+
 def _locate(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
     """Run the model over an aligning drive. Raises BagError or DataError."""
     recipe = replace(recipe, topics=_present(bag, recipe.topics))
-    with _cache() as cache:
-        run = _read(bag, cache, recipe, progress)
-        with _bar(run, progress) as bar:
-            observations = []
-            for observation in observer.observe_run(run):
-                observations.append(observation)
-                bar.update()
-        return _Located.of(run, observations)
+    with observed(bag, observer, recipe, progress) as found:
+        return _Located.of(*found)
 
 
 def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Replay:
@@ -250,13 +258,13 @@ def _cache() -> AbstractContextManager[Path]:
     return image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate')
 
 
-def _bar(run: Run, progress: bool) -> Any:
-    return progress_bar(f'locate the images of {run.name}', len(run.panoramas), shown=progress)
+def _title(run: Run) -> str:
+    return f'locate the images of {run.name}'
 
 
-def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool) -> Run:
-    run = read_drive(bag, cache, recipe, progress, want_truth=True, odometry_tolerance_s=0.0)
-    if run.ground_truth is None or len(run.ground_truth) < 2:
+def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
+    run = read_drive(bag, cache, recipe, progress, want_truth=truth, odometry_tolerance_s=0.0)
+    if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
         raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
     return run
 
@@ -271,7 +279,7 @@ def _replayed(
     observations: list[Observation] = []
     fused, states = [], dict[str, float]()
     before_ns = int(run.odometry.stamps_ns[0])
-    with _bar(run, progress) as bar:
+    with progress_bar(_title(run), len(run.panoramas), shown=progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
             if observation is not None:
                 observations.append(observation)

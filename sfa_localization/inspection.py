@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,34 +33,21 @@ from sfa_localization.metric.sufficiency import ROUTE, is_one_route
 
 PANORAMA, OMNIDIRECTIONAL, FISHEYE = 'panorama', 'omnidirectional', 'fisheye'
 DUAL_FISHEYE, ORDINARY = 'dual fisheye', 'ordinary camera'
+SAMPLES, SAMPLE_SIDE = 16, 640
+"""Images on the contact sheet, and their longer side (pixels)."""
 SECTORS = 6
 """Line directions that are distinguished, of 30 degrees each."""
-MIN_DIRECTIONS = 3
-"""Directions a drive needs: with fewer the shape of the map remains ambiguous."""
-MIN_SHARE = 0.05
-"""Share of the path along a direction that counts as driven."""
-MIN_COVERED = 0.65
-"""Share of the area that must be covered: below it whole regions are extrapolated."""
-MAX_LOST = 0.1
-"""Share of images that may lack odometry: more means that recording or clocks are wrong."""
-MAX_GAP_S = 2.0
-"""Longest pause of a topic (s) that is not reported."""
-EVEN, EVEN_SHARE = 3.0, 0.9
-"""A topic keeps time where this share of its intervals is no longer than this many usual ones."""
-SAMPLES = 16
-"""Images on the contact sheet: as many as can be seen at once."""
-SAMPLE_SIDE = 640
-"""Longer side of an image on the contact sheet (pixels)."""
-REPEATED = 0.05
-"""Share of images that repeat the one before that is worth a word."""
-STANDING_M = 0.02
-"""Images nearer to each other than this (m) were taken standing."""
-GRID = 100
-"""Points per axis at which coverage is evaluated: steps of 1 % of the area's extent."""
-DARK = 12.0
-"""Mean gray level of 255 below which an image is dark."""
-DELAY_SHOWN_S = 0.02
-"""A smaller delay of the camera is within the period of usual odometry."""
+# What a drive needs: directions, each with a share of the path (with fewer the shape of the map
+# remains ambiguous), and a share of the area (below it whole regions are extrapolated).
+MIN_DIRECTIONS, MIN_SHARE, MIN_COVERED = 3, 0.05, 0.65
+MAX_LOST = 0.1  # share of images that may lack odometry: more means that clocks are wrong
+MAX_GAP_S = 2.0  # longest pause of a topic that is not reported
+EVEN, EVEN_SHARE = 3.0, 0.9  # a topic keeps time where this share of intervals is that usual
+REPEATED = 0.05  # share of images that repeat the one before that is worth a word
+STANDING_M = 0.02  # images nearer to each other were taken standing
+GRID = 100  # points per axis at which coverage is evaluated: steps of 1 % of the area's extent
+DARK = 12.0  # mean gray level of 255 below which an image is dark
+DELAY_SHOWN_S = 0.02  # a smaller delay of the camera is within the period of usual odometry
 # Of an unrolled circle; the inner third shows the robot or the camera itself.
 _RADII, _ANGLES, _INNER = 30, 400, 10
 
@@ -81,7 +69,7 @@ class InspectionConfig(Settings):
 class TopicReport:
     """One topic: `problems` are sentences; stamps are those of the sender where it set them.
 
-    `recorded` is the count of the bag's metadata or index.
+    `recorded` is the count of the bag's metadata or index; what can be read of it has a stamp.
     """
 
     name: str
@@ -101,38 +89,31 @@ class TopicReport:
         return self.recorded > 0 and self.count == 0
 
     @property
-    def keeps_time(self) -> bool:
-        """Whether messages come evenly: a topic that speaks only on change does not pause."""
-        intervals = np.diff(self.stamps_ns)
-        usual = float(np.median(intervals)) if len(intervals) else 0.0
-        return bool(len(intervals) and np.mean(intervals <= EVEN * usual) >= EVEN_SHARE)
-
-    @property
     def rate_hz(self) -> float:
         """Messages per second, by the median of their intervals; 0 for fewer than two."""
-        if len(self.stamps_ns) < 2:
-            return 0.0
-        return float(1e9 / max(np.median(np.diff(self.stamps_ns)), 1))
+        steps = np.diff(self.stamps_ns)
+        return float(1e9 / max(np.median(steps), 1)) if len(steps) else 0.0
 
     @property
     def largest_gap_s(self) -> float:
         """Longest time between two messages."""
-        return float(np.diff(self.stamps_ns).max() * 1e-9) if len(self.stamps_ns) > 1 else 0.0
+        return float(np.diff(self.stamps_ns).max(initial=0) * 1e-9)
 
-    def as_text(self) -> str:
-        """Lines for a terminal."""
-        kind = self.kind.rsplit('/', 1)[-1] or 'unknown type'
-        line = f'  {self.name} ({kind}): {self.count} messages, {self.rate_hz:.1f} Hz'
-        return '\n'.join([line, *(f'    problem: {problem}' for problem in self.problems)])
+    @property
+    def pauses(self) -> bool:
+        """Whether messages come evenly but for a pause: a topic may speak only on change."""
+        steps = np.diff(self.stamps_ns)
+        even = len(steps) and np.mean(steps <= EVEN * np.median(steps)) >= EVEN_SHARE
+        return bool(even and self.largest_gap_s > max(MAX_GAP_S, 5 / max(self.rate_hz, 1e-9)))
 
     def as_dict(self) -> dict[str, Any]:
-        known = len(self.stamps_ns) > 0
+        stamps = self.stamps_ns.tolist()
         return {
             'type': self.kind,
             'count': self.count,
             'recorded': self.recorded,
-            'first_stamp_ns': int(self.stamps_ns[0]) if known else None,
-            'last_stamp_ns': int(self.stamps_ns[-1]) if known else None,
+            'first_stamp_ns': stamps[0] if stamps else None,
+            'last_stamp_ns': stamps[-1] if stamps else None,
             'rate_hz': round(self.rate_hz, 3),
             'largest_gap_s': round(self.largest_gap_s, 3),
             'problems': self.problems,
@@ -144,10 +125,10 @@ class ImageTopic:
     """A topic of images: size, guessed geometry, and samples from all over the drive."""
 
     topic: str
-    stamps_ns: Stamps
     width: int
     height: int
     geometry: str
+    stamps_ns: Stamps
     samples: list[Image]
 
     def as_dict(self) -> dict[str, Any]:
@@ -156,40 +137,25 @@ class ImageTopic:
 
 @dataclass
 class DrivenPath:
-    """The path of the robot by its odometry, and the poses at which images were taken."""
+    """The path of the robot by its odometry, and the poses (M, 3) of images with odometry.
+
+    `clock` says by how much images are stamped late, as far as turns show it.
+    """
 
     topic: str
     odometry: Odometry
     places: Array
-    """Poses (M, 3) of the images that have odometry."""
-    clock: CameraClock = field(default_factory=CameraClock)
-    """By how much the images are stamped late, as far as turns show it."""
-
-    def as_text(self) -> str:
-        """Lines for a terminal."""
-        clock = self.clock_text()
-        return '\n'.join([self.path_text(), *([f'  clocks: {clock}'] if clock else [])])
+    clock: CameraClock
 
     def clock_text(self) -> str:
         """What turns show about the clocks; '' where they show nothing."""
-        if not self.clock.known:
-            return ''
-        delay_s = self.clock.delay_ns * 1e-9
-        if abs(delay_s) < DELAY_SHOWN_S:
-            return 'images and odometry agree'
+        delay_s = self.clock.delay_s
+        if not self.clock.known or abs(delay_s) < DELAY_SHOWN_S:
+            return 'images and odometry agree' if self.clock.known else ''
         late = 'late' if delay_s > 0 else 'early'
         corrected = abs(self.clock.delay_ns) <= DELAY_LIMIT_NS
         remedy = 'train and the filter correct it' if corrected else 'synchronize the clocks'
         return f'images are stamped {abs(delay_s):.2f} s {late}: {remedy}'
-
-    def path_text(self) -> str:
-        """A line about the path."""
-        found = self.as_dict()
-        return (
-            f'  drive: {found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images '
-            f'over {found["area_m2"]:.0f} m2, {found["spacing_m"]:.2f} m apart, '
-            f'along {found["directions"]} of {SECTORS} directions'
-        )
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -219,6 +185,22 @@ class BagReport:
     drive: DrivenPath | None = None
     lacks: list[str] = field(default_factory=list)
 
+    @property
+    def facts(self) -> dict[str, str]:
+        """Camera, drive and clocks, in words."""
+        facts = {}
+        if self.images is not None:
+            facts['images'] = f'{self.images.width}x{self.images.height}, {self.images.geometry}'
+        if self.drive is not None:
+            found = self.drive.as_dict()
+            facts['drive'] = (
+                f'{found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images over '
+                f'{found["area_m2"]:.0f} m2, {found["spacing_m"]:.2f} m apart, '
+                f'along {found["directions"]} of {SECTORS} directions'
+            )
+            facts |= {'clocks': text} if (text := self.drive.clock_text()) else {}
+        return facts
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
@@ -237,12 +219,13 @@ class BagReport:
         """Lines for a terminal."""
         if self.error:
             return f'error: {self.error}'
-        lines = [self.path, *(topic.as_text() for topic in self.topics)]
-        if self.images is not None:
-            size = f'{self.images.width}x{self.images.height}'
-            lines.append(f'  images: {size}, {self.images.geometry}')
-        if self.drive is not None:
-            lines.append(self.drive.as_text())
+        lines = [self.path]
+        for topic in self.topics:
+            kind = topic.kind.rsplit('/', 1)[-1] or 'unknown type'
+            count = f'{topic.count} messages, {topic.rate_hz:.1f} Hz'
+            lines.append(f'  {topic.name} ({kind}): {count}')
+            lines += [f'    problem: {problem}' for problem in topic.problems]
+        lines += [f'  {name}: {fact}' for name, fact in self.facts.items()]
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
@@ -261,19 +244,15 @@ def inspect(
     config, topics = config or InspectionConfig(), topics or TopicNames()
     report = BagReport(str(path))
     with Bag(path, strict=strict, config=bag_config) as bag:
-        image, odometry = (
-            _found(bag, kind, name, report)
-            for kind, name in (('image', topics.image), ('odometry', topics.odometry))
-        )
-        survey = _Survey(bag, image, odometry)
-        survey.read()
-        report.topics = survey.topics()
+        image = _found(bag, 'image', topics.image, report)
+        survey = _Survey(bag, image, _found(bag, 'odometry', topics.odometry, report))
+        report.topics = [survey.topic(stream) for stream in survey.streams]
         report.images = survey.images()
-        report.drive = survey.drive(report.images)
+        report.drive = survey.drive()
         report.problems, report.notes = bag.problems, bag.recording.notes
     if report.drive is not None and _one_route(report.drive.places):
         report.notes.append(ROUTE)
-    report.lacks += lacks(report, config)
+    report.lacks += [] if report.lacks else lacks(report, config)
     return report
 
 
@@ -290,37 +269,27 @@ class _Survey:
     """One pass over all topics of a bag."""
 
     def __init__(self, bag: Bag, image: str, odometry: str) -> None:
-        # Empty where there is none: damaged bags also have topics without a name.
-        self._bag, self._image, self._odometry = bag, image, odometry
-        self._stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
-        self._motion: list[tuple[int, Any]] = []
-        self._turned: list[tuple[int, float]] = []
+        # None where there is none: damaged bags also have topics without a name.
+        self._bag, self._image, self._odometry = bag, image or None, odometry
+        self._driven = odometry.partition(':')[0] or None
+        self._values: dict[str, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
         self._gyro, self._frozen, self._repeats = VisualGyro(), FrozenWatch(), 0
-        self._sizes: dict[tuple[int, ...], int] = {}
+        self._sizes: Counter[tuple[int, ...]] = Counter()
         self._samples: list[Image] = []
-        self._streams: list[Stream] = []
-        count = bag.topics[image].count if image else 0
-        self._every = max(count // SAMPLES, 1)
-
-    def read(self) -> None:
-        self._streams = [self._stream(name) for name in self._bag.topics]
-        for stream, stamp_ns, value in self._bag.read(self._streams):
-            self._stamps[stream.topic].append(stamp_ns)
-            if self._odometry and stream.topic == self._odometry.partition(':')[0]:
-                self._motion.append((stamp_ns, value))
-            elif self._image and stream.topic == self._image:
-                self._turned.append((stamp_ns, value))
+        self._every = max(bag.topics[image].count // SAMPLES, 1) if image else 1
+        self.streams = [self._stream(name) for name in bag.topics]
+        for stream, stamp_ns, value in bag.read(self.streams):
+            self._values[stream.topic].append((stamp_ns, value))
 
     def _stream(self, name: str) -> Stream:
-        if self._odometry and name == self._odometry.partition(':')[0]:
+        if name == self._driven:
             stream = self._bag.stream(self._odometry, decoding.odometry_of)
             stream.required = False
             return stream
-        if self._image and name == self._image:
+        if name == self._image:
             return self._bag.any_stream(name, self._sample)
-        if self._bag.topics[name].kind in KINDS['image'].found:
-            return self._bag.any_stream(name, decoding.image_of)
-        return self._bag.any_stream(name, lambda message: None)
+        image = self._bag.topics[name].kind in KINDS['image'].found
+        return self._bag.any_stream(name, _checked if image else lambda message: None)
 
     def _sample(self, message: Any) -> float:
         """Decode an image; keep its size, and every so often the image itself.
@@ -329,61 +298,58 @@ class _Survey:
         """
         image = decoding.image_of(message)
         self._repeats += not self._frozen.add(image)
-        number = sum(self._sizes.values())
-        self._sizes[image.shape[:2]] = self._sizes.get(image.shape[:2], 0) + 1
-        if number % self._every == 0 and len(self._samples) < SAMPLES:
+        if self._sizes.total() % self._every == 0 and len(self._samples) < SAMPLES:
             self._samples.append(_small(image))
+        self._sizes[image.shape[:2]] += 1
         return self._gyro.add(_unrolled(image))
 
-    def topics(self) -> list[TopicReport]:
-        reports = []
-        for stream in self._streams:
-            topic = self._bag.topics[stream.topic]
-            stamps = np.array(self._stamps[topic.name], np.int64)
-            report = TopicReport(topic.name, topic.kind, topic.count, stamps)
-            report.problems = list(self._problems(stream, report))
-            reports.append(report)
-        return reports
+    def _stamps(self, name: str | None) -> Stamps:
+        return np.array([stamp for stamp, _ in self._values.get(name or '', ())], np.int64)
+
+    def topic(self, stream: Stream) -> TopicReport:
+        topic = self._bag.topics[stream.topic]
+        report = TopicReport(topic.name, topic.kind, topic.count, self._stamps(topic.name))
+        report.problems = list(self._problems(stream, report))
+        return report
 
     def _problems(self, stream: Stream, report: TopicReport) -> Iterator[str]:
         for reason, number in stream.tally.count.skipped.items():
             yield f'{number} of {report.recorded} messages: {reason}'
         if report.recorded == 0:
             yield 'no messages'
-        longest = max(MAX_GAP_S, 5 / max(report.rate_hz, 1e-9))
-        if report.largest_gap_s > longest and report.keeps_time:
+        if report.pauses:
             yield f'pause of {report.largest_gap_s:.1f} s'
-        if self._image and stream.topic == self._image and len(self._sizes) > 1:
-            sizes = ', '.join(f'{w}x{h}' for h, w in self._sizes)
-            yield f'images of several sizes: {sizes}'
-        if stream.topic == self._image and self._repeats > REPEATED * report.recorded:
+        if stream.topic != self._image:
+            return
+        if len(self._sizes) > 1:
+            yield f'images of several sizes: {", ".join(f"{w}x{h}" for h, w in self._sizes)}'
+        if self._repeats > REPEATED * report.recorded:
             yield f'{self._repeats} of {report.recorded} images repeat the one before'
 
     def images(self) -> ImageTopic | None:
-        if not self._samples:
+        if not self._samples or self._image is None:
             return None
-        height, width = max(self._sizes, key=lambda size: self._sizes[size])
-        same = [s for s in self._samples if s.shape == self._samples[0].shape]
-        stamps = np.array(self._stamps[self._image], np.int64)
-        return ImageTopic(self._image, stamps, width, height, guess_geometry(same), self._samples)
+        ((height, width), _), *_ = self._sizes.most_common(1)
+        geometry = guess_geometry([s for s in self._samples if s.shape == self._samples[0].shape])
+        stamps = self._stamps(self._image)
+        return ImageTopic(self._image, width, height, geometry, stamps, self._samples)
 
-    def drive(self, images: ImageTopic | None) -> DrivenPath | None:
-        if not self._motion:
+    def drive(self) -> DrivenPath | None:
+        """The path, and the delay of the camera's clock at images in the order of their stamps."""
+        if self._driven is None or not self._values[self._driven]:
             return None
-        stream = next(s for s in self._streams if s.topic == self._odometry.partition(':')[0])
-        odometry = self._bag.to_odometry(stream, self._motion)
-        stamps = images.stamps_ns if images else np.zeros(0, np.int64)
-        tolerance = int(ODOMETRY_TOLERANCE_S * 1e9)
-        near = stamps[odometry.trajectory.covers(stamps, tolerance)]
-        return DrivenPath(
-            self._odometry, odometry, odometry.trajectory.at(near), self._clock(odometry)
-        )
-
-    def _clock(self, odometry: Odometry) -> CameraClock:
-        """The delay of the camera's clock, at images in the order of their stamps."""
-        turned = sorted(self._turned)
+        stream = next(one for one in self.streams if one.topic == self._driven)
+        odometry = self._bag.to_odometry(stream, self._values[self._driven])
+        turned = sorted(self._values.get(self._image or '', ())) if self._image else []
         stamps = np.array([stamp for stamp, _ in turned], np.int64)
-        return camera_clock(odometry, stamps, [yaw for _, yaw in turned])
+        clock = camera_clock(odometry, stamps, [yaw for _, yaw in turned])
+        near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
+        return DrivenPath(self._odometry, odometry, odometry.trajectory.at(near), clock)
+
+
+def _checked(message: Any) -> None:
+    """Decode an image, which may be faulty, and forget it."""
+    decoding.image_of(message)
 
 
 def _small(image: Image) -> Image:
@@ -476,23 +442,22 @@ def directions(places: Array) -> int:
     return int((share >= MIN_SHARE).sum())
 
 
-def lacks(report: BagReport, config: InspectionConfig) -> list[str]:
+def _one_route(places: Array) -> bool:
+    """Whether training will learn one route, and no area, from images at places (M, 3)."""
+    moved = len(places) > 1 and path_length(places) >= 1.0
+    return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
+
+
+def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
     """The reasons why a bag is not enough to train on, each with the remedy."""
-    if report.images is None or report.drive is None:
-        parts = ('images', report.images), ('odometry', report.drive)
-        missing = ' and no '.join(name for name, part in parts if part is None)
-        return [] if report.lacks else [f'no {missing} could be read']
-    places = report.drive.places
-    apart = abs(report.drive.clock.delay_ns) > DELAY_LIMIT_NS
-    return [
-        *([report.drive.clock_text()] if apart else []),
-        *_lacks_of_images(report.images, len(places), config),
-        *(_lacks_of_drive(places, config) if len(places) > 1 else ()),
-    ]
-
-
-def _lacks_of_images(images: ImageTopic, used: int, config: InspectionConfig) -> Iterator[str]:
-    recorded = len(images.stamps_ns)
+    images, drive = report.images, report.drive
+    if images is None or drive is None:
+        parts = ('images', images), ('odometry', drive)
+        yield f'no {" and no ".join(name for name, part in parts if part is None)} could be read'
+        return
+    if abs(drive.clock.delay_ns) > DELAY_LIMIT_NS:
+        yield drive.clock_text()
+    used, recorded = len(drive.places), len(images.stamps_ns)
     if used < config.min_pictures:
         yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
     if used < (1 - MAX_LOST) * recorded:
@@ -504,12 +469,7 @@ def _lacks_of_images(images: ImageTopic, used: int, config: InspectionConfig) ->
         yield 'the images do not show all directions: an omnidirectional camera is needed'
     if float(np.mean([sample.mean() for sample in images.samples])) < DARK:
         yield 'the images are dark: open the lens or wait for daylight'
-
-
-def _one_route(places: Array) -> bool:
-    """Whether training will learn one route, and no area, from images at places (M, 3)."""
-    moved = len(places) > 1 and path_length(places) >= 1.0
-    return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
+    yield from _lacks_of_drive(drive.places, config) if used > 1 else ()
 
 
 def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:

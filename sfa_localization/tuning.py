@@ -3,34 +3,31 @@
 """Find the filter's noise parameters from drives: by likelihood, or by the paper's grid search.
 
 The likelihood needs no ground truth: the innovations of a well-tuned filter are as large as its
-covariances. The grid search of the paper (section 5.1) compares poses with ground truth, where
-there is some, and takes the least mean error.
+covariances. The grid search of the paper (section 5.1) takes the least mean error against truth.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from tempfile import gettempdir
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from sfa_localization.bags.drives import as_live, image_cache, read_drive
+from sfa_localization.bags.drives import as_live
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, align
-from sfa_localization.data.progress import progress_bar, progress_over
-from sfa_localization.data.run import Odometry, Run, Stamps, Trajectory
+from sfa_localization.data.progress import progress_bar
+from sfa_localization.data.run import Odometry, Stamps, Trajectory
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.evaluation import observed
 from sfa_localization.fusion.pose_filter import PoseFilter, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Observer
@@ -61,12 +58,8 @@ class TuneConfig(Settings):
     trials: int = setting(120, 'settings to try by likelihood', low=10, high=100_000)
 
 
-@dataclass(frozen=True, slots=True)
-class ImagePoses:
-    """Poses from the usable images of a drive: stamps (N,), poses (N, 3), covariances (N, 3, 3).
-
-    An unusable image changes nothing in the filter.
-    """
+class ImagePoses(NamedTuple):
+    """Of the usable images of a drive: stamps (N,), poses (N, 3), covariances (N, 3, 3)."""
 
     stamps_ns: Stamps
     poses: Array
@@ -81,6 +74,19 @@ class TuningDrive:
     images: ImagePoses
     truth: Trajectory | None = None
     correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
+
+    def halves(self) -> list[TuningDrive]:
+        """The drive before and after the middle of its images."""
+        stamps = self.images.stamps_ns
+        middle_ns = int(np.median(stamps)) if len(stamps) else 0
+        parts = []
+        for early in (True, False):
+            rows = (self.odometry.stamps_ns < middle_ns) == early
+            seen = (stamps < middle_ns) == early
+            odometry = [getattr(self.odometry, item.name)[rows] for item in fields(self.odometry)]
+            images = ImagePoses(*(part[seen] for part in self.images))
+            parts.append(replace(self, odometry=Odometry(*odometry), images=images))
+        return parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,149 +109,85 @@ class Validation:
         return self.after < self.before
 
 
-def validate(
-    parts: Sequence[TuningDrive],
-    config: FilterConfig,
-    found: Callable[[list[int]], FilterConfig],
-    cost: Callable[[Iterable[TuningDrive], FilterConfig], float],
-) -> Validation | None:
-    """Leave one part out, tune on the others (`found` of their indices), and judge on that one.
-
-    None where a part has too few images to decide anything.
-    """
-    if len(parts) < 2 or min(len(part.images.stamps_ns) for part in parts) < MIN_IMAGES:
-        return None
-    costs = []
-    for left_out, part in enumerate(parts):
-        others = [i for i in range(len(parts)) if i != left_out]
-        costs.append((cost([part], config), cost([part], found(others))))
-    before, after = np.mean(costs, axis=0).tolist()
-    return Validation(before, after)
-
-
-def parts_of(drives: Sequence[TuningDrive]) -> list[TuningDrive]:
-    """The drives, or the halves of a single one."""
-    if len(drives) != 1:
-        return list(drives)
-    odometry, images = drives[0].odometry, drives[0].images
-    middle_ns = int(np.median(images.stamps_ns)) if len(images.stamps_ns) else 0
-    halves = []
-    for early in (True, False):
-        rows = (odometry.stamps_ns < middle_ns) == early
-        seen = (images.stamps_ns < middle_ns) == early
-        halves.append(
-            dataclasses.replace(
-                drives[0],
-                odometry=Odometry(
-                    *(getattr(odometry, item.name)[rows] for item in dataclasses.fields(odometry))
-                ),
-                images=ImagePoses(
-                    *(getattr(images, item.name)[seen] for item in dataclasses.fields(images))
-                ),
-            )
-        )
-    return halves
-
-
-def middle(configs: Sequence[FilterConfig], names: Sequence[str]) -> FilterConfig:
-    """The first of some settings, with the geometric means of all for the named numbers."""
-    means = {
-        name: math.exp(float(np.mean([math.log(getattr(one, name) or _LEAST) for one in configs])))
-        for name in names
-    }
-    return dataclasses.replace(configs[0], **means)  # type: ignore[arg-type]
-
-
-def read_drives(
-    bags: Sequence[Path],
-    model: PlaceModel,
-    recipe: Recipe,
-    want_truth: bool,
-    progress: bool,
-    watch: WatchConfig | None = None,
-) -> list[TuningDrive]:
-    """Each bag's odometry, and the poses of its images by the model. Raises BagError."""
-    drives = []
-    for bag in bags:
-        with image_cache(Path(gettempdir()) / 'sfa_localization_tune') as cache:
-            run = read_drive(
-                bag,
-                cache,
-                as_live(recipe, model.panorama),
-                progress,
-                want_truth=want_truth,
-                odometry_tolerance_s=0.0,
-            )
-            images = _locate(run, Observer(model, watch), progress)
-            drive = TuningDrive(run.odometry, images, run.ground_truth, model.error_correlation)
-            drives.append(drive)
-    return drives
-
-
-def _locate(run: Run, observer: Observer, progress: bool) -> ImagePoses:
-    count = len(run.panoramas)
-    title = f'locate the images of {run.name}'
-    observations = progress_over(observer.observe_run(run), title, count, shown=progress)
-    usable = [one for one in observations if not one.problem]
-    return ImagePoses(
+def read_drive(
+    bag: Path, model: PlaceModel, recipe: Recipe, watch: WatchConfig | None, want_truth: bool
+) -> TuningDrive:
+    """A bag's odometry, and the poses of its images by the model. Raises BagError, DataError."""
+    live = as_live(recipe, model.panorama)
+    with observed(bag, Observer(model, watch), live, True, want_truth) as (run, observations):
+        usable = [one for one in observations if not one.problem]
+    images = ImagePoses(
         np.array([one.stamp_ns for one in usable], np.int64),
         np.reshape([one.pose for one in usable], (-1, 3)),
         np.reshape([one.covariance for one in usable], (-1, 3, 3)),
     )
+    return TuningDrive(run.odometry, images, run.ground_truth, model.error_correlation)
 
 
 def tune(
     drives: Sequence[TuningDrive], config: FilterConfig, how: TuneConfig, progress: bool
 ) -> Outcome:
     """The best setting by the method of `how`. Raises DataError without enough data."""
+    images = sum(len(drive.images.stamps_ns) for drive in drives)
+    if images < MIN_IMAGES:
+        raise DataError(f'{images} images are too few to tune on: {MIN_IMAGES} at least')
     total = len(FACTORS) ** 2 if how.method == 'grid' else how.trials
     with progress_bar(f'tune by {how.method}', total, 'trials', shown=progress) as bar:
         if how.method == 'grid':
-            return tune_by_grid(drives, config, bar.update)[0]
+            return tune_by_grid(drives, config, bar.update)
         return tune_by_likelihood(drives, config, how.trials, bar.update)
 
 
+def validate(
+    drives: Sequence[TuningDrive], config: FilterConfig, how: TuneConfig, progress: bool
+) -> Validation | None:
+    """Leave out one drive at a time, or one half of a single one: tune on the others, judge on it.
+
+    None where one has too few images to decide anything.
+    """
+    parts = drives if len(drives) > 1 else drives[0].halves()
+    if min(len(part.images.stamps_ns) for part in parts) < MIN_IMAGES:
+        return None
+    cost = error_cost if how.method == 'grid' else likelihood_cost
+    costs = []
+    for part in parts:
+        found = tune([other for other in parts if other is not part], config, how, progress)
+        costs.append((cost([part], config), cost([part], found.config)))
+    return Validation(*np.mean(costs, axis=0).tolist())
+
+
 def tune_by_likelihood(
-    drives: Sequence[TuningDrive],
-    config: FilterConfig,
-    trials: int,
-    tried: Callable[[], object],
+    drives: Sequence[TuningDrive], config: FilterConfig, trials: int, tried: Callable[[], object]
 ) -> Outcome:
     """The setting under which the innovations are likeliest; `tried` is called after each trial.
 
     Nelder-Mead over the logarithms of TUNED: the cost is not smooth where the gate decides.
     """
-    _require_data(drives)
     start = np.log([getattr(config, name) or _LEAST for name in TUNED])
 
-    def cost(logs: NDArray[np.float64]) -> float:
+    def cost(logs: Array) -> float:
         tried()
         pull = _PULL * float(np.sum((logs - start) ** 2))
-        return likelihood_cost(drives, _with_logs(config, logs)) + pull
+        return likelihood_cost(drives, with_logs(config, logs)) + pull
 
     simplex = np.vstack([start, start + _FIRST_STEP * np.eye(len(TUNED))])
-    found = minimize(
-        cost,
-        start,
-        method='Nelder-Mead',
-        options={'maxfev': trials, 'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 1e-3},
-    )
-    return Outcome(_with_logs(config, found.x), float(found.fun))
+    options = {'maxfev': trials, 'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 1e-3}
+    found = minimize(cost, start, method='Nelder-Mead', options=options)
+    return Outcome(with_logs(config, found.x), float(found.fun))
 
 
 def tune_by_grid(
     drives: Sequence[TuningDrive], config: FilterConfig, tried: Callable[[], object]
-) -> list[Outcome]:
-    """The paper's grid search: every pair of factors, the least mean error against truth first."""
-    _require_data(drives)
+) -> Outcome:
+    """The paper's grid search: the pair of factors with the least mean error against truth."""
     if any(drive.truth is None for drive in drives):
         raise DataError('the grid search needs ground truth in every bag; use the likelihood')
     outcomes = []
     for images, odometry in itertools.product(FACTORS, FACTORS):
-        trial = dataclasses.replace(config, measurement_factor=images, odometry_factor=odometry)
+        trial = replace(config, measurement_factor=images, odometry_factor=odometry)
         outcomes.append(Outcome(trial, error_cost(drives, trial)))
         tried()
-    return sorted(outcomes, key=lambda outcome: outcome.cost)
+    return min(outcomes, key=lambda outcome: outcome.cost)
 
 
 def likelihood_cost(drives: Iterable[TuningDrive], config: FilterConfig) -> float:
@@ -295,17 +237,11 @@ def _fuse(fused: PoseFilter, drive: TuningDrive) -> Iterator[Update]:
             yield fused.add_measurement(stamp_ns, images.poses[i], images.covariances[i])
 
 
-def _with_logs(config: FilterConfig, logs: NDArray[np.float64]) -> FilterConfig:
-    """The settings with other values of TUNED, given as logarithms, kept inside their ranges."""
-    ranges = {item.name: item.metadata for item in dataclasses.fields(config)}
+def with_logs(config: FilterConfig, logs: Array) -> FilterConfig:
+    """The settings with other values of TUNED, given as logarithms (4,), kept in their ranges."""
+    ranges = {item.name: item.metadata for item in fields(config)}
     changes: dict[str, Any] = {}
     for name, log in zip(TUNED, logs, strict=True):
         low, high = ranges[name]['low'] or _LEAST, ranges[name]['high']
         changes[name] = float(np.clip(math.exp(min(log, 50.0)), low, high))
-    return dataclasses.replace(config, **changes)
-
-
-def _require_data(drives: Sequence[TuningDrive]) -> None:
-    images = sum(len(drive.images.stamps_ns) for drive in drives)
-    if images < MIN_IMAGES:
-        raise DataError(f'{images} images are too few to tune on: {MIN_IMAGES} at least')
+    return replace(config, **changes)

@@ -211,7 +211,6 @@ BASE = {
     'tune': '{data}/test --model {data}/model.npz --output {out}/out.yaml --trials 10',
     'config': '',
     'demo': '--out {out}/demo',
-    'reproduce': 'light --out {out}/light',
 }
 DAMAGED = {
     'train': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
@@ -226,16 +225,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--size': Case('--size 40x12', lambda a, b: b.bag()['pictures'].shape[1:3] == (12, 40)),
         '--compressed': Case(
             '--compressed', lambda a, b: '/panorama/compressed' in {*b.bag()['topics']}
-        ),
-        '--poses': Case(
-            '--poses {data}/positions.csv --area 20x20',
-            lambda a, b: a.code == 1 and 'give both' in a.text and len(b.bag()['truth']) > 10,
-            beside='--odometry {data}/odom.csv',
-        ),
-        '--odometry': Case(
-            '--odometry {data}/odom.csv',
-            lambda a, b: a.code == 1 and len(b.bag()['odometry'].poses) > 100,
-            beside='--poses {data}/positions.csv --area 20x20',
         ),
         '--trajectory': Case('--trajectory curves', another_drive),
         '--seed': Case('--seed 2', another_drive),
@@ -395,20 +384,6 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--seed': Case('--seed 4', noted(('seed', 4))),
         '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
     },
-    'reproduce': {
-        '--out': Case('--out {out}/elsewhere', written('elsewhere/matrix.png')),
-        '--quick': Case('--quick', noted(('area', (8.0, 8.0)))),
-        '--world': Case('--world 3', noted(('world', 3))),
-        '--seed': Case('--seed 40', noted(('seed', 40), ('seed', 41))),
-        '--seeds': Case(
-            '--seeds 2', noted(('simulator', 2)), base='simulator --out {out}/simulator'
-        ),
-        '--test': Case(
-            '--test {data}/test',
-            lambda a, b: a.code == 1 and b.code == 0 and ('test', 'test') in b.noted,
-            base='baselines {data}/bag --out {out}/baselines',
-        ),
-    },
 }
 SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
 
@@ -425,14 +400,14 @@ def small_network() -> Iterator[None]:
 
 @pytest.fixture(scope='module', autouse=True)
 def gardens() -> Iterator[None]:
-    """Build a garden once for all drives in it: seed, area, light, season and lawn make it."""
+    """Build a garden once for all drives in it: seed, area, light and season make it."""
     made: dict[Any, simulation.Garden] = {}
     garden = simulation.Garden
 
-    def again(seed: int, settings: SimulationConfig, open_lawn: bool) -> simulation.Garden:
-        place = (seed, settings.area, settings.light, settings.season, open_lawn)
+    def again(seed: int, settings: SimulationConfig) -> simulation.Garden:
+        place = (seed, settings.area, settings.light, settings.season)
         if place not in made:
-            made[place] = garden(seed, settings, open_lawn)
+            made[place] = garden(seed, settings)
         return made[place]
 
     with pytest.MonkeyPatch.context() as patch:
@@ -442,14 +417,12 @@ def gardens() -> Iterator[None]:
 
 @contextlib.contextmanager
 def watched(name: str, notes: list[Any]) -> Iterator[None]:
-    """Note what no output shows; minutes of work of `demo` and `reproduce` are left out."""
+    """Note what no output shows; minutes of work of `demo` are left out."""
     with pytest.MonkeyPatch.context() as patch:
         if name == 'play':
             watch_play(patch, notes)
         if name == 'demo':
             watch_demo(patch, notes)
-        if name == 'reproduce':
-            watch_reproduce(patch, notes)
         if name == 'train':
             watch_cluster(patch, notes)
         yield
@@ -484,7 +457,8 @@ def watch_play(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
 
 def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     """Only the demo's own steps run, with nothing in their places."""
-    from sfa_localization.commands import demonstration
+    from sfa_localization import training
+    from sfa_localization.commands import demo, live_nodes
 
     def run_live(programs, logs, on_end):
         notes.extend(pair for words in programs.values() for pair in pairwise(words))
@@ -492,41 +466,11 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     def simulated(settings, out, progress):
         notes.extend([('world', settings.world), ('seed', settings.seed)])
 
-    patch.setattr(demonstration, 'simulate', simulated)
-    patch.setattr(demonstration, 'train', lambda *_args, **_named: None)
-    patch.setattr(demonstration, 'run_live', run_live)
-    patch.setattr(demonstration, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
-    patch.setattr(demonstration, '_write_results', lambda *_args: None)
-
-
-def watch_reproduce(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
-    """Drives are noted instead of simulated, and none is trained on or judged."""
-    from sfa_localization.commands import light_matrix, paper_tables, reproduction
-
-    def simulated(settings, out, panorama, progress):
-        notes.extend((name, getattr(settings, name)) for name in ('world', 'seed', 'area'))
-
-    def judged(_model, _bag, _trained, transform):
-        return {'sfa': {'mean_m': 0.1}, 'localized': 1.0}, transform
-
-    def noted_experiment(_site, _results, name, seed, _figures):
-        notes.append((name, seed))
-
-    def noted_baselines(site, _results, _world):
-        notes.append(('test', site.test.name))
-
-    patch.setattr(paper_tables.Site, 'simulated', lambda *_args: None)
-    patch.setattr(paper_tables, 'experiment', noted_experiment)
-    patch.setattr(paper_tables, 'baselines', noted_baselines)
-    patch.setattr(reproduction, 'simulate', simulated)
-    patch.setattr(light_matrix, 'train', lambda *_args, **_named: None)
-    patch.setattr(light_matrix.PlaceModel, 'load', lambda _path: None)
-    patch.setattr(light_matrix, '_read', lambda *_args: None)
-    patch.setattr(light_matrix, '_retrieval', lambda _runs: None)
-    patch.setattr(light_matrix, '_paper_recipe', lambda *_args: lambda _run: {'mean_m': 0.4})
-    patch.setattr(light_matrix, '_slow_alone', lambda *_args: {'mean_m': 0.3})
-    patch.setattr(light_matrix, '_retrieved', lambda *_args: {'mean_m': 0.2})
-    patch.setattr(light_matrix, '_judged', judged)
+    patch.setattr(simulation, 'simulate', simulated)
+    patch.setattr(training, 'train', lambda *_args, **_named: None)
+    patch.setattr(live_nodes, 'run_live', run_live)
+    patch.setattr(demo, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
+    patch.setattr(demo, '_write_results', lambda *_args: None)
 
 
 def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:

@@ -10,8 +10,7 @@ import json
 import numpy as np
 import pytest
 
-pytest.importorskip('rclpy')
-from sfa_localization.commands import demonstration
+from sfa_localization.commands import demo
 from sfa_localization.commands.demo import DemoConfig
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Trajectory
@@ -29,39 +28,37 @@ def fill(out) -> None:
 def test_a_foreign_folder_is_not_changed(tmp_path):
     (tmp_path / 'thesis.tex').write_text('ten years of work')
     with pytest.raises(LocalizationError, match='--out'):
-        demonstration.prepare_folder(tmp_path, DemoConfig())
+        demo.prepare_folder(tmp_path, DemoConfig())
     assert [path.name for path in tmp_path.iterdir()] == ['thesis.tex']
 
 
 def test_bags_of_the_same_settings_are_reused(tmp_path):
     out = tmp_path / 'new' / 'demo'
-    demonstration.prepare_folder(out, DemoConfig(world=3))
+    demo.prepare_folder(out, DemoConfig(world=3))
     fill(out)
-    demonstration.prepare_folder(out, DemoConfig(world=3))
+    demo.prepare_folder(out, DemoConfig(world=3))
     names = {path.name for path in out.iterdir()}
-    assert names == {*OURS, demonstration.MARKER, 'my_notes.txt'}, (
-        'old results must not survive a failure'
-    )
+    assert names == {*OURS, demo.MARKER, 'my_notes.txt'}, 'old results must not survive a failure'
 
 
 @pytest.mark.parametrize('changed', [DemoConfig(world=4), DemoConfig(world=3, seed=2)])
 def test_bags_of_other_settings_are_removed(tmp_path, changed):
-    demonstration.prepare_folder(tmp_path, DemoConfig(world=3))
+    demo.prepare_folder(tmp_path, DemoConfig(world=3))
     fill(tmp_path)
-    demonstration.prepare_folder(tmp_path, changed)
-    assert {path.name for path in tmp_path.iterdir()} == {demonstration.MARKER, 'my_notes.txt'}
-    assert json.loads((tmp_path / demonstration.MARKER).read_text())['world'] == changed.world
+    demo.prepare_folder(tmp_path, changed)
+    assert {path.name for path in tmp_path.iterdir()} == {demo.MARKER, 'my_notes.txt'}
+    assert json.loads((tmp_path / demo.MARKER).read_text())['world'] == changed.world
 
 
 @pytest.mark.parametrize('name', ['file', 'file/demo'])
 def test_a_folder_that_cannot_be_created_is_named(tmp_path, name):
     (tmp_path / 'file').write_text('')
     with pytest.raises(LocalizationError, match='cannot be written'):
-        demonstration.prepare_folder(tmp_path / name, DemoConfig())
+        demo.prepare_folder(tmp_path / name, DemoConfig())
 
 
 def test_distance_of_two_paths_by_hand():
     stamps = np.array([0, 10, 20], np.int64)
     a = Trajectory(stamps, np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], float))
     b = Trajectory(stamps[:2], np.array([[0, 3, 0], [1, 5, 0]], float))
-    assert demonstration.mean_distance(a, b) == pytest.approx(4.0)
+    assert demo.mean_distance(a, b) == pytest.approx(4.0)

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import yaml
 from filter_drives import Drive
+from study.__main__ import study_parser
 
 from sfa_localization import cli
 from sfa_localization.data.settings import Settings
@@ -88,6 +89,8 @@ def check(words: list[str]) -> None:
         check_ros2(rest)
     elif program == 'make':
         targets = [word for word in rest if '=' not in word]
+        if targets == ['study'] and rest[1:]:
+            study_parser().parse_args(shlex.split(rest[1].removeprefix('ARGS=')))
         subprocess.run(['make', '--dry-run', *targets], cwd=ROOT, check=True, capture_output=True)
     elif words[:3] == ['python', '-m', 'sfa_localization']:
         check_command(*words[3:])

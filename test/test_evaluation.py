@@ -74,14 +74,11 @@ def test_unusable_pictures_are_not_scored(bag, tmp_path):
 
 
 def test_tune_leaves_out_the_same_pictures(bag):
-    counts = [
-        len(
-            tuning.read_drives([bag], PictureReader(), Recipe(), False, False, watch)[
-                0
-            ].images.poses
-        )
+    drives = [
+        tuning.read_drive(bag, PictureReader(), Recipe(), watch, False)
         for watch in (None, WatchConfig(novelty_limit=1.5))
     ]
+    counts = [len(drive.images.poses) for drive in drives]
     assert counts == [102, 102 - 3]
 
 

@@ -33,7 +33,7 @@ from sfa_localization.data.errors import BagError, DataError, LocalizationError
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.inspection import BagReport
 from sfa_localization.reports import bag as report_bag
-from sfa_localization.reports import evaluation as report
+from sfa_localization.reports import figures
 
 BAGS = Path(__file__).parents[1] / 'bags'
 FULL = OSError(errno.ENOSPC, 'No space left on device')
@@ -43,11 +43,11 @@ PLACES = np.zeros((5, 3))
 
 def mark_a_demo(path: Path) -> None:
     pytest.importorskip('rclpy')
-    from sfa_localization.commands import demonstration
+    from sfa_localization.commands import demo
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demonstration, 'MARKER', path.name)
-        demonstration.prepare_folder(path.parent, DemoConfig())
+        patch.setattr(demo, 'MARKER', path.name)
+        demo.prepare_folder(path.parent, DemoConfig())
 
 
 WRITERS = {
@@ -58,9 +58,9 @@ WRITERS = {
     'figures of an evaluation': lambda p: evaluation.write_json(p, {'ekf': 1}),
     'path of the filter': lambda p: filtering.write_tum(p, np.arange(5), PLACES),
     'what was inspected': lambda p: inspect_command.write_json(p, [BagReport('bag')]),
-    'figure': lambda p: report.save(Figure(), p),
-    'text of a report': lambda p: report.save_text(p, 'text'),
-    'contact sheet': lambda p: report_bag.write_contact_sheet([PICTURE], 'bag', p),
+    'figure': lambda p: figures.save(Figure(), p),
+    'text of a report': lambda p: figures.save_text(p, 'text'),
+    'contact sheet': lambda p: figures.write_contact_sheet([PICTURE], 'bag', p),
     'path of a bag': lambda p: report_bag.write_path(PLACES, PLACES, 'bag', p),
     'marker of the demo': mark_a_demo,
 }
@@ -264,7 +264,6 @@ def test_streams_may_be_closed(closed, tmp_path):
         'train bag --output bag/sample.mcap',
         'train bag --update model.npz --output bag/sample.mcap',
         'tune bag --model model.npz --output model.npz',
-        'tune odom.csv positions.csv --output odom.csv',
     ],
 )
 def test_no_output_replaces_what_is_read(command, tmp_path, monkeypatch, capsys):

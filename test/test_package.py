@@ -63,7 +63,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
     'training': (CORE | {'place_model'}, {'numpy'}),
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
-    'tuning': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
+    'tuning': (CORE | {'place_model', 'localizer', 'training', 'evaluation'}, NUMERIC),
     'updating': (CORE - {'metric'} | {'place_model', 'localizer'}, NUMERIC),
     'inspection': ({'data', 'camera', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
@@ -260,6 +260,18 @@ def test_robot_needs_no_training_code(node):
 def test_no_module_imports_itself_through_others():
     circles = [m for m in MODULES if any(m in reached(other) for other in own(m) - {m})]
     assert circles == []
+
+
+STUDY_LINES = 4500
+"""Of all studies, at most."""
+
+
+def test_studies_stay_outside_of_the_package():
+    """They are not installed, and small; what is installed knows none (see ROOMS)."""
+    assert not [name for name in setup_arguments()['packages'] if 'study' in name]
+    files = list((ROOT / 'test/study').glob('*.py'))
+    assert 0 < sum(len(path.read_text('utf-8').splitlines()) for path in files) <= STUDY_LINES
+    assert wrong_imports(f'{NAME}.cli', ['study.tables.Work']) == {'study.tables.Work'}
 
 
 def test_one_version():

@@ -78,7 +78,7 @@ def test_report_writes_whole_figures_and_nothing_else(tmp_path, truth, scores):
     report.write_report(
         folder, truth, {'ekf': late, 'my filter': late}, scores, positions, features
     )
-    names = {'trajectories', 'errors', 'firing_maps', 'heading', 'overview'}
+    names = {'trajectories', 'errors', 'firing_maps', 'overview'}
     assert {path.name for path in folder.iterdir()} == {f'{n}.png' for n in names} | {'report.md'}
     for name in names:
         picture = cv2.imread(str(folder / f'{name}.png'))

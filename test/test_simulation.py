@@ -15,15 +15,14 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from sfa_localization.bags.reader import Bag
 from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.cli import main
-from sfa_localization.data.errors import BagError, ConfigError, DataError
+from sfa_localization.data.errors import BagError, ConfigError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
-from sfa_localization.data.run import Odometry, Trajectory, differences, integrate
+from sfa_localization.data.run import differences, integrate
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.simulation.drive import (
     START_NS,
@@ -34,7 +33,6 @@ from sfa_localization.simulation.drive import (
     wandering,
 )
 from sfa_localization.simulation.garden import Garden, panel
-from sfa_localization.simulation.given_drive import given_drive
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view
 from sfa_localization.simulation.routes import CLEARANCE_M, ROUTES, Lawn
 from sfa_localization.simulation.settings import SimulationConfig
@@ -370,62 +368,8 @@ def test_bag_holds_every_message_in_order(tmp_path, options, topic):
     assert image_stamps == list(recorded.image_stamps_ns)
 
 
-# Drives of a real robot: its true poses, and the odometry that it measured.
-
-
-def half_real(gap=False):
-    """A circle of 2 m radius at 20 Hz, with the jitter of motion capture, and odometry at 10 Hz."""
-    rng, seconds = np.random.default_rng(5), np.arange(0, 40, 0.05)
-    angle = 0.25 * seconds
-    poses = np.column_stack([2 * np.cos(angle), 2 * np.sin(angle), angle + np.pi / 2])
-    poses[:, 2] = wrap_angle(poses[:, 2])
-    poses[:, :2] += 2e-4 * rng.standard_normal((len(poses), 2))
-    kept = (seconds < 10) | (seconds > 20) if gap else np.ones(len(seconds), bool)
-    truth = Trajectory(np.rint(seconds[kept] * 1e9).astype(np.int64), poses[kept])
-    times = np.arange(0, 400) * 100_000_000
-    twists = np.tile([0.48, 0.26], (400, 1))
-    return truth, Odometry(times, np.zeros((400, 3)), twists, np.zeros((400, 2)))
-
-
-def test_a_given_drive_keeps_poses_and_odometry_and_spaces_its_images_along_the_path():
-    truth, odometry = half_real()
-    config = dataclasses.replace(TINY, images_every=0.2, images_every_turn=90.0)
-    found = given_drive(truth, odometry, config)
-    steps = np.hypot(*np.diff(found.image_poses[:, :2], axis=0).T)
-    assert steps.min() >= 0.2 and steps.max() < 0.24  # jitter of 0.2 mm adds nothing
-    assert np.array_equal(found.truth.poses, truth.poses)
-    assert np.array_equal(found.odometry.twists, odometry.twists)
-    assert np.all(found.truth.stamps_ns - truth.stamps_ns == START_NS)
-    assert found.odometry.poses[10, 2] == pytest.approx(0.26)
-    assert found.yaw_rate is None
-
-
-def test_a_given_drive_has_no_image_where_its_poses_pause():
-    truth, odometry = half_real(gap=True)
-    found = given_drive(truth, odometry, TINY)
-    times = (found.image_stamps_ns - START_NS) * 1e-9
-    assert times.max() > 30 and not np.any((times > 9.9) & (times < 20))
-
-
-def test_a_given_drive_outside_of_the_garden_or_of_the_odometry_is_rejected():
-    truth, odometry = half_real()
-    with pytest.raises(ConfigError, match=r'--area of at least 2[0-9]x5'):
-        aside = Trajectory(truth.stamps_ns, truth.poses + np.array([9.0, 0.0, 0.0]))
-        given_drive(aside, odometry, TINY)
-    with pytest.raises(DataError, match='overlap'):
-        given_drive(Trajectory(truth.stamps_ns + 10**12, truth.poses), odometry, TINY)
-
-
-def test_a_given_drive_is_recorded_without_trees_on_the_lawn(tmp_path):
-    truth, odometry = half_real()
-    config = dataclasses.replace(TINY, area=(16.0, 18.0), images_every=4.0, images_every_turn=360.0)
-    given = given_drive(truth, odometry, config)
-    simulate(config, tmp_path / 'bag', SMALL, given=given)
-    with Bag(tmp_path / 'bag') as bag:
-        assert bag.trajectory().poses == pytest.approx(truth.poses, abs=1e-9)
-        assert bag.odometry().twists == pytest.approx(odometry.twists)
-        assert '/imu' not in bag.topics
-        assert sum(1 for _ in bag.images()) == len(given.image_stamps_ns)
+def test_an_open_lawn_has_no_trees():
+    config = dataclasses.replace(TINY, area=(16.0, 18.0))
     assert len(Garden(1, config).obstacles) == 3
     assert len(Garden(1, config, open_lawn=True).obstacles) == 0
 

@@ -3,7 +3,6 @@
 """Tuning: the likelihood finds the noise that is there, the grid the least error."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,12 +63,12 @@ def test_the_optimizer_improves_and_needs_no_truth():
 
 def test_the_grid_takes_the_least_error(monkeypatch):
     monkeypatch.setattr(tuning, 'FACTORS', (0.25, 1.0, 16.0))
-    drives = [tuning_drive(claimed=0.05, true=0.4)]
-    outcomes = tuning.tune_by_grid(drives, FilterConfig(), lambda: None)
-    assert len(outcomes) == 9
-    assert [o.cost for o in outcomes] == sorted(o.cost for o in outcomes)
-    assert outcomes[0].cost == tuning.error_cost(drives, outcomes[0].config)
-    assert outcomes[0].config.measurement_factor > 0.25
+    drives, tried = [tuning_drive(claimed=0.05, true=0.4)], []
+    best = tuning.tune_by_grid(drives, FilterConfig(), lambda: tried.append(1))
+    assert len(tried) == 9
+    assert best.cost == tuning.error_cost(drives, best.config)
+    assert best.cost <= tuning.error_cost(drives, FilterConfig())
+    assert best.config.measurement_factor > 0.25
 
 
 def test_the_error_is_measured_after_rigid_alignment():
@@ -100,8 +99,8 @@ def test_too_few_images_are_rejected():
 
 
 def test_tuned_settings_stay_in_their_ranges():
-    far = tuning._with_logs(FilterConfig(), np.full(len(tuning.TUNED), 90.0))
-    near = tuning._with_logs(FilterConfig(), np.full(len(tuning.TUNED), -90.0))
+    far = tuning.with_logs(FilterConfig(), np.full(len(tuning.TUNED), 90.0))
+    near = tuning.with_logs(FilterConfig(), np.full(len(tuning.TUNED), -90.0))
     assert far.measurement_factor == 1e4 and near.measurement_factor == 1e-3
 
 
@@ -114,95 +113,35 @@ def test_the_models_error_correlation_is_used():
     assert tuning.likelihood_cost([shared], config) < tuning.likelihood_cost([white], config)
 
 
-def test_what_is_worse_on_drives_not_seen_is_noticed():
+@pytest.mark.parametrize(('factor', 'better'), [(16.0, True), (0.05, False)])
+def test_what_is_worse_on_drives_not_seen_is_noticed(monkeypatch, factor, better):
     drives = [tuning_drive(claimed=0.1, true=0.4, seed=seed) for seed in range(3)]
     asked = []
 
-    def found(factor):
-        def of(others):
-            asked.append(others)
-            return FilterConfig(measurement_factor=factor)
+    def found(others, *_):
+        asked.append([k for k, one in enumerate(drives) if any(one is o for o in others)])
+        return Outcome(FilterConfig(measurement_factor=factor), 0.0)
 
-        return of
-
-    good = tuning.validate(drives, FilterConfig(), found(16.0), tuning.likelihood_cost)
-    bad = tuning.validate(drives, FilterConfig(), found(0.05), tuning.likelihood_cost)
-    assert asked[:3] == [[1, 2], [0, 2], [0, 1]]
-    assert good.better and not bad.better and good.before == bad.before
+    monkeypatch.setattr(tuning, 'tune', found)
+    judged = tuning.validate(drives, FilterConfig(), TuneConfig(), progress=False)
+    assert asked == [[1, 2], [0, 2], [0, 1]] and judged.better == better
 
 
 def test_one_drive_is_judged_by_halves():
     whole = tuning_drive()
-    first, second = tuning.parts_of([whole])
+    first, second = whole.halves()
     assert len(first.images.stamps_ns) + len(second.images.stamps_ns) == len(whole.images.stamps_ns)
     assert first.images.stamps_ns[-1] < second.images.stamps_ns[0]
     assert first.odometry.stamps_ns[-1] < second.odometry.stamps_ns[0]
-    assert tuning.validate([whole], FilterConfig(), lambda _: FilterConfig(), max) is None
-
-
-def log_of(folder, name, seed, claimed):
-    """CSV files of a drive whose positions err by 0.3 m and claim another standard deviation."""
-    drive = Drive(seconds=130, rate_hz=10, every=5, v_std=0.03, omega_std=0.02, position_std=0.3,
-                  seed=seed)  # fmt: skip
-    seconds = (drive.stamps_ns - drive.stamps_ns[0]) * 1e-9 + 100
-    paths = folder / f'{name}_odom.csv', folder / f'{name}_positions.csv'
-    at, seen = seconds[drive.pictures], drive.seen[:, :2]
-    variances = np.full((len(at), 2), claimed**2)
-    np.savetxt(paths[0], np.column_stack([seconds, drive.read]), '%.9f', ',')
-    np.savetxt(paths[1], np.column_stack([at, seen, variances]), '%.9f', ',')
-    return [str(path) for path in paths]
-
-
-@pytest.mark.parametrize('logs', [2, 1])
-def test_logs_without_ros_are_tuned_and_judged(tmp_path, capsys, logs):
-    paths = [path for k in range(logs) for path in log_of(tmp_path, f'log{k}', k, 0.1)]
-    code = main(['tune', *paths, '--output', str(tmp_path / 'tuned.yaml')])
-    said = capsys.readouterr().out
-    assert code == 0 and 'on what it did not see' in said and 'the settings stay' not in said
-    factor = load_changes(tmp_path / 'tuned.yaml')['ekf_node']['measurement_factor']
-    assert factor == pytest.approx(9.0, rel=0.3)
-
-
-def test_a_result_that_is_worse_on_other_logs_is_rejected(tmp_path, capsys):
-    paths = log_of(tmp_path, 'a', 0, 0.05) + log_of(tmp_path, 'b', 1, 1.5)
-    code = main(['tune', *paths, '--output', str(tmp_path / 'tuned.yaml')])
-    assert code == 0 and 'the settings stay' in capsys.readouterr().out
-    assert load_changes(tmp_path / 'tuned.yaml')['ekf_node']['measurement_factor'] == 1.0
+    assert tuning.validate([whole], FilterConfig(), TuneConfig(trials=10), progress=False)
+    few = [tuning_drive(seconds=2)]
+    assert tuning.validate(few, FilterConfig(), TuneConfig(), progress=False) is None
 
 
 def test_settings_of_the_user_stay_where_it_would_write(tmp_path, capsys):
-    mine, again = tmp_path / 'mine.yaml', tmp_path / 'again.yaml'
+    mine = tmp_path / 'mine.yaml'
     write_config(mine, {'ekf_node': {'lost_std': 7.5}})
-    paths = log_of(tmp_path, 'log', 0, 0.1)
-    words = ['tune', *paths, '--config', str(mine), '--output']
-    assert [main([*words, str(again)]) for _ in range(2)] == [0, 0]
-    again.write_text(again.read_text().replace('lost_std: 7.5', 'lost_std: 6.5'))
-    before = again.read_bytes()
-    assert main([*words, str(again)]) == 1
-    assert main(['tune', *paths, '--output', str(mine)]) == 1
+    assert main(['tune', 'bag', '--model', 'none.npz', '--output', str(mine)]) == 1
     error = f'error: {mine}: holds more than defaults: give another name, or remove it\n'
-    assert capsys.readouterr().err.endswith(error)
-    assert again.read_bytes() == before and load_changes(mine)['ekf_node']['lost_std'] == 7.5
-
-
-@pytest.mark.parametrize(('rows', 'later_s', 'problem'), [
-    ((1, 99), 0, 'odom.csv: 1 rows'), ((99, 3), 0, 'positions.csv: 3 rows'),
-    ((1300, 250), 1e6, 'the filter fused nothing'),
-])  # fmt: skip
-def test_logs_that_show_nothing_are_named_and_nothing_is_written(
-    tmp_path, capsys, rows, later_s, problem
-):
-    paths = [Path(path) for path in log_of(tmp_path, 'log', 0, 0.1)]
-    for path, count in zip(paths, rows, strict=True):
-        table = np.loadtxt(path, delimiter=',')[:count]
-        table[:, 0] += later_s if 'positions' in path.name else 0
-        np.savetxt(path, table, '%.9f', ',')
-    assert main(['tune', *map(str, paths), '--output', str(tmp_path / 'x.yaml')]) == 1
-    assert problem in capsys.readouterr().err
-    assert not (tmp_path / 'x.yaml').exists()
-
-
-@pytest.mark.parametrize('paths', [['a.csv'], ['a.csv', 'bag'], ['bag']])
-def test_what_cannot_be_tuned_on_is_named(tmp_path, capsys, paths):
-    assert main(['tune', *paths, '--output', str(tmp_path / 'x.yaml')]) == 1
-    assert ('CSV' in capsys.readouterr().err) == (paths != ['bag'])
+    assert capsys.readouterr().err == error
+    assert load_changes(mine)['ekf_node']['lost_std'] == 7.5

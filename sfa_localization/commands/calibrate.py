@@ -13,13 +13,7 @@ from sfa_localization.camera.settings import (
     LensCalibration,
     PanoramaConfig,
 )
-from sfa_localization.commands.options import (
-    add_settings,
-    given,
-    numbers,
-    require_kind,
-    settings,
-)
+from sfa_localization.commands.options import add_settings, given, numbers, require_kind, settings
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import require_outputs
 

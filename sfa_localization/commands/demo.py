@@ -1,18 +1,34 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run the whole chain on a simulated garden, and print its errors."""
+"""Simulate, train, run the three nodes live, compare with the truth."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+import json
+import shutil
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from sfa_localization import __version__
 from sfa_localization.commands.options import add_settings, settings
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.files import atomic_write
 from sfa_localization.data.settings import Settings, setting
+
+if TYPE_CHECKING:
+    from sfa_localization.data.run import Trajectory
+    from sfa_localization.evaluation import Evaluation
+    from sfa_localization.training import Trained
 
 WRITES = 'in its folder two bags, model.npz, report/ with figures, results.json, logs/'
 EXAMPLES = '  demo\n  demo --world 2 --out demo_of_world_2'
+MARKER = '.sfa_localization_demo.json'
+DRIVES = ('coverage', 'test')
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +50,100 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demonstration; print the errors."""
-    from sfa_localization.commands.demonstration import demonstrate
+    from sfa_localization.commands.live_nodes import commands, run_live
     from sfa_localization.reports.evaluation import heading_table, table
+    from sfa_localization.simulation.drive import simulate
+    from sfa_localization.simulation.settings import SimulationConfig
+    from sfa_localization.training import train
 
-    result = demonstrate(arguments.out, settings(DemoConfig, arguments), progress=True)
+    out, config, start = arguments.out, settings(DemoConfig, arguments), time.monotonic()
+
+    def announce(step: str) -> None:
+        print(f'[{time.monotonic() - start:4.0f} s] {step}', file=sys.stderr)
+
+    prepare_folder(out, config)
+    garden = SimulationConfig(world=config.world, seed=config.seed, compression='jpeg')
+    announce('simulate two drives through a garden')
+    for drive in DRIVES:
+        if not (out / drive).exists():
+            simulate(replace(garden, trajectory=drive), out / drive, progress=True)
+    announce('train on the first, without ground truth')
+    trained = train([out / 'coverage'], out / 'model.npz', progress=True, resume=True)
+    announce('run the three nodes live on the second')
+    live = run_live(
+        commands(out / 'model.npz', out / 'test', config.rate),
+        out / 'logs',
+        on_end=lambda state: announce(f'the robot is {state or "silent"}'),
+    )
+    announce('compare with the truth')
+    result, offline_m = _compare(trained, live, out)
+    _write_results(out, result, trained)
+    announce(f'live and offline differ by {offline_m:.3f} m on average; see {out / "report"}')
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
     return 0
+
+
+def prepare_folder(out: Path, config: DemoConfig) -> None:
+    """Create the folder, or clear the results of a demonstration with other settings.
+
+    Bags and an unfinished training with the same settings stay. Raises LocalizationError.
+    """
+    marker, kept = out / MARKER, {**asdict(config), 'version': __version__}
+    del kept['rate']
+    text = json.dumps(kept)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()) and not marker.exists():
+            raise LocalizationError(
+                f'{out}: not a folder of the demo: choose another one with --out'
+            )
+        if marker.exists() and marker.read_text(encoding='utf-8') != text:
+            for name in (*DRIVES, 'logs', 'report'):
+                shutil.rmtree(out / name, ignore_errors=True)
+        for name in ('model.npz', 'results.json'):
+            (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise LocalizationError(f'{out}: cannot be written: {error.strerror}') from None
+    with atomic_write(marker) as file:
+        file.write(text.encode())
+
+
+def _compare(
+    trained: Trained, live: Mapping[str, Trajectory], out: Path
+) -> tuple[Evaluation, float]:
+    """Evaluate the live estimates; also return their mean distance (m) from the offline ones."""
+    from sfa_localization.evaluation import evaluate, moved, score
+
+    offline = evaluate(trained.model, out / 'test', align_bags=[out / 'coverage'], progress=True)
+    in_truth = {name: moved(estimate, offline.transform) for name, estimate in live.items()}
+    estimates = {**offline.estimates, **in_truth}
+    scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}
+    counts = {name: count for name, count in offline.counts.items() if name != 'fusion'}
+    counts['published'] = {name: len(estimate) for name, estimate in live.items()}
+    result = replace(offline, estimates=estimates, scores=scores, counts=counts)
+    return result, mean_distance(estimates['ekf'], offline.estimates['ekf'])
+
+
+def mean_distance(a: Trajectory, b: Trajectory) -> float:
+    """Mean distance in meters at the stamps of `a` that `b` covers."""
+    import numpy as np
+
+    stamps = a.stamps_ns[b.covers(a.stamps_ns)]
+    return float(np.hypot(*(a.at(stamps) - b.at(stamps))[:, :2].T).mean())
+
+
+def _write_results(out: Path, result: Evaluation, trained: Trained) -> None:
+    """Write errors and figures; firing maps are drawn at the true places of the training images."""
+    import numpy as np
+
+    from sfa_localization.bags.reader import Bag
+    from sfa_localization.evaluation import write_json
+    from sfa_localization.reports.evaluation import write_report
+
+    write_json(out / 'results.json', result.as_dict())
+    with Bag(out / 'coverage') as bag:
+        truth = bag.trajectory()
+    stamps = np.concatenate([run.panoramas.stamps_ns for run in trained.runs])
+    places = truth.at(stamps)[:, :2]
+    shown = {name: result.estimates[name] for name in ('odometry', 'sfa', 'ekf')}
+    write_report(out / 'report', result.truth, shown, result.scores, places, trained.features)

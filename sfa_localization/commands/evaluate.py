@@ -60,11 +60,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate; print the errors, and what was used and rejected."""
     from sfa_localization import evaluation
     from sfa_localization.place_model import PlaceModel
-    from sfa_localization.reports.evaluation import heading_table, table, trust_lines, write_report
-    from sfa_localization.reports.page import begin_page
+    from sfa_localization.reports.evaluation import heading_table, table, trust_lines
 
+    read = arguments.model, arguments.bag, *arguments.align, arguments.config
     if arguments.json:
-        read = arguments.model, arguments.bag, *arguments.align, arguments.config
         require_output(arguments.json, read, '.json')
     require_report(arguments.report, arguments.json)
     model = PlaceModel.load(arguments.model)
@@ -84,33 +83,29 @@ def run(arguments: argparse.Namespace) -> int:
     print(*_input_lines(result.counts), *_fusion_lines(result.counts), sep='\n')
     print(f'aligned on {result.aligned_on}')
     if arguments.report:
-        places = result.estimates['sfa'].poses[:, :2]
-        results = result.truth, result.estimates, result.scores, places, result.features
-        begin_page(arguments.report)
-        write_report(arguments.report, *results)
-        _write_page(arguments, result)
+        _write_report(arguments, result)
     if arguments.json:
         evaluation.write_json(arguments.json, result.as_dict())
     return 0
 
 
-def _write_page(arguments: argparse.Namespace, result: Evaluation) -> None:
-    """Write the page, with the worst images read from the bag once more."""
+def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
+    """Write figures and the page, with the worst images read from the bag once more."""
     from sfa_localization.bags.drives import images_at
-    from sfa_localization.reports.evaluation_page import worst_images, write_evaluation_page
-    from sfa_localization.reports.page import PAGE
+    from sfa_localization.reports.evaluation import worst_of, write_evaluation_page, write_report
+    from sfa_localization.reports.page import PAGE, begin_page
 
+    folder, drive = arguments.report, (result.truth, result.estimates, result.scores)
+    begin_page(folder)
+    write_report(folder, *drive, result.estimates['sfa'].poses[:, :2], result.features)
     late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
-    worst = worst_images(result.truth, result.estimates['sfa'])
-    stamps = {one: one.stamp_ns + late_ns for one in worst}
+    worst = worst_of(result.truth, result.estimates['sfa'])
+    stamps = {one: stamp + late_ns for one, stamp in worst.items()}
     read = images_at(arguments.bag, stamps.values(), recipe(arguments))
     samples = {one: read[stamp] for one, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
-    write_evaluation_page(
-        arguments.report, title, result.truth, result.estimates, result.scores, result.counts,
-        samples,
-    )  # fmt: skip
-    print(f'{arguments.report / PAGE}: written')
+    write_evaluation_page(folder, title, *drive, result.counts, samples)
+    print(f'{folder / PAGE}: written')
 
 
 def _input_lines(counts: Mapping[str, Any]) -> list[str]:
@@ -125,16 +120,14 @@ def _input_lines(counts: Mapping[str, Any]) -> list[str]:
 
 def _fusion_lines(counts: Mapping[str, Any]) -> list[str]:
     """Describe what the filter rejected, its time in each state, and the delay of the images."""
-    usual = {'odometry: used', 'measurement: accepted', 'measurement: started'}
-    rejected = {reason: n for reason, n in counts['fusion'].items() if reason not in usual}
-    lines = [f'filter: {n} times {reason}' for reason, n in sorted(rejected.items())]
+    usual = 'odometry: used', 'measurement: accepted', 'measurement: started'
+    rejected = sorted((why, n) for why, n in counts['fusion'].items() if why not in usual)
+    lines = [f'filter: {n} times {reason}' for reason, n in rejected]
     states = ', '.join(f'{name} {seconds:.1f} s' for name, seconds in counts['states_s'].items())
     lines.append(f'state: {states}')
-    if counts['false_localised_s'] > 0:
-        wrong = counts['false_localised_s']
+    if (wrong := counts['false_localised_s']) > 0:
         lines.append(f'state: LOCALISED for {wrong:.1f} s with an error of more than a meter')
-    if 'camera_delay_s' in counts:
-        delay = counts['camera_delay_s']
+    if (delay := counts.get('camera_delay_s')) is not None:
         late = 'late' if delay > 0 else 'early'
         lines.append(f'camera: images are stamped {abs(delay):.2f} s {late}')
     return lines

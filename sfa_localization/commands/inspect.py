@@ -64,12 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
         _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
-    return 1 if any(map(_unreadable, reports)) else 0
-
-
-def _unreadable(report: BagReport) -> bool:
-    """Whether a bag, or all that a topic of it recorded, cannot be read."""
-    return bool(report.error) or any(topic.unreadable for topic in report.topics)
+    unreadable = [one for one in reports if one.error or any(t.unreadable for t in one.topics)]
+    return 1 if unreadable else 0
 
 
 def write_json(path: Path, reports: Sequence[BagReport]) -> None:
@@ -80,52 +76,26 @@ def write_json(path: Path, reports: Sequence[BagReport]) -> None:
 
 
 def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
-    """Write figures and the page of all bags."""
-    from sfa_localization.reports.page import begin_page
+    """Write figures of all bags, and the page that shows them."""
+    from sfa_localization.reports.bag import bag_sections, write_path
+    from sfa_localization.reports.figures import write_contact_sheet
+    from sfa_localization.reports.page import PAGE, begin_page, write_page
 
     begin_page(folder)
-    for number, report in enumerate(reports):
-        prefix = f'{number}_' if len(reports) > 1 else ''
-        _write_figures(report, folder, prefix)
-    _write_page(folder, reports)
-
-
-def _write_page(folder: Path, reports: Sequence[BagReport]) -> None:
-    """Write the page of all bags, with the figures that `_write_figures` made."""
-    from sfa_localization.reports.bag import bag_sections
-    from sfa_localization.reports.page import PAGE, write_page
-
     sections = []
     for number, report in enumerate(reports):
-        prefix = f'{number}_' if len(reports) > 1 else ''
-        name = f'{prefix}{Path(report.path).stem}'
-        shown = {}
+        stem, shown = Path(report.path).stem, dict[Path, str]()
+        file = f'{number}_{stem}' if len(reports) > 1 else stem
         if report.drive is not None:
-            shown[folder / f'{name}_path.png'] = 'The path by odometry, with the images'
+            target, drive = folder / f'{file}_path.png', report.drive
+            title = f'{stem}: {report.facts["drive"]}'.replace(', along', ',\nalong')
+            write_path(drive.odometry.poses, drive.places, title, target)
+            shown[target] = 'The path by odometry, with the images'
         if report.images is not None:
-            shown[folder / f'{name}_pictures.png'] = 'Images from all over the drive'
-        sections += bag_sections(report.as_dict(), _facts(report), shown)
+            target, images = folder / f'{file}_pictures.png', report.images
+            title = f'{stem}: {images.topic}, {report.facts["images"]}'
+            write_contact_sheet(images.samples, title, target)
+            shown[target] = 'Images from all over the drive'
+        sections += bag_sections(report.as_dict(), [*map(': '.join, report.facts.items())], shown)
     write_page(folder, 'What is in the recording', *sections)
     print(f'{folder / PAGE}: written')
-
-
-def _facts(report: BagReport) -> list[str]:
-    """Camera, drive and clocks, in words."""
-    images, drive = report.images, report.drive
-    camera = [f'{images.width}x{images.height}, {images.geometry}'] if images else []
-    clock = [f'clocks: {drive.clock_text()}'] if drive and drive.clock_text() else []
-    return [*camera, *([drive.path_text().strip()] if drive else []), *clock]
-
-
-def _write_figures(report: BagReport, folder: Path, prefix: str) -> None:
-    from sfa_localization.reports.bag import write_contact_sheet, write_path
-
-    name = Path(report.path).stem
-    images, drive = report.images, report.drive
-    if images is not None:
-        title = f'{name}: {images.topic}, {images.width}x{images.height}, {images.geometry}'
-        write_contact_sheet(images.samples, title, folder / f'{prefix}{name}_pictures.png')
-    if drive is not None:
-        title = f'{name}:{drive.path_text().partition(":")[2]}'
-        target = folder / f'{prefix}{name}_path.png'
-        write_path(drive.odometry.poses, drive.places, title.replace(', along', ',\nalong'), target)

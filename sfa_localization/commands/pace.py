@@ -18,13 +18,7 @@ from typing import Any
 from sfa_localization.data.settings import Settings, setting
 
 PAUSE, STEP, FASTER, SLOWER = 'pause', 'step', 'faster', 'slower'
-KEYS = {
-    b' ': PAUSE,
-    b's': STEP,
-    b'\x1b[C': STEP,
-    b'\x1b[A': FASTER,
-    b'\x1b[B': SLOWER,
-}
+KEYS = {b' ': PAUSE, b's': STEP, b'\x1b[C': STEP, b'\x1b[A': FASTER, b'\x1b[B': SLOWER}
 
 
 @dataclass(frozen=True, slots=True)

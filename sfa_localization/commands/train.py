@@ -120,15 +120,14 @@ def _write_report(folder: Path, bags: Sequence[Path], trained: Trained, used: Re
     """Write figures and the page, with the worst images read from the bags once more."""
     from sfa_localization.bags.drives import images_at
     from sfa_localization.reports.page import PAGE, begin_page
-    from sfa_localization.reports.training import worst_images, write_training_report
+    from sfa_localization.reports.training import worst_of, write_training_report
 
-    worst = worst_images(trained)
-    read = {
-        run: images_at(bag, [one.stamp_ns for one in worst if one.run == run], used)
-        for run, bag in enumerate(bags)
-        if any(one.run == run for one in worst)
-    }
-    samples = {one: read[one.run][one.stamp_ns] for one in worst if one.stamp_ns in read[one.run]}
+    worst = worst_of(trained)
+    read = [
+        images_at(bag, [stamp for run, stamp in worst.values() if run == number], used)
+        for number, bag in enumerate(bags)
+    ]
+    samples = {one: read[run][at] for one, (run, at) in worst.items() if at in read[run]}
     begin_page(folder)
     write_training_report(folder, trained, samples)
     print(f'{folder / PAGE}: written')

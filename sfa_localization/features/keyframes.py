@@ -242,11 +242,6 @@ def _contrast(values: Texture) -> Texture:
     return np.asarray(np.moveaxis(contrast.reshape(*values.shape), 2, 0), np.float32)
 
 
-def small_gray(panorama: Image, rows: int, columns: int) -> Texture:
-    """A panorama (H, W, 3) uint8 in gray, of at most so many rows and columns."""
-    return _small(cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY), rows, columns)
-
-
 def _small(image: NDArray[Any], rows: int, columns: int) -> Texture:
     """An image (H, W) or (H, W, C) of at most so many rows and columns."""
     size = min(image.shape[1], columns), min(image.shape[0], rows)

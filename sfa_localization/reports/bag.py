@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures and page of a bag: a contact sheet of its images, the path of its odometry."""
+"""The page of bags: enough or not, what to drive next, what is in them, path and images."""
 
 from __future__ import annotations
 
@@ -12,33 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Image
 from sfa_localization.reports import page
-from sfa_localization.reports.evaluation import as_title, save
-
-
-def write_contact_sheet(
-    samples: Sequence[Image], title: str, path: Path, captions: Sequence[str] = ()
-) -> None:
-    """Write BGR images (H, W, 3) as one PNG, in reading order, each below its caption.
-
-    Raises LocalizationError.
-    """
-    height, width = samples[0].shape[:2]
-    columns = max(1, round(np.sqrt(len(samples) * height / width)))
-    rows = -(-len(samples) // columns)
-    inches = 10 / columns
-    row = inches * height / width + (0.3 if captions else 0.0)
-    figure = Figure((10, rows * row + 0.5), layout='constrained')
-    figure.suptitle(as_title(title), fontsize=10)
-    axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
-    for axis in axes:
-        axis.set_axis_off()
-    for axis, sample in zip(axes, samples, strict=False):
-        axis.imshow(sample[..., ::-1], interpolation='lanczos')
-    for axis, caption in zip(axes, captions, strict=False):
-        axis.set_title(caption, fontsize=9)
-    save(figure, path)
+from sfa_localization.reports.figures import in_meters, save
 
 
 def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
@@ -52,9 +27,7 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
     order = np.linspace(0, 100, len(places))
     dots = axes.scatter(places[:, 0], places[:, 1], c=order, s=5, cmap='viridis', zorder=2)
     axes.plot(*poses[0, :2], 'o', color='#D55E00', markersize=7, label='start', zorder=3)
-    axes.set_aspect('equal', adjustable='datalim')
-    axes.set(title=as_title(title), xlabel='x in m (odometry)', ylabel='y in m (odometry)')
-    axes.title.set_fontsize(10)
+    in_meters(axes, title, ' of the odometry')
     axes.legend(loc='upper right')
     figure.colorbar(dots, label='images, % of the drive', shrink=0.7)
     save(figure, path)
@@ -63,10 +36,10 @@ def write_path(poses: Array, places: Array, title: str, path: Path) -> None:
 def bag_sections(
     found: Mapping[str, Any], facts: Sequence[str], shown: Mapping[Path, str]
 ) -> list[str]:
-    """The sections of a page about a bag: enough or not, what to drive next, what is in it.
+    """The sections of a page about a bag. Raises LocalizationError.
 
     `found` are the findings as plain values, `facts` sentences about images, drive and clocks,
-    `shown` figures with their captions. Raises LocalizationError.
+    `shown` figures with their captions.
     """
     enough = found['enough_to_train_on']
     answer = 'is enough to train on.' if enough else 'is not enough to train on yet.'

@@ -1,14 +1,14 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures and table of an evaluation: the estimated paths and their errors.
+"""Figures, tables and page of an evaluation: how far off, where, was the robot sure and wrong.
 
-Every function takes plain arrays and trajectories in the frame of the ground truth and writes one
-file; nothing here opens a window. The colors are those of Okabe and Ito for color-blind readers.
+Trajectories are in the frame of the ground truth. The colors are those of Okabe and Ito for
+color-blind readers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,17 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure, SubFigure
 
-from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.data.rejections import encodable
-from sfa_localization.data.run import Stamps, Trajectory
+from sfa_localization.data.run import Image, Stamps, Trajectory
+from sfa_localization.reports import page
+from sfa_localization.reports.figures import (
+    WorstImage,
+    in_meters,
+    save,
+    save_text,
+    worst_images,
+    write_worst_images,
+)
 
 Estimates = Mapping[str, Trajectory]
 Scores = Mapping[str, Mapping[str, Any]]
@@ -48,10 +55,12 @@ MAPS_SHOWN = 8
 """Firing maps in one figure: the slowest features carry the place."""
 FEATURE_LIMIT = 2.0
 """Standard deviations at which the colors saturate; slow features have unit variance."""
-DOTS_PER_INCH = 130
-"""Resolution of the figures: sharp on a screen, and still small files."""
 MARGIN_M = 0.5
 """Margin around the paths (m)."""
+TRUSTED_SHARE = 0.8
+"""Of the true positions, the filter's regions of 95 % hold at least so many where they can be
+believed: errors of neighboring images are alike, so one bad corner moves the share."""
+_WEAK = 2.0  # times the mean error: places that are clearly worse than usual
 
 
 def position_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Array]:
@@ -59,9 +68,8 @@ def position_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Arr
 
     Estimates at stamps without ground truth are left out.
     """
-    kept = truth.covers(estimate.stamps_ns)
-    offset = estimate.poses[kept, :2] - truth.at(estimate.stamps_ns[kept])[:, :2]
-    return _seconds(truth, estimate.stamps_ns[kept]), np.hypot(offset[:, 0], offset[:, 1])
+    stamps, _, errors = _errors(truth, estimate)
+    return (stamps - truth.stamps_ns[0]) * 1e-9, errors
 
 
 def heading_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Array]:
@@ -70,94 +78,64 @@ def heading_errors(truth: Trajectory, estimate: Trajectory) -> tuple[Array, Arra
     Estimates without a heading (NaN) or without ground truth are left out.
     """
     kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
-    offset = wrap_angle(estimate.poses[kept, 2] - truth.at(estimate.stamps_ns[kept])[:, 2])
-    return _seconds(truth, estimate.stamps_ns[kept]), np.degrees(offset)
+    stamps = estimate.stamps_ns[kept]
+    offset = wrap_angle(estimate.poses[kept, 2] - truth.at(stamps)[:, 2])
+    return (stamps - truth.stamps_ns[0]) * 1e-9, np.degrees(offset)
 
 
-def _seconds(truth: Trajectory, stamps_ns: Stamps) -> Array:
-    return np.asarray((stamps_ns - truth.stamps_ns[0]) * 1e-9)
-
-
-def trajectories_figure(
-    path: Path, truth: Trajectory, estimates: Estimates, scores: Scores | None = None
-) -> None:
-    """Draw the true and the estimated paths from above, axes equal, in meters.
-
-    `scores`, by the estimates' names, adds each mean error to the legend.
-    """
-    figure = Figure(figsize=(8.0, 7.6), layout='constrained')
-    _draw_paths(figure.add_subplot(), truth, estimates, scores or {})
-    save(figure, path)
-
-
-def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
-    """Draw position errors (m) and heading errors (degrees) over time (s)."""
-    figure = Figure(figsize=(9.6, 6.0), layout='constrained')
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    _draw_position_errors(upper, truth, estimates)
-    _draw_heading_errors(lower, truth, estimates)
-    upper.set_xlabel('')
-    save(figure, path)
-
-
-def heading_figure(path: Path, truth: Trajectory, estimate: Trajectory, name: str = 'ekf') -> None:
-    """Draw the true path colored by the absolute heading error (degrees) of one estimate."""
-    figure = Figure(figsize=(8.0, 6.6), layout='constrained')
-    axes = figure.add_subplot()
-    kept = truth.covers(estimate.stamps_ns) & np.isfinite(estimate.poses[:, 2])
+def _errors(truth: Trajectory, estimate: Trajectory) -> tuple[Stamps, Array, Array]:
+    """Stamps (M,), true places (M, 2) and position errors (M,) m where the truth is known."""
+    kept = truth.covers(estimate.stamps_ns)
     places = truth.at(estimate.stamps_ns[kept])[:, :2]
-    _, error = heading_errors(truth, estimate)
-    top = max(float(np.percentile(np.abs(error), 98)), 1.0) if len(error) else 1.0
-    dots = _dots(axes, places, np.abs(error), 16.0, 'viridis', (0.0, top))
-    figure.colorbar(dots, label='absolute heading error (°)', shrink=0.85, extend='max')
-    axes.set_title(f'Heading error along the path: {_label(name)}')
-    save(figure, path)
-
-
-def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
-    """Draw the spatial firing maps of the first 8 slow features: their value at every place.
-
-    `positions` (N, 2) of the images in meters; `features` (N, K).
-    """
-    figure = Figure(figsize=(12.0, 6.2), layout='compressed')
-    grid = figure.subplots(2, MAPS_SHOWN // 2, sharex=True, sharey=True, squeeze=False)
-    _draw_firing_maps(figure, list(grid.flat), positions, features)
-    save(figure, path)
-
-
-def overview_figure(
-    path: Path,
-    truth: Trajectory,
-    estimates: Estimates,
-    scores: Scores,
-    positions: Array,
-    features: Array,
-) -> None:
-    """Draw paths, position error over time and four firing maps in one figure.
-
-    `positions` (N, 2) of the images in meters; `features` (N, K).
-    """
-    figure = Figure(figsize=(13.0, 6.2), layout='constrained')
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
-    _draw_paths(left.add_subplot(), truth, estimates, scores)
-    upper, lower = right.subfigures(2, 1, squeeze=False, height_ratios=(0.8, 1.0)).flat
-    row = upper.subplots(1, 4, sharey=True, squeeze=False)[0]
-    _draw_firing_maps(upper, row, positions, features)
-    _draw_position_errors(lower.add_subplot(), truth, estimates)
-    save(figure, path)
+    errors = np.asarray(np.hypot(*(estimate.poses[kept, :2] - places).T))
+    return estimate.stamps_ns[kept], places, errors
 
 
 def table(scores: Scores) -> str:
     """Position errors in meters, one line per estimate, as a Markdown table."""
-    rows = {name: [number(score[c], c) for c in COLUMNS] for name, score in scores.items()}
-    return _markdown('position error (m)', COLUMNS, rows)
+    return _markdown(*_position_rows(scores))
 
 
 def heading_table(scores: Scores) -> str:
     """Heading errors in degrees, one line per estimate that has a heading."""
-    errors = {name: score['yaw_deg'] for name, score in scores.items() if score.get('yaw_deg')}
-    rows = {name: [f'{yaw[column]:.2f}' for column in YAW_COLUMNS] for name, yaw in errors.items()}
-    return _markdown('heading error (degrees)', YAW_COLUMNS, rows)
+    return _markdown(*_heading_rows(scores))
+
+
+Rows = tuple[list[str], list[list[str]]]
+
+
+def _position_rows(scores: Scores) -> Rows:
+    rows = [[_label(n), *(number(one[c], c) for c in COLUMNS)] for n, one in scores.items()]
+    return ['position error (m)', *COLUMNS], rows
+
+
+def _heading_rows(scores: Scores) -> Rows:
+    errors = {name: one['yaw_deg'] for name, one in scores.items() if one.get('yaw_deg')}
+    rows = [[_label(n), *(f'{yaw[c]:.2f}' for c in YAW_COLUMNS)] for n, yaw in errors.items()]
+    return ['heading error (degrees)', *YAW_COLUMNS], rows
+
+
+def number(value: float | None, column: str) -> str:
+    """A score as text, by its column; '-' where there is none."""
+    if value is None:
+        return '-'
+    return f'{int(value)}' if column == 'n' else f'{value:.3f}'
+
+
+def _label(name: str) -> str:
+    return LABELS.get(name, name)
+
+
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table with padded columns, so that it is readable as plain text too."""
+    first = max(len(row[0]) for row in (head, *rows))
+    width = max(len(cell) for row in (head, *rows) for cell in row[1:])
+    lines = [
+        f'| {row[0].ljust(first)} | ' + ' | '.join(cell.rjust(width) for cell in row[1:]) + ' |'
+        for row in (head, *rows)
+    ]
+    rule = f'|{"-" * (first + 2)}|' + f'{"-" * (width + 1)}:|' * (len(head) - 1)
+    return '\n'.join([lines[0], rule, *lines[1:]])
 
 
 def trust_lines(scores: Scores) -> list[str]:
@@ -183,23 +161,6 @@ def trust_lines(scores: Scores) -> list[str]:
     return lines
 
 
-def _markdown(corner: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> str:
-    """A table with padded columns, so that it is readable as plain text too."""
-    labels = {name: _label(name) for name in rows}
-    first = max(map(len, [corner, *labels.values()]))
-    width = max(map(len, [*columns, *(cell for row in rows.values() for cell in row)]))
-    lines = [
-        _row(corner.ljust(first), columns, width),
-        f'|{"-" * (first + 2)}|' + f'{"-" * (width + 1)}:|' * len(columns),
-        *(_row(labels[name].ljust(first), row, width) for name, row in rows.items()),
-    ]
-    return '\n'.join(lines)
-
-
-def _row(head: str, cells: Sequence[str], width: int) -> str:
-    return f'| {head} | ' + ' | '.join(cell.rjust(width) for cell in cells) + ' |'
-
-
 def write_report(
     folder: Path,
     truth: Trajectory,
@@ -217,13 +178,65 @@ def write_report(
     errors_figure(folder / 'errors.png', truth, estimates)
     firing_maps_figure(folder / 'firing_maps.png', positions, features)
     overview_figure(folder / 'overview.png', truth, estimates, scores, positions, features)
-    figures = ['trajectories', 'errors', 'firing_maps']
-    if 'ekf' in estimates:
-        heading_figure(folder / 'heading.png', truth, estimates['ekf'])
-        figures.append('heading')
-    images = [f'![{name}]({name}.png)' for name in figures]
+    images = [f'![{name}]({name}.png)' for name in ('trajectories', 'errors', 'firing_maps')]
     parts = ['# Evaluation', table(scores), heading_table(scores), *images]
     save_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
+
+
+def trajectories_figure(
+    path: Path, truth: Trajectory, estimates: Estimates, scores: Scores | None = None
+) -> None:
+    """Draw the true and the estimated paths from above, axes equal, in meters.
+
+    `scores`, by the estimates' names, adds each mean error to the legend.
+    """
+    figure = Figure(figsize=(8.0, 7.6), layout='constrained')
+    _draw_paths(figure.add_subplot(), truth, estimates, scores or {})
+    save(figure, path)
+
+
+def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
+    """Draw position errors (m) and heading errors (degrees) over time (s)."""
+    figure = Figure(figsize=(9.6, 6.0), layout='constrained')
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    _draw_position_errors(upper, truth, estimates)
+    for name, estimate in estimates.items():
+        lower.plot(*heading_errors(truth, estimate), **STYLES.get(name, OTHER))
+    lower.axhline(0.0, color='0.4', linewidth=0.8)
+    lower.set(xlabel='time (s)', ylabel='heading error (°)', xlim=(0, None))
+    lower.grid(alpha=0.3)
+    upper.set_xlabel('')
+    save(figure, path)
+
+
+def firing_maps_figure(path: Path, positions: Array, features: Array) -> None:
+    """Draw the spatial firing maps of the first 8 slow features: their value at every place.
+
+    `positions` (N, 2) of the images in meters; `features` (N, K).
+    """
+    figure = Figure(figsize=(12.0, 6.2), layout='compressed')
+    grid = figure.subplots(2, MAPS_SHOWN // 2, sharex=True, sharey=True, squeeze=False)
+    _draw_firing_maps(figure, list(grid.flat), positions, features)
+    save(figure, path)
+
+
+def overview_figure(
+    path: Path,
+    truth: Trajectory,
+    estimates: Estimates,
+    scores: Scores,
+    positions: Array,
+    features: Array,
+) -> None:
+    """Draw paths, errors and firing maps of `features` (N, K) at `positions` (N, 2) m in one."""
+    figure = Figure(figsize=(13.0, 6.2), layout='constrained')
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.2)).flat
+    _draw_paths(left.add_subplot(), truth, estimates, scores)
+    upper, lower = right.subfigures(2, 1, squeeze=False, height_ratios=(0.8, 1.0)).flat
+    row = upper.subplots(1, 4, sharey=True, squeeze=False)[0]
+    _draw_firing_maps(upper, row, positions, features)
+    _draw_position_errors(lower.add_subplot(), truth, estimates)
+    save(figure, path)
 
 
 def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Scores) -> None:
@@ -250,52 +263,27 @@ def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -
         axes.legend(**above, frameon=False, ncols=len(estimates), fontsize='small')
 
 
-def _draw_heading_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
-    for name, estimate in estimates.items():
-        axes.plot(*heading_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
-    axes.axhline(0.0, color='0.4', linewidth=0.8)
-    axes.set(xlabel='time (s)', ylabel='heading error (°)', xlim=(0, None))
-    axes.grid(alpha=0.3)
-
-
 def _draw_firing_maps(
     figure: Figure | SubFigure, panels: Sequence[Axes], positions: Array, features: Array
 ) -> None:
-    limits = (-FEATURE_LIMIT, FEATURE_LIMIT)
-    size = _filling_size(figure, len(panels), len(positions))
-    dots = None
+    # Dots of a panel touch one another: their area in square points.
+    inches = figure.bbox.width * figure.bbox.height / figure.dpi**2
+    size = np.clip(0.6 * inches * 72**2 / len(panels) / max(len(positions), 1), 2.0, 40.0)
+    dots: PathCollection | None = None
     for index, axes in enumerate(panels):
         if index >= features.shape[1]:
             axes.set_axis_off()
             continue
-        dots = _dots(axes, positions, features[:, index], size, 'RdBu_r', limits)
+        dots = axes.scatter(
+            positions[:, 0], positions[:, 1], c=features[:, index], s=size, linewidths=0,
+            cmap='RdBu_r', vmin=-FEATURE_LIMIT, vmax=FEATURE_LIMIT,
+        )  # fmt: skip
+        _frame_view(axes, positions)
         axes.set_title(f'slow feature {index + 1}', fontsize='medium')
         axes.label_outer()
     if dots is not None:
         bar = figure.colorbar(dots, ax=list(panels), shrink=0.7, aspect=14, extend='both')
         bar.set_label('standard deviations', fontsize='small')
-
-
-def _filling_size(figure: Figure | SubFigure, panels: int, points: int) -> float:
-    """Area of a dot in square points so that the dots of a panel touch one another."""
-    inches = figure.bbox.width * figure.bbox.height / figure.dpi**2
-    return float(np.clip(0.6 * inches * 72**2 / panels / max(points, 1), 2.0, 40.0))
-
-
-def _dots(
-    axes: Axes,
-    points: Array,
-    numbers: Array,
-    size: float,
-    colormap: str,
-    limits: tuple[float, float],
-) -> PathCollection:
-    """Scatter points (N, 2) colored by numbers (N,)."""
-    x, y = points[:, 0], points[:, 1]
-    low, high = limits
-    dots = axes.scatter(x, y, c=numbers, s=size, cmap=colormap, vmin=low, vmax=high, linewidths=0)
-    _frame_view(axes, points)
-    return dots
 
 
 def _bulk(estimate: Trajectory) -> Array:
@@ -315,29 +303,106 @@ def _frame_view(axes: Axes, points: Array) -> None:
     axes.set_axisbelow(True)
 
 
-def _label(name: str) -> str:
-    return LABELS.get(name, name)
+def worst_of(truth: Trajectory, estimate: Trajectory) -> dict[WorstImage, int]:
+    """The images whose positions are farthest from the truth, and their stamps."""
+    stamps, places, errors = _errors(truth, estimate)
+    return {one: int(stamps[one.row]) for one in worst_images(places, errors)}
 
 
-def number(value: float | None, column: str) -> str:
-    """A score as text, by its column; '-' where there is none."""
-    if value is None:
-        return '-'
-    return f'{int(value)}' if column == 'n' else f'{value:.3f}'
+def write_evaluation_page(
+    folder: Path,
+    title: str,
+    truth: Trajectory,
+    estimates: Estimates,
+    scores: Scores,
+    counts: Mapping[str, Any],
+    samples: Mapping[WorstImage, Image],
+) -> None:
+    """Write `folder`/index.html from the figures of `write_report`, and an error map.
+
+    `counts` are those of Evaluation, `samples` the worst images. Raises LocalizationError.
+    """
+    error_map_figure(folder / 'error_map.png', truth, estimates['ekf'])
+    if samples:
+        write_worst_images(folder / 'worst_images.png', samples)
+    page.write_page(
+        folder,
+        title,
+        page.verdict(*judgment(scores, counts)),
+        page.section('How far off?', page.table(*_position_rows(scores)),
+                     page.table(*_heading_rows(scores)),
+                     page.figure(folder / 'trajectories.png', 'Estimated and true paths')),
+        page.section('Where is it weak?', page.items([*_weak_lines(truth, estimates['ekf'])]),
+                     page.figure(folder / 'error_map.png', 'Error of the filter along the path')),
+        page.section('May I trust it?', page.items([*_trust(scores, counts)]),
+                     page.figure(folder / 'errors.png', 'Errors over time')),
+        page.section('What was rejected?', page.items([*_rejected(counts)])),
+        page.section('Slow features',
+                     page.figure(folder / 'firing_maps.png', 'Slow features at the estimates')),
+        page.section('Worst images', page.figure(folder / 'worst_images.png', 'Single images with '
+                     'the largest errors, and where they were taken')) if samples else '',
+    )  # fmt: skip
 
 
-def as_title(text: str) -> str:
-    """A text with names of files or topics, as matplotlib draws it: a dollar starts no formula."""
-    return encodable(text).replace('$', r'\$')
+def judgment(scores: Scores, counts: Mapping[str, Any]) -> tuple[str, str]:
+    """The color of the page, and its answer in a sentence."""
+    mean, wheels = scores['ekf']['mean'], scores['odometry']['mean']
+    if mean is None:
+        return page.BAD, 'The filter did not start, or the truth covers none of its estimates.'
+    if counts['false_localised_s'] > 0:
+        seconds = f'{counts["false_localised_s"]:.1f} s'
+        return page.BAD, f'For {seconds} the robot was sure and more than a meter off.'
+    if wheels is not None and mean > wheels:
+        return page.WEAK, f'The filter errs by {mean:.2f} m: more than the wheels alone.'
+    held = scores['ekf'].get('within_95')
+    if held is not None and held < TRUSTED_SHARE:
+        return page.WEAK, f'The filter errs by {mean:.2f} m, but is surer than it should be.'
+    return page.GOOD, f'The filter errs by {mean:.2f} m on average, and says how sure it is.'
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path) as file:
-        figure.savefig(file, dpi=DOTS_PER_INCH, format='png')
+def error_map_figure(path: Path, truth: Trajectory, estimate: Trajectory) -> None:
+    """Draw the true path colored by the position error (m) of an estimate."""
+    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    axes = figure.add_subplot()
+    _, places, errors = _errors(truth, estimate)
+    top = max(float(np.percentile(errors, 98)), 0.05) if len(errors) else 1.0
+    dots = axes.scatter(
+        places[:, 0], places[:, 1], c=errors, s=14, cmap='viridis', vmin=0.0, vmax=top
+    )
+    figure.colorbar(dots, label='position error (m)', shrink=0.85, extend='max')
+    in_meters(axes, 'Position error of the filter')
+    save(figure, path)
 
 
-def save_text(path: Path, text: str) -> None:
-    """Write a text file, completely or not at all. Raises LocalizationError."""
-    with atomic_write(path) as file:
-        file.write(encodable(text).encode())
+def _weak_lines(truth: Trajectory, estimate: Trajectory) -> Iterator[str]:
+    """Where the filter is worst: what to drive again in a further training drive."""
+    _, places, errors = _errors(truth, estimate)
+    if not len(errors):
+        return
+    worst = worst_images(places, errors)
+    found = [one for one in worst if one.error_m > _WEAK * errors.mean()]
+    for one in found[:3]:
+        yield f'x {one.x_m:.1f} m, y {one.y_m:.1f} m: {one.error_m:.2f} m'
+    if found:
+        yield 'Drive there in a further training drive, in two directions.'
+    else:
+        yield f'Nowhere is the error more than {_WEAK:g} times its mean.'
+
+
+def _trust(scores: Scores, counts: Mapping[str, Any]) -> Iterator[str]:
+    yield from trust_lines(scores)
+    total = sum(counts['states_s'].values())
+    for name, seconds in counts['states_s'].items():
+        yield f'{name}: {seconds / max(total, 1e-9):.0%} of the drive'
+    yield f'LOCALISED and more than a meter off: {counts["false_localised_s"]:.1f} s'
+
+
+def _rejected(counts: Mapping[str, Any]) -> Iterator[str]:
+    """What was not used, and why: of the inputs, and by the filter."""
+    for stream in ('images', 'odometry', 'observations'):
+        for reason, n in sorted(counts[stream]['skipped'].items()):
+            yield f'{n} {stream}: {reason}'
+    used = {'odometry: used', 'measurement: accepted', 'measurement: started'}
+    for reason, n in sorted(counts['fusion'].items()):
+        if reason not in used:
+            yield f'{n} times {reason}'

@@ -10,7 +10,7 @@ from html import escape
 from pathlib import Path
 
 from sfa_localization.data.errors import LocalizationError
-from sfa_localization.reports.evaluation import save_text
+from sfa_localization.reports.figures import save_text
 
 GOOD, WEAK, BAD = 'good', 'weak', 'bad'
 PAGE = 'index.html'
@@ -34,13 +34,7 @@ figcaption { font-size: 0.9rem; color: #555; text-align: center; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.2rem 0.7rem; border-bottom: 1px solid #ddd; text-align: right; }
 th:first-child, td:first-child { text-align: left; }
-pre { overflow-x: auto; font-size: 0.8rem; background: #f6f6f6; padding: 0.5rem; }
 """
-
-
-def paragraph(text: str) -> str:
-    """A paragraph of plain text."""
-    return f'<p>{escape(text)}</p>'
 
 
 def verdict(level: str, text: str) -> str:
@@ -57,17 +51,9 @@ def items(texts: Sequence[str]) -> str:
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table of plain texts, which scrolls sideways where the screen is narrow."""
     top = ''.join(f'<th>{escape(cell)}</th>' for cell in head)
-    body = ''.join(
-        '<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>' for row in rows
-    )
-    return (
-        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
-    )
-
-
-def text_block(text: str) -> str:
-    """Text as it is, with its line breaks."""
-    return f'<pre>{escape(text)}</pre>'
+    lines = [''.join(f'<td>{escape(cell)}</td>' for cell in row) for row in rows]
+    body = ''.join(f'<tr>{line}</tr>' for line in lines)
+    return f'<div class="wide"><table><tr>{top}</tr>{body}</table></div>'
 
 
 def figure(path: Path, caption: str) -> str:
@@ -93,7 +79,7 @@ def begin_page(folder: Path) -> None:
     """Mark a folder as that of a report before its figures are written: one that is interrupted is
     replaced by the next.
     """
-    write_page(folder, 'Unfinished report', paragraph('It was interrupted: run the command again.'))
+    write_page(folder, 'Unfinished report: it was interrupted; run the command again')
 
 
 def write_page(folder: Path, title: str, *parts: str) -> None:

@@ -42,18 +42,9 @@ def summary(trained: Trained) -> str:
             lines.append(
                 f'{run.name}: wheels lose {loss:.2f} m per radian in turns: taken into account'
             )
-    for name, count in _skipped(trained).items():
-        lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.items())]
+    used = {f'{run.name}: {name}': n for run in trained.runs for name, n in run.counts.items()}
+    used['metric learning: images'] = trained.segments.images
+    used['metric learning: odometry'] = trained.segments.odometry
+    for name, count in used.items():
+        lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.skipped.items())]
     return '\n'.join(lines)
-
-
-def _skipped(trained: Trained) -> dict[str, dict[str, int]]:
-    """What was not used, by reason: of every bag, and of the segments."""
-    skipped = {
-        f'{run.name}: {stream}': count.skipped
-        for run in trained.runs
-        for stream, count in run.counts.items()
-    }
-    skipped['metric learning: images'] = trained.segments.images.skipped
-    skipped['metric learning: odometry'] = trained.segments.odometry.skipped
-    return skipped

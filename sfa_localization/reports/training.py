@@ -1,69 +1,54 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a training, like figures 3 to 5 of the paper; no ground truth is needed."""
+"""The page of a training: is the map good, where is it weak, may I trust it, what to drive next."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
+from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.learning import positions
-from sfa_localization.reports import evaluation as report
-from sfa_localization.reports.bag import write_contact_sheet
+from sfa_localization.reports import figures, page
+from sfa_localization.reports.evaluation import firing_maps_figure
+from sfa_localization.reports.figures import WorstImage
 from sfa_localization.reports.summary import summary
-from sfa_localization.reports.training_page import drives, write_training_page
 from sfa_localization.training import Trained
 
-# Inches.
-_SIZE = (7.0, 6.0)
-
-
-WORST_IMAGES, WORST_APART_M = 6, 1.0
-"""Worst images shown, and the distance (m) between them: neighbors look alike."""
+GOOD_M, USEFUL_M = 0.5, 2.0
+"""Expected errors of one image (m) at which the filter's default limits make a state DEGRADED, and
+LOST."""
+TRUSTED_SHARE = 0.9
+"""Of the left-out images, the regions of 95 % hold at least so many where they can be believed."""
+FEW_CROSSINGS = 5
+"""With fewer crossings one bad stretch of odometry bends the map unnoticed."""
+PARALLEL = 0.3
+"""Spread of driving directions (0 parallel, 1 even) below which the drive was one-sided."""
+_PLACES, _APART_M = 3, 2.0  # weak places named, and the distance between them (m)
+_WEAK = 1.5  # times the expected error: ground that is clearly worse than usual
 _CAPTIONS = {
     'coverage': 'Where images were taken (black), on the expected error of one image',
     'line_fits': 'Each segment by odometry (wide) and by slow features (thin)',
-    'firing_maps': 'Slow features at the places of the images',
-    'odometry': 'The path by odometry alone, and in the map',
-    'headings': 'Heading errors of images that were left out',
-    'convergence': "Cost of the paper's descent",
-    'worst_images': 'Images with the largest errors, and where they were taken',
+    'firing_maps': 'Slow features at the places of the images: good ones change smoothly',
+    'worst_images': 'Images that the map puts farthest from where they were taken',
 }
 
 
-class WorstImage(NamedTuple):
-    """An image of a drive, where it was taken in the map (x, y in m), and its error (m)."""
-
-    run: int
-    stamp_ns: int
-    x_m: float
-    y_m: float
-    error_m: float
-
-
-def worst_images(trained: Trained) -> list[WorstImage]:
-    """The images that the map puts farthest from where their segment does."""
+def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
+    """The images that the map puts farthest from where their segment does: run and stamp."""
     images, places = positions(trained.metric, trained.segments)
-    errors = np.hypot(*trained.metric.residuals.T)
-    counts = np.cumsum([0, *(len(run.panoramas) for run in trained.runs)])
-    found: list[WorstImage] = []
-    for k in np.argsort(-errors):
-        x, y = places[k].tolist()
-        if any(np.hypot(one.x_m - x, one.y_m - y) < WORST_APART_M for one in found):
-            continue
-        run = int(np.searchsorted(counts, images[k], 'right')) - 1
-        stamps = trained.runs[run].panoramas.stamps_ns
-        found.append(WorstImage(run, int(stamps[images[k] - counts[run]]), x, y, float(errors[k])))
-        if len(found) == WORST_IMAGES:
-            break
-    return found
+    stamps = [
+        (number, stamp)
+        for number, run in enumerate(trained.runs)
+        for stamp in run.panoramas.stamps_ns.tolist()
+    ]
+    worst = figures.worst_images(places, np.hypot(*trained.metric.residuals.T))
+    return {one: stamps[images[one.row]] for one in worst}
 
 
 def write_training_report(
@@ -71,53 +56,110 @@ def write_training_report(
 ) -> None:
     """Write figures of the training, training.md, and the page index.html that contains them all.
 
-    Coverage, line fits, odometry, firing maps and, where there are any, headings, descent and the
-    `samples` of the worst images. Makes the folder. Raises LocalizationError when a file cannot
-    be written.
+    The `samples` of the worst images too, where there are any. Makes the folder. Raises
+    LocalizationError when a file cannot be written.
     """
     images, places = positions(trained.metric, trained.segments)
-    names = ['coverage', 'line_fits', 'odometry', 'firing_maps']
     coverage_figure(folder / 'coverage.png', trained, places)
     line_fits_figure(folder / 'line_fits.png', trained, places)
-    odometry_figure(folder / 'odometry.png', trained)
-    report.firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
-    if trained.heading is not None:
-        names.append('headings')
-        headings_figure(folder / 'headings.png', trained)
-    if len(trained.metric.history):
-        names.append('convergence')
-        convergence_figure(folder / 'convergence.png', trained.metric.history)
+    firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])
     if samples:
-        names.append('worst_images')
-        _worst_figure(folder / 'worst_images.png', samples)
+        figures.write_worst_images(folder / 'worst_images.png', samples)
+    names = [name for name in _CAPTIONS if samples or name != 'worst_images']
     shown = [f'![{name}]({name}.png)' for name in names]
     text = '\n\n'.join(['# Training', f'```\n{summary(trained)}\n```', *shown]) + '\n'
-    report.save_text(folder / 'training.md', text)
-    title = f'Training on {", ".join(run.name for run in trained.runs)}'
-    figures = [(f'{name}.png', _CAPTIONS[name]) for name in names]
-    write_training_page(folder, title, trained, figures)
+    figures.save_text(folder / 'training.md', text)
+    parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
+    page.write_page(
+        folder,
+        f'Training on {", ".join(run.name for run in trained.runs)}',
+        page.verdict(*judgment(trained)),
+        page.section('Is my map good?', page.items(summary(trained).splitlines()),
+                     parts['line_fits']),
+        page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage']),
+        page.section('May I trust it?', page.items(trust_lines(trained))),
+        page.section('What do I drive next?', page.items(advice(trained))),
+        page.section('Slow features', parts['firing_maps']),
+        page.section('Worst images', parts.get('worst_images', '')),
+    )  # fmt: skip
 
 
-def _worst_figure(path: Path, samples: Mapping[WorstImage, Image]) -> None:
-    captions = [f'x {k.x_m:.1f} m, y {k.y_m:.1f} m: error {k.error_m:.2f} m' for k in samples]
-    write_contact_sheet([*samples.values()], 'Worst images', path, captions)
+def judgment(trained: Trained) -> tuple[str, str]:
+    """The color of the page, and its answer in a sentence."""
+    quality = trained.model.quality
+    expected = quality['expected_error_m']
+    if expected > USEFUL_M or trained.metric.diagnostics.mirror_ambiguous:
+        return page.BAD, 'The map cannot be used yet: see what to drive next.'
+    sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
+    if expected > GOOD_M or not sure:
+        return page.WEAK, 'The map can be used with care: see where it is weak.'
+    return page.GOOD, f'The map is good: expect an error of {expected:.2f} m from one image.'
 
 
-def odometry_figure(path: Path, trained: Trained) -> None:
-    """Draw the path of each drive by odometry alone, laid on its path in the map."""
-    figure, axes = _figure()
-    for number, (_, places, driven) in enumerate(drives(trained)):
-        first = number == 0
-        axes.plot(*driven.T, color='#E69F00', linewidth=1.0, label='odometry' if first else None)
-        axes.plot(*places.T, color='#0072B2', linewidth=1.4, label='map' if first else None)
-    axes.legend(loc='upper right')
-    _places(axes, 'Odometry alone, and corrected by the map')
-    report.save(figure, path)
+def weak_places(forecast: Forecast) -> Iterator[tuple[float, float, float]]:
+    """x, y (m) and expected error (m) where it is largest, each apart from the others."""
+    local, points = forecast.local, forecast.points
+    left = np.ones(len(points), bool)
+    for _ in range(_PLACES):
+        at = int(np.argmax(np.where(left, local, -np.inf)))
+        if not left[at] or local[at] < _WEAK * forecast.expected_m:
+            return
+        yield float(points[at, 0]), float(points[at, 1]), float(local[at])
+        left &= np.hypot(*(points - points[at]).T) > _APART_M
+
+
+def weak_lines(trained: Trained) -> list[str]:
+    """Where the expected error is large."""
+    forecast = trained.metric.forecast
+    share = float((forecast.local > _WEAK * forecast.expected_m).mean())
+    lines = [
+        f'near x {x:.1f} m, y {y:.1f} m: {error:.2f} m' for x, y, error in weak_places(forecast)
+    ]
+    even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
+    uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
+    frame = 'x and y are those of the odometry where the first drive starts, or of its anchor.'
+    return [*lines, uneven if lines else even, frame]
+
+
+def trust_lines(trained: Trained) -> list[str]:
+    """The certificate and the calibration, in words."""
+    quality, found = trained.model.quality, trained.metric.diagnostics
+    angle = np.degrees(found.angle_std_rad)
+    proven = (
+        'Proven: no other directions of the segments fit odometry and images better '
+        if quality['certified']
+        else 'NOT proven: other directions of the segments may fit better '
+    )
+    lines = [
+        proven + f'(certificate {quality["certificate"]:.1e}, at least zero up to rounding).',
+        f'Of the images that were left out, {quality["left_out_within_95"]:.0%} lie in the region '
+        'that claims to hold 95 %.',
+        f'The least certain direction of a segment is known to {angle:.1f} degrees.',
+        'Not included: other light than in training, and a wheel radius that is wrong everywhere.',
+    ]
+    mirrored = 'The mirror image of the map fits as well: drive curves.'
+    return [*lines, mirrored] if found.mirror_ambiguous else lines
+
+
+def advice(trained: Trained) -> list[str]:
+    """What to drive next, most useful first."""
+    found, forecast = trained.metric.diagnostics, trained.metric.forecast
+    lines = [
+        f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, _ in weak_places(forecast)
+    ]
+    if found.directions < PARALLEL:
+        lines.append('Drive in other directions: most of this drive was parallel.')
+    if found.crossings < FEW_CROSSINGS:
+        lines.append(f'Cross your own track: this drive does so {found.crossings} times.')
+    if found.mirror_ambiguous:
+        lines.append('Drive some curves: straight lines alone do not show left and right.')
+    return [*lines, 'For other light, drive once more when it is cloudy, or at another hour.']
 
 
 def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw where images were taken, (M, 2) m, on the expected error around them."""
-    figure, axes = _figure()
+    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    axes = figure.subplots()
     expected = trained.metric.forecast
     dots = axes.scatter(
         expected.points[:, 0], expected.points[:, 1], c=expected.local, s=30, cmap='viridis'
@@ -127,13 +169,14 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     x, y, error = expected.worst
     axes.plot(x, y, 'x', color='red', markersize=10, label=f'worst: {error:.2f} m')
     axes.legend(loc='upper right')
-    _places(axes, 'Images in the map, and the expected error between them')
-    report.save(figure, path)
+    figures.in_meters(axes, 'Images in the map, and the expected error between them')
+    figures.save(figure, path)
 
 
 def line_fits_figure(path: Path, trained: Trained, places: Array) -> None:
     """Draw every segment by odometry (places (M, 2) m) and by the slow features."""
-    figure, axes = _figure()
+    figure = Figure(figsize=(7.0, 6.0), layout='constrained')
+    axes = figure.subplots()
     predicted = places - trained.metric.residuals
     start = 0
     for segment in trained.segments:
@@ -141,45 +184,5 @@ def line_fits_figure(path: Path, trained: Trained, places: Array) -> None:
         (line,) = axes.plot(*places[part].T, linewidth=2.5, alpha=0.4)
         axes.plot(*predicted[part].T, linewidth=0.8, color=line.get_color())
         start = part.stop
-    _places(axes, 'Segments: odometry (wide), slow features (thin)')
-    report.save(figure, path)
-
-
-def headings_figure(path: Path, trained: Trained) -> None:
-    """Draw the left-out heading error along the drive, and against the compass's certainty |g|."""
-    fit = trained.heading
-    assert fit is not None
-    figure = Figure(figsize=(9.0, 6.0), layout='constrained')
-    along, against = figure.subplots(2, 1)
-    error = np.degrees(fit.left_out_error)
-    limit = max(3 * float(np.quantile(np.abs(error), 0.95)), 1.0)
-    band = np.degrees(1.96 * fit.left_out_std)
-    along.fill_between(fit.images, -band, band, alpha=0.25, label='95 % interval')
-    along.plot(fit.images, error, '.', markersize=3, color='black')
-    along.set(xlabel='image', ylabel='left-out heading error (deg)', ylim=(-limit, limit))
-    along.legend(loc='upper right')
-    against.semilogy(fit.certainty, np.abs(error) + 1e-3, '.', markersize=3)
-    against.set(xlabel='certainty |g|', ylabel='|heading error| (deg)')
-    for axes in (along, against):
-        axes.grid(alpha=0.3)
-    report.save(figure, path)
-
-
-def convergence_figure(path: Path, history: Array) -> None:
-    """Draw the cost (I,) of the paper's descent over its iterations."""
-    figure, axes = _figure()
-    axes.loglog(np.arange(1, len(history) + 1), history)
-    axes.set(xlabel='iteration', ylabel='cost (m²)', title='Momentum descent (equations 7, 8)')
-    axes.grid(alpha=0.3)
-    report.save(figure, path)
-
-
-def _figure() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=_SIZE, layout='constrained')
-    return figure, figure.subplots()
-
-
-def _places(axes: Axes, title: str) -> None:
-    axes.set_aspect('equal')
-    axes.set(xlabel='x in map (m)', ylabel='y in map (m)', title=title)
-    axes.grid(alpha=0.3)
+    figures.in_meters(axes, 'Segments: odometry (wide), slow features (thin)')
+    figures.save(figure, path)

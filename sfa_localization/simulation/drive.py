@@ -15,6 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -261,73 +262,62 @@ def simulate(
     panorama: PanoramaConfig | None = None,
     camera: CameraModel | None = None,
     progress: bool = False,
-    given: Drive | None = None,
 ) -> Drive:
-    """Record a drive to the bag `out`; `progress` shows a bar. Returns what was recorded.
+    """Drive through the garden of `config` and `record` it. Returns what was recorded."""
+    garden = Garden(config.world, config)
+    driven = drive(garden, config)
+    record(driven, garden, config, out, panorama, camera, progress)
+    return driven
 
-    A `given` drive is recorded instead of one of `config`; no tree on the lawn is in its way.
+
+def record(
+    driven: Drive,
+    garden: Garden,
+    config: SimulationConfig,
+    out: Path,
+    panorama: PanoramaConfig | None = None,
+    camera: CameraModel | None = None,
+    progress: bool = False,
+) -> None:
+    """Record a drive to the bag `out`; `progress` shows a bar.
+
     Raises BagError when the bag exists or cannot be written, ConfigError for impossible settings.
     After an error or Ctrl-C nothing is left.
     """
-    garden = Garden(config.world, config, given is not None)
-    recorded = given or drive(garden, config)
     if config.images == 'panorama':
         view = panorama_view(panorama or PanoramaConfig())
     else:
         camera = camera or make_camera(LensCalibration(), RAW_SIZE)
         view = raw_view(camera.unproject, camera.size)
     with BagWriter(out, config.storage) as bag:
-        noisy = render_images(garden, recorded, config, view)
-        count = len(recorded.image_stamps_ns)
+        noisy = render_images(garden, driven, config, view)
+        count = len(driven.image_stamps_ns)
         shown = progress_over(noisy, f'render the images of {out.name}', count, shown=progress)
-        _write(bag, recorded, shown, config)
-    return recorded
+        _write(bag, driven, shown, config)
 
 
 def _write(bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig) -> None:
     """Write all messages in the order of their stamps."""
+    compressed = None if config.compression == 'none' else config.compression
+    topic = '/panorama' if config.images == 'panorama' else '/image_raw'
+    topic += '/compressed' if compressed else ''
+    image = partial(bag.image, frame_id='camera', compressed=compressed)
+    odometry, gyro, truth = drive.odometry, drive.yaw_rate, drive.truth
+    driven = odometry.poses, odometry.twists, odometry.variances
     entries = heapq.merge(
-        _sensor_entries(bag, drive),
-        _image_entries(bag, drive, frames, config),
+        _entries(bag.odometry, '/odom', odometry.stamps_ns, *driven),
+        _entries(bag.imu, '/imu', gyro.stamps_ns, gyro.omega, gyro.variance) if gyro else (),
+        _entries(bag.pose, '/ground_truth', truth.stamps_ns, truth.poses),
+        _entries(image, topic, drive.image_stamps_ns, frames),
         key=lambda entry: entry[0],
     )
     for _, write in entries:
         write()
 
 
-def _image_entries(
-    bag: BagWriter, drive: Drive, frames: Iterable[Image], config: SimulationConfig
+def _entries(
+    write: Callable[..., None], topic: str, stamps_ns: Stamps, *columns: Iterable[Any]
 ) -> Iterator[Entry]:
-    compressed = None if config.compression == 'none' else config.compression
-    topic = '/panorama' if config.images == 'panorama' else '/image_raw'
-    topic += '/compressed' if compressed else ''
-    for stamp, image in zip(map(int, drive.image_stamps_ns), frames, strict=True):
-        yield stamp, partial(bag.image, topic, stamp, image, 'camera', compressed)
-
-
-def _sensor_entries(bag: BagWriter, drive: Drive) -> Iterator[Entry]:
-    """What is not an image, in the order of the stamps."""
-    yield from heapq.merge(
-        _odometry_entries(bag, drive.odometry),
-        _gyro_entries(bag, drive.yaw_rate),
-        _truth_entries(bag, drive.truth),
-        key=lambda entry: entry[0],
-    )
-
-
-def _odometry_entries(bag: BagWriter, odometry: Odometry) -> Iterator[Entry]:
-    for i, stamp in enumerate(map(int, odometry.stamps_ns)):
-        twist, variance = odometry.twists[i], odometry.variances[i]
-        yield stamp, partial(bag.odometry, '/odom', stamp, odometry.poses[i], twist, variance)
-
-
-def _gyro_entries(bag: BagWriter, gyro: YawRate | None) -> Iterator[Entry]:
-    if gyro is None:
-        return
-    for i, stamp in enumerate(map(int, gyro.stamps_ns)):
-        yield stamp, partial(bag.imu, '/imu', stamp, gyro.omega[i], gyro.variance[i])
-
-
-def _truth_entries(bag: BagWriter, truth: Trajectory) -> Iterator[Entry]:
-    for stamp, pose in zip(map(int, truth.stamps_ns), truth.poses, strict=True):
-        yield stamp, partial(bag.pose, '/ground_truth', stamp, pose)
+    """What writes each message of a topic, by its stamp."""
+    for stamp, *values in zip(map(int, stamps_ns), *columns, strict=True):
+        yield stamp, partial(write, topic, stamp, *values)

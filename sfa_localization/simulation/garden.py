@@ -20,14 +20,7 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.simulation.daylight import LIGHTS
-from sfa_localization.simulation.rendering import (
-    Light,
-    Scene,
-    Shape,
-    View,
-    panorama_view,
-    raw_view,
-)
+from sfa_localization.simulation.rendering import Light, Scene, Shape, View, panorama_view, raw_view
 from sfa_localization.simulation.seasons import in_season
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.simulation.textures import Floats
@@ -51,19 +44,13 @@ BRICKS: tuple[Tint, ...] = ((0.13, 0.19, 0.42), (0.22, 0.32, 0.50))
 PLASTERS: tuple[Tint, ...] = (WHITE, (0.36, 0.62, 0.74), (0.55, 0.66, 0.76), (0.66, 0.60, 0.50))
 ROOFS: tuple[Tint, ...] = ((0.12, 0.17, 0.40), (0.19, 0.18, 0.18), (0.14, 0.20, 0.30))
 GREENS: tuple[Tint, ...] = (
-    (0.05, 0.19, 0.09),
-    (0.06, 0.26, 0.16),
-    (0.05, 0.14, 0.08),
-    (0.11, 0.24, 0.19),
-    (0.08, 0.30, 0.28),
-)
+    (0.05, 0.19, 0.09), (0.06, 0.26, 0.16), (0.05, 0.14, 0.08),
+    (0.11, 0.24, 0.19), (0.08, 0.30, 0.28),
+)  # fmt: skip
 BLOOMS: tuple[Tint, ...] = (
-    (0.15, 0.15, 0.65),
-    (0.50, 0.20, 0.55),
-    (0.08, 0.62, 0.75),
-    (0.70, 0.68, 0.72),
-    (0.60, 0.28, 0.25),
-)
+    (0.15, 0.15, 0.65), (0.50, 0.20, 0.55), (0.08, 0.62, 0.75),
+    (0.70, 0.68, 0.72), (0.60, 0.28, 0.25),
+)  # fmt: skip
 
 
 def choose(rng: np.random.Generator, tints: tuple[Tint, ...]) -> Tint:
@@ -197,14 +184,9 @@ def _windows(center: Array, size: Array, side: int, rng: np.random.Generator) ->
 
 
 def _pane(
-    middle: Array,
-    along: int,
-    wide: float,
-    low: float,
-    high: float,
-    door: bool,
+    middle: Array, along: int, wide: float, low: float, high: float, door: bool,
     rng: np.random.Generator,
-) -> list[Shape]:
+) -> list[Shape]:  # fmt: skip
     depths = ((0.08, 0.06, WHITE), (-0.06, 0.10, choose(rng, WOODS) if door else GLASS))
     shapes = []
     for margin, depth, tint in depths:
@@ -330,8 +312,8 @@ def buildings(plot: Plot) -> None:
     """The shed in the garden, the house behind one side, neighbors behind the others."""
     sides = plot.rng.permutation(4)
     shed = plot.beside(int(sides[0]), plot.rng.choice([-0.75, 0.75]), STRIP_M + 1.1)
-    plot.shapes += box(shed, np.array([2.0, 2.0, 2.1]), 'boards', choose(plot.rng, WOODS))
     size = np.array([2.0, 2.0, 2.1])
+    plot.shapes += box(shed, size, 'boards', choose(plot.rng, WOODS))
     plot.shapes += _gable(shed, size, ('boards', WOODS[0]), plot.rng)
     for number, side in enumerate(sides[1:]):
         out = 6.5 if number == 0 else plot.rng.uniform(10, 18)

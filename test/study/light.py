@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of `reproduce light`: one garden, trained in some lights, tested in all of them.
+"""The study `light`: one garden, trained in some lights, tested in all of them.
 
 A row of the matrix tests one model in every light; the last row tests in each light the model of
 the other three. The test drives have the same poses in every light. Bags, models and cells of the
@@ -12,37 +12,35 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.commands.paper_results import RECIPES, flat
-from sfa_localization.commands.reproduction import (
-    BATCH,
-    Cell,
-    Progress,
-    Results,
-    recorded,
-    settings_of,
-    usual_drift,
-)
-from sfa_localization.commands.trials import STRAIGHT, features_of, slow_of
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory
 from sfa_localization.evaluation import evaluate, fit_transform, moved, score
-from sfa_localization.features.retrieval import ImageRetrieval
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.reports.evaluation import save_text
-from sfa_localization.reports.light import matrix_figure, table
+from sfa_localization.reports.figures import save_text
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import Recipe, clock_of, cut_odometry, train
-
-if TYPE_CHECKING:
-    from sfa_localization.commands.reproduce import ReproduceConfig
+from study.light_report import matrix_figure, table
+from study.paper import RECIPES, flat
+from study.results import (
+    BATCH,
+    Cell,
+    Progress,
+    Results,
+    StudyConfig,
+    recorded,
+    settings_of,
+    usual_drift,
+)
+from study.retrieval import ImageRetrieval
+from study.trials import STRAIGHT, features_of, slow_of
 
 RESULTS = 'matrix.json'
 Condition = tuple[str, str]
@@ -102,7 +100,7 @@ class _Work:
     """The folder, the garden in it, and how its steps are shown."""
 
     out: Path
-    config: ReproduceConfig
+    config: StudyConfig
     plan: Plan
     progress: Progress
 
@@ -143,8 +141,8 @@ class _Work:
         return PlaceModel.load(path)
 
 
-def reproduce_light(
-    out: Path, config: ReproduceConfig, plan: Plan, *, progress: bool = False
+def fill_matrix(
+    out: Path, config: StudyConfig, plan: Plan, *, progress: bool = False
 ) -> list[Cell]:
     """Fill the matrix; write it as JSON, table and figure below `out`. Returns its cells.
 

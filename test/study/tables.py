@@ -8,18 +8,14 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from sfa_localization.commands.comparisons import MEASURES, SCORES, VARIANTS, ablations, baselines
-from sfa_localization.commands.paper_results import experiment
-from sfa_localization.commands.reproduction import Progress, Results, settings_of
-from sfa_localization.commands.sites import ROUTES, Plan, Site
-from sfa_localization.reports.evaluation import save_text
-from sfa_localization.reports.paper import comparison_table, paper_table
+from sfa_localization.reports.figures import save_text
 from sfa_localization.training import Recipe
-
-if TYPE_CHECKING:
-    from sfa_localization.commands.reproduce import ReproduceConfig
+from study.comparisons import MEASURES, SCORES, VARIANTS, ablations, baselines
+from study.paper import experiment
+from study.paper_report import comparison_table, paper_table
+from study.results import Progress, Results, StudyConfig, settings_of
+from study.sites import ROUTES, Plan, Site
 
 NAMES = ('simulator', 'robot', 'baselines', 'ablations')
 
@@ -31,7 +27,7 @@ class Work:
     """
 
     out: Path
-    config: ReproduceConfig
+    config: StudyConfig
     plan: Plan
     progress: Progress
     bags: tuple[Path, ...] = ()

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables and figures of the paper's experiments, beside the paper's own numbers.
 
-Cells are those of `commands/paper_results.py` and `commands/comparisons.py`; errors are mean
+Cells are those of `paper` and `comparisons`; errors are mean
 distances in meters. A number of several seeds is their mean and standard deviation.
 """
 
@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.reports.evaluation import MARGIN_M, TRUTH, save
+from sfa_localization.reports.evaluation import MARGIN_M, TRUTH
+from sfa_localization.reports.figures import save
 
 Cells = Sequence[Mapping[str, Any]]
 

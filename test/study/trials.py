@@ -16,24 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.bags.drives import read_drive
-from sfa_localization.commands.reproduction import BATCH, Cell
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import (
-    Array,
-    RigidTransform,
-    align,
-    compose,
-    invert,
-    rotation,
-)
+from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import known, regression, score
-from sfa_localization.features.image_features import (
-    REFINING_LAYER,
-    slow_features,
-    spectrum,
-)
+from sfa_localization.features.image_features import REFINING_LAYER, slow_features, spectrum
 from sfa_localization.features.network import Network
 from sfa_localization.filtering import Table, run_filter
 from sfa_localization.fusion.camera_clock import CameraClock
@@ -44,6 +32,7 @@ from sfa_localization.metric.segments import Segments, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe, clock_of, cut_odometry
+from study.results import BATCH, Cell
 
 Rows = NDArray[np.int64]
 Features = Callable[[Image], Array]

@@ -1,16 +1,34 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A real robot's drive in the simulated garden: its true poses, and the odometry it measured."""
+"""A real robot's drive in the simulated garden: its true poses, and the odometry it measured.
+
+TRUTH: TUM lines, or stamp_s,x_m,y_m,yaw_rad, with the garden's center at 0, 0.
+ODOM.csv: stamp_s,v_mps,omega_radps[,var_v,var_omega]
+"""
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 import numpy as np
 
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.commands.options import add_settings, numbers, settings
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, integrate
-from sfa_localization.simulation.drive import START_NS, Drive
+from sfa_localization.filtering import read_odometry_table, read_truth
+from sfa_localization.simulation.drive import START_NS, Drive, record
+from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig
+
+SUMMARY = "a bag of a real robot's poses and odometry, with rendered images"
+SETTINGS = (
+    'world', 'seed', 'light', 'season', 'area', 'images', 'images_every', 'images_every_turn',
+    'compression', 'storage', 'image_noise', 'illumination',
+)  # fmt: skip
+"""Of the simulation: those that a given drive leaves open."""
 
 POSE_GAP_S = 0.5
 """No image is taken where the true poses pause for longer: the robot may be anywhere between."""
@@ -57,3 +75,42 @@ def _image_stamps(truth: Trajectory, config: SimulationConfig) -> Stamps:
             chosen.append(int(i))
             last = truth.poses[i]
     return np.asarray(truth.stamps_ns[chosen])
+
+
+def measured(log: Path) -> Odometry:
+    """What a log says; its poses are zero, and variances that it does not state."""
+    table = read_odometry_table(log)
+    columns = [
+        np.nan_to_num(table.columns.get(name, np.zeros(len(table))))
+        for name in ('v', 'omega', 'var_v', 'var_omega')
+    ]
+    stamps, values = table.stamps_ns, np.column_stack(columns)
+    return Odometry(stamps, np.zeros((len(stamps), 3)), values[:, :2], values[:, 2:])
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the bag, both logs, and what they leave open."""
+    parser.description, parser.formatter_class = __doc__, argparse.RawDescriptionHelpFormatter
+    parser.set_defaults(run=run)
+    parser.add_argument('out', type=Path, metavar='OUT_BAG', help='folder of the bag to write')
+    parser.add_argument('--poses', type=Path, required=True, metavar='TRUTH', help='true poses')
+    parser.add_argument(
+        '--odometry', type=Path, required=True, metavar='ODOM.csv', help='what it measured there'
+    )
+    parser.add_argument('--size', type=numbers, help='columns x rows of --images panorama')
+    add_settings(parser, SimulationConfig, SETTINGS)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Drive and render; print the number of images."""
+    config, panorama = settings(SimulationConfig, arguments), PanoramaConfig()
+    if arguments.size:
+        width, height = map(int, arguments.size)
+        panorama = PanoramaConfig(width=width, height=height)
+    odometry = measured(arguments.odometry)
+    made = given_drive(read_truth(arguments.poses), odometry, config)
+    # No tree stands in the way of a robot that did not know of it.
+    garden = Garden(config.world, config, open_lawn=True)
+    record(made, garden, config, arguments.out, panorama, progress=True)
+    print(f'{arguments.out}: {len(made.image_stamps_ns)} images')
+    return 0

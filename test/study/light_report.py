@@ -3,7 +3,7 @@
 """Table and figure of the matrix of lights: trained in some, tested in all.
 
 A cell is a mapping with `trained`, `light` and `season`, and the scores that
-`commands/light_matrix.py` gives; a score that does not exist is None or missing.
+`light` gives; a score that does not exist is None or missing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.reports.evaluation import save
+from sfa_localization.reports.figures import save
 
 Cells = Sequence[Mapping[str, Any]]
 

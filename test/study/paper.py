@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of `reproduce simulator` and `reproduce robot`: the paper's two experiments.
+"""The studies `simulator` and `robot`: the paper's two experiments.
 
 Each seed has a garden and drives of its own, of the paper's sizes. One network serves all columns
 of the table; they differ in how meters are learned from what it outputs.
@@ -14,19 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.commands.reproduction import Cell, Results
-from sfa_localization.commands.sites import Site
-from sfa_localization.commands.trials import (
-    MONOMIALS,
-    STRAIGHT,
-    Study,
-    Trial,
-    known_start,
-    mean_distance,
-    mean_error,
-    slow_of,
-    turned_of,
-)
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, align
 from sfa_localization.data.run import Trajectory
@@ -39,8 +26,21 @@ from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import assignment
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.reports import paper as report
 from sfa_localization.reports.evaluation import firing_maps_figure
+from study import paper_report as report
+from study.results import Cell, Results
+from study.sites import Site
+from study.trials import (
+    MONOMIALS,
+    STRAIGHT,
+    Study,
+    Trial,
+    known_start,
+    mean_distance,
+    mean_error,
+    slow_of,
+    turned_of,
+)
 
 RECIPES = {'paper': replace(MONOMIALS, solver='paper'), 'certified': MONOMIALS}
 """Section 4: C' from odometry, by the paper's descent; and the optimum of the same problem."""
@@ -71,8 +71,8 @@ def experiment(site: Site, results: Results, name: str, seed: int, figures: Path
         if name == 'simulator':
             descent = _random_start(study, features, seed, columns)
         if figures is not None:
-            firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
             if descent:
+                firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
                 report.panels_figure(figures / 'figure_4.png', {"paper's descent": descent})
             _figures(figures, name, study, paths)
         drift = mean_distance(odometry_from_start(study.truth, study.test), study.truth)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of `reproduce baselines` and `reproduce ablations`: other features, and fewer parts.
+"""The studies `baselines` and `ablations`: other features, and fewer parts.
 
 Baselines replace the features, and go through the same metric learning and evaluation; ablations
 leave out a part of this package, and are evaluated as the nodes would work.
@@ -13,18 +13,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sfa_localization.commands.reproduction import BATCH, Cell, Results
-from sfa_localization.commands.sites import Site, learned
-from sfa_localization.commands.trials import (
-    MONOMIALS,
-    STRAIGHT,
-    Features,
-    Study,
-    Trial,
-    mean_error,
-    slow_of,
-    turned_of,
-)
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, Run
 from sfa_localization.evaluation import evaluate
@@ -34,18 +22,17 @@ from sfa_localization.features.network import (
     Layer,
     standard_architecture,
 )
-from sfa_localization.features.network_training import (
-    LIGHT_STD,
-    ImageSequence,
-    train_network,
-)
-from sfa_localization.features.retrieval import ImageRetrieval
+from sfa_localization.features.network_training import LIGHT_STD, ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
-from sfa_localization.features.signatures import FourierSignature, TurnedComponents
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
+from study.results import BATCH, Cell, Results
+from study.retrieval import ImageRetrieval
+from study.signatures import FourierSignature, TurnedComponents
+from study.sites import Site, learned
+from study.trials import MONOMIALS, STRAIGHT, Features, Study, Trial, mean_error, slow_of, turned_of
 
 BASELINES: dict[str, Callable[[Study, PlaceModel], Features]] = {
     'principal components of all rotations': (

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The steps of `reproduce year`: one garden, learned once, and a drive in each month after that.
+"""The study `year`: one garden, learned once, and a drive in each month after that.
 
 Each drive is judged before anything learns from it. The first model stays frozen; a copy of it is
 updated after each drive; in some months another is trained anew, on the first drive and the last.
@@ -11,28 +11,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from sfa_localization.commands.reproduction import (
-    Cell,
-    Progress,
-    Results,
-    recorded,
-    settings_of,
-    usual_drift,
-)
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.evaluation import evaluate
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.reports.evaluation import save_text
-from sfa_localization.reports.year import table, year_figure
+from sfa_localization.reports.figures import save_text
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import train
 from sfa_localization.updating import update
-
-if TYPE_CHECKING:
-    from sfa_localization.commands.reproduce import ReproduceConfig
+from study.results import Cell, Progress, Results, StudyConfig, recorded, settings_of, usual_drift
+from study.year_report import table
 
 RESULTS = 'year.json'
 FIRST = ('day', 'summer')
@@ -76,7 +65,7 @@ class _Work:
     """The folder, the garden in it, and how its steps are shown."""
 
     out: Path
-    config: ReproduceConfig
+    config: StudyConfig
     plan: YearPlan
     progress: Progress
 
@@ -119,10 +108,10 @@ class _Work:
         return PlaceModel.load(path)
 
 
-def reproduce_year(
-    out: Path, config: ReproduceConfig, plan: YearPlan, *, progress: bool = False
+def judge_year(
+    out: Path, config: StudyConfig, plan: YearPlan, *, progress: bool = False
 ) -> list[Cell]:
-    """Judge all models in all months; write JSON, table and figure below `out`. Returns the cells:
+    """Judge all models in all months; write JSON and table below `out`. Returns the cells:
     `model`, `month`, `light`, `season`, and the scores that `_judged` names.
 
     Raises LocalizationError, also for a folder with anything else.
@@ -133,8 +122,7 @@ def reproduce_year(
     report.say(f'this takes about {plan.minutes} minutes on two cores')
     _fill(_Work(out, config, plan, report), results)
     save_text(out / 'year.md', table(results.cells) + '\n')
-    year_figure(out / 'year.png', results.cells)
-    report.say(f'see {out / "year.png"}')
+    report.say(f'see {out / "year.md"}')
     return results.cells
 
 

@@ -11,17 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.keyframes import (
-    Texture,
-    normalized,
-    small_gray,
-    spectrum,
-)
+from sfa_localization.features.keyframes import Texture, normalized, spectrum
 from sfa_localization.features.nearby import Spectra
 
 COLUMNS, ROWS = 150, 30
@@ -64,4 +60,7 @@ class ImageRetrieval:
 
 def _likeness(panorama: Image) -> Texture:
     """A panorama (H, W, 3) as a gray image of at most (ROWS, COLUMNS), zero mean, unit norm."""
-    return normalized(small_gray(panorama, ROWS, COLUMNS))
+    gray = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
+    size = min(gray.shape[1], COLUMNS), min(gray.shape[0], ROWS)
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    return normalized(np.asarray(small, np.float32))

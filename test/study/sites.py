@@ -11,8 +11,6 @@ from pathlib import Path
 
 from sfa_localization.bags.drives import as_live, image_cache
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.commands.reproduction import Progress, recorded
-from sfa_localization.commands.trials import Study
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.network import Network, standard_architecture
@@ -22,6 +20,8 @@ from sfa_localization.simulation.drive import drive
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import Recipe, learn_place
+from study.results import Progress, recorded
+from study.trials import Study
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the results of `reproduce` share: a folder of finished cells, drives and messages.
+"""What the studies share: their settings, a folder of finished cells, drives and messages.
 
 A result is a list of cells. Cells, bags and models that are finished are kept, and used again when
 the command is repeated.
@@ -20,6 +20,7 @@ from typing import Any
 from sfa_localization import __version__
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.settings import Settings, setting
 from sfa_localization.evaluation import write_json
 from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
@@ -27,6 +28,18 @@ from sfa_localization.simulation.settings import SimulationConfig
 BATCH = 64
 """Images that are read together."""
 Cell = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class StudyConfig(Settings):
+    """Which gardens and drives a study uses."""
+
+    world: int = setting(1, 'garden, the first of --seeds', low=0, high=2**63 - 1)
+    seed: int = setting(1, 'drives and sensor errors; of each drive another', low=0, high=2**62)
+    seeds: int = setting(
+        1, 'gardens, each with drives of its own; ablations and light use the first',
+        low=1, high=1000,
+    )  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -114,7 +127,7 @@ class Progress:
     def say(self, step: str) -> None:
         """Name the next step, with the seconds since the start."""
         if self.shown:
-            print(f'[{time.monotonic() - self.start:4.0f} s] {step}', file=sys.stderr)
+            sys.stderr.write(f'[{time.monotonic() - self.start:4.0f} s] {step}\n')
 
 
 def recorded(

@@ -1,0 +1,115 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Make the tables and figures of test/EVALUATION.md; make half-real bags.
+
+PYTHONPATH=.:test python -m study all --quick
+PYTHONPATH=.:test python -m study simulator --seeds 5
+PYTHONPATH=.:test python -m study baselines --training bags/coverage bags/lines --test bags/test
+PYTHONPATH=.:test python -m study half_real bags/real --poses truth.tum --odometry odom.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sfa_localization.cli import guarded
+from sfa_localization.commands.options import add_settings, settings
+from sfa_localization.data.errors import ConfigError
+from study import half_real, light, light_report, year, year_report
+from study.results import Progress, StudyConfig
+from study.sites import FULL, QUICK
+from study.tables import NAMES, Work
+
+STUDIES = {
+    'all': 'the next five, which take hours',
+    'simulator': "the paper's experiment in its simulator",
+    'robot': "the paper's experiment with a robot, simulated",
+    'baselines': 'other features in the place of slow ones',
+    'ablations': 'this package without some of its parts',
+    'light': 'train in one, two or three lights, test in every light and season',
+    'year': 'train once, then a drive a month, with and without updates of the model',
+}
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run what the first word names; the exit code."""
+    arguments = study_parser().parse_args(words)
+    return guarded(lambda: int(arguments.run(arguments)))
+
+
+def study_parser() -> argparse.ArgumentParser:
+    """The parser of all studies."""
+    parser = argparse.ArgumentParser(
+        prog='study', description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(metavar='STUDY', required=True)
+    for name, summary in STUDIES.items():
+        add_arguments(commands.add_parser(name, help=summary), name)
+    half_real.add_arguments(commands.add_parser('half_real', help=half_real.SUMMARY))
+    return parser
+
+
+def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add the folder and the settings of a study."""
+    parser.set_defaults(run=run, study=name, training=[], test=None)
+    parser.add_argument(
+        '--out',
+        type=Path,
+        metavar='DIR',
+        help='folder to write, or one with the same settings to go on with [study_paper, '
+        'study_light, study_year; with --quick study_quick...]',
+    )
+    parser.add_argument(
+        '--quick', action='store_true', help='a smaller garden, smaller images, fewer seasons'
+    )
+    add_settings(parser, StudyConfig)
+    if name == 'baselines':
+        parser.add_argument(
+            '--training', nargs='+', type=Path, metavar='BAG', help='drives to train on'
+        )
+        parser.add_argument('--test', type=Path, metavar='BAG', help='drive to test on')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make what is missing of the studies; print their tables."""
+    config, start = (
+        settings(StudyConfig, arguments),
+        'study_quick_' if arguments.quick else 'study_',
+    )
+    if bool(arguments.training) != bool(arguments.test):
+        raise ConfigError('--training and --test: give both, or neither')
+    chosen = (*NAMES, 'light') if arguments.study == 'all' else (arguments.study,)
+    paper = [name for name in chosen if name in NAMES]
+    if paper:
+        _paper(paper, arguments.out or Path(f'{start}paper'), config, arguments)
+    if 'light' in chosen:
+        own = arguments.out and (arguments.out / 'light' if paper else arguments.out)
+        plan = light.QUICK if arguments.quick else light.FULL
+        cells = light.fill_matrix(own or Path(f'{start}light'), config, plan, progress=True)
+        print(light_report.table(cells))
+    if 'year' in chosen:
+        months = year.QUICK_YEAR if arguments.quick else year.YEAR
+        cells = year.judge_year(
+            arguments.out or Path(f'{start}year'), config, months, progress=True
+        )
+        print(year_report.table(cells))
+    return 0
+
+
+def _paper(
+    names: Sequence[str], out: Path, config: StudyConfig, arguments: argparse.Namespace
+) -> None:
+    """Those results that share a folder: say how long they take, then make what is missing."""
+    plan, training = QUICK if arguments.quick else FULL, tuple(arguments.training)
+    work = Work(out, config, plan, Progress(shown=True), training, arguments.test)
+    lights = light.QUICK if arguments.quick else light.FULL
+    work.announce(names, lights.minutes if arguments.study == 'all' else 0)
+    for name in names:
+        print(work.reproduced(name))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

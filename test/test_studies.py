@@ -1,0 +1,301 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Each study, tiny: it ends, what is finished is kept, and its numbers are plausible."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from study import __main__ as studies
+from study import comparisons, light, light_report, paper, results, year, year_report
+from study.comparisons import BASELINES, VARIANTS
+from study.half_real import given_drive
+from study.paper_report import PAPER, comparison_table, paper_table
+from study.results import Results
+from study.retrieval import ImageRetrieval
+from study.signatures import FourierSignature, TurnedComponents
+from study.sites import Plan
+from study.tables import NAMES
+from test_commands import gardens, small_network  # noqa: F401
+
+from sfa_localization.bags.reader import Bag
+from sfa_localization.data.errors import ConfigError, DataError, LocalizationError
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.run import Odometry, Trajectory
+from sfa_localization.simulation.drive import START_NS
+from sfa_localization.simulation.settings import SimulationConfig
+
+MINUTES = dict.fromkeys(NAMES, 1)
+PLAN = Plan((6.0, 6.0), (160, 16), {'coverage': 150, 'lines': 120, 'mower': 260}, MINUTES)
+LIGHTS = light.Plan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), (), 1)
+MONTHS = (('July', 'day', 'summer'), ('August', 'evening', 'summer'))
+
+
+def cells(file):
+    return json.loads(file.read_text('utf-8'))['cells']
+
+
+def never(*_args, **_named):
+    raise AssertionError('done again')
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory, gardens, small_network):  # noqa: F811
+    """All studies, once, in one folder each."""
+    out = tmp_path_factory.mktemp('studies')
+    variants = ('everything', 'no keyframes', 'four layers')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, 'SNAPSHOTS', {0: '', 1000: 'random', 2000: 'random_long'})
+        patch.setattr(comparisons, 'VARIANTS', {name: VARIANTS[name] for name in variants})
+        patch.setattr(studies, 'QUICK', PLAN)
+        patch.setattr(light, 'QUICK', LIGHTS)
+        patch.setattr(year, 'MONTHS', MONTHS)
+        patch.setattr(year, 'QUICK_YEAR', year.YearPlan((6.0, 6.0), (160, 16), (2,), 1))
+        for name in ('all', 'year'):
+            assert studies.main([name, '--quick', '--out', str(out / name)]) == 0
+        yield out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', ['simulator', 'robot'])
+def test_an_experiment_judges_every_recipe(made, name):
+    (cell,) = cells(made / 'all' / f'{name}.json')
+    assert cell['images'][0] == {'simulator': 150, 'robot': 260}[name]
+    assert cell['odometry'] == pytest.approx(0.31, abs=0.03)
+    columns = {'paper', 'certified', 'ours'} | ({'random', 'random_long'} & set(cell['columns']))
+    assert set(cell['columns']) == columns and ('random' in columns) == (name == 'simulator')
+    ours = cell['columns']['ours']
+    assert ours['training_supervised'] <= ours['training'] < 1 and ours['ekf'] < 1
+    assert 0 < ours['test'] < 2 and ours['scaled'] < 1.02 * ours['image'] != ours['test']
+    figures = {'simulator': (4, 5, 6), 'robot': (7, 8, 9)}[name]
+    for number in figures:
+        assert cv2.imread(str(made / 'all' / f'figure_{number}.png')).std() > 5
+
+
+@pytest.mark.slow
+def test_baselines_are_judged_alike(made):
+    found = {cell['features']: cell for cell in cells(made / 'all' / 'baselines.json')}
+    assert all(0 < found[name]['test'] < 6 for name in BASELINES)
+    assert found['slow features, first pass']['test'] < 1.5
+    assert found[comparisons.RETRIEVAL]['test_supervised'] < 1
+
+
+@pytest.mark.slow
+def test_ablations_leave_out_what_they_name(made):
+    found = {cell['variant']: cell for cell in cells(made / 'all' / 'ablations.json')}
+    whole, bare = found['everything'], found['no keyframes']
+    assert bare['slow'] == whole['slow'] == bare['sfa'] != whole['sfa']
+    assert 'rows' in found['four layers']['problem'], 'these images are too small for it'
+
+
+@pytest.mark.slow
+def test_lights_are_tested_by_models_of_some_lights(made):
+    found = cells(made / 'all' / 'light' / 'matrix.json')
+    assert [cell['trained'] for cell in found] == ['day'] * 2 + ['day + overcast'] * 2
+    *_, last = light.trainings(light.FULL)
+    assert last.trained == light.ALL_BUT and {test[0] for test in last.tests}.isdisjoint(
+        last.lights
+    )
+    for cell in found:
+        assert 0 <= cell['localized'] <= 1 and 0 < cell['sfa']['mean_m'] < 6
+        assert cell['slow']['mean_m'] > 0 and ('paper' in cell) == (cell['trained'] == 'day')
+    assert found[0]['retrieval']['mean_m'] < 1
+    assert cv2.imread(str(made / 'all' / 'light' / 'matrix.png')).std() > 5
+
+
+@pytest.mark.slow
+def test_a_year_judges_before_anything_is_learned(made):
+    found = {(cell['month'], cell['model']): cell for cell in cells(made / 'year' / 'year.json')}
+    assert found['July', 'frozen']['ekf_m'] == found['July', 'updated']['ekf_m']
+    assert {model for month, model in found if month == 'August'} == {
+        'frozen', 'updated', 'retrained',
+    }  # fmt: skip
+    assert '| August | evening, summer |' in (made / 'year' / 'year.md').read_text()
+
+
+@pytest.mark.slow
+def test_what_is_finished_is_not_made_again(made, monkeypatch, capsys):
+    for module, step in ((results, 'simulate'), (light, 'evaluate'), (year, 'evaluate'),
+                         (comparisons, 'evaluate'), (paper, 'evaluate')):  # fmt: skip
+        monkeypatch.setattr(module, step, never)
+    for name in ('all', 'year'):
+        assert studies.main([name, '--quick', '--out', str(made / name)]) == 0
+    assert '| ours |' in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_bags_are_compared_like_simulated_drives(made):
+    garden = made / 'all' / 'garden_1_1'
+    words = ['--training', garden / 'coverage', garden / 'lines', '--test', garden / 'test']
+    out = ['--quick', '--out', made / 'all']
+    assert studies.main(['baselines', *map(str, words + out)]) == 0
+    found = cells(made / 'all' / 'baselines.json')
+    half = len(found) // 2
+    for one, other in zip(found[:half], found[half:], strict=True):
+        assert one['features'] == other['features'] and 'garden_1_1' in other['world']
+        assert other.get('test', 0) == pytest.approx(one.get('test', 0), rel=1e-6)
+
+
+# What is kept
+
+
+@pytest.mark.parametrize('content', [None, '[]', '{"settings": 1}', '\0'])
+def test_a_foreign_folder_is_not_changed(tmp_path, content):
+    (tmp_path / 'thesis.tex').write_text('ten years of work')
+    if content is not None:
+        (tmp_path / 'year.json').write_text(content)
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert studies.main(['year', '--quick', '--out', str(tmp_path)]) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_results_of_other_settings_are_left_alone(tmp_path):
+    first = Results.opened(tmp_path / 'robot.json', {'world': 1})
+    first.keep({'seed': 3})
+    for name in ('robot.json', 'baselines.json'):
+        with pytest.raises(LocalizationError, match='--out'):
+            Results.opened(tmp_path / name, {'world': 2}, ('robot.json',))
+    assert Results.opened(tmp_path / 'robot.json', {'world': 1}).find(seed=3) == {'seed': 3}
+
+
+# Tables
+
+
+def rows(table):
+    """The cells of each line of a Markdown table, by the first one."""
+    lines = [[word.strip() for word in line.split('|')[1:-1]] for line in table.splitlines()]
+    assert len({len(line) for line in lines}) == 1
+    return {line[0]: line[1:] for line in lines}
+
+
+def test_the_table_has_the_papers_numbers_and_mean_and_spread_of_ours():
+    columns = {'paper': {'problem': 'a wrong minimum'}, 'ours': {'test': 0.1, 'ekf': 0.062}}
+    seeds = [{'seed': k, 'odometry': 0.31, 'columns': columns} for k in (1, 2)]
+    seeds[1] = {**seeds[1], 'columns': {**columns, 'ours': {'test': 0.2, 'ekf': 0.062}}}
+    table = rows(paper_table('robot', seeds))
+    assert table['test, unsupervised map'] == ['0.14', '-', '0.150 ± 0.071']
+    assert table['EKF against odometry'] == ['-65 %', '-', '-80 ± 0 %']
+    assert round(1 - PAPER['robot']['ekf'] / PAPER['robot']['odometry'], 2) == 0.65
+
+
+def test_tables_have_a_dash_where_there_is_no_result():
+    worlds = [{'world': 'a', 'features': 'slow', 'test': 0.12345},
+              {'world': 'b', 'features': 'slow', 'problem': 'too few'}]  # fmt: skip
+    assert rows(comparison_table(worlds, 'features', {'test': 'm'}))['slow'] == ['0.123', '-']
+    blind = {'light': 'evening', 'season': 'winter', 'problem': 'dark'}
+    line = rows(light_report.table([{'trained': 'day', **blind}]))['day']
+    assert set(line[1:]) == {'-'}
+    line = rows(year_report.table([{'model': 'frozen', 'month': 'May', **blind}]))['May']
+    assert set(line[1:]) == {'-'}
+
+
+def test_the_recorded_results_name_columns_and_rows_of_the_table():
+    from study.paper_report import COLUMNS, ROWS
+    from test_reproduce_quick import RECORDED
+
+    recorded = json.loads(RECORDED.read_text('utf-8'))
+    assert set(recorded) == {'simulator', 'robot'}
+    for columns in recorded.values():
+        assert set(columns) <= set(COLUMNS)
+        assert all(set(errors) <= set(ROWS) for errors in columns.values())
+
+
+# Other features
+
+
+def panoramas(count, seed=0):
+    """Smooth random panoramas (count, 20, 150, 3) that repeat around, as real ones."""
+    noise = np.random.default_rng(seed).standard_normal((count, 20, 150, 3))
+    smooth = [cv2.GaussianBlur(np.concatenate([n] * 3, 1), (0, 0), 3)[:, 150:300] for n in noise]
+    return np.clip(np.array(smooth) / np.std(smooth) * 40 + 120, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize('clockwise', [True, False])
+def test_retrieval_finds_the_image_and_the_turn(clockwise):
+    images = panoramas(12)
+    poses = np.column_stack([np.arange(12.0), -np.arange(12.0), np.linspace(-3, 3, 12)])
+    retrieval = ImageRetrieval.of(images, poses, clockwise)
+    for k, columns in [(0, 0), (4, 50), (11, 130)]:
+        darker = np.rint(0.4 * images[k] + 20).astype(np.uint8)
+        x, y, yaw = retrieval.locate(np.roll(darker, columns * (1 if clockwise else -1), axis=1))
+        assert (x, y) == (k, -k)
+        assert abs(wrap_angle(yaw - poses[k, 2] - 2 * np.pi * columns / 150)) < np.radians(2.5)
+
+
+@pytest.mark.parametrize('kind', [FourierSignature, TurnedComponents])
+def test_signatures_depend_neither_on_heading_nor_on_exposure(kind):
+    images = panoramas(40)
+    signature = kind.fit(lambda: np.split(images, [16, 30]))
+    features = signature.features(images)
+    turned = signature.features(np.roll(images, 37, axis=2))
+    darker = signature.features(np.rint(0.5 * images + 10).astype(np.uint8))
+    assert np.abs(turned - features).max() < 1e-9 * features.std()
+    assert np.abs(darker - features).max() < 0.05 * features.std()
+    assert np.abs(features - np.roll(features, 1, axis=0)).max(1).min() > 0.1 * features.std()
+    with pytest.raises(DataError, match='two images'):
+        kind.fit(lambda: [images[:1]])
+
+
+# Drives of a real robot: its true poses, and the odometry that it measured.
+
+
+def circle(gap=False):
+    """2 m of radius at 20 Hz, with the jitter of motion capture, and odometry at 10 Hz."""
+    rng, seconds = np.random.default_rng(5), np.arange(0, 40, 0.05)
+    angle = 0.25 * seconds
+    poses = np.column_stack([2 * np.cos(angle), 2 * np.sin(angle), angle + np.pi / 2])
+    poses[:, :2] += 2e-4 * rng.standard_normal((len(poses), 2))
+    kept = (seconds < 10) | (seconds > 20) if gap else np.ones(len(seconds), bool)
+    truth = Trajectory(np.rint(seconds[kept] * 1e9).astype(np.int64), poses[kept])
+    twists = np.tile([0.48, 0.26], (400, 1))
+    times = np.arange(400) * 100_000_000
+    return truth, Odometry(times, np.zeros((400, 3)), twists, np.zeros((400, 2)))
+
+
+HALF_REAL = SimulationConfig(area=(6.0, 6.0), images_every=0.2, images_every_turn=90.0)
+
+
+def test_a_given_drive_spaces_its_images_along_the_path():
+    truth, odometry = circle()
+    found = given_drive(truth, odometry, HALF_REAL)
+    steps = np.hypot(*np.diff(found.image_poses[:, :2], axis=0).T)
+    assert steps.min() >= 0.2 and steps.max() < 0.24  # jitter of 0.2 mm adds nothing
+    assert np.all(found.truth.stamps_ns - truth.stamps_ns == START_NS)
+    assert found.yaw_rate is None
+
+
+def test_a_given_drive_has_no_image_where_its_poses_pause():
+    found = given_drive(*circle(gap=True), HALF_REAL)
+    times = (found.image_stamps_ns - START_NS) * 1e-9
+    assert times.max() > 30 and not np.any((times > 9.9) & (times < 20))
+
+
+def test_a_given_drive_outside_of_the_garden_or_of_the_odometry_is_rejected():
+    truth, odometry = circle()
+    with pytest.raises(ConfigError, match=r'--area of at least 2[0-9]x5'):
+        aside = replace(truth, poses=truth.poses + np.array([9.0, 0.0, 0.0]))
+        given_drive(aside, odometry, HALF_REAL)
+    with pytest.raises(DataError, match='overlap'):
+        given_drive(replace(truth, stamps_ns=truth.stamps_ns + 10**12), odometry, HALF_REAL)
+
+
+def test_logs_become_a_half_real_bag(tmp_path, capsys):
+    truth, odometry = circle()
+    poses, log = tmp_path / 'truth.csv', tmp_path / 'odom.csv'
+    for file, head, one, values in (
+        (poses, 'stamp_s,x_m,y_m,yaw_rad', truth, truth.poses),
+        (log, 'stamp_s,v_mps,omega_radps', odometry, odometry.twists),
+    ):
+        lines = np.column_stack([one.stamps_ns * 1e-9 + 1e9, values])
+        np.savetxt(file, lines, '%.9f', ',', header=head, comments='')
+    words = ['--poses', poses, '--odometry', log, '--area', '6x6', '--images', 'panorama']
+    words += ['--size', '32x8', '--images-every', '2', '--images-every-turn', '360']
+    assert studies.main(['half_real', str(tmp_path / 'bag'), *map(str, words)]) == 0
+    assert 'images' in capsys.readouterr().out
+    with Bag(tmp_path / 'bag') as bag:
+        assert bag.trajectory().poses[:, :2] == pytest.approx(truth.poses[:, :2], abs=1e-6)
+        assert bag.odometry().twists == pytest.approx(odometry.twists)
+        assert '/imu' not in bag.topics
+        assert sum(1 for _ in bag.images()) > 5
