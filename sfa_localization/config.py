@@ -219,12 +219,7 @@ def _require_known(values: Mapping[str, Any], known: set[str], where: str) -> No
 
 
 def _value(item: dataclasses.Field[Any], value: Any) -> Any:
-    """Convert as ROS does: for YAML 1.1, 1e-3 is a string; an integer is accepted as a float.
-
-    `ros2 param dump` writes an empty list as null.
-    """
-    if item.default == () and value is None:
-        return ()
+    """Convert as ROS does: for YAML 1.1, 1e-3 is a string; an integer is accepted as a float."""
     if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)

@@ -76,22 +76,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self.active = False
         self.failure = ''
         self._resolved: dict[str, str] = {}
-        self._settings: dict[type[Settings], Settings] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         everything: list[type[Settings]] = [NodeConfig, *kinds]
-        for kind in everything:
-            self._declare(kind)
+        self._settings = {kind: parameters.declare(self, kind) for kind in everything}
+        parameters.on_change(self, self._settings, self.settings_changed)
         parameters.warn_of_unknown(self)
-
-    def _declare(self, kind: type[Settings]) -> None:
-        self._settings[kind] = parameters.declare(self, kind)
-
-        def apply(settings: Settings) -> None:
-            self._settings[kind] = settings
-            self.settings_changed(settings)
-
-        parameters.on_change(self, lambda: self._settings[kind], apply)
 
     # What a node fills in.
 
