@@ -4,19 +4,23 @@
 
 import numpy as np
 import pytest
+from picture_readers import PictureReader
 from ros_domains import free_domain
+
+from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
 
 from nav_msgs.msg import Odometry  # noqa: E402
 from ros_bench import Bench, until  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
+from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
 
 from sfa_localization.nodes import discovery  # noqa: E402
 from sfa_localization.nodes.conversions import to_image, to_odometry  # noqa: E402
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
+from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
 
 DOMAIN = free_domain()
 
@@ -88,6 +92,54 @@ def test_a_topic_of_another_robot_is_not_taken(bench):
     node = bench.run(EkfNode, options={'namespace': 'robot1'})
     assert until(lambda: node.count_publishers('/robot2/wheels'))
     assert node._discovery.found(node.monitor('odom')) == ''
+
+
+@pytest.mark.parametrize(
+    ('kind', 'robot', 'there', 'remedy'),
+    [
+        (EkfNode, '/robot1', ['/robot1/ekf/odometry'], 'odom:=NAME'),
+        (OmnicamNode, '/robot1', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
+        # The driver is in the namespace, or its topic alone, because a bridge has none.
+        (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
+        # Played from a bag, of another namespace.
+        (EkfNode, '', ['/robot1/ekf/odometry'], 'odom:=NAME'),
+        (OmnicamNode, '', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
+    ],
+)
+def test_the_output_of_another_localizer_is_no_sensor(bench, kind, robot, there, remedy):
+    if robot:
+        bench.run(kind, options={'namespace': robot})
+    message = Odometry if kind is EkfNode else Image
+    publishers = [bench.node.create_publisher(message, name, 10) for name in there]
+    node = bench.run(kind)
+    monitor = node.monitor('odom' if kind is EkfNode else 'image_raw')
+    assert until(lambda: all(node.count_publishers(name) for name in there))
+    assert until(lambda: node._discovery.found(monitor) or all(map(hint_of(node).count, there)))
+    assert node._discovery.found(monitor) == '' and not node._discovery._taken
+    assert remedy in hint_of(node) and '-r ' not in hint_of(node)
+    assert len(publishers) == len(there)
+
+
+def hint_of(node):
+    return node._discovery.hint
+
+
+@pytest.mark.parametrize('transport', ['raw', 'compressed'])
+@pytest.mark.parametrize(
+    ('kind', 'settings'), [(OmnicamNode, {'silence_timeout': 0.05}), (SfaNode, {'model': 'a.npz'})]
+)
+def test_without_images_the_diagnostics_name_those_that_there_are(
+    bench, monkeypatch, kind, settings, transport
+):
+    """Of both types: another `image_transport` may be all that is wrong."""
+    monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
+    there = {'/a': Image, '/b': Image, '/a/packed': CompressedImage, '/b/packed': CompressedImage}
+    publishers = [bench.node.create_publisher(made, name, 1) for name, made in there.items()]
+    node = bench.run(kind, image_transport=transport, **settings)
+    bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
+    words = [f'{name} (sensor_msgs/msg/{made.__name__})' for name, made in there.items()]
+    assert until(lambda: all(word in node.health()[1] for word in words))
+    assert len(publishers) == 4
 
 
 def test_what_has_been_heard_stays(bench):

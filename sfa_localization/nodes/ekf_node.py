@@ -104,7 +104,7 @@ class EkfNode(LocalizationNode):
         self._begin()
         self._restore_pose()
         self._make_publishers()
-        self._discovery = Discovery(self, _ODOM, Odometry)
+        self._discovery = Discovery(self, _ODOM, [Odometry], 'odom')
         self._subscribe_odometry()
         self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))

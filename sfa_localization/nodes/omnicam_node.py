@@ -85,7 +85,8 @@ class OmnicamNode(LocalizationNode):
         self._discovery, self._instead = None, ''
         if self._source.source == 'topic':
             self.require_input(self._input)
-            self._discovery = Discovery(self, self._input, self._kind())
+            kinds = [ImageMessage, CompressedImage] if raw else [CompressedImage, ImageMessage]
+            self._discovery = Discovery(self, self._input, kinds, 'image', 'panorama')
             self.every(1.0, self._find_images)
         else:
             self._input = self._source.source_path
@@ -239,7 +240,8 @@ class OmnicamNode(LocalizationNode):
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
         if silent_s > self._source.silence_timeout:
-            return _ERROR, f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
+            silent = f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
+            return _ERROR, (self._discovery and self._discovery.hint) or silent
         return _OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:
