@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import re
 import textwrap
 from collections.abc import Collection, Mapping
@@ -61,6 +62,7 @@ _WILDCARDS = {'**': r'(/\w+)*', '*': r'/\w+'}
 _ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 """Parameters that rclpy declares for every node; no settings of this package."""
 _WIDTH = 100
+_MISSPELT = 0.85  # similarity of names; ekf_filter_node, of another package, has 0.7
 _HEAD = """\
 # Every parameter of sfa_localization, with its default; all are optional.
 # Nodes read this file with --ros-args --params-file FILE, commands with --config FILE.
@@ -118,13 +120,22 @@ def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
 
 
 def ignored_sections(path: Path | str, node: str) -> list[str]:
-    """Return the keys of a file's sections for a node's name, where ROS takes none of them.
+    """Return the keys of a file's sections that are for a node, and of which ROS gives it nothing.
 
-    `node` is the full name, such as /robot1/ekf_node. Raises ConfigError for an unreadable file.
+    `node` is the full name, such as /robot1/ekf_node. A section's own name may be misspelt; others
+    are of other namespaces, where there is none for this one. Raises ConfigError for an unreadable
+    file.
     """
     name = _node_of(node)
-    keys = [key for key in _sections(Path(path)) if _node_of(key) == name]
-    return [] if any(_matches(key, node) for key in keys) else keys
+    keys = [*_sections(Path(path))]
+    misspelt = [
+        key
+        for key in keys
+        if difflib.get_close_matches(_node_of(key), {*SECTIONS, name}, 1, _MISSPELT) == [name]
+        and _node_of(key) != name
+    ]
+    own = [key for key in keys if _node_of(key) == name]
+    return misspelt + ([] if any(_matches(key, node) for key in keys) else own)
 
 
 def _node_of(key: str) -> str:

@@ -36,6 +36,7 @@ REASONS = {
     'camera/watch.py': ('judge', 'judge_novelty'),
     'localizer.py': ('_observation',),
     'nodes/discovery.py': ('_tell',),
+    'nodes/lifecycle.py': ('_time_problem',),
     'nodes/ekf_node.py': ('_status', '_receive_pose'),
     'nodes/sfa_node.py': ('health',),
     'nodes/omnicam_node.py': ('health', '_judge_source', '_judge_images'),

@@ -32,8 +32,10 @@ from sfa_localization.data.rejections import encodable, short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
 from sfa_localization.nodes import parameters, signals
-from sfa_localization.nodes.monitor import Monitor
+from sfa_localization.nodes.discovery import PATIENCE_S
+from sfa_localization.nodes.monitor import Monitor, steady_s
 from sfa_localization.nodes.settings import NodeConfig
+from sfa_localization.nodes.signals import CANNOT_START, DIED
 
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
@@ -111,9 +113,18 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """An input by its full name, after remapping; what is no topic, as it is."""
         return self._resolved.get(topic, topic)
 
-    def status_name(self, part: str) -> str:
-        """The name of a diagnostic status: the node's with its namespace, and what it is about."""
-        return f'{self.get_fully_qualified_name().lstrip("/")}: {part}'
+    def diagnostic(
+        self, part: str, level: Any, text: str, values: dict[str, str], stamp: Any
+    ) -> DiagnosticArray:
+        """One status, with the node's name and namespace, about a part of it."""
+        name = f'{self.get_fully_qualified_name().lstrip("/")}: {part}'
+        status = DiagnosticStatus(
+            level=level, name=name, message=text, hardware_id='sfa_localization'
+        )
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = stamp
+        return message
 
     def monitor(self, name: str) -> Monitor:
         """The counts of one input, made at its first use."""
@@ -311,6 +322,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
+            self._configured_s = steady_s()
             self._diagnostics = self.publisher(DiagnosticArray, '/diagnostics')
             self.every(DIAGNOSTICS_PERIOD_S, self._publish_health)
             self.setup()
@@ -373,16 +385,25 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         if not self._attempt('health', lambda: found.append(self.health())):
             found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be determined', {}))
         level, text, values = found[0]
+        problem = self._time_problem()
+        if problem:
+            self.refuse('/clock', problem)
+            level, text = max(level, DiagnosticStatus.WARN), f'{problem}; {text}'
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{self.shown(topic)}: '))
-        status = DiagnosticStatus(
-            level=level, name=self.status_name('status'), hardware_id='sfa_localization'
-        )
-        status.message = text
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        now = self.get_clock().now().to_msg()
+        self._diagnostics.publish(self.diagnostic('status', level, text, values, now))
+
+    def _time_problem(self) -> str:
+        """What is wrong where simulated time is asked for, and does not come."""
+        waiting = steady_s() < self._configured_s + PATIENCE_S
+        if (
+            waiting
+            or not self.get_parameter('use_sim_time').value
+            or self.get_clock().now().nanoseconds
+        ):
+            return ''
+        return 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
 
 
 def refusal(request: Any, response: Any, reason: str) -> Any:
@@ -399,33 +420,33 @@ def refusal(request: Any, response: Any, reason: str) -> Any:
 
 
 def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start.
+    """Run a node until SIGINT or SIGTERM, which is exit code 0; or until it dies.
 
     For the main thread of a process that then ends: signals are ignored afterwards.
     """
     node = None
     signals.end_at_once()
     try:
-        if not _initialised(args):
-            return 1
+        if not _initialised(sys.argv if args is None else args):
+            return CANNOT_START
         signals.leave_to_ros()
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
         parameters.warn_of_ignored_files(node, sys.argv if args is None else args)
         if not node.start():
-            return int(rclpy.ok())  # a signal is no failure
+            return CANNOT_START if rclpy.ok() else 0  # a signal is no failure
         with one_core():
             _spin(executor, node)
     except ExternalShutdownException:
         return 0
-    except rclpy_implementation.RCLError:
-        if rclpy.ok():
-            raise
-        return 0
-    except LocalizationError as error:
-        rclpy.logging.get_logger('sfa_localization').fatal(str(error))
-        return 1
+    except Exception as error:
+        if isinstance(error, rclpy_implementation.RCLError) and not rclpy.ok():
+            return 0
+        known = isinstance(error, LocalizationError)
+        text = str(error) if known else traceback.format_exc()
+        rclpy.logging.get_logger('sfa_localization').fatal(text)
+        return DIED if node is not None and node.active else CANNOT_START
     finally:
         if node is not None:
             node.destroy_node()
@@ -434,10 +455,15 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     return 0
 
 
-def _initialised(args: Sequence[str] | None) -> bool:
+def _initialised(args: Sequence[str]) -> bool:
     """Initialize ROS; False, and why is logged, where its arguments or files cannot be used."""
+    reason = ''
     try:
-        rclpy.init(args=None if args is None else list(args))
+        rclpy.init(args=list(args))
+        others = rclpy.utilities.remove_ros_args(list(args))[1:]
+        if others:
+            reason = f'unknown arguments {encodable(" ".join(others))}: give parameters as '
+            reason += '--ros-args -p NAME:=VALUE, and topics as --ros-args -r NAME:=TOPIC'
     except (RuntimeError, UnicodeEncodeError) as error:  # the first is the base of all of rclpy's
         reason = str(error)
         # Of unknown arguments its text is their list, and no more.
@@ -445,9 +471,9 @@ def _initialised(args: Sequence[str] | None) -> bool:
             reason = f'unknown arguments after --ros-args: {reason}'
         elif isinstance(error, UnicodeEncodeError):
             reason = f'an argument is not UTF-8: {encodable(error.object)}'
+    if reason:
         rclpy.logging.get_logger('sfa_localization').fatal(reason)
-        return False
-    return True
+    return not reason
 
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:

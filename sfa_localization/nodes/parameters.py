@@ -111,7 +111,7 @@ def warn_of_unknown(node: Node) -> None:
 
 
 def warn_of_ignored_files(node: Node, arguments: Sequence[str]) -> None:
-    """Warn of each parameter file among the arguments whose sections for the node are not its.
+    """Warn of each parameter file among the arguments with sections for the node that are not its.
 
     ROS takes `ekf_node:` for a node without namespace, and gives /robot1/ekf_node nothing of it.
     """
