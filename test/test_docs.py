@@ -221,6 +221,13 @@ def test_robot_localization_takes_position_and_heading_of_our_pose():
     assert used == [0, 1, 5], 'x, y and yaw'
 
 
+def test_the_page_leaves_out_ekf_node_where_robot_localization_is_alone(launch):
+    text = (ROOT / 'config/robot_localization.md').read_text('utf-8')
+    (line,) = (line for line in text.splitlines() if line.startswith('ros2 launch'))
+    arguments = dict(word.split(':=') for word in shlex.split(line)[4:])
+    assert [*launch(**arguments)] == ['omnicam_node', 'sfa_node']
+
+
 def test_robot_localization_finds_a_robot_that_starts_anywhere():
     """A filter of x, y and yaw: predicted from zero; images that are too far off are rejected."""
     text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
