@@ -284,8 +284,7 @@ def remapped():
 def test_a_remap_of_the_base_topic_holds_for_its_transports(remapped, rules, heard):
     node = remapped(*rules, image_transport='compressed')
     assert node.start(), node.failure
-    node._subscribe()
-    assert node._subscription.topic_name == heard
+    assert node.shown(node._input) == heard
 
 
 def test_a_remap_of_the_panorama_takes_its_companions_along(remapped):

@@ -350,12 +350,10 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.active = False
         self._drop()
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.active = False
         self._drop()
         return super().on_error(state)
 
@@ -371,6 +369,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._state_machine.destroy_when_not_in_use()
 
     def _drop(self) -> None:
+        self.active = False
         self.teardown()
         for destroy, entity in reversed(self._entities):
             destroy(entity)
