@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from sfa_localization.nodes.monitor import Monitor, steady_s
+from sfa_localization.nodes.monitor import steady_s
 
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
@@ -18,48 +18,54 @@ _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
 class Discovery:
     """Looks for topics of the types `kinds`, of which the first is that of the input `topic`.
 
-    `arguments` of the launch file choose another topic: the first is the input's.
+    `arguments` of the launch file choose another topic: the first is the input's. `take` is called
+    with the only topic that qualifies, where the input was not remapped, and with the input's own
+    when somebody publishes on that again.
     """
 
-    def __init__(self, node: Any, topic: str, kinds: Sequence[Any], *arguments: str) -> None:
-        self._node, self._arguments = node, arguments
+    def __init__(
+        self,
+        node: Any,
+        topic: str,
+        kinds: Sequence[Any],
+        arguments: Sequence[str],
+        take: Callable[[str], None] | None = None,
+    ) -> None:
+        self._node, self._topic, self._arguments = node, topic, arguments
         self._types = [f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}' for kind in kinds]
         self._start_s = steady_s()
         self._given = node.resolve_topic_name(topic)
-        self._remapped = self._given != node.resolve_topic_name(topic, only_expand=True)
+        remapped = self._given != node.resolve_topic_name(topic, only_expand=True)
+        self._take = None if remapped else take
         self._taken = False
         self.hint = ''
         """Which topics there are, while nobody publishes on that of the input."""
+        node.every(1.0, self.look)
 
-    def found(self, monitor: Monitor) -> str:
-        """The topic to take from now on; '' for no change.
-
-        It is the only one that qualifies, where the input was not remapped; or the input's own
-        again when somebody publishes on that.
-        """
-        if self._taken:
-            self._taken = not self._node.count_publishers(self._given)
-            return '' if self._taken else self._given
-        there = self._there(monitor)
-        names = [] if self._remapped else [*filter(self._qualifies, there.get(self._types[0], []))]
-        if len(names) != 1:
+    def look(self) -> None:
+        """Take a topic, or log, and keep in `hint`, which ones there are."""
+        if self._taken and self._take is not None:
+            if self._node.count_publishers(self._given):
+                self._taken = False
+                self._take(self._given)
+            return
+        there = self._there()
+        names = [*filter(self._qualifies, there.get(self._types[0], []))]
+        if self._take is None or len(names) != 1:
             self._tell(there)
-            return ''
+            return
         self._taken, self.hint = True, ''
         self._node.get_logger().warning(
             f'nobody publishes on {self._given}: taking {names[0]}, the only {self._types[0]}; '
             f'{self._arguments[0]}:={names[0].removesuffix("/compressed")} makes this permanent'
         )
-        return names[0]
+        self._take(names[0])
 
-    def look(self, monitor: Monitor) -> None:
-        """Log, and keep in `hint`, what there is; take nothing."""
-        self._tell(self._there(monitor))
-
-    def _there(self, monitor: Monitor) -> dict[str, list[str]]:
+    def _there(self) -> dict[str, list[str]]:
         """Topics of other nodes, by type; none where there is an input, or soon may be."""
         early = steady_s() < self._start_s + PATIENCE_S
-        if early or monitor.received or self._node.count_publishers(self._given):
+        received = self._node.monitor(self._topic).received
+        if early or received or self._node.count_publishers(self._given):
             return {}
         named = sorted(self._node.get_topic_names_and_types())
         return {

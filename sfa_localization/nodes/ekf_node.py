@@ -104,8 +104,8 @@ class EkfNode(LocalizationNode):
         self._begin()
         self._restore_pose()
         self._make_publishers()
-        self._discovery = Discovery(self, _ODOM, [Odometry], 'odom')
         self._subscribe_odometry()
+        self._discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
         self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
         for kind, topic, receive in (
@@ -119,7 +119,6 @@ class EkfNode(LocalizationNode):
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
-        self.every(1.0, self._find_odometry)
         # Looped playback steps simulated time back; stamps alone would show it only later.
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -168,15 +167,9 @@ class EkfNode(LocalizationNode):
     # Inputs.
 
     def _subscribe_odometry(self, instead: str = '') -> None:
+        self.unsubscribe(_ODOM)
         receive = self._receive_odometry
         self.subscribe(Odometry, _ODOM, receive, sensor_qos(100), instead=instead)
-
-    def _find_odometry(self) -> None:
-        """Take the only topic with odometry where nobody publishes on the expected one."""
-        found = self._discovery.found(self.monitor(_ODOM))
-        if found:
-            self.unsubscribe(_ODOM)
-            self._subscribe_odometry(found)
 
     def _receive_odometry(self, message: Odometry) -> None:
         motion = read_odometry(message)

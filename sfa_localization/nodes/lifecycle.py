@@ -167,8 +167,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._entities.append((self.destroy_subscription, made))
 
     def unsubscribe(self, topic: str) -> None:
-        """Drop the subscriptions of an input."""
-        resolved = self._resolved[topic]
+        """Drop the subscriptions of an input, if there are any."""
+        resolved = self.shown(topic)
         for entry in [*self._entities]:
             if isinstance(entry[1], Subscription) and entry[1].topic_name == resolved:
                 self._entities.remove(entry)

@@ -85,8 +85,8 @@ class OmnicamNode(LocalizationNode):
         if self._source.source == 'topic':
             self.require_input(self._input)
             kinds = [ImageMessage, CompressedImage] if raw else [CompressedImage, ImageMessage]
-            self._discovery = Discovery(self, self._input, kinds, 'image', 'panorama')
-            self.every(1.0, self._find_images)
+            arguments = 'image', 'panorama'
+            self._discovery = Discovery(self, self._input, kinds, arguments, self._take)
         else:
             self._input = self._source.source_path
             guarded = self._guarded(self._input, self._use_newest)
@@ -130,13 +130,11 @@ class OmnicamNode(LocalizationNode):
         """What the images come as."""
         return CompressedImage if self._config.image_transport == 'compressed' else ImageMessage
 
-    def _find_images(self) -> None:
-        """Take the only topic with images where nobody publishes on the expected one."""
-        found = self._discovery.found(self.monitor(self._input)) if self._discovery else ''
-        if found:
-            self._stop_listening()
-            self.require_input(self._input, found)
-            self._instead = found
+    def _take(self, topic: str) -> None:
+        """Take images from another topic than the expected one, or again from that."""
+        self._stop_listening()
+        self.require_input(self._input, topic)
+        self._instead = topic
 
     def _stop_listening(self) -> None:
         if self._listening:

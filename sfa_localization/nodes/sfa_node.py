@@ -78,8 +78,7 @@ class SfaNode(LocalizationNode):
         # Depth 1: when images come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
         kinds = [ImageMessage, CompressedImage]
-        self._discovery = Discovery(self, self._topic, kinds, 'panorama')
-        self.every(1.0, self._look_for_images)
+        self._discovery = Discovery(self, self._topic, kinds, ['panorama'])
 
     def started(self) -> None:
         self._publish_correlation()
@@ -140,9 +139,6 @@ class SfaNode(LocalizationNode):
         self._delay.publish(Float64(data=float(self._observer.model.camera_delay_s)))
 
     # Images.
-
-    def _look_for_images(self) -> None:
-        self._discovery.look(self.monitor(self._topic))
 
     def _receive_info(self, message: String) -> None:
         self._declared = read_info(message)
