@@ -89,14 +89,12 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
     several namespaces that differ: a command cannot choose between robots.
     """
     known = {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
-    anywhere = {item.name for kinds in SECTIONS.values() for kind in kinds
-                for item in dataclasses.fields(kind)}  # fmt: skip
     shared: dict[str, Any] = {}
     robots: dict[str, dict[str, Any]] = {}
     for key, values in _known_sections(path).items():
         namespace, _, node = key.strip('/').rpartition('/')
         if node in _WILDCARDS:
-            _require_known(values, anywhere, f'{path}: {key}')
+            _require_known(values, all_names(), f'{path}: {key}')
             shared.update(values)
         elif node == section:
             _require_known(values, set(known), f'{path}: {section}')
@@ -107,6 +105,12 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
         for name, value in given.items()
         if name in known or _is_of_ros(name)
     }
+
+
+def all_names() -> set[str]:
+    """Return the names of the parameters of all sections."""
+    kinds = [kind for kinds in SECTIONS.values() for kind in kinds]
+    return {item.name for kind in kinds for item in dataclasses.fields(kind)}
 
 
 def _is_of_ros(name: str) -> bool:

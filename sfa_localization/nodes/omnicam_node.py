@@ -84,9 +84,9 @@ class OmnicamNode(LocalizationNode):
         self._discovery, self._instead = None, ''
         if self._source.source == 'topic':
             self.require_input(self._input)
-            kinds = [ImageMessage, CompressedImage] if raw else [CompressedImage, ImageMessage]
+            self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
             arguments = 'image', 'panorama'
-            self._discovery = Discovery(self, self._input, kinds, arguments, self._take)
+            self._discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
         else:
             self._input = self._source.source_path
             guarded = self._guarded(self._input, self._use_newest)
@@ -120,15 +120,10 @@ class OmnicamNode(LocalizationNode):
             self._feed.check()
         elif self._wanted() and not self._listening:
             self._listening, self._listening_since_s = True, steady_s()
-            self.subscribe(
-                self._kind(), self._input, self._use_message, sensor_qos(1), instead=self._instead
-            )
+            kind, receive = self._kinds[0], self._use_message
+            self.subscribe(kind, self._input, receive, sensor_qos(1), instead=self._instead)
         elif not self._wanted():
             self._stop_listening()
-
-    def _kind(self) -> Any:
-        """What the images come as."""
-        return CompressedImage if self._config.image_transport == 'compressed' else ImageMessage
 
     def _take(self, topic: str) -> None:
         """Take images from another topic than the expected one, or again from that."""

@@ -20,7 +20,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import SECTIONS, ignored_sections
+from sfa_localization.config import all_names, ignored_sections
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, nearest
 
@@ -96,16 +96,10 @@ def warn_of_unknown(node: Node) -> None:
 
     Parameters of the other nodes are ignored: a section `/**` gives them to all.
     """
-    others = {
-        item.name
-        for kinds in SECTIONS.values()
-        for kind in kinds
-        for item in dataclasses.fields(kind)
-    }
     # rclpy has no public way to ask what was given but not declared.
     given = node._parameter_overrides
     known = node.list_parameters([], 0).names
-    for name in sorted(set(given) - set(known) - others):
+    for name in sorted(set(given) - set(known) - all_names()):
         if not name.startswith('qos_overrides.'):  # declared with their topics
             node.get_logger().warning(f'unknown parameter {name!r}{nearest(name, known)}')
 
