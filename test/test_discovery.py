@@ -106,7 +106,8 @@ def test_a_topic_of_another_robot_is_not_taken(bench):
         (OmnicamNode, '/robot1', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
         # The driver is in the namespace, or its topic alone, because a bridge has none.
         (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
-        # Played from a bag, of another namespace.
+        # Played from a bag, of another namespace, and of the node's own.
+        (OmnicamNode, '', ['/panorama'], 'image:=NAME or panorama:=NAME'),
         (EkfNode, '', ['/robot1/ekf/odometry'], 'odom:=NAME'),
         (OmnicamNode, '', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
     ],

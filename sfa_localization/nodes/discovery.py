@@ -32,6 +32,7 @@ class Discovery:
         take: Callable[[str], None] | None = None,
     ) -> None:
         self._node, self._topic, self._arguments = node, topic, arguments
+        self._own = node.get_name(), node.get_namespace()
         self._types = [f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}' for kind in kinds]
         self._start_s = steady_s()
         self._given = node.resolve_topic_name(topic)
@@ -69,7 +70,9 @@ class Discovery:
             return {}
         named = sorted(self._node.get_topic_names_and_types())
         return {
-            wanted: [name for name, kinds in named if wanted in kinds and self._of_others(name)]
+            wanted: [
+                n for n, kinds in named if wanted in kinds and self._publishers(n) - {self._own}
+            ]
             for wanted in self._types
         }
 
@@ -82,16 +85,13 @@ class Discovery:
             self._node.get_logger().warning(self.hint)
 
     def _qualifies(self, name: str) -> bool:
-        """Not an output of this package, and not in a namespace where other nodes are."""
+        """No output of this node or package, and in no namespace where only other nodes are."""
         below = self._node.get_namespace().rstrip('/') + '/'
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))
-        return (
-            name.startswith(below) and not name.startswith(others) and not name.endswith(_OUTPUTS)
-        )
+        usual = name.startswith(below) and not name.startswith(others)
+        return usual and not name.endswith(_OUTPUTS) and self._own not in self._publishers(name)
 
-    def _of_others(self, name: str) -> bool:
-        own = self._node.get_name(), self._node.get_namespace()
+    def _publishers(self, name: str) -> set[tuple[str, str]]:
         infos = self._node.get_publishers_info_by_topic(name)
-        publishers = {(info.node_name, info.node_namespace) for info in infos}
-        return bool(publishers) and own not in publishers
+        return {(info.node_name, info.node_namespace) for info in infos}
