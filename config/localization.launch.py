@@ -9,12 +9,17 @@ from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushROSNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from sfa_localization.nodes.signals import CANNOT_START
+
 PACKAGE = 'sfa_localization'
+RESPAWN_DELAY_S = 2.0
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -26,41 +31,51 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
         DeclareLaunchArgument('image', default_value='image_raw', description="camera's topic"),
         DeclareLaunchArgument(
+            'panorama', default_value='', description='topic of panoramas, without an omnicam_node'
+        ),
+        DeclareLaunchArgument(
             'image_transport', default_value='raw', description='raw, or compressed images'
         ),
         DeclareLaunchArgument('odom', default_value='odom', description="odometry's topic"),
+        DeclareLaunchArgument(
+            'ekf', default_value='true', description='false: without ekf_node, poses of images only'
+        ),
         DeclareLaunchArgument(
             'tf', default_value='tf', description="the transform's topic, in the namespace; or /tf"
         ),
         DeclareLaunchArgument(
             'use_sim_time', default_value='false', description='time from /clock (bags, simulators)'
         ),
+        DeclareLaunchArgument(
+            'respawn', default_value='true', description='start a node again that has died'
+        ),
     ]
-    image = LaunchConfiguration('image')
-    transport = {'image_transport': LaunchConfiguration('image_transport')}
-    images = [('image_raw', image), ('image_raw/compressed', [image, '/compressed'])]
-    odometry = [('odom', LaunchConfiguration('odom'))]
-    return LaunchDescription(
-        [
-            *arguments,
-            OpaqueFunction(function=_require_config),
-            PushROSNamespace(LaunchConfiguration('namespace')),
-            _node('omnicam_node', images, transport),
-            _node('sfa_node', [], {'model': LaunchConfiguration('model')}),
-            # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
-            _node('ekf_node', [*odometry, ('/tf', LaunchConfiguration('tf'))], {}),
-        ]
-    )
+    return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
 
 
-def _require_config(context: LaunchContext) -> None:
-    """Raise for a parameter file that is missing: launch would go on with every default."""
-    path = LaunchConfiguration('config').perform(context)
-    if not Path(path).is_file():
-        raise FileNotFoundError(f'config:={path}: there is no such parameter file')
+def _nodes(context: LaunchContext) -> list:
+    """The nodes in their namespace. Raises FileNotFoundError for a missing parameter file.
+
+    launch itself would go on with every default.
+    """
+    given = context.launch_configurations
+    if not Path(given['config']).is_file():
+        raise FileNotFoundError(f'config:={given["config"]}: there is no such parameter file')
+    transport = {'image_transport': given['image_transport']}
+    model = {'model': given['model']}
+    image, panorama = given['image'], given['panorama']
+    images = [('image_raw', image), ('image_raw/compressed', f'{image}/compressed')]
+    # As Nav2 does, so that robots with frames of the same names do not meet on /tf.
+    odometry = [('odom', given['odom']), ('/tf', given['tf'])]
+    if panorama:
+        seeing = [_node('sfa_node', [('panorama', panorama)], {**model, **transport})]
+    else:
+        seeing = [_node('omnicam_node', images, transport), _node('sfa_node', [], model)]
+    ekf = _node('ekf_node', odometry, {}, condition=IfCondition(given['ekf']))
+    return [PushROSNamespace(given['namespace']), *seeing, ekf]
 
 
-def _node(name: str, remappings: list, parameters: dict) -> Node:
+def _node(name: str, remappings: list, parameters: dict, **options: object) -> Node:
     sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     return Node(
         package=PACKAGE,
@@ -69,4 +84,14 @@ def _node(name: str, remappings: list, parameters: dict) -> Node:
         output='screen',
         parameters=[LaunchConfiguration('config'), {'use_sim_time': sim_time, **parameters}],
         remappings=remappings,
+        respawn=LaunchConfiguration('respawn'),
+        respawn_delay=RESPAWN_DELAY_S,
+        on_exit=_exited,
+        **options,
     )
+
+
+def _exited(event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch, with exit code 1, where a node cannot start: it could not the next time."""
+    if event.returncode == CANNOT_START and not context.is_shutdown:
+        raise RuntimeError(f'{event.process_name} cannot start: see its message above')

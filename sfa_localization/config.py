@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import re
 import textwrap
 from collections.abc import Collection, Mapping
@@ -49,6 +50,7 @@ _WILDCARDS = {'**': r'(/\w+)*', '*': r'/\w+'}
 _ROS_PARAMETERS = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
 """Parameters that rclpy declares for every node; no settings of this package."""
 _WIDTH = 100
+_MISSPELT = 0.85  # similarity of names; ekf_filter_node, of another package, has 0.7
 _HEAD = """\
 # Every parameter of sfa_localization, with its default; all are optional.
 # Nodes read this file with --ros-args --params-file FILE, commands with --config FILE.
@@ -75,7 +77,6 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
     several namespaces that differ: a command cannot choose between robots.
     """
     known = _items(section)
-    anywhere = {name for other in SECTIONS for name in _items(other)}
     shared: dict[str, Any] = {}
     robots: dict[str, dict[str, Any]] = {}
     for key, values in _sections(path).items():
@@ -86,7 +87,7 @@ def load_section(path: Path, section: str) -> dict[str, Any]:
                 f'a namespace, and /**'
             )
         if node in _WILDCARDS:
-            _require_known(values, anywhere, f'{path}: {key}')
+            _require_known(values, all_names(), f'{path}: {key}')
             shared.update(values)
         elif node == section:
             _require_known(values, known, f'{path}: {section}')
@@ -104,6 +105,11 @@ def _items(section: str) -> dict[str, dataclasses.Field[Any]]:
     return {item.name: item for kind in SECTIONS[section] for item in dataclasses.fields(kind)}
 
 
+def all_names() -> set[str]:
+    """Return the names of the parameters of all sections."""
+    return {name for section in SECTIONS for name in _items(section)}
+
+
 def _is_of_ros(name: str) -> bool:
     """Whether ROS declares the parameter, written as a tree or with dots."""
     return name.partition('.')[0] in _ROS_PARAMETERS
@@ -115,12 +121,22 @@ def load_changes(path: Path | str) -> dict[str, dict[str, Any]]:
 
 
 def ignored_sections(path: Path | str, node: str) -> list[str]:
-    """Return the keys of a file's sections for a node's name, where ROS takes none of them.
+    """Return the keys of a file's sections that are for a node, and of which ROS gives it nothing.
 
-    `node` is the full name, such as /robot1/ekf_node. Raises ConfigError for an unreadable file.
+    `node` is the full name, such as /robot1/ekf_node. A section's own name may be misspelt; others
+    are of other namespaces, where there is none for this one. Raises ConfigError for an unreadable
+    file.
     """
-    keys = [key for key in _sections(Path(path)) if _node_of(key) == _node_of(node)]
-    return [] if any(_matches(key, node) for key in keys) else keys
+    name = _node_of(node)
+    keys = [*_sections(Path(path))]
+    misspelt = [
+        key
+        for key in keys
+        if difflib.get_close_matches(_node_of(key), {*SECTIONS, name}, 1, _MISSPELT) == [name]
+        and _node_of(key) != name
+    ]
+    own = [key for key in keys if _node_of(key) == name]
+    return misspelt + ([] if any(_matches(key, node) for key in keys) else own)
 
 
 def _node_of(key: str) -> str:
@@ -202,12 +218,7 @@ def _require_known(values: Mapping[str, Any], known: Collection[str], where: str
 
 
 def _value(item: dataclasses.Field[Any], value: Any) -> Any:
-    """Convert as ROS does: for YAML 1.1, 1e-3 is a string; an integer is accepted as a float.
-
-    `ros2 param dump` writes an empty list as null.
-    """
-    if item.default == () and value is None:
-        return ()
+    """Convert as ROS does: for YAML 1.1, 1e-3 is a string; an integer is accepted as a float."""
     if isinstance(item.default, float) and type(value) in (str, int):
         try:
             return float(value)

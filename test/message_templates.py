@@ -35,6 +35,8 @@ REASONS = {
     'fusion/recover.py': ('weighed',),
     'camera/watch.py': ('judge', 'judge_novelty'),
     'localizer.py': ('_observation',),
+    'nodes/discovery.py': ('_tell',),
+    'nodes/lifecycle.py': ('_time_problem',),
     'nodes/ekf_node.py': ('_status', '_receive_pose'),
     'nodes/sfa_node.py': ('health',),
     'nodes/omnicam_node.py': ('health', '_judge_source', '_judge_images'),

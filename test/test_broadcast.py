@@ -69,8 +69,10 @@ def test_what_is_newest_holds_ahead():
 
 
 def test_nothing_is_dated_ahead_where_nothing_is_asked():
-    buffer, _ = sent(START_NS + np.arange(1, 11), np.zeros((10, 3)), 0)
-    assert buffer.newest_ns == START_NS + 10
+    """One transform a message, as config/README.md says."""
+    broadcast = Broadcast()
+    for stamp_ns in range(START_NS, START_NS + 10 * SECOND_NS, SECOND_NS // 50):
+        assert [dated[0] for dated in broadcast.add(stamp_ns, np.zeros(3), 0)] == [stamp_ns]
 
 
 def test_late_odometry_is_sent_at_its_own_stamp_only():

@@ -26,8 +26,10 @@ from filter_drives import Drive
 from study.__main__ import study_parser
 
 from sfa_localization import cli
+from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes.settings import EkfNodeConfig
+from sfa_localization.nodes.signals import CANNOT_START, DIED
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -104,6 +106,9 @@ def check(words: list[str]) -> None:
 
 def check_ros2(words: list[str]) -> None:
     if tuple(words[:2]) in OTHER_ROS:
+        return
+    if words[:2] == ['bag', 'play']:
+        assert all((ROOT / path / 'metadata.yaml').is_file() for path in words[2:])
         return
     verb, package, name, *rest = words
     assert package == 'sfa_localization'
@@ -219,6 +224,13 @@ def test_robot_localization_takes_position_and_heading_of_our_pose():
     assert used == [0, 1, 5], 'x, y and yaw'
 
 
+def test_the_page_leaves_out_ekf_node_where_robot_localization_is_alone(launch):
+    text = (ROOT / 'config/robot_localization.md').read_text('utf-8')
+    (line,) = (line for line in text.splitlines() if line.startswith('ros2 launch'))
+    arguments = dict(word.split(':=') for word in shlex.split(line)[4:])
+    assert [*launch(**arguments)] == ['omnicam_node', 'sfa_node']
+
+
 def test_robot_localization_finds_a_robot_that_starts_anywhere():
     """A filter of x, y and yaw: predicted from zero; images that are too far off are rejected."""
     text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
@@ -277,16 +289,16 @@ class Recorded:
     def __init__(self, *given, **named):
         self.given, self.named = given, named
 
-    def perform(self, context):
-        return context[self.given[0]]
-
 
 @pytest.fixture
-def actions(monkeypatch):
-    """Return the actions that the launch file makes, with launch replaced by stand-ins."""
+def launch_file(monkeypatch):
+    """Return what is in the launch file, with launch replaced by stand-ins."""
     names = {
         'launch': ['LaunchContext', 'LaunchDescription'],
         'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
+        'launch.conditions': ['IfCondition'],
+        'launch.events': [],
+        'launch.events.process': ['ProcessExited'],
         'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
         'launch_ros.actions': ['Node', 'PushROSNamespace'],
         'launch_ros.parameter_descriptions': ['ParameterValue'],
@@ -297,42 +309,99 @@ def actions(monkeypatch):
         for each in classes:
             setattr(module, each, type(each, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
-    made = runpy.run_path(str(ROOT / 'config/localization.launch.py'))
-    (actions,) = made['generate_launch_description']().given
-    return actions
+    return runpy.run_path(str(ROOT / 'config/localization.launch.py'))
 
 
 @pytest.fixture
-def launched(actions):
-    """Return the arguments of each node in the launch file."""
-    return [action.named for action in actions if type(action).__name__ == 'Node']
+def launch(launch_file):
+    """Return a function that starts the launch file: the arguments of its nodes, by their names."""
+
+    def start(**arguments):
+        (actions,) = launch_file['generate_launch_description']().given
+        *declared, nodes = actions
+        given = {action.given[0]: action.named.get('default_value') for action in declared}
+        assert set(arguments) <= set(given)
+        given.update({'config': ROOT / 'config/localization.yaml', **arguments})
+        context = types.SimpleNamespace(launch_configurations=given)
+        namespace, *nodes = nodes.named['function'](context)
+        assert namespace.given == (arguments.get('namespace', ''),)
+        always = Recorded('true')
+        return {
+            node.named['executable']: node.named
+            for node in nodes
+            if node.named.get('condition', always).given == always.given
+        }
+
+    return start
 
 
-def test_a_missing_parameter_file_stops_the_launch(actions):
-    """Before the nodes: launch_ros itself only warns, and starts them with every default."""
-    kinds = [type(action).__name__ for action in actions]
-    check = actions[kinds.index('OpaqueFunction')].named['function']
-    assert kinds.index('OpaqueFunction') < kinds.index('Node')
-    assert check({'config': str(ROOT / 'config/localization.yaml')}) is None
+def test_a_missing_parameter_file_stops_the_launch(launch):
+    """launch_ros itself only warns, and starts the nodes with every default."""
     with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
-        check({'config': '/nowhere.yaml'})
+        launch(config='/nowhere.yaml')
 
 
-def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launched):
-    assert [node['executable'] for node in launched] == list(NODES)
-    for node in launched:
+def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launch):
+    launched = launch(model='model.npz')
+    assert [*launched] == list(NODES)
+    for node in [*launched.values(), *launch(panorama='/panorama').values()]:
         _file, given = node['parameters']
         assert set(given) <= parameters()
         known = topics() | {'image_raw', 'odom', '/tf'}
         assert {source for source, _ in node['remappings']} <= known
 
 
-def test_the_launched_transform_is_in_the_namespace_unless_asked(actions, launched):
+def test_the_launched_transform_is_in_the_namespace_unless_asked(launch):
     """Two robots whose frames have the same names must not meet on /tf; Nav2 looks there too."""
-    given = {a.given[0]: a.named for a in actions if type(a).__name__ == 'DeclareLaunchArgument'}
-    assert given['tf']['default_value'] == 'tf'
-    (target,) = (to for name, to in launched[-1]['remappings'] if name == '/tf')
-    assert target.given == ('tf',)
+    assert ('/tf', 'tf') in launch()['ekf_node']['remappings']
+    assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
+
+
+def test_nodes_can_be_left_out_of_the_launch(launch):
+    assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
+    assert [*launch(panorama='/panorama')] == ['sfa_node', 'ekf_node']
+    assert ('panorama', '/panorama') in launch(panorama='/panorama')['sfa_node']['remappings']
+
+
+def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch, launch_file):
+    """An exception makes launch end with exit code 1; a launch that ends already goes on."""
+    for node in launch().values():
+        assert node['respawn'].given == ('respawn',) and node['respawn_delay'] > 0
+        assert node['on_exit'] is launch_file['_exited']
+    running, ending = (types.SimpleNamespace(is_shutdown=over) for over in (False, True))
+
+    def exited(code, context):
+        event = types.SimpleNamespace(returncode=code, process_name='sfa_node-2')
+        return launch_file['_exited'](event, context)
+
+    with pytest.raises(RuntimeError, match='sfa_node-2 cannot start'):
+        exited(CANNOT_START, running)
+    for code in (0, DIED, -9, -11):
+        assert exited(code, running) is None
+    assert exited(CANNOT_START, ending) is None
+
+
+def replay():
+    """Return launch arguments and bag of the replay that the README shows."""
+    text = (ROOT / 'README.md').read_text('utf-8')
+    (block,) = (block for block in BLOCK.findall(text) if 'ros2 bag play' in block)
+    launched, played = (shlex.split(line, comments=True) for line in block.splitlines())
+    assert launched[:3] == ['ros2', 'launch', 'sfa_localization']
+    assert played[:3] == ['ros2', 'bag', 'play'] and len(played) == 4
+    return dict(word.split(':=') for word in launched[4:]), ROOT / played[3]
+
+
+def test_the_replay_of_the_readme_feeds_the_launched_nodes(launch):
+    arguments, path = replay()
+    launched = launch(**arguments)
+    assert [*launched] == ['sfa_node', 'ekf_node'], 'the bag holds panoramas'
+    with Bag(path) as bag:
+        played = {name: topic.kind for name, topic in bag.topics.items()}
+    panorama = dict(launched['sfa_node']['remappings'])['panorama']
+    assert launched['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
+    assert played[f'{panorama}/compressed'] == 'sensor_msgs/msg/CompressedImage'
+    odometry = dict(launched['ekf_node']['remappings'])['odom']
+    assert played[f'/{odometry}'] == 'nav_msgs/msg/Odometry'
 
 
 def test_package_manifest_is_of_format_3():

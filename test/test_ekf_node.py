@@ -37,7 +37,7 @@ from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 
 from sfa_localization.data.messages import read_stamp, read_yaw  # noqa: E402
-from sfa_localization.nodes import ekf_node  # noqa: E402
+from sfa_localization.nodes import ekf_node, lifecycle  # noqa: E402
 from sfa_localization.nodes.conversions import (  # noqa: E402
     read_pose,
     to_error_correlation,
@@ -190,6 +190,7 @@ def test_every_measurement_gets_its_verdict(bench):
     play(bench, node, drive)
     assert until(lambda: len(heard) == len(drive.pictures))
     values = [{v.key: v.value for v in m.status[0].values} for m in heard]
+    assert {m.status[0].hardware_id for m in heard} == {'sfa_localization'}
     assert values[3]['accepted'] == 'true' and values[10]['accepted'] == 'false'
     assert float(values[10]['d2']) > float(values[10]['threshold'])
     assert heard[10].status[0].message == 'outside the gate'
@@ -393,7 +394,7 @@ def test_diagnostics_hold_rates_latencies_and_counts(bench):
 
     assert until(lambda: told().get('odometry: used') == '100')
     values = told()
-    assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'localized'
+    assert values['state'] == 'LOCALISED' and heard[-1].status[0].message == 'LOCALISED'
     assert values['/odom: received'] == '100' and float(values['/odom: rate [Hz]']) > 0
     assert float(values['/odom: latency p99 [ms]']) >= float(values['/odom: latency p50 [ms]']) > 0
     assert 'measurement: accepted' in values and 'position std [m]' in values
@@ -406,6 +407,20 @@ def test_silence_is_reported_without_any_clock_moving(bench):
     play(bench, node, drive)
     assert until(lambda: any(s.data.startswith('DEGRADED: nothing on /odom') for s in states))
     assert until(lambda: any(f'nothing on /{IMAGE_POSE}' in s.data for s in states))
+
+
+def test_an_input_that_nobody_publishes_is_named(bench):
+    """As when sfa_node has died, at the start or later."""
+    drive = Drive(seconds=2, **NOISY)
+    node = bench.run(EkfNode, initial_pose=AT_ORIGIN, silence_timeout=0.2)
+    states = bench.listen(String, 'ekf/state', latched_qos())
+    odometry, images = 'nobody publishes on /odom', f'nobody publishes on /{IMAGE_POSE}'
+    assert until(lambda: states and odometry in states[-1].data and images in states[-1].data)
+    play(bench, node, drive)
+    assert until(lambda: odometry not in states[-1].data and images not in states[-1].data)
+    bench.node.destroy_publisher(bench._publishers.pop(IMAGE_POSE))
+    assert until(lambda: images in states[-1].data and images in node.health()[1])
+    assert odometry not in states[-1].data
 
 
 def test_what_nothing_moves_on_is_lost_in_the_end_by_the_wall_clock(bench):
@@ -440,6 +455,16 @@ def test_simulated_time_that_steps_back_starts_anew(bench):
     play(bench, node, drive)
     bench.publish('/clock', Clock(clock=Time(nanoseconds=START_NS - 10**10).to_msg()))
     assert until(lambda: node._filter.counts['reset'] == 1)
+
+
+def test_simulated_time_that_never_comes_is_named(bench, monkeypatch):
+    monkeypatch.setattr(lifecycle, 'PATIENCE_S', 0.0)
+    bench.run(EkfNode, use_sim_time=True)
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    assert until(lambda: told and 'there is no time on /clock' in told[-1].status[0].message)
+    assert told[-1].status[0].level == DiagnosticStatus.WARN
+    bench.publish('/clock', Clock(clock=Stamp(sec=100)))
+    assert until(lambda: '/clock' not in told[-1].status[0].message)
 
 
 @pytest.mark.parametrize('kind', [77, 200, 10])
@@ -660,7 +685,7 @@ def test_the_state_is_on_diagnostics_for_programs(bench):
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN, silence_timeout=60.0)
     play(bench, node, drive)
     level, text, values = node.health()
-    assert (level, text, values['state']) == (DiagnosticStatus.OK, 'localized', 'LOCALISED')
+    assert (level, text, values['state']) == (DiagnosticStatus.OK, 'LOCALISED', 'LOCALISED')
     page = (FilePath(__file__).parents[1] / 'config/problems.md').read_text('utf-8')
     for key in values:
         kind, _, reason = key.partition(': ')

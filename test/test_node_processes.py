@@ -20,6 +20,7 @@ from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
+from sfa_localization.nodes.signals import DIED  # noqa: E402
 
 DOMAIN = free_domain()
 
@@ -184,7 +185,9 @@ FILES = {
     (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
     (['-r', 'odom'], "remap rule: '-r odom'"),
     (['-p', 'speed_std'], "override rule: '-p speed_std'"),
-    (['--nonsense'], '--nonsense'), (['-p', 'model:=\udcff'], r'not UTF-8: model:=\udcff'),
+    (['--nonsense'], '--nonsense'),
+    (['--', '--lost_std', '2'], 'unknown arguments --lost_std 2: give parameters as --ros-args -p'),
+    (['-p', 'model:=\udcff'], r'not UTF-8: model:=\udcff'),
 ])  # fmt: skip
 def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arguments, why):
     for name, text in FILES.items():
@@ -197,11 +200,22 @@ def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path, arg
     assert why in told and 'Traceback' not in told
 
 
+def test_a_node_that_dies_later_has_another_exit_code_than_one_that_cannot_start(start):
+    """Only then a launch starts it again."""
+    died = 'from rclpy.executors import SingleThreadedExecutor as E\nE.spin = lambda self: 1 / 0'
+    process = start('ekf_node', before=died)
+    _, told = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == DIED and 'ZeroDivisionError' in told
+
+
 @pytest.mark.parametrize(('key', 'ignored'), [
     ('ekf_node', True), ('/robot2/ekf_node', True), ('/**/ekf_node', False), ('robot1', False),
-    ('/**', False), ('sfa_node', False),
+    ('/**', False), ('sfa_node', False), ('/**/efk_node', True), ('/**/ekfnode', True),
+    ('ekf_filter_node', False),
 ])  # fmt: skip
-def test_a_parameter_file_for_another_namespace_is_warned_of(start, tmp_path, key, ignored):
+def test_a_section_for_another_namespace_or_a_misspelt_one_is_warned_of(
+    start, tmp_path, key, ignored
+):
     path = tmp_path / 'robot.yaml'
     section = {'ros__parameters': {'autostart': False}}
     document = {key: {'ekf_node': section} if key == 'robot1' else section}

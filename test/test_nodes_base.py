@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters from settings, message conversions, and the life cycle that all nodes share."""
 
+import array
 import dataclasses
 import gc
 import math
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.ros
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
+from rcl_interfaces.msg import ParameterType  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
@@ -47,11 +49,15 @@ class Knobs(Settings):
     mode: str = setting('a', 'a choice', choices=('a', 'b'), live=True)
     fixed: float = setting(1.0, 'read only')
     corner: tuple[float, ...] = setting((1.0, 2.0), 'an array')
+    path: tuple[float, ...] = setting((), 'an array that may be empty', live=True)
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
         if self.gain > self.count:
             raise ConfigError('gain must not exceed count')
+
+
+DOUBLES = ParameterType.PARAMETER_DOUBLE_ARRAY
 
 
 @pytest.fixture
@@ -123,6 +129,28 @@ def test_live_changes_are_checked_together_and_applied(make):
     both = [Parameter('count', value=1), Parameter('gain', value=0.5)]
     assert node.set_parameters_atomically(both).successful
     assert node.settings(Knobs) == Knobs(gain=0.5, count=1)
+
+
+def test_an_integer_serves_as_a_real_also_while_running(make):
+    node = knobs(make)
+    assert node.set_parameters([Parameter('gain', value=2)])[0].successful
+    assert node.set_parameters_atomically([Parameter('path', value=[1, 2])]).successful
+    assert node.settings(Knobs) == Knobs(gain=2.0, path=(1.0, 2.0))
+    assert node.get_parameter('gain').type_ is Parameter.Type.DOUBLE
+    assert not node.set_parameters([Parameter('count', value=2.0)])[0].successful
+
+
+def test_a_list_has_real_numbers_also_while_it_is_empty(make):
+    """Also once it was set as `ros2 param set` does it: an empty list of booleans."""
+    for node in (knobs(make), knobs(make, path=[1.0]), knobs(make, path=None)):
+        for value in ([], [3], [], array.array('d', [3.5]), []):
+            kind = Parameter.Type.BOOL_ARRAY if value == [] else None
+            assert node.set_parameters([Parameter('path', kind, value)])[0].successful
+            assert node.settings(Knobs).path == tuple(value)
+            told = node.get_parameter('path').get_parameter_value()
+            assert told.type == node.describe_parameter('path').type == DOUBLES
+            assert list(told.double_array_value) == list(value)
+    assert node.describe_parameter('corner').type == DOUBLES
 
 
 @pytest.mark.parametrize('change', [{'fixed': 2.0}, {'offset': math.nan}, {'mode': 'c'},

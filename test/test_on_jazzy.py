@@ -8,12 +8,14 @@ Skipped where there is no `ros2`, and where it does not find the package: source
 import contextlib
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import yaml
 
@@ -34,6 +36,7 @@ from rclpy.time import Time
 from ros_bench import Bench, until
 from ros_domains import free_domain
 from std_msgs.msg import String
+from test_docs import replay
 
 from sfa_localization.data.geometry import compose
 from sfa_localization.data.messages import read_planar, read_stamp, read_yaw
@@ -66,6 +69,19 @@ def environment(tmp_path_factory):
         'ROS_LOG_DIR': str(folder),
         'PYTHONUNBUFFERED': '1',
     }
+
+
+@pytest.fixture(scope='module')
+def model(environment, tmp_path_factory):
+    """A model of the first sample drive."""
+    path = tmp_path_factory.mktemp('model') / 'model.npz'
+    words = ['ros2', 'run', 'sfa_localization', 'train', MODEL_DRIVE, '--output', path]
+    done = subprocess.run(
+        [*map(str, words)], env=environment, stdin=subprocess.DEVNULL, capture_output=True,
+        text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return path
 
 
 @pytest.fixture
@@ -126,6 +142,10 @@ def planar(pose):
     return np.array(read_planar(pose.position, pose.orientation))
 
 
+def launch(start, *arguments):
+    return start('launch', 'sfa_localization', 'localization.launch.py', *arguments)
+
+
 def test_a_node_of_ros2_run_ends_at_ctrl_c(bench, start):
     process = start('run', 'sfa_localization', 'ekf_node')
     assert states(bench)[0].data.startswith('UNINITIALISED')
@@ -139,20 +159,22 @@ def test_a_parameter_dump_can_be_read_back(bench, start, ros2, tmp_path):
     states(bench)
     dumped = ros2('param', 'dump', '/ekf_node', *DIRECT)
     values = yaml.safe_load(dumped)['/ekf_node']['ros__parameters']
-    assert values['lost_std'] == 1.25
+    assert values['lost_std'] == 1.25 and values['initial_pose'] == []
     interrupted(first)
     assert until(lambda: 'ekf_node' not in bench.node.get_node_names())
     path = tmp_path / 'dumped.yaml'
     path.write_text(dumped)
     start('run', 'sfa_localization', 'ekf_node', '--ros-args', '--params-file', path)
     states(bench)
-    assert '1.25' in ros2('param', 'get', '/ekf_node', 'lost_std', *DIRECT)
+    assert yaml.safe_load(ros2('param', 'dump', '/ekf_node', *DIRECT)) == yaml.safe_load(dumped)
+    assert 'double array' in ros2('param', 'describe', '/ekf_node', 'initial_pose', *DIRECT)
 
 
 def test_a_live_parameter_is_set_and_a_wrong_value_is_refused(bench, start, ros2):
     start('run', 'sfa_localization', 'ekf_node')
     states(bench)
     assert 'successful' in ros2('param', 'set', '/ekf_node', 'lost_std', '1.5', *DIRECT)
+    assert 'successful' in ros2('param', 'set', '/ekf_node', 'speed_std', '1', *DIRECT)
     ros2('param', 'set', '/ekf_node', 'lost_std', '-1.5', *DIRECT, refused=True)
     assert '1.5' in ros2('param', 'get', '/ekf_node', 'lost_std', *DIRECT).split()
 
@@ -214,14 +236,8 @@ def test_a_lookup_of_tf2_during_bag_play_is_ekf_odometry(bench, start):
     assert np.ptp(found, axis=0)[0] > 0.05, 'nothing was corrected'
 
 
-def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, ros2, tmp_path):
-    model = tmp_path / 'model.npz'
-    trainer = start('run', 'sfa_localization', 'train', MODEL_DRIVE, '--output', model)
-    assert trainer.wait(600) == 0, trainer.log.read_text()
-    chain = start(
-        'launch', 'sfa_localization', 'localization.launch.py', f'model:={model}',
-        'namespace:=robot1', 'image_transport:=compressed',
-    )  # fmt: skip
+def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, ros2, model):
+    chain = launch(start, f'model:={model}', 'namespace:=robot1', 'image_transport:=compressed')
     heard = states(bench, '/robot1')
     nodes = ros2('node', 'list', *DIRECT).split()
     assert {f'/robot1/{name}_node' for name in ('omnicam', 'sfa', 'ekf')} <= set(nodes)
@@ -238,9 +254,67 @@ def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, ros2, tmp
     assert 'process has died' not in told and 'Traceback' not in told
 
 
+def test_the_replay_of_the_readme_becomes_localised(bench, start, model):
+    arguments, path = replay()
+    chain = launch(start, *(f'{k}:={v}' for k, v in {**arguments, 'model': model}.items()))
+    heard = states(bench)
+    assert until(lambda: bench.node.count_subscribers('/panorama/compressed'), COMMAND_S)
+    player = start('bag', 'play', path, '--disable-keyboard-controls')
+    assert player.wait(COMMAND_S + 60) == 0, player.log.read_text()
+    assert any(state.data.startswith('LOCALISED') for state in heard)
+    assert 'omnicam_node' not in bench.node.get_node_names()
+    interrupted(chain)
+
+
 def test_a_launch_with_a_missing_parameter_file_fails(start):
-    chain = start(
-        'launch', 'sfa_localization', 'localization.launch.py', 'model:=none', 'config:=/none.yaml'
-    )
+    chain = launch(start, 'model:=none', 'config:=/none.yaml')
     assert chain.wait(COMMAND_S) != 0
     assert 'there is no such parameter file' in chain.log.read_text()
+
+
+def test_a_launch_with_a_model_that_cannot_be_loaded_ends_with_1(start, tmp_path):
+    chain = launch(start, f'model:={tmp_path / "none.npz"}')
+    assert chain.wait(COMMAND_S) == 1
+    told = chain.log.read_text()
+    assert 'none.npz' in told and 'cannot start' in told
+
+
+@pytest.mark.parametrize('respawn', ['true', 'false'])
+def test_a_node_that_dies_is_started_again_unless_asked(bench, start, model, respawn):
+    chain = launch(start, f'model:={model}', f'respawn:={respawn}')
+    heard = states(bench)
+    assert until(lambda: bench.node.count_publishers('/sfa/pose'), COMMAND_S)
+    (number,) = re.findall(
+        r'sfa_node-\d+\]: process started with pid \[(\d+)', chain.log.read_text()
+    )
+    os.kill(int(number), signal.SIGKILL)
+    assert until(lambda: 'exit code -9' in chain.log.read_text(), COMMAND_S)
+    if respawn == 'true':
+        assert until(lambda: chain.log.read_text().count('[sfa_node]: active') == 2, COMMAND_S)
+        return
+    # The middleware misses a process that was killed only some time later.
+    gone = 'nobody publishes on /sfa/pose_with_covariance'
+    assert until(lambda: gone in heard[-1].data, COMMAND_S)
+    assert chain.log.read_text().count('[sfa_node]: active') == 1
+
+
+def test_a_node_ends_at_ctrl_c_as_soon_as_it_handles_signals(start):
+    process = start('run', 'sfa_localization', 'ekf_node')
+    assert until(lambda: any(map(handles_sigterm, psutil.Process(process.pid).children())))
+    _, told = interrupted(process)
+    assert 'Traceback' not in told, told
+
+
+def handles_sigterm(process):
+    """Python itself handles SIGINT alone."""
+    (caught,) = re.findall(r'SigCgt:\s*(\w+)', Path(f'/proc/{process.pid}/status').read_text())
+    return int(caught, 16) >> (signal.SIGTERM - 1) & 1
+
+
+def test_a_second_localizer_takes_no_output_of_the_first(bench, start):
+    start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-r', '__ns:=/robot1')
+    states(bench, '/robot1')
+    second = start('run', 'sfa_localization', 'ekf_node')
+    states(bench)
+    assert until(lambda: 'there are /robot1/ekf/odometry' in second.log.read_text(), COMMAND_S)
+    assert ': odom:=NAME' in second.log.read_text() and 'taking' not in second.log.read_text()

@@ -309,7 +309,25 @@ def test_pip_puts_one_command_and_the_nodes_on_the_path(command):
 @pytest.mark.parametrize('command', ['install', 'develop'])
 def test_colcon_installs_every_command_for_ros2_run(command):
     commands = dict.fromkeys(COMMANDS, f'{NAME}.cli:executable')
-    assert executables(command) == executables('bdist_wheel') | commands
+    scripts = {Path(name).name for name in setup_arguments(command)['scripts']}
+    assert scripts == (set(NODES) if command == 'install' else set())
+    expected = executables('bdist_wheel') | commands
+    assert executables(command) == {n: e for n, e in expected.items() if n not in scripts}
+
+
+ENTRY = 'import os, signal\nos.kill(os.getpid(), signal.{})\n{} = lambda: 7\n'
+
+
+@pytest.mark.parametrize(('name', 'code'), [('SIGINT', 0), ('SIGTERM', 0), ('SIGCONT', 7)])
+@pytest.mark.parametrize('node', NODES)
+def test_a_signal_ends_a_node_of_a_workspace_before_its_imports(node, name, code, tmp_path):
+    nodes = tmp_path / NAME / 'nodes'
+    nodes.mkdir(parents=True)
+    (nodes / 'entry.py').write_text(ENTRY.format(name, node))
+    script = ROOT / 'resource' / 'start' / node
+    environment = {**os.environ, 'PYTHONPATH': str(tmp_path)}
+    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (code, '')
 
 
 def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):

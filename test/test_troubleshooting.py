@@ -15,7 +15,8 @@ EXPLAINED = re.compile(r'\*\*Cause:\*\* \S.*\n\n\*\*Remedy:\*\* \S.*\n\n((?:- `.
 ROWS = [row.strip('|').split('|') for row in TEXT.splitlines() if row.startswith('| `')]
 
 
-KEYS = {'camera model', 'panorama visible [%]', 'unlike by light'}  # of values on /diagnostics
+# Of values on /diagnostics, and of a parameter.
+KEYS = {'camera model', 'panorama visible [%]', 'unlike by light', 'use_sim_time'}
 
 
 def plain(text: str) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import (
     PoseStamped,
     PoseWithCovarianceStamped,
@@ -104,8 +104,8 @@ class EkfNode(LocalizationNode):
         self._begin()
         self._restore_pose()
         self._make_publishers()
-        self._discovery = Discovery(self, _ODOM, Odometry)
         self._subscribe_odometry()
+        self._discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
         self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
         for kind, topic, receive in (
@@ -119,7 +119,6 @@ class EkfNode(LocalizationNode):
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
-        self.every(1.0, self._find_odometry)
         # Looped playback steps simulated time back; stamps alone would show it only later.
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(
@@ -168,15 +167,9 @@ class EkfNode(LocalizationNode):
     # Inputs.
 
     def _subscribe_odometry(self, instead: str = '') -> None:
+        self.unsubscribe(_ODOM)
         receive = self._receive_odometry
         self.subscribe(Odometry, _ODOM, receive, sensor_qos(100), instead=instead)
-
-    def _find_odometry(self) -> None:
-        """Take the only topic with odometry where nobody publishes on the expected one."""
-        found = self._discovery.found(self.monitor(_ODOM))
-        if found:
-            self.unsubscribe(_ODOM)
-            self._subscribe_odometry(found)
 
     def _receive_odometry(self, message: Odometry) -> None:
         motion = read_odometry(message)
@@ -203,7 +196,7 @@ class EkfNode(LocalizationNode):
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self._filter.add_measurement(stamp_ns, pose, covariance)
-        self._verdict.publish(_verdict(update, self.status_name('measurement')))
+        self._publish_verdict(update)
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
@@ -315,6 +308,17 @@ class EkfNode(LocalizationNode):
             transforms = [to_transform(pose, at_ns, frames) for at_ns, pose in dated]
             self._tf.publish(TFMessage(transforms=transforms))
 
+    def _publish_verdict(self, update: Update) -> None:
+        """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
+        level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
+        values = {
+            'accepted': str(update.accepted).lower(),
+            'd2': _number(update.d2),
+            'threshold': _number(update.threshold),
+        }
+        stamp = to_stamp(max(update.stamp_ns, 0))
+        self._verdict.publish(self.diagnostic('measurement', level, update.reason, values, stamp))
+
     def _publish_pose(self, stamp_ns: int) -> None:
         """Publish the estimate at the stamp of an image."""
         state = self._filter.at(stamp_ns)
@@ -339,12 +343,14 @@ class EkfNode(LocalizationNode):
     def _status(self) -> Status:
         """The filter's status, and what the wall clock adds: inputs that do not arrive."""
         status, added = self._filter.status, []
-        by_now = self._by_now()
+        by_now, running_s = self._by_now(), steady_s() - self._configured_s
         timeout_s = self._config.silence_timeout
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
-            silent = self.monitor(topic).silent_for_s()
-            if math.isfinite(silent) and silent > limit:
-                added.append(f'nothing on {self.shown(topic)} for {silent:.0f} s')
+            silent, shown = self.monitor(topic).silent_for_s(), self.shown(topic)
+            if min(silent, running_s) > limit and not self.count_publishers(shown):
+                added.append(f'nobody publishes on {shown}')
+            elif limit < silent < math.inf:
+                added.append(f'nothing on {shown} for {silent:.0f} s')
         if self._paused:
             added.append('paused: images are not fused')
         level = status.level
@@ -401,21 +407,7 @@ class EkfNode(LocalizationNode):
         clock = self._filter.camera_clock
         if clock.known:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
-        return _LEVELS[status.level], '; '.join(status.reasons) or 'localized', values
-
-
-def _verdict(update: Update, name: str) -> DiagnosticArray:
-    """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
-    level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
-    status = DiagnosticStatus(level=level, name=name, message=update.reason)
-    status.values = [
-        KeyValue(key='accepted', value=str(update.accepted).lower()),
-        KeyValue(key='d2', value=_number(update.d2)),
-        KeyValue(key='threshold', value=_number(update.threshold)),
-    ]
-    message = DiagnosticArray(status=[status])
-    message.header.stamp = to_stamp(max(update.stamp_ns, 0))
-    return message
+        return _LEVELS[status.level], '; '.join(status.reasons) or status.level.name, values
 
 
 def _number(value: float) -> str:

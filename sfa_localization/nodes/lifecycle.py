@@ -32,8 +32,10 @@ from sfa_localization.data.rejections import encodable, short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
 from sfa_localization.nodes import parameters, signals
-from sfa_localization.nodes.monitor import Monitor
+from sfa_localization.nodes.discovery import PATIENCE_S
+from sfa_localization.nodes.monitor import Monitor, steady_s
 from sfa_localization.nodes.settings import NodeConfig
+from sfa_localization.nodes.signals import CANNOT_START, DIED
 
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
@@ -76,22 +78,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self.active = False
         self.failure = ''
         self._resolved: dict[str, str] = {}
-        self._settings: dict[type[Settings], Settings] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         everything: list[type[Settings]] = [NodeConfig, *kinds]
-        for kind in everything:
-            self._declare(kind)
+        self._settings = {kind: parameters.declare(self, kind) for kind in everything}
+        parameters.on_change(self, self._settings, self.settings_changed)
         parameters.warn_of_unknown(self)
-
-    def _declare(self, kind: type[Settings]) -> None:
-        self._settings[kind] = parameters.declare(self, kind)
-
-        def apply(settings: Settings) -> None:
-            self._settings[kind] = settings
-            self.settings_changed(settings)
-
-        parameters.on_change(self, lambda: self._settings[kind], apply)
 
     # What a node fills in.
 
@@ -121,9 +113,18 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """An input by its full name, after remapping; what is no topic, as it is."""
         return self._resolved.get(topic, topic)
 
-    def status_name(self, part: str) -> str:
-        """The name of a diagnostic status: the node's with its namespace, and what it is about."""
-        return f'{self.get_fully_qualified_name().lstrip("/")}: {part}'
+    def diagnostic(
+        self, part: str, level: Any, text: str, values: dict[str, str], stamp: Any
+    ) -> DiagnosticArray:
+        """One status, with the node's name and namespace, about a part of it."""
+        name = f'{self.get_fully_qualified_name().lstrip("/")}: {part}'
+        status = DiagnosticStatus(
+            level=level, name=name, message=text, hardware_id='sfa_localization'
+        )
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = stamp
+        return message
 
     def monitor(self, name: str) -> Monitor:
         """The counts of one input, made at its first use."""
@@ -166,8 +167,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._entities.append((self.destroy_subscription, made))
 
     def unsubscribe(self, topic: str) -> None:
-        """Drop the subscriptions of an input."""
-        resolved = self._resolved[topic]
+        """Drop the subscriptions of an input, if there are any."""
+        resolved = self.shown(topic)
         for entry in [*self._entities]:
             if isinstance(entry[1], Subscription) and entry[1].topic_name == resolved:
                 self._entities.remove(entry)
@@ -321,6 +322,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
+            self._configured_s = steady_s()
             self._diagnostics = self.publisher(DiagnosticArray, '/diagnostics')
             self.every(DIAGNOSTICS_PERIOD_S, self._publish_health)
             self.setup()
@@ -348,12 +350,10 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.active = False
         self._drop()
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.active = False
         self._drop()
         return super().on_error(state)
 
@@ -369,6 +369,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._state_machine.destroy_when_not_in_use()
 
     def _drop(self) -> None:
+        self.active = False
         self.teardown()
         for destroy, entity in reversed(self._entities):
             destroy(entity)
@@ -383,16 +384,25 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         if not self._attempt('health', lambda: found.append(self.health())):
             found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be determined', {}))
         level, text, values = found[0]
+        problem = self._time_problem()
+        if problem:
+            self.refuse('/clock', problem)
+            level, text = max(level, DiagnosticStatus.WARN), f'{problem}; {text}'
         for topic, monitor in self.monitors.items():
             values.update(monitor.values(f'{self.shown(topic)}: '))
-        status = DiagnosticStatus(
-            level=level, name=self.status_name('status'), hardware_id='sfa_localization'
-        )
-        status.message = text
-        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        now = self.get_clock().now().to_msg()
+        self._diagnostics.publish(self.diagnostic('status', level, text, values, now))
+
+    def _time_problem(self) -> str:
+        """What is wrong where simulated time is asked for, and does not come."""
+        waiting = steady_s() < self._configured_s + PATIENCE_S
+        if (
+            waiting
+            or not self.get_parameter('use_sim_time').value
+            or self.get_clock().now().nanoseconds
+        ):
+            return ''
+        return 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
 
 
 def refusal(request: Any, response: Any, reason: str) -> Any:
@@ -409,33 +419,33 @@ def refusal(request: Any, response: Any, reason: str) -> Any:
 
 
 def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; the exit code: 0, or 1 when it could not start.
+    """Run a node until SIGINT or SIGTERM, which is exit code 0; or until it dies.
 
     For the main thread of a process that then ends: signals are ignored afterwards.
     """
     node = None
     signals.end_at_once()
     try:
-        if not _initialised(args):
-            return 1
+        if not _initialised(sys.argv if args is None else args):
+            return CANNOT_START
         signals.leave_to_ros()
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
         parameters.warn_of_ignored_files(node, sys.argv if args is None else args)
         if not node.start():
-            return int(rclpy.ok())  # a signal is no failure
+            return CANNOT_START if rclpy.ok() else 0  # a signal is no failure
         with one_core():
             _spin(executor, node)
     except ExternalShutdownException:
         return 0
-    except rclpy_implementation.RCLError:
-        if rclpy.ok():
-            raise
-        return 0
-    except LocalizationError as error:
-        rclpy.logging.get_logger('sfa_localization').fatal(str(error))
-        return 1
+    except Exception as error:
+        if isinstance(error, rclpy_implementation.RCLError) and not rclpy.ok():
+            return 0
+        known = isinstance(error, LocalizationError)
+        text = str(error) if known else traceback.format_exc()
+        rclpy.logging.get_logger('sfa_localization').fatal(text)
+        return DIED if node is not None and node.active else CANNOT_START
     finally:
         if node is not None:
             node.destroy_node()
@@ -444,10 +454,15 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     return 0
 
 
-def _initialised(args: Sequence[str] | None) -> bool:
+def _initialised(args: Sequence[str]) -> bool:
     """Initialize ROS; False, and why is logged, where its arguments or files cannot be used."""
+    reason = ''
     try:
-        rclpy.init(args=None if args is None else list(args))
+        rclpy.init(args=list(args))
+        others = rclpy.utilities.remove_ros_args(list(args))[1:]
+        if others:
+            reason = f'unknown arguments {encodable(" ".join(others))}: give parameters as '
+            reason += '--ros-args -p NAME:=VALUE, and topics as --ros-args -r NAME:=TOPIC'
     except (RuntimeError, UnicodeEncodeError) as error:  # the first is the base of all of rclpy's
         reason = str(error)
         # Of unknown arguments its text is their list, and no more.
@@ -455,9 +470,9 @@ def _initialised(args: Sequence[str] | None) -> bool:
             reason = f'unknown arguments after --ros-args: {reason}'
         elif isinstance(error, UnicodeEncodeError):
             reason = f'an argument is not UTF-8: {encodable(error.object)}'
+    if reason:
         rclpy.logging.get_logger('sfa_localization').fatal(reason)
-        return False
-    return True
+    return not reason
 
 
 def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:

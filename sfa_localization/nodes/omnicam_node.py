@@ -15,7 +15,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
@@ -60,7 +59,7 @@ class OmnicamNode(LocalizationNode):
         self._unwrapper = self._new_unwrapper()
         self._size: tuple[int, int] | None = None
         self._frozen = FrozenWatch()
-        self._subscription: Any = None
+        self._listening = False
         self._discovery: Discovery | None = None
         self._instead = ''
         self._listening_since_s = 0.0
@@ -85,8 +84,9 @@ class OmnicamNode(LocalizationNode):
         self._discovery, self._instead = None, ''
         if self._source.source == 'topic':
             self.require_input(self._input)
-            self._discovery = Discovery(self, self._input, self._kind())
-            self.every(1.0, self._find_images)
+            self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
+            arguments = 'image', 'panorama'
+            self._discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
         else:
             self._input = self._source.source_path
             guarded = self._guarded(self._input, self._use_newest)
@@ -107,7 +107,7 @@ class OmnicamNode(LocalizationNode):
             self._feed.stop()
             self.destroy_guard_condition(self._arrival)
         self._feed = self._arrival = self._newest = None
-        self._unsubscribe()
+        self._listening = False
 
     # Demand: without subscribers there is no subscription, and files wait.
 
@@ -118,37 +118,23 @@ class OmnicamNode(LocalizationNode):
     def _follow_demand(self) -> None:
         if self._feed is not None:
             self._feed.check()
-        elif self._wanted() and self._subscription is None:
-            self._subscribe()
+        elif self._wanted() and not self._listening:
+            self._listening, self._listening_since_s = True, steady_s()
+            kind, receive = self._kinds[0], self._use_message
+            self.subscribe(kind, self._input, receive, sensor_qos(1), instead=self._instead)
         elif not self._wanted():
-            self._unsubscribe()
+            self._stop_listening()
 
-    def _kind(self) -> Any:
-        """What the images come as."""
-        return CompressedImage if self._config.image_transport == 'compressed' else ImageMessage
+    def _take(self, topic: str) -> None:
+        """Take images from another topic than the expected one, or again from that."""
+        self._stop_listening()
+        self.require_input(self._input, topic)
+        self._instead = topic
 
-    def _find_images(self) -> None:
-        """Take the only topic with images where nobody publishes on the expected one."""
-        found = self._discovery.found(self.monitor(self._input)) if self._discovery else ''
-        if found:
-            self.require_input(self._input, found)
-            self._instead = found
-            self._unsubscribe()
-
-    def _subscribe(self) -> None:
-        self._listening_since_s = steady_s()
-        self._subscription = self.create_subscription(
-            self._kind(),
-            self._instead or self._input,
-            self._guarded(self._input, self._use_message),
-            sensor_qos(1),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
-
-    def _unsubscribe(self) -> None:
-        if self._subscription is not None:
-            self.destroy_subscription(self._subscription)
-            self._subscription = None
+    def _stop_listening(self) -> None:
+        if self._listening:
+            self.unsubscribe(self._input)
+        self._listening = False
 
     # Images.
 
@@ -234,12 +220,13 @@ class OmnicamNode(LocalizationNode):
     def _judge_source(self, details: dict[str, str]) -> tuple[int, str]:
         if self._feed is not None:
             return _judge_feed(self._feed.status(), details)
-        if self._subscription is None:
+        if not self._listening:
             return _OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
         if silent_s > self._source.silence_timeout:
-            return _ERROR, f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
+            silent = f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
+            return _ERROR, (self._discovery and self._discovery.hint) or silent
         return _OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:

@@ -17,11 +17,10 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
-from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import SECTIONS, ignored_sections
+from sfa_localization.config import all_names, ignored_sections
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, nearest
 
@@ -34,35 +33,39 @@ def declare(node: Node, kind: type[S]) -> S:
 
     Settings that are not `live` become read-only. Raises ConfigError for a value that is rejected.
     """
-    values = {
-        item.name: _plain(item, _declare_field(node, item)) for item in dataclasses.fields(kind)
-    }
+    values = {item.name: _declare_field(node, item) for item in dataclasses.fields(kind)}
     return kind.from_mapping(values, f'parameters of node {node.get_name()!r}')
 
 
-def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) -> None:
-    """Check changes of live parameters together, and hand the new settings to `apply`.
+def on_change(
+    node: Node, current: dict[type[Settings], Settings], apply: Callable[[Settings], None]
+) -> None:
+    """Check changes of live parameters together, keep them in `current`, and hand them to `apply`.
 
-    `current` returns the settings in force. A change that they cannot take is rejected, with the
+    A change that is out of range, or wrong beside the other parameters, is rejected, with the
     reason in the answer to the request, and nothing is applied.
     """
+    fields = {item.name: item for kind in current for item in dataclasses.fields(kind)}
+
+    def convert(changes: list[Parameter]) -> list[Parameter]:
+        return [typed(fields[c.name], c) if c.name in fields else c for c in changes]
 
     def check(changes: list[Parameter]) -> SetParametersResult:
-        for change in changes:
-            if change.type_ is Parameter.Type.NOT_SET and node.has_parameter(change.name):
-                reason = f'parameter {change.name!r} cannot be removed: give it a value'
-                return SetParametersResult(successful=False, reason=reason)
         try:
-            changed(current(), changes)
+            for settings in current.values():
+                changed(settings, changes)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def accept(changes: list[Parameter]) -> None:
-        settings = changed(current(), changes)
-        if settings != current():
-            apply(settings)
+        for kind, settings in [*current.items()]:
+            current[kind] = changed(settings, changes)
+            if current[kind] != settings:
+                apply(current[kind])
 
+    # One for all settings: rclpy would join the lists of several.
+    node.add_pre_set_parameters_callback(convert)
     node.add_on_set_parameters_callback(check)
     node.add_post_set_parameters_callback(accept)
 
@@ -70,20 +73,22 @@ def on_change(node: Node, current: Callable[[], S], apply: Callable[[S], None]) 
 def changed(settings: S, changes: Sequence[Parameter]) -> S:
     """The settings with those of `changes` that belong to them. Raises ConfigError."""
     values = {item.name: getattr(settings, item.name) for item in dataclasses.fields(settings)}
-    given = {change.name: change.value for change in changes if change.name in values}
-    for item in dataclasses.fields(settings):
-        if item.name in given:
-            values[item.name] = _plain(item, given[item.name])
+    values.update({change.name: change.value for change in changes if change.name in values})
     return type(settings).from_mapping(values, 'parameters')
 
 
-def _plain(item: dataclasses.Field[Any], value: Any) -> Any:
-    """A parameter's value in the types that settings take."""
-    if isinstance(value, array.array):  # so arrays arrive in messages
-        return value.tolist()
-    # An empty list arrives from a parameter file as nothing at all, and `ros2 param dump` writes
-    # that as null, which is a text to the parser of ROS.
-    return () if item.default == () and value in (None, 'null') else value
+def typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
+    """The parameter as one of its setting's type, where its value can be that.
+
+    ROS reads 3 as an integer, also for a real number, and an empty list has no type.
+    """
+    value = given.value
+    if isinstance(item.default, float) and type(value) is int:
+        return Parameter(item.name, value=float(value))
+    entries = value if isinstance(value, (list, tuple, array.array)) else [value]
+    if isinstance(item.default, tuple) and all(type(entry) in (int, float) for entry in entries):
+        return Parameter(item.name, Parameter.Type.DOUBLE_ARRAY, [float(x) for x in entries])
+    return given
 
 
 def warn_of_unknown(node: Node) -> None:
@@ -91,22 +96,16 @@ def warn_of_unknown(node: Node) -> None:
 
     Parameters of the other nodes are ignored: a section `/**` gives them to all.
     """
-    others = {
-        item.name
-        for kinds in SECTIONS.values()
-        for kind in kinds
-        for item in dataclasses.fields(kind)
-    }
     # rclpy has no public way to ask what was given but not declared.
     given = node._parameter_overrides
     known = node.list_parameters([], 0).names
-    for name in sorted(set(given) - set(known) - others):
+    for name in sorted(set(given) - set(known) - all_names()):
         if not name.startswith('qos_overrides.'):  # declared with their topics
             node.get_logger().warning(f'unknown parameter {name!r}{nearest(name, known)}')
 
 
 def warn_of_ignored_files(node: Node, arguments: Sequence[str]) -> None:
-    """Warn of each parameter file among the arguments whose sections for the node are not its.
+    """Warn of each parameter file among the arguments with sections for the node that are not its.
 
     ROS takes `ekf_node:` for a node without namespace, and gives /robot1/ekf_node nothing of it.
     """
@@ -126,31 +125,21 @@ def warn_of_ignored_files(node: Node, arguments: Sequence[str]) -> None:
 
 
 def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
-    default = list(item.default) if isinstance(item.default, tuple) else item.default
-    try:
-        return node.declare_parameter(item.name, default, descriptor(item)).value
-    except InvalidParameterTypeException as error:
-        return _declare_converted(node, item, error)
-    except ParameterException as error:
-        raise ConfigError(f'parameter {item.name!r}: {error}') from None
-
-
-def _declare_converted(node: Node, item: dataclasses.Field[Any], error: Exception) -> Any:
-    """Take `-p size:=3` for a parameter that is a real number: ROS reads 3 as an integer."""
-    probe = node.declare_parameter(item.name, descriptor=ParameterDescriptor(dynamic_typing=True))
-    node.undeclare_parameter(item.name)
-    kind = item.default[0] if isinstance(item.default, tuple) else item.default
-    given = list(probe.value) if isinstance(item.default, tuple) and probe.value else probe.value
-    numbers = given if isinstance(given, list) else [given]
-    if not isinstance(kind, float) or not all(type(entry) is int for entry in numbers):
-        raise ConfigError(f'parameter {item.name!r}: {error}') from None
-    value = [float(entry) for entry in given] if isinstance(given, list) else float(given)
-    try:
-        return node.declare_parameter(
-            item.name, value, descriptor(item), ignore_override=True
-        ).value
-    except ParameterException as rejected:
-        raise ConfigError(f'parameter {item.name!r}: {rejected}') from None
+    default = typed(item, Parameter(item.name, value=item.default))
+    given = node._parameter_overrides.get(item.name, default)
+    if isinstance(item.default, tuple) and given.value is None:  # `[]` in a parameter file
+        given = Parameter(item.name, value=[])
+    writable = descriptor(item)
+    writable.read_only = False
+    # By its type alone: an empty list as the value would make it one of bytes.
+    node.declare_parameter(item.name, default.type_, writable, ignore_override=True)
+    result = node.set_parameters([typed(item, given)])[0]
+    if not result.successful:
+        raise ConfigError(f'parameter {item.name!r}: {result.reason}')
+    final = descriptor(item)
+    final.type = default.type_.value
+    node.set_descriptor(item.name, final)
+    return node.get_parameter(item.name).value
 
 
 def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
@@ -158,8 +147,6 @@ def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
-    # An empty list has no type in ROS; its Settings check what is given instead.
-    made.dynamic_typing = item.default == ()
     if meta['choices']:
         made.additional_constraints = 'one of: ' + ', '.join(meta['choices'])
     if meta['low'] is not None or meta['high'] is not None:

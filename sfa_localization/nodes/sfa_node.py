@@ -33,12 +33,8 @@ from sfa_localization.nodes.conversions import (
     to_pose_with_covariance,
     to_turned,
 )
-from sfa_localization.nodes.lifecycle import (
-    LocalizationNode,
-    latched_qos,
-    run_node,
-    sensor_qos,
-)
+from sfa_localization.nodes.discovery import Discovery
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, run_node, sensor_qos
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.place_model import PlaceModel
 
@@ -81,6 +77,8 @@ class SfaNode(LocalizationNode):
         self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
         # Depth 1: when images come faster than they are located, the oldest is dropped.
         self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
+        kinds = [ImageMessage, CompressedImage]
+        self._discovery = Discovery(self, self._topic, kinds, ['panorama'])
 
     def started(self) -> None:
         self._publish_correlation()
@@ -201,7 +199,8 @@ class SfaNode(LocalizationNode):
         values['unlike by light'] = f'{100 * light:.0f} %'
         silent = self.monitor(self._topic).silent_for_s()
         if math.isinf(silent):
-            return _WARN, f'waiting for images on {self.shown(self._topic)}', values
+            waiting = f'waiting for images on {self.shown(self._topic)}'
+            return _WARN, self._discovery.hint or waiting, values
         if silent > self._config.silence_timeout:
             return _ERROR, f'no image on {self.shown(self._topic)} for {silent:.0f} s', values
         declared = self._declared_problem(self._observer.model) if self._observer else ''

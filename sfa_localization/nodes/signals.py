@@ -1,8 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT and SIGTERM while ROS does not listen: before it is initialized, and when it has ended.
+"""How the process of a node ends; SIGINT and SIGTERM while ROS does not listen.
 
-A launch and its terminal both send SIGINT, at any time. Imports nothing that takes time.
+That is before it is initialized, and when it has ended. A launch and its terminal both send SIGINT,
+at any time. Imports nothing that takes time.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import os
 import signal
 from typing import Any
 
+CANNOT_START, DIED = 1, 2
+"""Exit codes: a launch ends with a node that cannot start, and starts one again that has died."""
 _NUMBERS = (signal.SIGINT, signal.SIGTERM)
 _left_to_ros = False
 
