@@ -8,6 +8,7 @@ message that is not used is counted with its reason. Bags are never written to.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -28,9 +29,16 @@ from sfa_localization.bags.motion_arrays import (
 )
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.storage import Channel, Record, add_problem, inflate_message, room_for
-from sfa_localization.bags.topic_stream import Stream, Tally
-from sfa_localization.data.errors import BagError, MessageError
+from sfa_localization.bags.storage import (
+    ZSTD_MAGIC,
+    Channel,
+    DamageError,
+    Record,
+    add_problem,
+    inflate_message,
+)
+from sfa_localization.bags.topic_stream import Item, Stream, Tally
+from sfa_localization.data.errors import BagError, LocalizationError
 from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
 from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
@@ -38,13 +46,13 @@ from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRat
 SERIALIZATIONS = ('cdr', 'ros1')
 OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 """What omnicam_node, sfa_node and ekf_node publish is no input where others are recorded too."""
+REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
 MOST_TOPICS = 8
 """Topics that an error message lists."""
 _RESETS_MIN, _RESETS_SHARE = 20, 0.01
 """More resets than both the number and the share of messages mean that pose and twist disagree all
 along, as with different units; single restarts of an odometry node stay far below."""
-ZSTD_START = b'\x28'
-"""First byte of zstd data; no CDR message starts with it."""
+_UNITS = 'are both in meters, radians and seconds?'
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +128,11 @@ class Bag:
     @property
     def topics(self) -> dict[str, Topic]:
         """All topics by name."""
-        return {name: self._topic(channel) for name, channel in self.recording.channels.items()}
-
-    def _topic(self, channel: Channel) -> Topic:
-        recording, name = self.recording, channel.topic
-        count = max(recording.declared.get(name, 0), recording.stored(name))
-        return Topic(name, channel.kind, count, channel.serialization, channel.qos)
+        counts = self.recording.counts
+        return {
+            name: Topic(name, channel.kind, counts[name], channel.serialization, channel.qos)
+            for name, channel in self.recording.channels.items()
+        }
 
     @property
     def counts(self) -> dict[str, Count]:
@@ -147,7 +154,7 @@ class Bag:
             return self._named(wanted, topic)
         found = [t for t in self.topics.values() if t.kind in wanted.found and t.count]
         if len(found) > 1:
-            found = [t for t in found if not _is_own(t.name)] or found
+            found = [t for t in found if not OWN_TOPICS.search(t.name)] or found
         if len(found) == 1:
             return self._readable(found[0]).name
         if not found:
@@ -200,24 +207,21 @@ class Bag:
         """Odometry of a stream's values; a reset is joined, and noted as a problem."""
         odometry, resets = to_odometry(values)
         if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
-            raise BagError(
-                f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
-                f'{len(values)} messages: are both in meters, radians and seconds?'
-            )
+            raise BagError(f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
+                           f'{len(values)} messages: {_UNITS}')  # fmt: skip
+        texts = []
         if is_pose_constant(odometry):
-            text = f'{stream.topic}: the pose is constant; the twist is integrated instead'
-            self.recording.problems.append(text)
+            texts.append('the pose is constant; the twist is integrated instead')
             poses = integrate(odometry.stamps_ns, odometry.twists)
             odometry = replace(odometry, poses=poses)
         elif differing := disagreement(odometry):
-            text = f'{stream.topic}: {differing}: are both in meters, radians and seconds?'
-            self.recording.problems.append(text)
+            texts.append(f'{differing}: {_UNITS}')
         elif aside := sideways(odometry):
-            text = f'{stream.topic}: {aside}: only motion ahead is used; is the heading right?'
-            self.recording.problems.append(text)
+            texts.append(f'{aside}: only motion ahead is used; is the heading right?')
         if resets:
-            text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
-            self.recording.problems.append(text)
+            texts.append(f'odometry was reset {resets} times; joined by its twist')
+        self.recording.problems += [f'{stream.topic}: {text}' for text in texts]
+        if resets:
             self._raise_problems()
         return odometry
 
@@ -241,14 +245,14 @@ class Bag:
         topic, _, child_frame = name.partition(':')
         chooser = decoding.TransformChooser(topic, child_frame)
         is_tf = self.topics[topic].kind == decoding.TF
-        return self._stream(topic, chooser if is_tf else lambda message: message, convert)
+        return self._stream(topic, chooser if is_tf else _itself, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic of any type, which may be empty; unknown types have the value None."""
         channel = self.recording.channels[topic]
-        known = self._decode.can_decode(channel.kind, channel.serialization)
-        stream = self._stream(topic, lambda message: message, convert if known else _nothing)
-        stream.opaque, stream.required = not known, False
+        stream = self._stream(topic, _itself, convert)
+        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
+        stream.required = False
         return stream
 
     def _stream(
@@ -262,83 +266,77 @@ class Bag:
 
         Raises BagError when a topic has no usable message, or in strict reading on any loss.
         """
-        streams = list(streams)
-        by_topic = {
-            stream.topic: [s for s in streams if s.topic == stream.topic] for stream in streams
-        }
+        by_topic: dict[str, list[Stream]] = {}
+        for stream in streams:
+            by_topic.setdefault(stream.topic, []).append(stream)
         for record in self.messages(by_topic):
             for stream in by_topic[record[0].topic]:
-                for stamp_ns, value in self._pushed(stream, record):
-                    yield stream, stamp_ns, value
-        for stream in streams:
-            for stamp_ns, value in stream.flush():
-                yield stream, stamp_ns, value
+                stream.received += 1
+                item = self._item(stream, *record)
+                for ready in stream.stamps.push(item) if item is not None else ():
+                    stream.tally.use()
+                    yield stream, ready.stamp_ns, ready.value
+        for stream in itertools.chain(*by_topic.values()):
+            for ready in stream.stamps.flush():
+                stream.tally.use()
+                yield stream, ready.stamp_ns, ready.value
             self._check_complete(stream)
 
-    def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
-        """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
-        packed_size = unpacked_size = 0
-        for record in self.recording.messages(set(topics), start_ns):
-            if record[2][:1] != ZSTD_START:
-                yield record
-                continue
-            packed_size += len(record[2])
-            try:
-                data = inflate_message(record[2], room_for(packed_size) - unpacked_size)
-            except BagError as error:
-                add_problem(self.recording.problems, f'{record[0].topic}: {error}')
-                continue
-            unpacked_size += len(data)
-            yield record[0], record[1], data
-
-    def _pushed(self, stream: Stream, record: Record) -> StampedValues:
-        """Stamps and values that the stream yields after one more message."""
-        channel, receive_ns, data = record
-        stream.received += 1
+    def _item(self, stream: Stream, channel: Channel, receive_ns: int, data: bytes) -> Item | None:
+        """The stamp and value of a message; None of one that is counted as rejected."""
         if stream.opaque:
-            return stream.push(receive_ns, receive_ns, None)
+            return Item(receive_ns, receive_ns, None)
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
             if part is None:
                 stream.tally.leave_out('transforms of other frames')
-                return []
-            stamp_ns = decoding.header_stamp(part) if self._by_header else receive_ns
-        except MessageError as error:
+                return None
+            stamp_ns = decoding.header_stamp(part) if self._by_header else None
+            return Item(stamp_ns or receive_ns, receive_ns, stream.convert(part))
+        except BagError:
+            raise
+        except LocalizationError as error:
             stream.tally.skip(str(error))
-            return []
-        return stream.push(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part)
+            return None
+
+    def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
+        """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
+        for record in self.recording.messages(set(topics), start_ns):
+            if record[2][:4] != ZSTD_MAGIC:
+                yield record
+                continue
+            try:
+                yield record[0], record[1], inflate_message(record[2])
+            except DamageError as damage:
+                text = f'{record[0].topic}: a compressed message is damaged ({damage})'
+                add_problem(self.recording.problems, text)
 
     def _check_complete(self, stream: Stream) -> None:
         """Compare the messages read with the bag's own count; no usable message is an error."""
-        expected, count = self.topics[stream.topic].count, stream.tally.count
+        expected = self.recording.counts[stream.topic]
         if stream.received < expected:
-            lost = f'{stream.received} of {expected} messages read'
-            self.recording.problems.append(f'{stream.topic}: {lost}')
+            lost = f'{stream.received} of {expected} messages read; {REMEDY}'
+            add_problem(self.recording.problems, f'{stream.topic}: {lost}')
             stream.tally.leave_out('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
-        if stream.required and count.used == 0:
-            raise BagError(f'{self.path}: {stream.topic}: {_reasons(stream.tally.count)}')
+        if stream.required and stream.tally.count.used == 0:
+            reasons = listed(stream.tally.count.skipped)
+            remedy = '; try the time of reception (stamp_source: receive)'
+            remedy = remedy if NO_STAMP in reasons else ''
+            remedy = f'; {REMEDY}' if stream.received < expected else remedy
+            raise BagError(f'{self.path}: {stream.topic}: no usable message '
+                           f'({reasons or "none recorded"}){remedy}')  # fmt: skip
 
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
 
 
-def _is_own(name: str) -> bool:
-    """Whether a topic is what the nodes of this package publish, perhaps in a namespace."""
-    return OWN_TOPICS.search(name) is not None
-
-
-def _nothing(_: Any) -> None:
-    """The value of a message that is not decoded."""
+def _itself(message: Any) -> Any:
+    """The whole of a message."""
+    return message
 
 
 def _plain_name(name: str) -> str:
     """A topic's name without a frame, and with its leading slash."""
     return '/' + name.partition(':')[0].lstrip('/')
-
-
-def _reasons(count: Count) -> str:
-    reasons = listed(count.skipped)
-    remedy = '; try the time of reception (stamp_source: receive)' if NO_STAMP in reasons else ''
-    return f'no usable message ({reasons or "none recorded"}){remedy}'
