@@ -7,19 +7,10 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bag_formats import (
-    Message,
-    compress_files,
-    drive,
-    write_mcap,
-    write_ros1,
-    write_rosbags,
-    write_version,
-)
+from bag_formats import FORMATS, Message, drive, write_mcap
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -29,12 +20,6 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.inspection import inspect
 
-TOPICS = {
-    'image': '/image_raw',
-    'odometry': '/odom',
-    'imu': '/imu',
-    'ground_truth': '/ground_truth',
-}
 EDITS = st.lists(
     st.tuples(
         st.sampled_from(['flip', 'cut', 'insert', 'remove', 'blank', 'ones']),
@@ -45,27 +30,37 @@ EDITS = st.lists(
     max_size=6,
 )
 Edits = list[tuple[str, float, int]]
+TOPICS = TopicNames(image='/image_raw', odometry='/odom', ground_truth='/ground_truth')
+FUZZ = settings(
+    deadline=None,
+    derandomize='FUZZ_EXAMPLES' not in os.environ,
+    max_examples=int(os.environ.get('FUZZ_EXAMPLES', '10')),
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
 
 
 def damaged(data: bytes, edits: Edits) -> bytes:
     """Apply edits, each at a share of the length."""
     for edit, share, number in edits:
         at = int(share * max(len(data) - 1, 0))
-        changes = {
-            'flip': lambda d, at, n: d[:at] + bytes([d[at] ^ n]) + d[at + 1 :] if d else d,
-            'cut': lambda d, at, n: d[:at],
-            'insert': lambda d, at, n: d[:at] + bytes([n]) * n + d[at:],
-            'remove': lambda d, at, n: d[:at] + d[at + n :],
-            'blank': lambda d, at, n: d[:at] + bytes(len(d[at : at + n])) + d[at + n :],
-            'ones': lambda d, at, n: d[:at] + b'\xff' * len(d[at : at + n]) + d[at + n :],
-        }
-        data = changes[edit](data, at, number)
+        before, part, after = data[:at], data[at : at + number], data[at + number :]
+        data = (
+            before
+            + {
+                'flip': bytes([data[at] ^ number]) + data[at + 1 :] if data else b'',
+                'cut': b'',
+                'insert': bytes([number]) * number + data[at:],
+                'remove': after,
+                'blank': bytes(len(part)) + after,
+                'ones': b'\xff' * len(part) + after,
+            }[edit]
+        )
     return data
 
 
 def read_all(path: Path, folder: Path) -> None:
     """Use every reading function; ours are the only errors that may come."""
-    readers: list[Callable[[Bag], object]] = [
+    uses = [
         lambda bag: [len(data) for _, _, data in bag.messages(bag.topics)],
         lambda bag: list(bag.images('/image_raw')),
         lambda bag: bag.odometry('/odom'),
@@ -73,22 +68,16 @@ def read_all(path: Path, folder: Path) -> None:
         lambda bag: bag.trajectory('/ground_truth'),
         lambda bag: [bag.find(kind) for kind in KINDS],
     ]
-    for strict in (False, True):
-        for reader in readers:
-            try:
-                with Bag(path, strict=strict) as bag:
-                    reader(bag)
-            except LocalizationError as error:
-                assert '\n' not in str(error)
-    for use in (lambda: inspect(path), lambda: run(path, folder)):
-        with contextlib.suppress(LocalizationError):
-            use()
-
-
-def run(path: Path, folder: Path) -> None:
-    """Load the drive with its truth."""
-    topics = TopicNames(image='/image_raw', odometry='/odom', ground_truth='/ground_truth')
-    load_run(path, cache=folder / 'cache', topics=topics, want_truth=True)
+    for use, strict in [(use, strict) for use in uses for strict in (False, True)]:
+        try:
+            with Bag(path, strict=strict) as bag:
+                use(bag)
+        except LocalizationError as error:
+            assert '\n' not in str(error)
+    with contextlib.suppress(LocalizationError):
+        inspect(path)
+    with contextlib.suppress(LocalizationError):
+        load_run(path, cache=folder / 'cache', topics=TOPICS, want_truth=True)
 
 
 @pytest.fixture(scope='module')
@@ -103,84 +92,47 @@ def quiet(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.ERROR, 'sfa_localization')
 
 
-WRITERS: dict[str, Callable[[Path, list[Message]], object]] = {
-    'sqlite3': lambda p, m: write_version(p, m, 5),
-    'sqlite3 v9': lambda p, m: write_rosbags(p, m),
-    'mcap': lambda p, m: write_mcap(p / 'a.mcap', m),
-    'mcap zstd': lambda p, m: write_mcap(p / 'a.mcap', m, compression='zstd'),
-    'mcap lz4': lambda p, m: write_mcap(p / 'a.mcap', m, compression='lz4'),
-    'mcap bare': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None, index=False),
-    'ROS 1': lambda p, m: write_ros1(p / 'a.bag', m),
-    'ROS 1 lz4': lambda p, m: write_ros1(p / 'a.bag', m, 'lz4'),
-}
+WHOLE = [
+    *('version 5', 'version 9', 'lone mcap', 'lone mcap, zstd', 'lone mcap, lz4'),
+    *('lone mcap, no index', 'lone mcap, neither', 'ROS 1', 'ROS 1 lz4'),
+    *('sqlite3 zstd file', 'mcap zstd file', 'mcap zstd message'),
+]
 
 
 @pytest.fixture(scope='module')
 def bags(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
     """Return a folder with one whole bag of every name."""
     folder = tmp_path_factory.mktemp('bags')
-    for name, write in WRITERS.items():
-        write(folder / name, messages)
+    for name in WHOLE:
+        FORMATS[name](folder / name, messages)
     return folder
 
 
-def lone(bag: Path, folder: str) -> Path:
-    """Copy a bag without its metadata; return its file."""
-    copy = Path(shutil.copytree(bag, Path(folder) / 'bag'))
-    (copy / 'metadata.yaml').unlink(missing_ok=True)
-    (file,) = copy.iterdir()
-    return file
-
-
-FUZZ = settings(
-    deadline=None,
-    derandomize='FUZZ_EXAMPLES' not in os.environ,
-    max_examples=int(os.environ.get('FUZZ_EXAMPLES', '10')),
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
-
-
-@pytest.mark.parametrize('name', WRITERS)
+@pytest.mark.parametrize('name', WHOLE)
 @FUZZ
-@given(edits=EDITS)
-def test_damaged_files(name: str, edits: Edits, bags: Path) -> None:
+@given(edits=EDITS, with_metadata=st.booleans())
+def test_damaged_files(name: str, edits: Edits, with_metadata: bool, bags: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        file = lone(bags / name, folder)
+        bag = Path(shutil.copytree(bags / name, Path(folder) / 'bag'))
+        if not with_metadata:
+            (bag / 'metadata.yaml').unlink(missing_ok=True)
+        file = next(file for file in bag.iterdir() if file.suffix != '.yaml')
         file.write_bytes(damaged(file.read_bytes(), edits))
-        read_all(file, Path(folder))
-
-
-@pytest.mark.parametrize('name', ['sqlite3', 'mcap'])
-@FUZZ
-@given(edits=EDITS)
-def test_damaged_compressed_files(name: str, edits: Edits, bags: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        compress_files(lone(bags / name, folder).parent)
-        (file,) = (Path(folder) / 'bag').iterdir()
-        file.write_bytes(damaged(file.read_bytes(), edits))
-        read_all(file.parent, Path(folder))
+        read_all(bag, Path(folder))
 
 
 @FUZZ
-@given(edits=EDITS)
-def test_damaged_metadata(edits: Edits, bags: Path) -> None:
+@given(edits=EDITS, text=st.text(alphabet=':-[]{}"\'#&*!|>%@ \n\tab01é\0', max_size=80))
+def test_damaged_metadata(edits: Edits, text: str, bags: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(shutil.copytree(bags / 'sqlite3 v9', Path(folder) / 'bag'))
-        file = path / 'metadata.yaml'
-        file.write_bytes(damaged(file.read_bytes(), edits))
-        read_all(path, Path(folder))
+        bag = Path(shutil.copytree(bags / 'version 9', Path(folder) / 'bag'))
+        file = bag / 'metadata.yaml'
+        for content in (damaged(file.read_bytes(), edits), text.encode()):
+            file.write_bytes(content)
+            read_all(bag, Path(folder))
 
 
-@FUZZ
-@given(text=st.text(alphabet=st.sampled_from('ab01:-[]{}"\'#&*!|>%@ \n\t\0é'), max_size=80))
-def test_any_text_as_metadata(text: str, bags: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(shutil.copytree(bags / 'sqlite3 v9', Path(folder) / 'bag'))
-        (path / 'metadata.yaml').write_text(text)
-        read_all(path, Path(folder))
-
-
-@pytest.mark.parametrize('topic', TOPICS.values())
+@pytest.mark.parametrize('topic', ['/image_raw', '/odom', '/imu', '/ground_truth'])
 @FUZZ
 @given(edits=EDITS, every=st.integers(1, 4))
 def test_damaged_messages(topic: str, edits: Edits, every: int, messages: list[Message]) -> None:
@@ -192,13 +144,11 @@ def test_damaged_messages(topic: str, edits: Edits, every: int, messages: list[M
         read_all(write_mcap(Path(folder) / 'bag.mcap', spoilt), Path(folder))
 
 
+STARTS = [b'', b'SQLite format 3\0', b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n', b'\x28\xb5\x2f\xfd']
+
+
 @FUZZ
-@given(
-    data=st.binary(max_size=200),
-    start=st.sampled_from(
-        [b'', b'SQLite format 3\0', b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n', b'\x28\xb5\x2f\xfd']
-    ),
-)
+@given(data=st.binary(max_size=200), start=st.sampled_from(STARTS))
 def test_any_bytes_as_bag(data: bytes, start: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / 'bag.mcap'

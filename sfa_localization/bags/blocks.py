@@ -14,10 +14,11 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sfa_localization.bags.storage import (
     LARGEST_CHUNK,
+    MOST_QOS,
     MOST_TOPICS,
     Channel,
     DamageError,
@@ -111,7 +112,7 @@ class BlockStorage(ABC):
 
     def _clear(self) -> None:
         self._room = room_for(self.size)  # what chunks may become in one reading of the file
-        self._channels: dict[int, Channel] = {}
+        self._qos_room, self._channels = MOST_QOS, dict[int, Channel]()
         self.blocks: list[Block] = []
         self.message_counts: Counter[int] = Counter()
 
@@ -138,10 +139,12 @@ class BlockStorage(ABC):
         if stamps:
             self.blocks.append(Block(min(stamps), max(stamps), offset, length))
 
-    def define(self, key: int, *fields: Any) -> None:
+    def define(self, key: int, topic: str, kind: str, serialization: str, qos: str = '') -> None:
         """Register a topic by the fields of its channel. Raises BagError for too many."""
         if key not in self._channels:  # else repeated, and the same by the format
-            self._channels[key] = make_channel(*fields)
+            self._qos_room -= len(qos)
+            profiles = qos if self._qos_room >= 0 else ''
+            self._channels[key] = make_channel(topic, kind, serialization, profiles)
             if len(self._channels) > MOST_TOPICS:
                 raise BagError(f'{self.path}: has more than {MOST_TOPICS} topics')
 
@@ -170,11 +173,11 @@ class BlockStorage(ABC):
         """A chunk of at most `size` bytes. Raises DamageError."""
         if size > LARGEST_CHUNK:
             raise DamageError(f'it has {size} bytes, more than {LARGEST_CHUNK}')
-        plain = inflate(packed, method, min(size, self._room))
+        plain = inflate(packed, method, min(size, max(self._room, 0)))
         self._room -= len(plain)
         return plain
 
-    def skip_chunk(self, offset: int, damage: DamageError) -> None:
+    def skip_chunk(self, offset: int, reason: object) -> None:
         """Note that a chunk cannot be read."""
-        text = f'the chunk at byte {offset} is damaged ({damage}); skipped'
+        text = f'the chunk at byte {offset} is damaged ({reason}); skipped'
         add_problem(self.problems, f'{self.path.name}: {text}')

@@ -18,6 +18,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from sfa_localization.bags.blocks import Block, BlockStorage
 from sfa_localization.bags.storage import LARGEST_CHUNK, DamageError, one_line
+from sfa_localization.data.errors import BagError
 
 MAGIC = b'#ROSBAG V'
 _VERSION_LINE = b'#ROSBAG V2.0\n'
@@ -40,7 +41,7 @@ class Ros1Storage(BlockStorage):
         try:
             with _ChunkIndex(self.path) as reader:
                 for connection in reader.connections:
-                    self.define(connection.id, connection.topic, connection.msgtype, 'ros1', '')
+                    self.define(connection.id, connection.topic, connection.msgtype, 'ros1')
                 for info in reader.chunk_infos:
                     chunk = reader.chunks[info.pos]
                     length = chunk.datapos + chunk.datasize - info.pos
@@ -66,17 +67,18 @@ class Ros1Storage(BlockStorage):
     def read_messages(self, offset: int, length: int) -> Iterator[tuple[int, int, bytes]]:
         """Of chunks, and outside of them."""
         self.file.seek(offset)
-        for header, data in _records(self.file.read(length)):
-            if header.get_uint8('op') != RecordType.CHUNK:
-                yield from self._message(header, data)
-                continue
-            try:
-                plain = self.inflate(data, header.get_string('compression'), LARGEST_CHUNK)
-            except DamageError as damage:
-                self.skip_chunk(offset, damage)
-                continue
-            for inner in _records(plain):
-                yield from self._message(*inner)
+        try:
+            for header, data in _records(self.file.read(length)):
+                if header.get_uint8('op') != RecordType.CHUNK:
+                    yield from self._message(header, data)
+                    continue
+                method, size = header.get_string('compression'), header.get_uint32('size')
+                for part in _records(self.inflate(data, method, size)):
+                    yield from self._message(*part)
+        except BagError:
+            raise
+        except Exception as error:  # as above
+            self.skip_chunk(offset, one_line(error))
 
     def _message(self, header: Header, data: bytes) -> Iterator[tuple[int, int, bytes]]:
         """The message in a record, if it holds one; a topic in it is defined."""
@@ -87,7 +89,7 @@ class Ros1Storage(BlockStorage):
             text = Header.read(BytesIO(len(data).to_bytes(4, 'little') + data))
             message_type = normalize_msgtype(text.get_string('type'))
             topic = header.get_string('topic')
-            self.define(header.get_uint32('conn'), topic, message_type, 'ros1', '')
+            self.define(header.get_uint32('conn'), topic, message_type, 'ros1')
 
 
 def _records(data: bytes) -> Iterator[tuple[Header, bytes]]:

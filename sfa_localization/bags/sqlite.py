@@ -23,6 +23,7 @@ from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 
 from sfa_localization.bags.storage import (
+    MOST_QOS,
     MOST_TOPICS,
     Channel,
     Record,
@@ -36,8 +37,6 @@ MAGIC = b'SQLite format 3\x00'
 _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE = 50_000_000, 16, 1 << 16
 """Instructions of SQLite for a file, more for each of its bytes, and those between two looks at
 their number: a row takes about 20. Damaged pages can lead in circles."""
-LONGEST_TOPICS = 1 << 20
-"""Characters of the names, types and QoS profiles of all topics: two thousand publishers."""
 _LARGEST_GAP = 1 << 40
 """Numbers that are tried after the last row that can be read."""
 _PLAIN_TABLE = re.compile(
@@ -159,8 +158,8 @@ def _require_plain_tables(database: sqlite3.Connection) -> None:
     topics = database.execute('SELECT * FROM topics').fetchmany(MOST_TOPICS + 1)
     if len(topics) > MOST_TOPICS:
         raise ValueError(f'it has more than {MOST_TOPICS} topics')
-    if sum(len(str(value)) for row in topics for value in row) > LONGEST_TOPICS:
-        raise ValueError(f'its topics have more than {LONGEST_TOPICS} characters')
+    if sum(len(str(value)) for row in topics for value in row) > MOST_QOS:
+        raise ValueError(f'its topics have more than {MOST_QOS} characters')
 
 
 def _copy_rows(database: sqlite3.Connection, target: Path, room: int) -> None:

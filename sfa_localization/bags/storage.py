@@ -25,8 +25,8 @@ ALWAYS_ALLOWED, LARGEST_RATIO = 1 << 24, 1000
 the dark compresses less, and a bomb more."""
 MOST_TOPICS = 10_000
 """Topics of a file: a hundred times those of a large robot."""
-LONGEST_QOS = 1 << 16
-"""Characters of the QoS profiles of one topic: two hundred publishers."""
+LONGEST_QOS, MOST_QOS = 1 << 16, 1 << 20
+"""Characters of the QoS profiles of one topic and of a file: two hundred publishers, and all."""
 LONGEST_NAME = 1000
 """Characters of the name of a topic or type: ROS allows 255."""
 MOST_PROBLEMS = 50
@@ -102,13 +102,13 @@ def inflate(packed: bytes, method: str, room: int) -> bytes:
     Raises DamageError.
     """
     try:
+        if method in ('', 'none'):
+            return packed
         if method == 'zstd':
             plain = ZstdDecompressor().stream_reader(packed).read(room + 1)
         elif method in ('lz4', 'bz2'):
             inflater = LZ4FrameDecompressor() if method == 'lz4' else BZ2Decompressor()
             plain = inflater.decompress(packed, room + 1)
-        elif method in ('', 'none'):
-            plain = packed
         else:
             raise DamageError(f'unknown compression {one_line(method)!r}')
     except (ZstdError, RuntimeError, OSError, EOFError, MemoryError):
