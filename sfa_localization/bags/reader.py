@@ -13,20 +13,13 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Qos
 
 from sfa_localization.bags import decoding
-from sfa_localization.bags.motion_arrays import (
-    StampedValues,
-    disagreement,
-    is_pose_constant,
-    sideways,
-    to_odometry,
-    to_trajectory,
-    to_yaw_rate,
-)
+from sfa_localization.bags import motion_arrays as motion
+from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.storage import (
@@ -55,8 +48,7 @@ along, as with different units; single restarts of an odometry node stay far bel
 _UNITS = 'are both in meters, radians and seconds?'
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(NamedTuple):
     """The use of a topic: its title in errors, its command line flag, the types that can serve.
 
     `found` are the types by which it is found, `named` those accepted when it is named.
@@ -68,14 +60,12 @@ class Kind:
     named: tuple[str, ...]
 
 
-_IMAGES = (decoding.IMAGE, decoding.COMPRESSED)
+_IMAGES, _TRUTH = (decoding.IMAGE, decoding.COMPRESSED), decoding.STAMPED_POSES
 KINDS = {
     'image': Kind('images', '--image-topic', _IMAGES, _IMAGES),
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
-    'ground_truth': Kind(
-        'true poses', '--ground-truth-topic', decoding.STAMPED_POSES, decoding.POSES
-    ),
+    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.POSES),
 }
 
 
@@ -156,67 +146,79 @@ class Bag:
         if len(found) > 1:
             found = [t for t in found if not OWN_TOPICS.search(t.name)] or found
         if len(found) == 1:
-            return self._readable(found[0]).name
+            return self._readable(found[0])
         if not found:
-            types = ' or '.join(name.rsplit('/', 1)[1] for name in wanted.found)
-            raise BagError(
-                f'{self.path}: has no {wanted.title} ({types}); {self._contents(wanted)}'
-            )
+            types = _short(wanted.found, ' or ')
+            raise self._error(f'has no {wanted.title} ({types}); {self._contents(wanted)}')
         names = ', '.join(sorted(topic.name for topic in found))
-        raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
-                       f'choose one with {wanted.flag}')  # fmt: skip
+        raise self._error(
+            f'several topics have {wanted.title}: {names}; choose one with {wanted.flag}'
+        )
 
     def _named(self, wanted: Kind, name: str) -> str:
-        topic = self.topics.get(_plain_name(name)) or self.topics.get(_plain_name(name).lstrip('/'))
+        plain, colon, child_frame = name.lstrip('/').partition(':')
+        topic = self.topics.get(f'/{plain}') or self.topics.get(plain)
         if topic is None:
-            raise BagError(f'{self.path}: has no topic {name}; {self._contents(wanted)}')
+            raise self._error(f'has no topic {name}; {self._contents(wanted)}')
         if topic.kind not in wanted.named:
-            types = ', '.join(entry.rsplit('/', 1)[1] for entry in wanted.named)
-            raise BagError(f'{self.path}: {topic.name} is {topic.kind or "of unknown type"}, not '
-                           f'one of {types}; name another with {wanted.flag}')  # fmt: skip
+            types = f'not one of {_short(wanted.named, ", ")}; name another with {wanted.flag}'
+            raise self._error(f'{topic.name} is {topic.kind or "of unknown type"}, {types}')
         if topic.count == 0:
-            raise BagError(f'{self.path}: {topic.name} has no messages; {self._contents(wanted)}')
-        _, _, child_frame = name.partition(':')
-        return self._readable(topic).name + (f':{child_frame}' if child_frame else '')
+            raise self._error(f'{topic.name} has no messages; {self._contents(wanted)}')
+        return self._readable(topic) + (colon + child_frame if child_frame else '')
 
-    def _readable(self, topic: Topic) -> Topic:
+    def _readable(self, topic: Topic) -> str:
         if topic.serialization in SERIALIZATIONS:
-            return topic
-        raise BagError(f'{self.path}: {topic.name} is serialized as {topic.serialization!r}; '
-                       f'only cdr can be read: record it so')  # fmt: skip
+            return topic.name
+        raise self._error(f'{topic.name} is serialized as {topic.serialization!r}; only cdr can be '
+                          'read: record it so')  # fmt: skip
 
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
-        kinds = [f'{t.name} ({t.kind.rsplit("/", 1)[-1]}, {t.count})' for t in self.topics.values()]
-        shown = ', '.join(sorted(kinds)[:MOST_TOPICS]) + (
-            ', ...' if len(kinds) > MOST_TOPICS else ''
-        )
-        return f'it has {shown or "no topics"}: record one, or name one with {wanted.flag}'
+        kinds = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
+        shown = kinds[:MOST_TOPICS] + ['...'] * (len(kinds) > MOST_TOPICS)
+        known = ', '.join(shown) or 'no topics'
+        return f'it has {known}: record one, or name one with {wanted.flag}'
+
+    def _error(self, text: str) -> BagError:
+        return BagError(f'{self.path}: {text}')
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
-        stream = self.stream(self.find('image', topic), decoding.image_of)
-        return ((stamp, image) for _, stamp, image in self.read([stream]))
+        return self._values(self.stream(self.find('image', topic), decoding.image_of))
 
     def odometry(self, topic: str = '') -> Odometry:
         """All odometry; of a topic with poses only, twists are their differences."""
         stream = self.odometry_stream(topic)
-        return self.to_odometry(stream, [(stamp, value) for _, stamp, value in self.read([stream])])
+        return self.to_odometry(stream, list(self._values(stream)))
+
+    def yaw_rate(self, topic: str = '') -> YawRate:
+        """All yaw rates of an Imu."""
+        stream = self.stream(self.find('imu', topic), read_yaw_rate)
+        return motion.to_yaw_rate(list(self._values(stream)))
+
+    def trajectory(self, topic: str = '') -> Trajectory:
+        """All poses of a topic, by default of the true poses."""
+        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
+        return motion.to_trajectory(list(self._values(stream)))
+
+    def _values(self, stream: Stream) -> Iterator[tuple[int, Any]]:
+        return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
         """Odometry of a stream's values; a reset is joined, and noted as a problem."""
-        odometry, resets = to_odometry(values)
+        odometry, resets = motion.to_odometry(values)
         if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
-            raise BagError(f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
-                           f'{len(values)} messages: {_UNITS}')  # fmt: skip
+            share = f'{resets} of {len(values)} messages'
+            raise self._error(f'{stream.topic}: pose and twist disagree in {share}: {_UNITS}')
         texts = []
-        if is_pose_constant(odometry):
+        if motion.is_pose_constant(odometry):
             texts.append('the pose is constant; the twist is integrated instead')
             poses = integrate(odometry.stamps_ns, odometry.twists)
             odometry = replace(odometry, poses=poses)
-        elif differing := disagreement(odometry):
+        elif differing := motion.disagreement(odometry):
             texts.append(f'{differing}: {_UNITS}')
-        elif aside := sideways(odometry):
+        elif aside := motion.sideways(odometry):
             texts.append(f'{aside}: only motion ahead is used; is the heading right?')
         if resets:
             texts.append(f'odometry was reset {resets} times; joined by its twist')
@@ -225,20 +227,9 @@ class Bag:
             self._raise_problems()
         return odometry
 
-    def yaw_rate(self, topic: str = '') -> YawRate:
-        """All yaw rates of an Imu."""
-        stream = self.stream(self.find('imu', topic), read_yaw_rate)
-        return to_yaw_rate([(stamp, value) for _, stamp, value in self.read([stream])])
-
-    def trajectory(self, topic: str = '') -> Trajectory:
-        """All poses of a topic, by default of the true poses."""
-        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
-        return to_trajectory([(stamp, value) for _, stamp, value in self.read([stream])])
-
     def odometry_stream(self, topic: str = '') -> Stream:
         """Stream of (pose, twist and its variances; None of a type without twists)."""
-        name = self.find('odometry', topic)
-        return self.stream(name, decoding.odometry_of)
+        return self.stream(self.find('odometry', topic), decoding.odometry_of)
 
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
@@ -320,12 +311,11 @@ class Bag:
             stream.tally.leave_out('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
         if stream.required and stream.tally.count.used == 0:
-            reasons = listed(stream.tally.count.skipped)
-            remedy = '; try the time of reception (stamp_source: receive)'
-            remedy = remedy if NO_STAMP in reasons else ''
-            remedy = f'; {REMEDY}' if stream.received < expected else remedy
-            raise BagError(f'{self.path}: {stream.topic}: no usable message '
-                           f'({reasons or "none recorded"}){remedy}')  # fmt: skip
+            reasons = listed(stream.tally.count.skipped) or 'none recorded'
+            remedy = f'; {REMEDY}' if stream.received < expected else ''
+            if NO_STAMP in reasons:
+                remedy = '; try the time of reception (stamp_source: receive)'
+            raise self._error(f'{stream.topic}: no usable message ({reasons}){remedy}')
 
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
@@ -337,6 +327,6 @@ def _itself(message: Any) -> Any:
     return message
 
 
-def _plain_name(name: str) -> str:
-    """A topic's name without a frame, and with its leading slash."""
-    return '/' + name.partition(':')[0].lstrip('/')
+def _short(kinds: Iterable[str], between: str = '') -> str:
+    """Names of types without their package."""
+    return between.join(kind.rsplit('/', 1)[-1] for kind in kinds)
