@@ -74,19 +74,18 @@ class McapStorage(BlockStorage):
                 yield record.channel_id, record.log_time, record.data
 
     def _records(self, offset: int, length: int) -> Iterator[records.McapRecord]:
-        """The records in a part of the file, and in its chunks, up to the first damage.
-
-        What a cut-off file lacks of the part is taken for zeros, which are no records.
-        """
+        """The records in a part of the file, and in its chunks, up to the first damage."""
         self.file.seek(offset)
         data = self.file.read(length)
+        lacking = length - len(data)  # after a cut: zeros, for the sake of the chunk's beginning
         for record in _stream(data.ljust(length, b'\0')):
             if not isinstance(record, records.Chunk):
-                self._define(record)
-                yield record
+                if not lacking:
+                    self._define(record)
+                    yield record
                 continue
             try:
-                plain = self._plain(record, len(data) < length)
+                plain = self._plain(record, lacking)
             except DamageError as damage:
                 self.skip_chunk(offset, damage)
                 continue
@@ -95,11 +94,12 @@ class McapStorage(BlockStorage):
                     self._define(part)
                 yield part
 
-    def _plain(self, chunk: records.Chunk, cut: bool) -> bytes:
-        """The data of a chunk; of a cut-off one the bytes before the cut. Raises DamageError."""
+    def _plain(self, chunk: records.Chunk, lacking: int) -> bytes:
+        """The data of a chunk, of a cut-off one those before the cut. Raises DamageError."""
         size, checksum = chunk.uncompressed_size, chunk.uncompressed_crc
-        plain = self.inflate(chunk.data, chunk.compression, size)
-        if not cut and (len(plain) != size or (checksum and crc32(plain) != checksum)):
+        packed = chunk.data[: max(len(chunk.data) - lacking, 0)]
+        plain = self.inflate(packed, chunk.compression, size)
+        if not lacking and (len(plain) != size or (checksum and crc32(plain) != checksum)):
             raise DamageError('checksum or size is wrong')
         return plain
 

@@ -175,22 +175,22 @@ class BagWriter:
 
     def _stamped(self, kind: str, stamp_ns: int, frame_id: str) -> Any:
         """A message of zeros with a header."""
-        message = _blank(self._types, kind)
+        message = blank(self._types, kind)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(int(stamp_ns), 10**9)
         message.header.frame_id = frame_id
         return message
 
 
-def _blank(types: Typestore, kind: str) -> Any:
-    """A message of zeros and empty texts."""
+def blank(types: Typestore, kind: str) -> Any:
+    """A message of zeros, empty texts and empty lists."""
 
     def value(node: Nodetype, detail: Any) -> Any:
         if node == Nodetype.NAME:
-            return _blank(types, detail)
+            return blank(types, detail)
         if node == Nodetype.BASE:
             return {'string': '', 'float64': 0.0}.get(detail[0], 0)
-        (_, (base, _)), length = detail
-        return np.zeros(length, base)
+        (inner, base), length = detail
+        return np.zeros(length, base[0]) if inner == Nodetype.BASE else []
 
     return types.types[kind](**{name: value(*field) for name, field in types.fielddefs[kind][1]})
 
