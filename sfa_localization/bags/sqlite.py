@@ -9,6 +9,7 @@ limits: SQLite itself checks a file before.
 from __future__ import annotations
 
 import itertools
+import os
 import re
 import shutil
 import sqlite3
@@ -98,15 +99,24 @@ class SqliteStorage:
         return Path(folder) / 'copy.db3'
 
     def _completed(self) -> Path:
-        """The file, or a copy with the transactions in the logs of a recorder that crashed."""
-        ends = [end for end in ('-wal', '-journal') if _size(f'{self._path}{end}')]
-        if not ends:
+        """The file, or a copy: with what is in the logs of a recorder that crashed, in whole pages.
+
+        Of a page that was cut off, SQLite would take the rest for zeros.
+        """
+        with self._path.open('rb') as file:
+            page = int.from_bytes(file.read(18)[16:], 'big')
+        size = _size(self._path)
+        whole = size - size % (page if page > 1 else 1 << 16)
+        ends = [end for end in ('-wal', '-journal') if _size(Path(f'{self._path}{end}'))]
+        if not ends and whole == size:
             return self._path
         copy = self._copy_name()
         for end in ('', *ends):
             shutil.copyfile(f'{self._path}{end}', f'{copy}{end}')
-        with closing(sqlite3.connect(copy)) as database:
-            database.execute('PRAGMA journal_mode=DELETE').fetchall()
+        os.truncate(copy, whole)
+        if ends:
+            with closing(sqlite3.connect(copy)) as database:
+                database.execute('PRAGMA journal_mode=DELETE').fetchall()
         return copy
 
     def _sound(self, source: Path) -> Path:
@@ -133,9 +143,9 @@ class SqliteStorage:
         return copy
 
 
-def _size(path: str) -> int:
+def _size(path: Path) -> int:
     """Bytes of a file, 0 where there is none."""
-    return Path(path).stat().st_size if Path(path).is_file() else 0
+    return path.stat().st_size if path.is_file() else 0
 
 
 def _damage(database: sqlite3.Connection) -> str:
