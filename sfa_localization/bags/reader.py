@@ -45,7 +45,6 @@ MOST_TOPICS = 8
 _RESETS_MIN, _RESETS_SHARE = 20, 0.01
 """More resets than both the number and the share of messages mean that pose and twist disagree all
 along, as with different units; single restarts of an odometry node stay far below."""
-_UNITS = 'are both in meters, radians and seconds?'
 
 
 class Kind(NamedTuple):
@@ -148,30 +147,32 @@ class Bag:
         if len(found) == 1:
             return self._readable(found[0])
         if not found:
-            types = _short(wanted.found, ' or ')
-            raise self._error(f'has no {wanted.title} ({types}); {self._contents(wanted)}')
+            kinds = _short(wanted.found, ' or ')
+            raise BagError(
+                f'{self.path}: has no {wanted.title} ({kinds}); {self._contents(wanted)}'
+            )
         names = ', '.join(sorted(topic.name for topic in found))
-        raise self._error(
-            f'several topics have {wanted.title}: {names}; choose one with {wanted.flag}'
-        )
+        raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
+                       f'choose one with {wanted.flag}')  # fmt: skip
 
     def _named(self, wanted: Kind, name: str) -> str:
         plain, colon, child_frame = name.lstrip('/').partition(':')
         topic = self.topics.get(f'/{plain}') or self.topics.get(plain)
         if topic is None:
-            raise self._error(f'has no topic {name}; {self._contents(wanted)}')
+            raise BagError(f'{self.path}: has no topic {name}; {self._contents(wanted)}')
         if topic.kind not in wanted.named:
-            types = f'not one of {_short(wanted.named, ", ")}; name another with {wanted.flag}'
-            raise self._error(f'{topic.name} is {topic.kind or "of unknown type"}, {types}')
+            kinds = _short(wanted.named, ', ')
+            raise BagError(f'{self.path}: {topic.name} is {topic.kind or "of unknown type"}, not '
+                           f'one of {kinds}; name another with {wanted.flag}')  # fmt: skip
         if topic.count == 0:
-            raise self._error(f'{topic.name} has no messages; {self._contents(wanted)}')
+            raise BagError(f'{self.path}: {topic.name} has no messages; {self._contents(wanted)}')
         return self._readable(topic) + (colon + child_frame if child_frame else '')
 
     def _readable(self, topic: Topic) -> str:
         if topic.serialization in SERIALIZATIONS:
             return topic.name
-        raise self._error(f'{topic.name} is serialized as {topic.serialization!r}; only cdr can be '
-                          'read: record it so')  # fmt: skip
+        raise BagError(f'{self.path}: {topic.name} is serialized as {topic.serialization!r}; '
+                       'only cdr can be read: record it so')  # fmt: skip
 
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
@@ -179,9 +180,6 @@ class Bag:
         shown = kinds[:MOST_TOPICS] + ['...'] * (len(kinds) > MOST_TOPICS)
         known = ', '.join(shown) or 'no topics'
         return f'it has {known}: record one, or name one with {wanted.flag}'
-
-    def _error(self, text: str) -> BagError:
-        return BagError(f'{self.path}: {text}')
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
@@ -209,15 +207,17 @@ class Bag:
         """Odometry of a stream's values; a reset is joined, and noted as a problem."""
         odometry, resets = motion.to_odometry(values)
         if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
-            share = f'{resets} of {len(values)} messages'
-            raise self._error(f'{stream.topic}: pose and twist disagree in {share}: {_UNITS}')
+            raise BagError(
+                f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
+                f'{len(values)} messages: are both in meters, radians and seconds?'
+            )
         texts = []
         if motion.is_pose_constant(odometry):
             texts.append('the pose is constant; the twist is integrated instead')
             poses = integrate(odometry.stamps_ns, odometry.twists)
             odometry = replace(odometry, poses=poses)
         elif differing := motion.disagreement(odometry):
-            texts.append(f'{differing}: {_UNITS}')
+            texts.append(f'{differing}: are both in meters, radians and seconds?')
         elif aside := motion.sideways(odometry):
             texts.append(f'{aside}: only motion ahead is used; is the heading right?')
         if resets:
@@ -315,7 +315,7 @@ class Bag:
             remedy = f'; {REMEDY}' if stream.received < expected else ''
             if NO_STAMP in reasons:
                 remedy = '; try the time of reception (stamp_source: receive)'
-            raise self._error(f'{stream.topic}: no usable message ({reasons}){remedy}')
+            raise BagError(f'{self.path}: {stream.topic}: no usable message ({reasons}){remedy}')
 
     def _raise_problems(self) -> None:
         if self.strict and self.problems:

@@ -68,15 +68,10 @@ def load_run(
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         for problem in bag.problems:
             logger.warning('%s: %s', path, problem)
-    yaw_rate, truth = values.get('imu'), values.get('ground_truth')
-    return Run(
-        name=bag.path.name,
-        panoramas=panoramas,
-        odometry=odometry,
-        yaw_rate=to_yaw_rate(yaw_rate) if yaw_rate else None,
-        ground_truth=to_trajectory(truth) if truth else None,
-        counts={use: stream.tally.count for use, stream in {'images': images, **streams}.items()},
-    )
+    counts = {use: s.tally.count for use, s in {'images': images, **streams}.items()}
+    yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
+    truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, counts)
 
 
 class PanoramaFile:
