@@ -15,10 +15,10 @@ from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.convert.converter import migrate_bytes
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bags.writer import RELIABLE, BagWriter
+from sfa_localization.bags.writer import BagWriter
 
 START = 1_700_000_000_123_456_789
 PERIOD = 100_000_000
@@ -103,17 +103,11 @@ def kinds(messages: Sequence[Message]) -> dict[str, str]:
 
 
 def write_rosbags(path: Path, messages: Sequence[Message], storage: str = 'sqlite3') -> Path:
-    """Write with rosbags; mcap with chunks and an index."""
+    """Write with the newest metadata, as rosbags does."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        connections = {
-            topic: writer.add_connection(
-                topic, kind, typestore=store, offered_qos_profiles=[RELIABLE]
-            )
-            for topic, kind in kinds(messages).items()
-        }
-        for message in messages:
-            writer.write(connections[message.topic], message.receive_ns, message.data)
+    with BagWriter(path, storage) as writer:
+        for m in messages:
+            writer.message(m.topic, m.receive_ns, store.deserialize_cdr(m.data, m.kind))
     return path
 
 

@@ -5,7 +5,7 @@
 Not the directory reader of rosbags (0.11.9), because it rejects a bag when one of its files is
 missing or its metadata is damaged or newer, opens no compressed file without metadata, and reads
 0 of 145 messages, without an error, when metadata and file spell a type differently
-(test_bag.py::test_other_words_in_the_metadata_do_not_empty_a_bag).
+(test_bag.py::test_silence_of_a_library_is_an_error).
 """
 
 from __future__ import annotations
