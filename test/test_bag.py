@@ -366,7 +366,7 @@ def test_messages_in_a_leftover_log_are_read(tmp_path: Path, messages: list[Mess
     assert snapshot(tmp_path / 'bag') == before
 
 
-@pytest.mark.parametrize('name', ['a?b', 'a#b', 'a%20b', 'ä b'])
+@pytest.mark.parametrize('name', ['a?b', 'a#b', 'a%20b', 'ä b', '\udcff'])
 def test_odd_names_are_opened(name: str, tmp_path: Path, messages: list[Message]) -> None:
     write_rosbags(tmp_path / 'plain', messages).rename(tmp_path / name)
     with Bag(tmp_path / name, strict=True) as bag:

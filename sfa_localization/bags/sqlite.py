@@ -40,6 +40,8 @@ _STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE = 50_000_000, 16, 1 << 16
 their number: a row takes about 20. Damaged pages can lead in circles."""
 _LARGEST_GAP = 1 << 40
 """Numbers that are tried after the last row that can be read."""
+_ODD_LETTERS = re.compile('[?#%\udc80-\udcff]')
+"""What has a meaning in an address of SQLite, or none in UTF-8."""
 _PLAIN_TABLE = re.compile(
     r'CREATE TABLE\s+"?\w+"?\s*\(\s*"?id"? INTEGER PRIMARY KEY'
     r'(\s*,\s*"?\w+"? (INTEGER|TEXT|BLOB)( NOT NULL)?)+\s*\)'
@@ -128,7 +130,7 @@ class SqliteStorage:
                 lambda: next(spent) * _STEPS_AT_ONCE > most, _STEPS_AT_ONCE
             )
             reason = _damage(database)
-            if not reason and source.suffix == '.db3' and not re.search('[?#%]', str(source)):
+            if not reason and source.suffix == '.db3' and not _ODD_LETTERS.search(str(source)):
                 return source
             copy = self._copy_name()
             if not reason:  # but a name that is no part of an address
