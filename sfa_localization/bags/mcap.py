@@ -8,14 +8,15 @@ import struct
 from binascii import crc32
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
 
 from mcap import records
 from mcap.opcode import Opcode
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from sfa_localization.bags.blocks import Block, BlockStorage
-from sfa_localization.bags.storage import LARGEST_CHUNK, DamageError
+from sfa_localization.bags.storage import LARGEST_CHUNK, DamageError, one_line
 
 MAGIC = b'\x89MCAP0\r\n'
 _FOOTER_SIZE = 29 + len(MAGIC)
@@ -86,10 +87,12 @@ class McapStorage(BlockStorage):
                 continue
             try:
                 plain = self._plain(record, lacking)
-            except DamageError as damage:
-                self.skip_chunk(offset, damage)
+                whole = replace(record, compression='', data=plain)
+                parts = _stream(plain) if lacking else breakup_chunk(whole)
+            except Exception as damage:  # a parser of foreign bytes fails in many ways
+                self.skip_chunk(offset, one_line(damage))
                 continue
-            for part in _stream(plain):
+            for part in parts:
                 if not isinstance(part, records.Message):
                     self._define(part)
                 yield part
@@ -115,5 +118,5 @@ class McapStorage(BlockStorage):
 
 def _stream(data: bytes) -> Iterator[records.McapRecord]:
     """Records one after the other, until the data end or make no sense."""
-    with suppress(Exception):  # a parser of foreign bytes fails in many ways
+    with suppress(Exception):  # as above
         yield from StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records
