@@ -237,9 +237,20 @@ def test_chunks_of_the_same_time_wait_in_bounded_memory(messages, tmp_path, monk
     rejected(write_mcap(tmp_path / 'a.mcap', messages, chunk_size=1 << 20), 'chunks of the same')
 
 
-def test_more_topics_than_robots_have(messages, tmp_path):
+@pytest.mark.parametrize('write', [write_mcap, write_ros1])
+def test_more_topics_than_robots_have(write, messages, tmp_path):
     many = [messages[0]._replace(topic=f'/{number}') for number in range(10_001)]
-    rejected(write_mcap(tmp_path / 'many.mcap', many), 'more than 10000 topics')
+    path = write(tmp_path / 'many.mcap', many)
+    rejected(path, 'more than 10000 topics')
+    os.truncate(path, path.stat().st_size - 1)
+    rejected(path, 'more than 10000 topics')
+
+
+def test_times_that_ros_does_not_have(messages, tmp_path):
+    spoilt = [m._replace(receive_ns=(1 << 64) - 1) if m.topic == '/imu' else m for m in messages]
+    path = write_mcap(tmp_path / 'a.mcap', spoilt)
+    assert read(path)[0] == {**COUNTS, '/imu': 0}
+    assert inspect(path).drive is not None
 
 
 def test_problems_of_any_number_are_described_in_part(messages, tmp_path):

@@ -34,6 +34,8 @@ SPAN = 1 << 20
 """Bytes of messages outside of chunks that make one block."""
 MOST_PENDING = 1 << 29
 """Bytes of messages that wait because blocks overlap in time: a recorder's overlap by a second."""
+_LAST_NS = 1 << 63
+"""The end of the times that ROS has."""
 _reception = itemgetter(1)
 
 
@@ -144,9 +146,9 @@ class BlockStorage(ABC):
         if key not in self._channels:  # else repeated, and the same by the format
             self._qos_room -= len(qos)
             profiles = qos if self._qos_room >= 0 else ''
-            self._channels[key] = make_channel(topic, kind, serialization, profiles)
-            if len(self._channels) > MOST_TOPICS:
+            if len(self._channels) >= MOST_TOPICS:
                 raise BagError(f'{self.path}: has more than {MOST_TOPICS} topics')
+            self._channels[key] = make_channel(topic, kind, serialization, profiles)
 
     def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
         """Messages received at or after `start_ns`, by reception; damaged blocks are skipped."""
@@ -161,7 +163,7 @@ class BlockStorage(ABC):
             pending = pending[ready:] + [
                 (wanted[key], stamp, data)
                 for key, stamp, data in self.read_messages(block.offset, block.length)
-                if key in wanted and stamp >= start_ns
+                if key in wanted and start_ns <= stamp < _LAST_NS
             ]
             pending.sort(key=_reception)
             if sum(len(data) for _, _, data in pending) > MOST_PENDING:

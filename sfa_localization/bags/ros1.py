@@ -47,6 +47,8 @@ class Ros1Storage(BlockStorage):
                     length = chunk.datapos + chunk.datasize - info.pos
                     self.blocks.append(Block(info.start_time, info.end_time, info.pos, length))
                     self.message_counts.update(info.connection_counts)
+        except BagError:
+            raise
         except Exception as error:  # a parser of foreign bytes fails in many ways
             raise DamageError(one_line(error).rstrip('.')) from None
         return True
@@ -54,15 +56,17 @@ class Ros1Storage(BlockStorage):
     def scan(self) -> None:
         """Read record after record."""
         at = len(_VERSION_LINE)
-        with suppress(Exception):  # as above
-            while at < self.size:
-                self.file.seek(at)
+        while at < self.size:
+            self.file.seek(at)
+            try:
                 Header.read(self.file)
                 size = read_uint32(self.file)
-                length = self.file.tell() + size - at
-                if length <= LARGEST_CHUNK:
-                    self.add_block(at, length)
-                at += length
+            except Exception:  # as above
+                return
+            length = self.file.tell() + size - at
+            if length <= LARGEST_CHUNK:
+                self.add_block(at, length)
+            at += length
 
     def read_messages(self, offset: int, length: int) -> Iterator[tuple[int, int, bytes]]:
         """Of chunks, and outside of them."""
