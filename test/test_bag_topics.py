@@ -84,10 +84,7 @@ def record(path: Path, entries: list[Entry], serialization: str = 'cdr') -> Path
         for topic, receive_ns, message in entries:
             if topic not in connections:
                 connections[topic] = writer.add_connection(
-                    topic,
-                    message.__msgtype__,
-                    typestore=STORE,
-                    serialization_format=serialization,
+                    topic, message.__msgtype__, typestore=STORE, serialization_format=serialization
                 )
             data = STORE.serialize_cdr(message, message.__msgtype__)
             writer.write(connections[topic], receive_ns, data)

@@ -86,11 +86,7 @@ class Bag:
     """
 
     def __init__(
-        self,
-        path: Path | str,
-        *,
-        strict: bool = False,
-        config: BagConfig | None = None,
+        self, path: Path | str, *, strict: bool = False, config: BagConfig | None = None
     ) -> None:
         self.path, self.strict = Path(path), strict
         self._by_header = (config or BagConfig()).stamp_source == 'header'
