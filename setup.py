@@ -59,9 +59,10 @@ setup(
         'scipy>=1.11',
         'opencv-python-headless>=4.6',
         'filterpy>=1.4.5',
-        'rosbags>=0.10.9',
-        # They read compressed bags, without rosbags, whose versions require different ones.
-        'backports.zstd>=1.0; python_version < "3.14"',
+        'rosbags>=0.11.3',
+        # Bags that were cut off; it needs the next two, which bound what compressed bags become.
+        'mcap>=1.2',
+        'zstandard>=0.22',
         'lz4>=4.0',
         'PyYAML>=5.4',
         'threadpoolctl>=3.1',

@@ -42,7 +42,8 @@ OPTIONAL = {
     'mdp': 'MDP==3.6',
     'distributed': 'distributed',
     'lz4': 'lz4',
-    'zstandard': 'backports.zstd',
+    'mcap': 'mcap',
+    'zstandard': 'zstandard',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }
 """Packages that only some commands need, and how to install them."""

@@ -2,28 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """One small drive written as every kind of bag, by hand or by rosbags, for the tests."""
 
-import io
 import sqlite3
-import struct
-import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import lz4.frame
 import numpy as np
 import yaml
+import zstandard
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
 from rosbags.convert.converter import migrate_bytes
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from sfa_localization.bags.writer import RELIABLE, BagWriter
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from sfa_localization.bags.writer import BagWriter
 
 START = 1_700_000_000_123_456_789
 PERIOD = 100_000_000
@@ -99,12 +94,6 @@ COUNTS = {
 }
 
 
-def counts(messages: Sequence[Message]) -> dict[str, int]:
-    """Messages per topic."""
-    topics = [message.topic for message in messages]
-    return {topic: topics.count(topic) for topic in dict.fromkeys(topics)}
-
-
 def kinds(messages: Sequence[Message]) -> dict[str, str]:
     """Type of each topic."""
     return {message.topic: message.kind for message in messages}
@@ -113,23 +102,12 @@ def kinds(messages: Sequence[Message]) -> dict[str, str]:
 # Files.
 
 
-def write_rosbags(path: Path, messages: Sequence[Message], **options: object) -> Path:
-    """Write with rosbags; `storage`, `version`, `compression` (a CompressionMode)."""
-    storage = StoragePlugin.MCAP if options.get('storage') == 'mcap' else StoragePlugin.SQLITE3
-    writer = Writer(path, version=options.get('version', 9), storage_plugin=storage)
-    mode = options.get('compression')
-    if mode is not None:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
+def write_rosbags(path: Path, messages: Sequence[Message], storage: str = 'sqlite3') -> Path:
+    """Write with the newest metadata, as rosbags does."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    with writer:
-        connections = {
-            topic: writer.add_connection(
-                topic, kind, typestore=store, offered_qos_profiles=[RELIABLE]
-            )
-            for topic, kind in kinds(messages).items()
-        }
-        for message in messages:
-            writer.write(connections[message.topic], message.receive_ns, message.data)
+    with BagWriter(path, storage) as writer:
+        for m in messages:
+            writer.message(m.topic, m.receive_ns, store.deserialize_cdr(m.data, m.kind))
     return path
 
 
@@ -178,45 +156,34 @@ def metadata(
     *,
     storage: str = 'sqlite3',
     kind: Callable[[str], str] = str,
-    serialization: str = 'cdr',
-    qos: str = QOS_TEXT,
     compression: str = '',
-    file_counts: Sequence[int] = (),
 ) -> str:
-    """Text of metadata.yaml as its version has it."""
-    told = []
-    for topic, count in counts(messages).items():
-        entry = {'name': topic, 'type': kind(kinds(messages)[topic])}
-        entry['serialization_format'] = serialization
-        if version >= 4:
-            entry['offered_qos_profiles'] = qos if version < 9 else yaml.safe_load(qos or '[]')
-        if version >= 7:
-            entry['type_description_hash'] = ''
-        told.append({'topic_metadata': entry, 'message_count': count})
+    """Text of metadata.yaml as its version has it, of all that is read."""
+    qos = yaml.safe_load(QOS_TEXT) if version >= 9 else QOS_TEXT
+    told = [
+        {
+            'topic_metadata': {
+                'name': topic,
+                'type': kind(kinds(messages)[topic]),
+                'serialization_format': 'cdr',
+                **({'offered_qos_profiles': qos} if version >= 4 else {}),
+            },
+            'message_count': count,
+        }
+        for topic, count in Counter(message.topic for message in messages).items()
+    ]
     receptions = [message.receive_ns for message in messages]
-    start = {'nanoseconds_since_epoch': min(receptions)}
-    duration = {'nanoseconds': max(receptions) - min(receptions)}
     information = {
         'version': version,
         'storage_identifier': storage,
         'relative_file_paths': [f'bag/{file}' if version < 4 else file for file in files],
-        'duration': duration,
-        'starting_time': start,
+        'duration': {'nanoseconds': max(receptions) - min(receptions)},
+        'starting_time': {'nanoseconds_since_epoch': min(receptions)},
         'message_count': len(messages),
         'topics_with_message_count': told,
+        'compression_format': 'zstd' if compression else '',
+        'compression_mode': compression,
     }
-    if version >= 3:
-        information['compression_format'] = 'zstd' if compression else ''
-        information['compression_mode'] = compression
-    if version >= 5:
-        information['files'] = [
-            {'path': file, 'starting_time': start, 'duration': duration, 'message_count': number}
-            for file, number in zip(files, file_counts or [len(messages)], strict=True)
-        ]
-    if version >= 6:
-        information['custom_data'] = None
-    if version >= 8:
-        information['ros_distro'] = 'jazzy'
     return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)
 
 
@@ -228,92 +195,37 @@ def write_version(path: Path, messages: Sequence[Message], version: int) -> Path
     return path
 
 
-# mcap by hand: https://mcap.dev/spec
-
-
-def _text(text: str | bytes) -> bytes:
-    data = text.encode() if isinstance(text, str) else text
-    return struct.pack('<I', len(data)) + data
-
-
-def _record(opcode: int, body: bytes) -> bytes:
-    return struct.pack('<BQ', opcode, len(body)) + body
-
-
-def _definitions(messages: Sequence[Message], serialization: str) -> bytes:
-    parts = []
-    for number, (topic, kind) in enumerate(kinds(messages).items(), 1):
-        parts.append(
-            _record(3, struct.pack('<H', number) + _text(kind) + _text('ros2msg') + _text(''))
-        )
-        qos = _text('offered_qos_profiles') + _text(QOS_TEXT)
-        body = struct.pack('<HH', number, number) + _text(topic) + _text(serialization) + _text(qos)
-        parts.append(_record(4, body))
-    return b''.join(parts)
-
-
-def _bodies(messages: Sequence[Message], all_messages: Sequence[Message]) -> bytes:
-    ids = {topic: number for number, topic in enumerate(kinds(all_messages), 1)}
-    return b''.join(
-        _record(5, struct.pack('<HIQQ', ids[m.topic], 0, m.receive_ns, m.receive_ns) + m.data)
-        for m in messages
-    )
-
-
-PACKERS: dict[str, Callable[[bytes], bytes]] = {
-    '': bytes,
-    'zstd': zstd.compress,
-    'lz4': lz4.frame.compress,
-}
-
-
 def write_mcap(
     path: Path,
     messages: Sequence[Message],
     *,
     compression: str | None = '',
-    per_chunk: int = 20,
     index: bool = True,
-    serialization: str = 'cdr',
+    chunk_size: int = 4000,
 ) -> Path:
     """Write an .mcap in chunks, or without (`compression` None), with an index or without."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    out, chunks = io.BytesIO(), []
-    out.write(b'\x89MCAP0\r\n' + _record(1, _text('ros2') + _text('test')))
-    definitions = _definitions(messages, serialization)
-    if compression is None:
-        out.write(definitions + _bodies(messages, messages))
-    for start in range(0, len(messages) if compression is not None else 0, per_chunk):
-        part = messages[start : start + per_chunk]
-        plain = (definitions if start == 0 else b'') + _bodies(part, messages)
-        first, last = min(m.receive_ns for m in part), max(m.receive_ns for m in part)
-        packed = PACKERS[compression](plain)
-        head = struct.pack('<QQQI', first, last, len(plain), 0) + _text(compression)
-        record = _record(6, head + struct.pack('<Q', len(packed)) + packed)
-        entry = struct.pack('<QQQQ', first, last, out.tell(), len(record)) + struct.pack(
-            '<IQ', 0, 0
-        )
-        chunks.append(_record(8, entry + _text(compression) + struct.pack('<QQ', 0, 0)))
-        out.write(record)
-    out.write(_record(15, struct.pack('<I', 0)))
-    start = out.tell() if index else 0
-    if index:
-        out.write(definitions + b''.join(chunks) + _statistics(messages, len(chunks)))
-    out.write(_record(2, struct.pack('<QQI', start, 0, 0)) + b'\x89MCAP0\r\n')
-    path.write_bytes(out.getvalue())
+    writer = McapWriter(
+        str(path),
+        chunk_size=chunk_size,
+        compression=CompressionType[(compression or 'none').upper()],
+        index_types=IndexType.ALL if index else IndexType.NONE,
+        repeat_channels=index,
+        repeat_schemas=index,
+        use_chunking=compression is not None,
+        use_statistics=index,
+        use_summary_offsets=index,
+    )
+    writer.start('ros2', 'test')
+    channels = {}
+    for topic, kind in kinds(messages).items():
+        schema = writer.register_schema(kind, 'ros2msg', b'')
+        qos = {'offered_qos_profiles': QOS_TEXT}
+        channels[topic] = writer.register_channel(topic, 'cdr', schema, qos)
+    for m in messages:
+        writer.add_message(channels[m.topic], m.receive_ns, m.data, m.receive_ns)
+    writer.finish()
     return path
-
-
-def _statistics(messages: Sequence[Message], chunks: int) -> bytes:
-    told = b''.join(
-        struct.pack('<HQ', number, count)
-        for number, count in enumerate(counts(messages).values(), 1)
-    )
-    topics, times = len(kinds(messages)), [message.receive_ns for message in messages]
-    head = struct.pack(
-        '<QHIIIIQQ', len(messages), topics, topics, 0, 0, chunks, min(times), max(times)
-    )
-    return _record(11, head + _text(told))
 
 
 def write_ros1(
@@ -345,54 +257,39 @@ def write_ros1(
 def compress_files(folder: Path) -> None:
     """Compress every storage file of a folder as `ros2 bag record --compression-mode file`."""
     for file in [*folder.glob('*.db3'), *folder.glob('*.mcap')]:
-        file.with_name(f'{file.name}.zstd').write_bytes(zstd.compress(file.read_bytes()))
+        file.with_name(f'{file.name}.zstd').write_bytes(zstandard.compress(file.read_bytes()))
         file.unlink()
 
 
-def compressed_messages(messages: Sequence[Message]) -> list[Message]:
-    """Messages as `--compression-mode message` stores them."""
-    return [message._replace(data=zstd.compress(message.data)) for message in messages]
-
-
-def write_split(path: Path, messages: Sequence[Message], storage: str, files: int = 12) -> Path:
-    """Write a bag in several files, more than nine, so that names must be sorted by number."""
-    size = -(-len(messages) // files)
-    names, numbers = [], []
-    for index in range(files):
+def write_split(path: Path, messages: Sequence[Message], storage: str) -> Path:
+    """Write a bag in twelve files, so that names in order are not files in order."""
+    size, names = -(-len(messages) // 12), []
+    for index in range(12):
         part = messages[index * size : (index + 1) * size]
-        numbers.append(len(part))
         if storage == 'mcap':
             names.append(write_mcap(path / f'bag_{index}.mcap', part, compression='zstd').name)
         else:
             names.append(write_database(path / f'bag_{index}.db3', part).name)
-    text = metadata(5, names, messages, storage=storage, file_counts=numbers)
-    (path / 'metadata.yaml').write_text(text)
+    (path / 'metadata.yaml').write_text(metadata(5, names, messages, storage=storage))
     return path
 
 
-def _without_metadata(path: Path) -> Path:
+def without_metadata(path: Path) -> Path:
     (path / 'metadata.yaml').unlink()
     return path
 
 
-def _message_mode(path: Path, messages: Sequence[Message], storage: str) -> Path:
-    packed = compressed_messages(messages)
-    if storage == 'mcap':
-        name = write_mcap(path / 'bag_0.mcap', packed).name
-    else:
-        name = write_database(path / 'bag_0.db3', packed, schema=3).name
-    text = metadata(6, [name], messages, storage=storage, compression='MESSAGE')
-    (path / 'metadata.yaml').write_text(text)
-    return path
-
-
-def _file_mode(path: Path, messages: Sequence[Message], storage: str) -> Path:
-    name = f'bag_0.{"mcap" if storage == "mcap" else "db3"}'
-    write = write_mcap if storage == 'mcap' else write_database
+def _packed(path: Path, messages: Sequence[Message], storage: str, mode: str) -> Path:
+    """Compress every message, or every file, as `ros2 bag record --compression-mode` does."""
+    if mode == 'MESSAGE':
+        messages = [m._replace(data=zstandard.compress(m.data)) for m in messages]
+    write, name = (write_mcap, 'bag_0.mcap') if storage == 'mcap' else (write_database, 'bag_0.db3')
     write(path / name, messages)
-    text = metadata(5, [f'{name}.zstd'], messages, storage=storage, compression='FILE')
+    if mode == 'FILE':
+        compress_files(path)
+        name += '.zstd'
+    text = metadata(6, [name], messages, storage=storage, compression=mode)
     (path / 'metadata.yaml').write_text(text)
-    compress_files(path)
     return path
 
 
@@ -405,35 +302,27 @@ def _other_text(path: Path, messages: Sequence[Message]) -> Path:
 
 
 Format = Callable[[Path, Sequence[Message]], Path]
-STORAGE = CompressionMode.STORAGE
 FORMATS: dict[str, Format] = {
-    **{f'version {v}': lambda p, m, v=v: write_version(p, m, v) for v in range(1, 10)},
-    'sqlite3': lambda p, m: write_rosbags(p, m),
-    'sqlite3 v8': lambda p, m: write_rosbags(p, m, version=8),
-    'sqlite3 zstd file': lambda p, m: write_rosbags(p, m, compression=CompressionMode.FILE),
-    'sqlite3 zstd message': lambda p, m: write_rosbags(p, m, compression=CompressionMode.MESSAGE),
+    **{f'version {v}': lambda p, m, v=v: write_version(p, m, v) for v in (1, 3, 4, 5, 8, 9)},
+    'sqlite3': write_rosbags,
+    'sqlite3 zstd file': lambda p, m: _packed(p, m, 'sqlite3', 'FILE'),
+    'sqlite3 zstd message': lambda p, m: _packed(p, m, 'sqlite3', 'MESSAGE'),
     'mcap': lambda p, m: write_rosbags(p, m, storage='mcap'),
-    'mcap zstd chunks': lambda p, m: write_rosbags(p, m, storage='mcap', compression=STORAGE),
-    'old sqlite3 zstd file': lambda p, m: _file_mode(p, m, 'sqlite3'),
-    'mcap zstd file': lambda p, m: _file_mode(p, m, 'mcap'),
-    'old sqlite3 zstd message': lambda p, m: _message_mode(p, m, 'sqlite3'),
-    'mcap zstd message': lambda p, m: _message_mode(p, m, 'mcap'),
+    'mcap zstd file': lambda p, m: _packed(p, m, 'mcap', 'FILE'),
+    'mcap zstd message': lambda p, m: _packed(p, m, 'mcap', 'MESSAGE'),
     'split sqlite3': lambda p, m: write_split(p, m, 'sqlite3'),
     'split mcap': lambda p, m: write_split(p, m, 'mcap'),
-    'split sqlite3 without metadata': lambda p, m: _without_metadata(write_split(p, m, 'sqlite3')),
-    'split mcap without metadata': lambda p, m: _without_metadata(write_split(p, m, 'mcap')),
-    'sqlite3 without metadata': lambda p, m: _without_metadata(write_version(p, m, 5)),
-    'zstd file without metadata': lambda p, m: _without_metadata(_file_mode(p, m, 'sqlite3')),
-    'zstd message without metadata': lambda p, m: _without_metadata(_message_mode(p, m, 'mcap')),
+    'split without metadata': lambda p, m: without_metadata(write_split(p, m, 'mcap')),
+    'without metadata': lambda p, m: without_metadata(write_version(p, m, 5)),
+    'zstd without metadata': lambda p, m: without_metadata(_packed(p, m, 'sqlite3', 'FILE')),
     'other text in the metadata': _other_text,
     'lone db3': lambda p, m: write_database(p / 'lone.db3', m),
     'lone mcap': lambda p, m: write_mcap(p / 'lone.mcap', m),
+    'lone mcap, zstd': lambda p, m: write_mcap(p / 'lone.mcap', m, compression='zstd'),
     'lone mcap, lz4': lambda p, m: write_mcap(p / 'lone.mcap', m, compression='lz4'),
     'lone mcap, no chunks': lambda p, m: write_mcap(p / 'lone.mcap', m, compression=None),
     'lone mcap, no index': lambda p, m: write_mcap(p / 'lone.mcap', m, index=False),
-    'lone mcap, neither': lambda p, m: write_mcap(
-        p / 'lone.mcap', m, compression=None, index=False
-    ),
+    'lone mcap, neither': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None, index=False),
     'ROS 1': lambda p, m: write_ros1(p / 'lone.bag', m),
     'ROS 1 bz2': lambda p, m: write_ros1(p / 'lone.bag', m, 'bz2'),
     'ROS 1 lz4': lambda p, m: write_ros1(p / 'lone.bag', m, 'lz4'),

@@ -7,19 +7,10 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bag_formats import (
-    Message,
-    compress_files,
-    drive,
-    write_mcap,
-    write_ros1,
-    write_rosbags,
-    write_version,
-)
+from bag_formats import FORMATS, drive
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -29,12 +20,6 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.inspection import inspect
 
-TOPICS = {
-    'image': '/image_raw',
-    'odometry': '/odom',
-    'imu': '/imu',
-    'ground_truth': '/ground_truth',
-}
 EDITS = st.lists(
     st.tuples(
         st.sampled_from(['flip', 'cut', 'insert', 'remove', 'blank', 'ones']),
@@ -45,93 +30,7 @@ EDITS = st.lists(
     max_size=6,
 )
 Edits = list[tuple[str, float, int]]
-
-
-def damaged(data: bytes, edits: Edits) -> bytes:
-    """Apply edits, each at a share of the length."""
-    for edit, share, number in edits:
-        at = int(share * max(len(data) - 1, 0))
-        changes = {
-            'flip': lambda d, at, n: d[:at] + bytes([d[at] ^ n]) + d[at + 1 :] if d else d,
-            'cut': lambda d, at, n: d[:at],
-            'insert': lambda d, at, n: d[:at] + bytes([n]) * n + d[at:],
-            'remove': lambda d, at, n: d[:at] + d[at + n :],
-            'blank': lambda d, at, n: d[:at] + bytes(len(d[at : at + n])) + d[at + n :],
-            'ones': lambda d, at, n: d[:at] + b'\xff' * len(d[at : at + n]) + d[at + n :],
-        }
-        data = changes[edit](data, at, number)
-    return data
-
-
-def read_all(path: Path, folder: Path) -> None:
-    """Use every reading function; ours are the only errors that may come."""
-    readers: list[Callable[[Bag], object]] = [
-        lambda bag: [len(data) for _, _, data in bag.messages(bag.topics)],
-        lambda bag: list(bag.images('/image_raw')),
-        lambda bag: bag.odometry('/odom'),
-        lambda bag: bag.yaw_rate(),
-        lambda bag: bag.trajectory('/ground_truth'),
-        lambda bag: [bag.find(kind) for kind in KINDS],
-    ]
-    for strict in (False, True):
-        for reader in readers:
-            try:
-                with Bag(path, strict=strict) as bag:
-                    reader(bag)
-            except LocalizationError as error:
-                assert '\n' not in str(error)
-    for use in (lambda: inspect(path), lambda: run(path, folder)):
-        with contextlib.suppress(LocalizationError):
-            use()
-
-
-def run(path: Path, folder: Path) -> None:
-    """Load the drive with its truth."""
-    topics = TopicNames(image='/image_raw', odometry='/odom', ground_truth='/ground_truth')
-    load_run(path, cache=folder / 'cache', topics=topics, want_truth=True)
-
-
-@pytest.fixture(scope='module')
-def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
-    """Return the drive that is damaged."""
-    return drive(tmp_path_factory.mktemp('drive'))[:90]
-
-
-@pytest.fixture(autouse=True)
-def quiet(caplog: pytest.LogCaptureFixture) -> None:
-    """Keep warnings of thousands of damaged bags out of the report."""
-    caplog.set_level(logging.ERROR, 'sfa_localization')
-
-
-WRITERS: dict[str, Callable[[Path, list[Message]], object]] = {
-    'sqlite3': lambda p, m: write_version(p, m, 5),
-    'sqlite3 v9': lambda p, m: write_rosbags(p, m),
-    'mcap': lambda p, m: write_mcap(p / 'a.mcap', m),
-    'mcap zstd': lambda p, m: write_mcap(p / 'a.mcap', m, compression='zstd'),
-    'mcap lz4': lambda p, m: write_mcap(p / 'a.mcap', m, compression='lz4'),
-    'mcap bare': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None, index=False),
-    'ROS 1': lambda p, m: write_ros1(p / 'a.bag', m),
-    'ROS 1 lz4': lambda p, m: write_ros1(p / 'a.bag', m, 'lz4'),
-}
-
-
-@pytest.fixture(scope='module')
-def bags(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
-    """Return a folder with one whole bag of every name."""
-    folder = tmp_path_factory.mktemp('bags')
-    for name, write in WRITERS.items():
-        write(folder / name, messages)
-    return folder
-
-
-def lone(bag: Path, folder: str) -> Path:
-    """Copy a bag without its metadata; return its file."""
-    copy = Path(shutil.copytree(bag, Path(folder) / 'bag'))
-    (copy / 'metadata.yaml').unlink(missing_ok=True)
-    (file,) = copy.iterdir()
-    return file
-
-
+TOPICS = TopicNames(image='/image_raw', odometry='/odom', ground_truth='/ground_truth')
 FUZZ = settings(
     deadline=None,
     derandomize='FUZZ_EXAMPLES' not in os.environ,
@@ -140,67 +39,89 @@ FUZZ = settings(
 )
 
 
-@pytest.mark.parametrize('name', WRITERS)
-@FUZZ
-@given(edits=EDITS)
-def test_damaged_files(name: str, edits: Edits, bags: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        file = lone(bags / name, folder)
-        file.write_bytes(damaged(file.read_bytes(), edits))
-        read_all(file, Path(folder))
+def damaged(data: bytes, edits: Edits) -> bytes:
+    """Apply edits, each at a share of the length."""
+    for edit, share, number in edits:
+        at = int(share * max(len(data) - 1, 0))
+        before, part, after = data[:at], data[at : at + number], data[at + number :]
+        data = (
+            before
+            + {
+                'flip': bytes([data[at] ^ number]) + data[at + 1 :] if data else b'',
+                'cut': b'',
+                'insert': bytes([number]) * number + data[at:],
+                'remove': after,
+                'blank': bytes(len(part)) + after,
+                'ones': b'\xff' * len(part) + after,
+            }[edit]
+        )
+    return data
 
 
-@pytest.mark.parametrize('name', ['sqlite3', 'mcap'])
-@FUZZ
-@given(edits=EDITS)
-def test_damaged_compressed_files(name: str, edits: Edits, bags: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        compress_files(lone(bags / name, folder).parent)
-        (file,) = (Path(folder) / 'bag').iterdir()
-        file.write_bytes(damaged(file.read_bytes(), edits))
-        read_all(file.parent, Path(folder))
-
-
-@FUZZ
-@given(edits=EDITS)
-def test_damaged_metadata(edits: Edits, bags: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(shutil.copytree(bags / 'sqlite3 v9', Path(folder) / 'bag'))
-        file = path / 'metadata.yaml'
-        file.write_bytes(damaged(file.read_bytes(), edits))
-        read_all(path, Path(folder))
-
-
-@FUZZ
-@given(text=st.text(alphabet=st.sampled_from('ab01:-[]{}"\'#&*!|>%@ \n\t\0é'), max_size=80))
-def test_any_text_as_metadata(text: str, bags: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(shutil.copytree(bags / 'sqlite3 v9', Path(folder) / 'bag'))
-        (path / 'metadata.yaml').write_text(text)
-        read_all(path, Path(folder))
-
-
-@pytest.mark.parametrize('topic', TOPICS.values())
-@FUZZ
-@given(edits=EDITS, every=st.integers(1, 4))
-def test_damaged_messages(topic: str, edits: Edits, every: int, messages: list[Message]) -> None:
-    spoilt = [
-        m._replace(data=damaged(m.data, edits)) if m.topic == topic and not i % every else m
-        for i, m in enumerate(messages)
+def read_all(path: Path, folder: Path) -> None:
+    """Use every reading function; ours are the only errors that may come."""
+    uses = [
+        lambda bag: [len(data) for _, _, data in bag.messages(bag.topics)],
+        lambda bag: list(bag.images('/image_raw')),
+        lambda bag: bag.odometry('/odom'),
+        lambda bag: bag.yaw_rate(),
+        lambda bag: bag.trajectory('/ground_truth'),
+        lambda bag: [bag.find(kind) for kind in KINDS],
     ]
+    for use, strict in [(use, strict) for use in uses for strict in (False, True)]:
+        try:
+            with Bag(path, strict=strict) as bag:
+                use(bag)
+        except LocalizationError as error:
+            assert '\n' not in str(error)
+    with contextlib.suppress(LocalizationError):
+        inspect(path)
+    with contextlib.suppress(LocalizationError):
+        load_run(path, cache=folder / 'cache', topics=TOPICS, want_truth=True)
+
+
+@pytest.fixture(autouse=True)
+def quiet(caplog: pytest.LogCaptureFixture) -> None:
+    """Keep warnings of thousands of damaged bags out of the report."""
+    caplog.set_level(logging.ERROR, 'sfa_localization')
+
+
+WHOLE = [
+    *('version 5', 'version 9', 'lone mcap', 'lone mcap, zstd', 'lone mcap, lz4'),
+    *('lone mcap, no index', 'lone mcap, neither', 'ROS 1', 'ROS 1 lz4'),
+    *('sqlite3 zstd file', 'mcap zstd file', 'mcap zstd message'),
+]
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with one whole bag of every name."""
+    folder = tmp_path_factory.mktemp('bags')
+    messages = drive(folder)[:90]
+    for name in WHOLE:
+        FORMATS[name](folder / name, messages)
+    return folder
+
+
+@pytest.mark.parametrize('name', WHOLE)
+@FUZZ
+@given(edits=EDITS, with_metadata=st.booleans())
+def test_damaged_files(name: str, edits: Edits, with_metadata: bool, bags: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        read_all(write_mcap(Path(folder) / 'bag.mcap', spoilt), Path(folder))
+        bag = Path(shutil.copytree(bags / name, Path(folder) / 'bag'))
+        if not with_metadata:
+            (bag / 'metadata.yaml').unlink(missing_ok=True)
+        file = next(file for file in bag.iterdir() if file.suffix != '.yaml')
+        file.write_bytes(damaged(file.read_bytes(), edits))
+        read_all(bag, Path(folder))
 
 
 @FUZZ
-@given(
-    data=st.binary(max_size=200),
-    start=st.sampled_from(
-        [b'', b'SQLite format 3\0', b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n', b'\x28\xb5\x2f\xfd']
-    ),
-)
-def test_any_bytes_as_bag(data: bytes, start: bytes) -> None:
+@given(edits=EDITS, text=st.text(alphabet=':-[]{}"\'#&*!|>%@ \n\tab01é\0', max_size=80))
+def test_damaged_metadata(edits: Edits, text: str, bags: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / 'bag.mcap'
-        file.write_bytes(start + data)
-        read_all(file, Path(folder))
+        bag = Path(shutil.copytree(bags / 'version 9', Path(folder) / 'bag'))
+        file = bag / 'metadata.yaml'
+        for content in (damaged(file.read_bytes(), edits), text.encode()):
+            file.write_bytes(content)
+            read_all(bag, Path(folder))

@@ -68,6 +68,7 @@ WRITERS = {
 OTHERS = {
     'bags/run_loader': 'decoded pictures, in a folder that its caller removes',
     'bags/storage': 'a decompressed copy, in a temporary folder',
+    'bags/sqlite': 'a copy of what is whole, in a temporary folder',
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
     'commands/processes': 'what a program prints, while it prints it',

@@ -56,7 +56,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
     'features': ({'data'}, NUMERIC | {'cv2', 'mdp', 'dask', 'distributed'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
-    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'lz4'}),
+    'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard'}),
     'metric': ({'data', 'features'}, NUMERIC),
     'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
     'localizer': ({'data', 'camera', 'features', 'fusion', 'metric', 'place_model'}, {'numpy'}),

@@ -103,10 +103,14 @@ def of_lens(settings: LensCalibration) -> Any:
 
 def of_bag(settings: BagConfig, folder: Path) -> Any:
     """Stamps of the images of a bag that were received later than they were taken."""
-    with BagWriter(folder / 'bag') as bag:
+
+    class Late(BagWriter):
+        def message(self, topic: str, stamp_ns: int, message: Any) -> None:
+            super().message(topic, stamp_ns + 5_000_000, message)
+
+    with Late(folder / 'bag') as bag:
         for stamp_ns in range(START_NS, START_NS + 10**9, 10**8):
-            image = bag._raw_image(bag._header(stamp_ns, 'camera'), np.zeros((8, 80, 3), np.uint8))
-            bag.message('/panorama', stamp_ns + 5_000_000, image)
+            bag.image('/panorama', stamp_ns, np.zeros((8, 80, 3), np.uint8), 'camera')
     with Bag(folder / 'bag', config=settings) as bag:
         return [stamp for stamp, _ in bag.images()]
 

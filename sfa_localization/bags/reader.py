@@ -8,29 +8,30 @@ message that is not used is counted with its reason. Bags are never written to.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.interfaces import Qos
 
 from sfa_localization.bags import decoding
-from sfa_localization.bags.motion_arrays import (
-    StampedValues,
-    disagreement,
-    is_pose_constant,
-    sideways,
-    to_odometry,
-    to_trajectory,
-    to_yaw_rate,
-)
+from sfa_localization.bags import motion_arrays as motion
+from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.storage import Channel, Record, add_problem, inflate_message, room_for
-from sfa_localization.bags.topic_stream import Stream, Tally
-from sfa_localization.data.errors import BagError, MessageError
+from sfa_localization.bags.storage import (
+    ZSTD_MAGIC,
+    Channel,
+    DamageError,
+    Record,
+    add_problem,
+    inflate_message,
+)
+from sfa_localization.bags.topic_stream import Item, Stream, Tally
+from sfa_localization.data.errors import BagError, LocalizationError
 from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
 from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
@@ -38,17 +39,15 @@ from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRat
 SERIALIZATIONS = ('cdr', 'ros1')
 OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 """What omnicam_node, sfa_node and ekf_node publish is no input where others are recorded too."""
+REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
 MOST_TOPICS = 8
 """Topics that an error message lists."""
 _RESETS_MIN, _RESETS_SHARE = 20, 0.01
 """More resets than both the number and the share of messages mean that pose and twist disagree all
 along, as with different units; single restarts of an odometry node stay far below."""
-ZSTD_START = b'\x28'
-"""First byte of zstd data; no CDR message starts with it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(NamedTuple):
     """The use of a topic: its title in errors, its command line flag, the types that can serve.
 
     `found` are the types by which it is found, `named` those accepted when it is named.
@@ -60,14 +59,12 @@ class Kind:
     named: tuple[str, ...]
 
 
-_IMAGES = (decoding.IMAGE, decoding.COMPRESSED)
+_IMAGES, _TRUTH = (decoding.IMAGE, decoding.COMPRESSED), decoding.STAMPED_POSES
 KINDS = {
     'image': Kind('images', '--image-topic', _IMAGES, _IMAGES),
     'odometry': Kind('odometry', '--odom-topic', (decoding.ODOMETRY,), decoding.POSES),
     'imu': Kind('yaw rates', '--imu-topic', (decoding.IMU,), (decoding.IMU,)),
-    'ground_truth': Kind(
-        'true poses', '--ground-truth-topic', decoding.STAMPED_POSES, decoding.POSES
-    ),
+    'ground_truth': Kind('true poses', '--ground-truth-topic', _TRUTH, decoding.POSES),
 }
 
 
@@ -89,11 +86,7 @@ class Bag:
     """
 
     def __init__(
-        self,
-        path: Path | str,
-        *,
-        strict: bool = False,
-        config: BagConfig | None = None,
+        self, path: Path | str, *, strict: bool = False, config: BagConfig | None = None
     ) -> None:
         self.path, self.strict = Path(path), strict
         self._by_header = (config or BagConfig()).stamp_source == 'header'
@@ -120,12 +113,11 @@ class Bag:
     @property
     def topics(self) -> dict[str, Topic]:
         """All topics by name."""
-        return {name: self._topic(channel) for name, channel in self.recording.channels.items()}
-
-    def _topic(self, channel: Channel) -> Topic:
-        recording, name = self.recording, channel.topic
-        count = max(recording.declared.get(name, 0), recording.stored(name))
-        return Topic(name, channel.kind, count, channel.serialization, channel.qos)
+        counts = self.recording.counts
+        return {
+            name: Topic(name, channel.kind, counts[name], channel.serialization, channel.qos)
+            for name, channel in self.recording.channels.items()
+        }
 
     @property
     def counts(self) -> dict[str, Count]:
@@ -147,108 +139,107 @@ class Bag:
             return self._named(wanted, topic)
         found = [t for t in self.topics.values() if t.kind in wanted.found and t.count]
         if len(found) > 1:
-            found = [t for t in found if not _is_own(t.name)] or found
+            found = [t for t in found if not OWN_TOPICS.search(t.name)] or found
         if len(found) == 1:
-            return self._readable(found[0]).name
+            return self._readable(found[0])
         if not found:
-            types = ' or '.join(name.rsplit('/', 1)[1] for name in wanted.found)
+            kinds = _short(wanted.found, ' or ')
             raise BagError(
-                f'{self.path}: has no {wanted.title} ({types}); {self._contents(wanted)}'
+                f'{self.path}: has no {wanted.title} ({kinds}); {self._contents(wanted)}'
             )
         names = ', '.join(sorted(topic.name for topic in found))
         raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
                        f'choose one with {wanted.flag}')  # fmt: skip
 
     def _named(self, wanted: Kind, name: str) -> str:
-        topic = self.topics.get(_plain_name(name)) or self.topics.get(_plain_name(name).lstrip('/'))
+        plain, colon, child_frame = name.lstrip('/').partition(':')
+        topic = self.topics.get(f'/{plain}') or self.topics.get(plain)
         if topic is None:
             raise BagError(f'{self.path}: has no topic {name}; {self._contents(wanted)}')
         if topic.kind not in wanted.named:
-            types = ', '.join(entry.rsplit('/', 1)[1] for entry in wanted.named)
+            kinds = _short(wanted.named, ', ')
             raise BagError(f'{self.path}: {topic.name} is {topic.kind or "of unknown type"}, not '
-                           f'one of {types}; name another with {wanted.flag}')  # fmt: skip
+                           f'one of {kinds}; name another with {wanted.flag}')  # fmt: skip
         if topic.count == 0:
             raise BagError(f'{self.path}: {topic.name} has no messages; {self._contents(wanted)}')
-        _, _, child_frame = name.partition(':')
-        return self._readable(topic).name + (f':{child_frame}' if child_frame else '')
+        return self._readable(topic) + (colon + child_frame if child_frame else '')
 
-    def _readable(self, topic: Topic) -> Topic:
+    def _readable(self, topic: Topic) -> str:
         if topic.serialization in SERIALIZATIONS:
-            return topic
+            return topic.name
         raise BagError(f'{self.path}: {topic.name} is serialized as {topic.serialization!r}; '
-                       f'only cdr can be read: record it so')  # fmt: skip
+                       'only cdr can be read: record it so')  # fmt: skip
 
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
-        kinds = [f'{t.name} ({t.kind.rsplit("/", 1)[-1]}, {t.count})' for t in self.topics.values()]
-        shown = ', '.join(sorted(kinds)[:MOST_TOPICS]) + (
-            ', ...' if len(kinds) > MOST_TOPICS else ''
-        )
-        return f'it has {shown or "no topics"}: record one, or name one with {wanted.flag}'
+        kinds = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
+        shown = kinds[:MOST_TOPICS] + ['...'] * (len(kinds) > MOST_TOPICS)
+        known = ', '.join(shown) or 'no topics'
+        return f'it has {known}: record one, or name one with {wanted.flag}'
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
-        stream = self.stream(self.find('image', topic), decoding.image_of)
-        return ((stamp, image) for _, stamp, image in self.read([stream]))
+        return self._values(self.stream(self.find('image', topic), decoding.image_of))
 
     def odometry(self, topic: str = '') -> Odometry:
         """All odometry; of a topic with poses only, twists are their differences."""
         stream = self.odometry_stream(topic)
-        return self.to_odometry(stream, [(stamp, value) for _, stamp, value in self.read([stream])])
+        return self.to_odometry(stream, list(self._values(stream)))
+
+    def yaw_rate(self, topic: str = '') -> YawRate:
+        """All yaw rates of an Imu."""
+        stream = self.stream(self.find('imu', topic), read_yaw_rate)
+        return motion.to_yaw_rate(list(self._values(stream)))
+
+    def trajectory(self, topic: str = '') -> Trajectory:
+        """All poses of a topic, by default of the true poses."""
+        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
+        return motion.to_trajectory(list(self._values(stream)))
+
+    def _values(self, stream: Stream) -> Iterator[tuple[int, Any]]:
+        return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
         """Odometry of a stream's values; a reset is joined, and noted as a problem."""
-        odometry, resets = to_odometry(values)
+        odometry, resets = motion.to_odometry(values)
         if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
             raise BagError(
                 f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
                 f'{len(values)} messages: are both in meters, radians and seconds?'
             )
-        if is_pose_constant(odometry):
-            text = f'{stream.topic}: the pose is constant; the twist is integrated instead'
-            self.recording.problems.append(text)
+        texts = []
+        if motion.is_pose_constant(odometry):
+            texts.append('the pose is constant; the twist is integrated instead')
             poses = integrate(odometry.stamps_ns, odometry.twists)
             odometry = replace(odometry, poses=poses)
-        elif differing := disagreement(odometry):
-            text = f'{stream.topic}: {differing}: are both in meters, radians and seconds?'
-            self.recording.problems.append(text)
-        elif aside := sideways(odometry):
-            text = f'{stream.topic}: {aside}: only motion ahead is used; is the heading right?'
-            self.recording.problems.append(text)
+        elif differing := motion.disagreement(odometry):
+            texts.append(f'{differing}: are both in meters, radians and seconds?')
+        elif aside := motion.sideways(odometry):
+            texts.append(f'{aside}: only motion ahead is used; is the heading right?')
         if resets:
-            text = f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
-            self.recording.problems.append(text)
+            texts.append(f'odometry was reset {resets} times; joined by its twist')
+        self.recording.problems += [f'{stream.topic}: {text}' for text in texts]
+        if resets:
             self._raise_problems()
         return odometry
 
-    def yaw_rate(self, topic: str = '') -> YawRate:
-        """All yaw rates of an Imu."""
-        stream = self.stream(self.find('imu', topic), read_yaw_rate)
-        return to_yaw_rate([(stamp, value) for _, stamp, value in self.read([stream])])
-
-    def trajectory(self, topic: str = '') -> Trajectory:
-        """All poses of a topic, by default of the true poses."""
-        stream = self.stream(self.find('ground_truth', topic), decoding.pose_of)
-        return to_trajectory([(stamp, value) for _, stamp, value in self.read([stream])])
-
     def odometry_stream(self, topic: str = '') -> Stream:
         """Stream of (pose, twist and its variances; None of a type without twists)."""
-        name = self.find('odometry', topic)
-        return self.stream(name, decoding.odometry_of)
+        return self.stream(self.find('odometry', topic), decoding.odometry_of)
 
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
         topic, _, child_frame = name.partition(':')
         chooser = decoding.TransformChooser(topic, child_frame)
         is_tf = self.topics[topic].kind == decoding.TF
-        return self._stream(topic, chooser if is_tf else lambda message: message, convert)
+        return self._stream(topic, chooser if is_tf else _itself, convert)
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic of any type, which may be empty; unknown types have the value None."""
         channel = self.recording.channels[topic]
-        known = self._decode.can_decode(channel.kind, channel.serialization)
-        stream = self._stream(topic, lambda message: message, convert if known else _nothing)
-        stream.opaque, stream.required = not known, False
+        stream = self._stream(topic, _itself, convert)
+        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
+        stream.required = False
         return stream
 
     def _stream(
@@ -262,83 +253,76 @@ class Bag:
 
         Raises BagError when a topic has no usable message, or in strict reading on any loss.
         """
-        streams = list(streams)
-        by_topic = {
-            stream.topic: [s for s in streams if s.topic == stream.topic] for stream in streams
-        }
+        by_topic: dict[str, list[Stream]] = {}
+        for stream in streams:
+            by_topic.setdefault(stream.topic, []).append(stream)
         for record in self.messages(by_topic):
             for stream in by_topic[record[0].topic]:
-                for stamp_ns, value in self._pushed(stream, record):
-                    yield stream, stamp_ns, value
-        for stream in streams:
-            for stamp_ns, value in stream.flush():
-                yield stream, stamp_ns, value
+                stream.received += 1
+                item = self._item(stream, *record)
+                for ready in stream.stamps.push(item) if item is not None else ():
+                    stream.tally.use()
+                    yield stream, ready.stamp_ns, ready.value
+        for stream in itertools.chain(*by_topic.values()):
+            for ready in stream.stamps.flush():
+                stream.tally.use()
+                yield stream, ready.stamp_ns, ready.value
             self._check_complete(stream)
 
-    def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
-        """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
-        packed_size = unpacked_size = 0
-        for record in self.recording.messages(set(topics), start_ns):
-            if record[2][:1] != ZSTD_START:
-                yield record
-                continue
-            packed_size += len(record[2])
-            try:
-                data = inflate_message(record[2], room_for(packed_size) - unpacked_size)
-            except BagError as error:
-                add_problem(self.recording.problems, f'{record[0].topic}: {error}')
-                continue
-            unpacked_size += len(data)
-            yield record[0], record[1], data
-
-    def _pushed(self, stream: Stream, record: Record) -> StampedValues:
-        """Stamps and values that the stream yields after one more message."""
-        channel, receive_ns, data = record
-        stream.received += 1
+    def _item(self, stream: Stream, channel: Channel, receive_ns: int, data: bytes) -> Item | None:
+        """The stamp and value of a message; None of one that is counted as rejected."""
         if stream.opaque:
-            return stream.push(receive_ns, receive_ns, None)
+            return Item(receive_ns, receive_ns, None)
         try:
             part = stream.select(self._decode(data, channel.kind, channel.serialization))
             if part is None:
                 stream.tally.leave_out('transforms of other frames')
-                return []
-            stamp_ns = decoding.header_stamp(part) if self._by_header else receive_ns
-        except MessageError as error:
+                return None
+            stamp_ns = decoding.header_stamp(part) if self._by_header else None
+            return Item(stamp_ns or receive_ns, receive_ns, stream.convert(part))
+        except BagError:
+            raise
+        except LocalizationError as error:
             stream.tally.skip(str(error))
-            return []
-        return stream.push(receive_ns if stamp_ns is None else stamp_ns, receive_ns, part)
+            return None
+
+    def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
+        """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
+        for record in self.recording.messages(set(topics), start_ns):
+            if record[2][:4] != ZSTD_MAGIC:
+                yield record
+                continue
+            try:
+                yield record[0], record[1], inflate_message(record[2])
+            except DamageError as damage:
+                text = f'{record[0].topic}: a compressed message is damaged ({damage})'
+                add_problem(self.recording.problems, text)
 
     def _check_complete(self, stream: Stream) -> None:
         """Compare the messages read with the bag's own count; no usable message is an error."""
-        expected, count = self.topics[stream.topic].count, stream.tally.count
+        expected = self.recording.counts[stream.topic]
         if stream.received < expected:
-            lost = f'{stream.received} of {expected} messages read'
-            self.recording.problems.append(f'{stream.topic}: {lost}')
+            lost = f'{stream.received} of {expected} messages read; {REMEDY}'
+            add_problem(self.recording.problems, f'{stream.topic}: {lost}')
             stream.tally.leave_out('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
-        if stream.required and count.used == 0:
-            raise BagError(f'{self.path}: {stream.topic}: {_reasons(stream.tally.count)}')
+        if stream.required and stream.tally.count.used == 0:
+            reasons = listed(stream.tally.count.skipped) or 'none recorded'
+            remedy = f'; {REMEDY}' if stream.received < expected else ''
+            if NO_STAMP in reasons:
+                remedy = '; try the time of reception (stamp_source: receive)'
+            raise BagError(f'{self.path}: {stream.topic}: no usable message ({reasons}){remedy}')
 
     def _raise_problems(self) -> None:
         if self.strict and self.problems:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
 
 
-def _is_own(name: str) -> bool:
-    """Whether a topic is what the nodes of this package publish, perhaps in a namespace."""
-    return OWN_TOPICS.search(name) is not None
+def _itself(message: Any) -> Any:
+    """The whole of a message."""
+    return message
 
 
-def _nothing(_: Any) -> None:
-    """The value of a message that is not decoded."""
-
-
-def _plain_name(name: str) -> str:
-    """A topic's name without a frame, and with its leading slash."""
-    return '/' + name.partition(':')[0].lstrip('/')
-
-
-def _reasons(count: Count) -> str:
-    reasons = listed(count.skipped)
-    remedy = '; try the time of reception (stamp_source: receive)' if NO_STAMP in reasons else ''
-    return f'no usable message ({reasons or "none recorded"}){remedy}'
+def _short(kinds: Iterable[str], between: str = '') -> str:
+    """Names of types without their package."""
+    return between.join(kind.rsplit('/', 1)[-1] for kind in kinds)

@@ -23,7 +23,7 @@ from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_yaw_rate
-from sfa_localization.data.run import Count, Image, Odometry, PanoramaArray, Run, Stamps
+from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, Stamps
 
 logger = logging.getLogger(__name__)
 Unwrap = Callable[[Image], Image]
@@ -54,12 +54,24 @@ def load_run(
     than the first, are skipped and counted; where only `distinct` ones are wanted, also those that
     repeat the one before, which was taken elsewhere. Raises BagError.
     """
+    names = topics or TopicNames()
     with Bag(path, strict=strict, config=config) as bag:
-        loader = _Loader(bag, topics or TopicNames(), want_truth, odometry_tolerance_s)
-        run = loader.load(Path(cache), _Decoder(unwrap, distinct), progress)
+        image_topic = bag.find('image', names.image)
+        streams = _other_streams(bag, names, want_truth)
+        try:
+            with PanoramaFile(Path(cache), bag.path.name) as file:
+                images = bag.stream(image_topic, _panorama_maker(file, unwrap, distinct))
+                values = _read(bag, images, streams, file, progress)
+                odometry = bag.to_odometry(streams['odometry'], values['odometry'])
+                panoramas = _joined(bag, images, file, odometry, odometry_tolerance_s)
+        except OSError as error:
+            raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         for problem in bag.problems:
             logger.warning('%s: %s', path, problem)
-    return run
+    counts = {use: s.tally.count for use, s in {'images': images, **streams}.items()}
+    yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
+    truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, counts)
 
 
 class PanoramaFile:
@@ -118,99 +130,75 @@ class PanoramaFile:
         return PanoramaArray(self.stamps_ns[kept], mapped)
 
 
-class _Loader:
-    """Reads the topics that make a run."""
-
-    def __init__(
-        self, bag: Bag, topics: TopicNames, want_truth: bool, odometry_tolerance_s: float
-    ) -> None:
-        self._bag, self._tolerance_s = bag, odometry_tolerance_s
-        self._image_topic = bag.find('image', topics.image)
-        self._streams = {'odometry': bag.odometry_stream(topics.odometry)}
-        if topics.imu or self._has_imu():
-            imu = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
-            imu.required = bool(topics.imu)
-            self._streams['imu'] = imu
-        if want_truth:
-            name = bag.find('ground_truth', topics.ground_truth)
-            self._streams['ground_truth'] = bag.stream(name, decoding.pose_of)
-        self._values: dict[str, StampedValues] = {use: [] for use in self._streams}
-
-    def _has_imu(self) -> bool:
-        """Whether a gyroscope was recorded; topics that are all empty are only warned of."""
-        found = [topic for topic in self._bag.topics.values() if topic.kind == decoding.IMU]
-        if found and not any(topic.count for topic in found):
-            names = ', '.join(topic.name for topic in found)
-            logger.warning('%s: no message on %s: continuing without gyroscope',
-                           self._bag.path, names)  # fmt: skip
-            return False
-        return bool(found)
-
-    def load(self, cache: Path, decoder: _Decoder, progress: Progress | None) -> Run:
-        try:
-            with PanoramaFile(cache, self._bag.path.name) as file:
-                images = self._bag.stream(
-                    self._image_topic, lambda m: file.check_size(decoder.panorama(m))
-                )
-                self._read(images, file, progress)
-                odometry = self._bag.to_odometry(
-                    self._streams['odometry'], self._values['odometry']
-                )
-                panoramas = self._join(images, file, odometry)
-        except OSError as error:
-            raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
-        return self._run(panoramas, odometry, images.tally.count)
-
-    def _read(self, images: Stream, file: PanoramaFile, progress: Progress | None) -> None:
-        uses = {id(stream): use for use, stream in self._streams.items()}
-        total = self._bag.topics[images.topic].count
-        for stream, stamp_ns, value in self._bag.read([images, *self._streams.values()]):
-            if stream is not images:
-                self._values[uses[id(stream)]].append((stamp_ns, value))
-                continue
-            file.add(stamp_ns, value)
-            if progress is not None:
-                progress(images.received, total)
-
-    def _join(self, images: Stream, file: PanoramaFile, odometry: Odometry) -> PanoramaArray:
-        """The images with odometry near enough on both sides."""
-        keep = odometry.trajectory.covers(file.stamps_ns, int(self._tolerance_s * 1e9))
-        lost = int(np.count_nonzero(~keep))
-        near = f'within {self._tolerance_s:g} s' if self._tolerance_s else 'before and after'
-        images.tally.withdraw(f'no odometry {near}', lost)
-        if not keep.any():
-            raise BagError(
-                f'{self._bag.path}: none of {lost} images of {images.topic} has odometry '
-                f'{near}; are both stamped by one clock (stamp_source: receive)?'
-            )
-        return file.finish(keep)
-
-    def _run(self, panoramas: PanoramaArray, odometry: Odometry, images: Count) -> Run:
-        yaw_rate, truth = self._values.get('imu'), self._values.get('ground_truth')
-        return Run(
-            name=self._bag.path.name,
-            panoramas=panoramas,
-            odometry=odometry,
-            yaw_rate=to_yaw_rate(yaw_rate) if yaw_rate else None,
-            ground_truth=to_trajectory(truth) if truth else None,
-            counts={
-                'images': images,
-                **{use: stream.tally.count for use, stream in self._streams.items()},
-            },
-        )
+def _other_streams(bag: Bag, topics: TopicNames, want_truth: bool) -> dict[str, Stream]:
+    """The topics beside the images that make a run, by their use."""
+    streams = {'odometry': bag.odometry_stream(topics.odometry)}
+    if topics.imu or _has_imu(bag):
+        streams['imu'] = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
+        streams['imu'].required = bool(topics.imu)
+    if want_truth:
+        name = bag.find('ground_truth', topics.ground_truth)
+        streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+    return streams
 
 
-class _Decoder:
-    """Makes panoramas of messages."""
+def _has_imu(bag: Bag) -> bool:
+    """Whether a gyroscope was recorded; topics that are all empty are only warned of."""
+    found = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
+    if found and not any(topic.count for topic in found):
+        names = ', '.join(topic.name for topic in found)
+        logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
+        return False
+    return bool(found)
 
-    def __init__(self, unwrap: Unwrap | None, distinct: bool) -> None:
-        self._unwrap, self._watch = unwrap, FrozenWatch() if distinct else None
 
-    def panorama(self, message: Any) -> Image:
-        """The image of a message as a panorama. Raises LocalizationError."""
+def _panorama_maker(
+    file: PanoramaFile, unwrap: Unwrap | None, distinct: bool
+) -> Callable[[Any], Image]:
+    """What makes panoramas of one size of messages; it raises LocalizationError."""
+    watch = FrozenWatch() if distinct else None
+
+    def panorama(message: Any) -> Image:
         image = decoding.image_of(message)
-        if self._unwrap is not None and not looks_like_panorama(*image.shape[:2]):
-            image = self._unwrap(image)
-        if self._watch is not None and not self._watch.add(image):
+        if unwrap is not None and not looks_like_panorama(*image.shape[:2]):
+            image = unwrap(image)
+        if watch is not None and not watch.add(image):
             raise MessageError('image repeats the one before')
-        return image
+        return file.check_size(image)
+
+    return panorama
+
+
+def _read(
+    bag: Bag,
+    images: Stream,
+    streams: dict[str, Stream],
+    file: PanoramaFile,
+    progress: Progress | None,
+) -> dict[str, StampedValues]:
+    """Read all in one pass, the images into the file; return the values of the other streams."""
+    values: dict[str, StampedValues] = {use: [] for use in streams}
+    uses = {id(stream): use for use, stream in streams.items()}
+    total = bag.topics[images.topic].count
+    for stream, stamp_ns, value in bag.read([images, *streams.values()]):
+        if stream is not images:
+            values[uses[id(stream)]].append((stamp_ns, value))
+            continue
+        file.add(stamp_ns, value)
+        if progress is not None:
+            progress(images.received, total)
+    return values
+
+
+def _joined(
+    bag: Bag, images: Stream, file: PanoramaFile, odometry: Odometry, tolerance_s: float
+) -> PanoramaArray:
+    """The images with odometry near enough on both sides. Raises BagError where none has."""
+    keep = odometry.trajectory.covers(file.stamps_ns, int(tolerance_s * 1e9))
+    lost = int(np.count_nonzero(~keep))
+    near = f'within {tolerance_s:g} s' if tolerance_s else 'before and after'
+    images.tally.withdraw(f'no odometry {near}', lost)
+    if not keep.any():
+        raise BagError(f'{bag.path}: none of {lost} images of {images.topic} has odometry {near}; '
+                       'are both stamped by one clock (stamp_source: receive)?')  # fmt: skip
+    return file.finish(keep)

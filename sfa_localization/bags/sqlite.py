@@ -1,23 +1,30 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bag files of the sqlite3 storage, every schema from ROS 2 Crystal on, damaged ones too.
+"""Bag files of the sqlite3 storage, read by rosbags; damaged ones from a copy of what is intact.
 
-Our own queries, because rosbags (0.11.9) opens no file that is cut off, stops at a damaged page and
-leaves out the messages of a leftover write-ahead log without an error. Of 13200 messages it reads 0
-where the file is cut off at 60 % (here 7692), and 6589 where 4096 bytes in the middle are
-overwritten (here 13199): `salvage` in test/benchmarks/bench_bag.py.
+rosbags opens no damaged file, leaves out what is in a leftover log without an error, and has no
+limits: SQLite itself checks a file before.
 """
 
 from __future__ import annotations
 
+import itertools
+import os
+import re
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
+from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.rosbag2 import Reader
+
 from sfa_localization.bags.storage import (
+    MOST_QOS,
     MOST_TOPICS,
     Channel,
     Record,
@@ -28,211 +35,171 @@ from sfa_localization.bags.storage import (
 from sfa_localization.data.errors import BagError
 
 MAGIC = b'SQLite format 3\x00'
-_STEPS, _STEPS_PER_BYTE = 50_000_000, 16
-"""Instructions of SQLite that one query may take, and more for each byte of the file: reading a row
-takes about 20. Damaged pages can lead in circles."""
-_STEPS_AT_ONCE = 1 << 16
-"""Instructions between two looks at their number."""
-_SMALLEST_ROW = 8
-"""Bytes of a row without its data."""
+_STEPS, _STEPS_PER_BYTE, _STEPS_AT_ONCE = 50_000_000, 16, 1 << 16
+"""Instructions of SQLite for a file, more for each of its bytes, and those between two looks at
+their number: a row takes about 20. Damaged pages can lead in circles."""
+_LARGEST_GAP = 1 << 40
+"""Numbers that are tried after the last row that can be read."""
+_ODD_LETTERS = re.compile('[?#%\udc80-\udcff]')
+"""What has a meaning in an address of SQLite, or none in UTF-8."""
+_PLAIN_TABLE = re.compile(
+    r'CREATE TABLE\s+"?\w+"?\s*\(\s*"?id"? INTEGER PRIMARY KEY'
+    r'(\s*,\s*"?\w+"? (INTEGER|TEXT|BLOB)( NOT NULL)?)+\s*\)'
+)
+"""What recorders write. A view, a generated column or a default make any number of bytes of a few,
+and so do numbers of topics that are not unique."""
 
 
 class SqliteStorage:
-    """One .db3 file. Raises BagError when not even its list of topics can be read."""
+    """One .db3 file, never written to. Raises BagError when its topics cannot be read."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self.problems, self.notes = path, list[str](), list[str]()
-        self._size = path.stat().st_size
-        self._copy: tempfile.TemporaryDirectory[str] | None = None
-        self._database = self._connect()
-        self._steps, self._repeats = 0, False
-        self._database.set_progress_handler(self._step, _STEPS_AT_ONCE)
+        self._path, self.problems, self._open = path, list[str](), ExitStack()
+        self._channels: dict[int, Channel] = {}
+        counts: Counter[str] = Counter()
         try:
-            self._by_id = self._read_topics_if_cut_off()
-        except (sqlite3.Error, ValueError, TypeError) as error:
+            source = self._completed()
+            self._room = source.stat().st_size
+            self._reader = self._open.enter_context(Reader(self._sound(source)))
+            for key, topic, kind, _, _, count, ext, _ in self._reader.connections:
+                assert isinstance(ext, ConnectionExtRosbag2)
+                channel = make_channel(
+                    topic, kind, ext.serialization_format, ext.offered_qos_profiles
+                )
+                self._channels[key] = channel
+                counts[channel.topic] += count
+        except Exception as error:  # a parser of foreign bytes fails in many ways
             self.close()
-            raise BagError(f'{path}: no readable bag database ({one_line(error)})') from None
-        self.channels = list(self._by_id.values())
-        counts = self._or_damaged(self._read_counts, None)
-        self.counts: dict[str, int] = counts if counts is not None else self._count_reachable()
-        self.start_ns = self._or_damaged(self._read_start, 0)
-
-    def _connect(self) -> sqlite3.Connection:
-        """Open read-only. Unfinished transactions are completed in a copy, never in the bag."""
-        path = self._path
-        logs = [path.with_name(path.name + end) for end in ('-wal', '-journal')]
-        logs = [log for log in logs if log.is_file() and log.stat().st_size > 0]
-        if logs:
-            self._copy = tempfile.TemporaryDirectory(prefix='bag-')
-            path = Path(self._copy.name) / self._path.name
-            for file in (self._path, *logs):
-                target = path.with_name(file.name)
-                shutil.copyfile(file, target)
-            self._size = sum(file.stat().st_size for file in (self._path, *logs))
-            self.notes.append(f'{self._path.name}: was not closed; its {logs[0].name} is read too')
-        access = 'mode=rw' if logs else 'mode=ro&immutable=1'
-        uri = f'{path.absolute().as_uri()}?{access}'
-        return sqlite3.connect(uri, uri=True, check_same_thread=False)
-
-    def _step(self) -> bool:
-        """True, which ends the query, when it has taken more steps than the file can be worth."""
-        self._steps += _STEPS_AT_ONCE
-        return self._is_slow()
-
-    def _is_slow(self) -> bool:
-        return self._steps > _STEPS + _STEPS_PER_BYTE * self._size
-
-    def _query(self, text: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
-        self._steps = 0
-        return self._database.execute(text, values)
-
-    def _or_damaged(self, read: Callable[[], Any], otherwise: Any) -> Any:
-        try:
-            return read()
-        except (sqlite3.Error, ValueError, TypeError) as error:
-            self._damaged(error)
-            return otherwise
-
-    def _damaged(self, error: Exception) -> None:
-        text = f'{self._path.name}: damaged database ({one_line(error)}); intact pages are read'
-        add_problem(self.problems, text)
-
-    def _columns(self, table: str) -> set[str]:
-        """Columns of a table. Raises ValueError where its rows are not what the file holds.
-
-        A view, a generated column or a default makes any number of bytes of a few.
-        """
-        query = 'SELECT type, rootpage FROM sqlite_master WHERE name = ? COLLATE NOCASE'
-        for kind, page in self._query(query, (table,)):
-            if kind != 'table' or not page:
-                raise ValueError(f'{table} is a {one_line(kind)} without rows of its own')
-        columns = list(self._query(f'PRAGMA table_xinfo({table})'))
-        if any(hidden or default is not None for *_, default, _key, hidden in columns):
-            raise ValueError(f'{table} has columns that are not stored')
-        return {column[1] for column in columns}
-
-    def _read_topics_if_cut_off(self) -> dict[int, Channel]:
-        """The topics, even of a file that is shorter than its header states."""
-        try:
-            return self._read_topics()
-        except sqlite3.DatabaseError as error:
-            self._damaged(error)
-            # Makes SQLite use the real length of the file; the file is open for reading only.
-            self._database.execute('PRAGMA writable_schema=ON')
-            return self._read_topics()
-
-    def _read_topics(self) -> dict[int, Channel]:
-        columns = self._columns('topics')
-        if not columns or not self._columns('messages'):
-            raise ValueError('it has no tables of topics and messages')
-        qos = 'offered_qos_profiles' if 'offered_qos_profiles' in columns else "''"
-        rows = self._query(
-            f'SELECT id, name, type, serialization_format, {qos} FROM topics ORDER BY id '
-            f'LIMIT {MOST_TOPICS + 1}'
-        )
-        channels = {
-            int(key): make_channel(topic, kind, serial, qos)
-            for key, topic, kind, serial, qos in rows
-        }
-        if len(channels) > MOST_TOPICS:
-            raise ValueError(f'it has more than {MOST_TOPICS} topics')
-        return channels
-
-    def _read_counts(self) -> dict[str, int]:
-        counts = {channel.topic: 0 for channel in self.channels}
-        query = (
-            "SELECT topic_id, count(*), sum(iif(typeof(data) = 'blob', length(data), 0)) "
-            'FROM messages GROUP BY topic_id'
-        )
-        held = 0
-        for key, count, size in self._query(query):
-            held += size + count * _SMALLEST_ROW
-            if key in self._by_id:
-                counts[self._by_id[key].topic] += count
-        if held > self._size:
-            self._repeats = True  # pages that several others lead to: sorting would copy them
-            raise sqlite3.DatabaseError('its rows are more than the file holds')
-        return counts
-
-    def _count_reachable(self) -> dict[str, int]:
-        """Messages per topic, counted row by row."""
-        counts = {channel.topic: 0 for channel in self.channels}
-        last = self._last_row()
-        for row in self._rows(range(1, last + 1), 'topic_id'):
-            if row[0] in self._by_id:
-                counts[self._by_id[row[0]].topic] += 1
-        lost = last - sum(counts.values())
-        self.problems.append(f'{self._path.name}: {lost} of {last} rows are on damaged pages')
-        return counts
-
-    def _rows(self, ids: Iterable[int], columns: str) -> Iterator[tuple[Any, ...]]:
-        """The rows of the messages that are on intact pages."""
-        query = f'SELECT {columns} FROM messages NOT INDEXED WHERE id = ?'
-        self._steps = 0
-        for row in ids:
-            try:
-                found = self._database.execute(query, (row,)).fetchone()
-            except (sqlite3.Error, OverflowError):
-                if self._is_slow():
-                    return
-                continue
-            if found is not None:
-                yield found
-
-    def _read_start(self) -> int:
-        (start,) = self._query('SELECT min(timestamp) FROM messages').fetchone()
-        return int(start or 0)
-
-    def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
-        """Messages by reception; those on damaged pages are skipped."""
-        wanted = {key: channel for key, channel in self._by_id.items() if channel.topic in topics}
-        query = (
-            'SELECT topic_id, timestamp, data, id FROM messages '
-            f'WHERE topic_id IN ({",".join(map(str, wanted))}) AND timestamp >= {start_ns} '
-            "AND typeof(data) = 'blob' ORDER BY timestamp"
-        )
-        last: tuple[int, int] | None = None
-        read = 0
-        try:
-            for key, stamp, data, row in () if self._repeats else self._query(query):
-                if type(stamp) is int and type(data) is bytes:
-                    read += len(data) + _SMALLEST_ROW
-                    if read > self._size:
-                        raise sqlite3.DatabaseError('its rows are more than the file holds')
-                    self._steps = 0
-                    last = stamp, row
-                    yield wanted[key], stamp, data
-        except (sqlite3.Error, OverflowError) as error:
-            self._damaged(error)
-            yield from self._salvaged(wanted, start_ns, last)
-        if self._repeats:
-            yield from self._salvaged(wanted, start_ns, None)
-
-    def _salvaged(
-        self, wanted: dict[int, Channel], start_ns: int, last: tuple[int, int] | None
-    ) -> Iterator[Record]:
-        """The messages on intact pages, row by row, without those up to `last` (stamp, row)."""
-        rows = self._rows(range(1, self._last_row() + 1), 'topic_id, timestamp, data, id')
-        read = 0
-        for key, stamp, data, row in rows:
-            if key not in wanted or type(stamp) is not int or type(data) is not bytes:
-                continue
-            read += len(data) + _SMALLEST_ROW
-            if read > self._size:
-                return
-            if stamp >= start_ns and (last is None or (stamp, row) > last):
-                yield wanted[key], stamp, data
-
-    def _last_row(self) -> int:
-        """The number of the last row, limited by the size of the file."""
-        room = self._size // _SMALLEST_ROW
-        last = self._or_damaged(
-            lambda: self._query('SELECT max(id) FROM messages').fetchone()[0], room
-        )
-        return min(int(last or 0), room)
+            raise BagError(f'{path}: no readable bag database ({one_line(error)}); '
+                           'try `sqlite3 FILE .recover`') from None  # fmt: skip
+        self.channels, self.counts = list(self._channels.values()), dict(counts)
+        self.start_ns = self._reader.start_time
 
     def close(self) -> None:
-        """Release the file and its copy."""
-        self._database.close()
-        if self._copy is not None:
-            self._copy.cleanup()
+        """Release the file and its copies."""
+        self._open.close()
+
+    def messages(self, topics: Collection[str], start_ns: int) -> Iterator[Record]:
+        """Messages received at or after `start_ns`, by reception."""
+        channels, room = self._channels, self._room
+        wanted = [c for c in self._reader.connections if channels[c.id].topic in topics]
+        try:
+            messages = self._reader.messages(wanted, start_ns) if wanted else ()
+            for connection, stamp, data in messages:
+                room -= len(data)
+                if room < 0:
+                    raise ValueError('its rows are more than the file holds')
+                if type(data) is bytes:
+                    yield channels[connection.id], stamp, data
+        except Exception as error:  # as above
+            text = f'damaged database ({one_line(error)}); read up to the damage'
+            add_problem(self.problems, f'{self._path.name}: {text}')
+
+    def _copy_name(self) -> Path:
+        """A name in a folder that is removed when the file is closed."""
+        folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix='bag-'))
+        return Path(folder) / 'copy.db3'
+
+    def _completed(self) -> Path:
+        """The file, or a copy: with what is in the logs of a recorder that crashed, in whole pages.
+
+        Of a page that was cut off, SQLite would take the rest for zeros.
+        """
+        with self._path.open('rb') as file:
+            page = int.from_bytes(file.read(18)[16:], 'big')
+        size = _size(self._path)
+        whole = size - size % (page if page > 1 else 1 << 16)
+        ends = [end for end in ('-wal', '-journal') if _size(Path(f'{self._path}{end}'))]
+        if not ends and whole == size:
+            return self._path
+        copy = self._copy_name()
+        for end in ('', *ends):
+            shutil.copyfile(f'{self._path}{end}', f'{copy}{end}')
+        os.truncate(copy, whole)
+        if ends:
+            with closing(sqlite3.connect(copy)) as database:
+                database.execute('PRAGMA journal_mode=DELETE').fetchall()
+        return copy
+
+    def _sound(self, source: Path) -> Path:
+        """A path that rosbags can read, perhaps of a copy. Raises sqlite3.Error or ValueError."""
+        address = f'{source.absolute().as_uri()}?mode=ro&immutable=1'
+        with closing(sqlite3.connect(address, uri=True)) as database:
+            spent, most = itertools.count(), _STEPS + _STEPS_PER_BYTE * self._room
+            database.set_progress_handler(
+                lambda: next(spent) * _STEPS_AT_ONCE > most, _STEPS_AT_ONCE
+            )
+            reason = _damage(database)
+            if not reason and source.suffix == '.db3' and not _ODD_LETTERS.search(str(source)):
+                return source
+            copy = self._copy_name()
+            if not reason:  # but a name that is no part of an address
+                copy.symlink_to(source.absolute())
+                return copy
+            # Makes SQLite use the real length of the file; the file is open for reading only.
+            database.execute('PRAGMA writable_schema=ON')
+            _require_plain_tables(database)
+            _copy_rows(database, copy, self._room)
+        text = f'{self._path.name}: damaged database ({reason}); intact pages are read'
+        self.problems.append(f'{text}; `sqlite3 FILE .recover` repairs it')
+        return copy
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, 0 where there is none."""
+    return path.stat().st_size if path.is_file() else 0
+
+
+def _damage(database: sqlite3.Connection) -> str:
+    """What is wrong with the pages of a database; '' for nothing."""
+    try:
+        _require_plain_tables(database)
+        sound = database.execute('PRAGMA quick_check(1)').fetchall() == [('ok',)]
+        return '' if sound else 'damaged pages'
+    except sqlite3.DatabaseError as error:
+        return one_line(error)
+
+
+def _require_plain_tables(database: sqlite3.Connection) -> None:
+    """Raise ValueError where rows are other than a recorder writes them."""
+    query = 'SELECT sql FROM sqlite_master WHERE name = ? COLLATE NOCASE'
+    for table in ('topics', 'messages'):
+        found = database.execute(query, (table,)).fetchone()
+        if found is None or not _PLAIN_TABLE.fullmatch(str(found[0])):
+            raise ValueError(f'it has no table of {table} as recorders write it')
+    topics = database.execute('SELECT * FROM topics').fetchmany(MOST_TOPICS + 1)
+    if len(topics) > MOST_TOPICS:
+        raise ValueError(f'it has more than {MOST_TOPICS} topics')
+    if sum(len(str(value)) for row in topics for value in row) > MOST_QOS:
+        raise ValueError(f'its topics have more than {MOST_QOS} characters')
+
+
+def _copy_rows(database: sqlite3.Connection, target: Path, room: int) -> None:
+    """Copy the rows on intact pages, topics without QoS. Raises sqlite3.Error without topics."""
+    topics = database.execute('SELECT id, name, type, serialization_format FROM topics').fetchall()
+    with closing(sqlite3.connect(target)) as copy, copy:
+        copy.execute('CREATE TABLE topics(id, name, type, serialization_format)')
+        copy.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)')
+        copy.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
+        copy.executemany('INSERT INTO topics VALUES(?, ?, ?, ?)', topics)
+        copy.executemany('INSERT INTO messages VALUES(?, ?, ?, ?)', _rows(database, room))
+
+
+def _rows(database: sqlite3.Connection, room: int) -> Iterator[tuple[Any, ...]]:
+    """The messages on intact pages, by number; after damage with gaps that double."""
+    query = (
+        'SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED '
+        "WHERE id >= ? AND typeof(data) = 'blob' AND typeof(timestamp) = 'integer' ORDER BY id"
+    )
+    at, gap = 0, 1
+    while gap < _LARGEST_GAP:
+        try:
+            for row in database.execute(query, (at,)):
+                room -= len(row[3])
+                if row[0] < at or room < 0:  # pages that several others lead to
+                    return
+                yield row
+                at, gap = row[0] + 1, 1
+            return
+        except sqlite3.DatabaseError:
+            at, gap = at + gap, 2 * gap

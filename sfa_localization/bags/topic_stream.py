@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sfa_localization.data.errors import BagError, LocalizationError
+from sfa_localization.data.errors import BagError
 from sfa_localization.data.messages import NO_STAMP
 from sfa_localization.data.rejections import RejectionCounter
 from sfa_localization.data.run import Count
@@ -56,6 +57,13 @@ class Item(NamedTuple):
     receive_ns: int
     value: Any
 
+    def continues(self, before: Item | None) -> bool:
+        """Whether stamps and receptions differ by about the same time from one before."""
+        if before is None:
+            return False
+        moved, received = self.stamp_ns - before.stamp_ns, self.receive_ns - before.receive_ns
+        return -CLOCK_JUMP_NS <= moved - received <= CLOCK_JUMP_NS
+
 
 class StampFilter:
     """Passes messages in strictly increasing order of stamp, and detects a clock that was set.
@@ -74,28 +82,23 @@ class StampFilter:
 
     def push(self, item: Item) -> list[Item]:
         """Messages that can be used now."""
-        last = self._last
-        if last is not None and self._suspect is None and item.stamp_ns > last.stamp_ns:
-            moved, received = item.stamp_ns - last.stamp_ns, item.receive_ns - last.receive_ns
-            if -CLOCK_JUMP_NS <= moved - received <= CLOCK_JUMP_NS:
-                self._last = item  # the usual case, kept short because it runs per message
-                return [item]
-        return self._judge(item)
-
-    def _judge(self, item: Item) -> list[Item]:
         if item.stamp_ns <= 0:
             self._tally.skip(NO_STAMP)
             return []
         suspect, self._suspect = self._suspect, None
-        if _continues(self._last, item):
+        if item.continues(self._last):
             self._drop(suspect)
             return self._in_order(item)
-        if _continues(self._behind, item) and not self._ahead(item):
+        if item.continues(self._behind) and not self._ahead(item):
             self._behind = item
             self._tally.skip('clock was set back')
             return []
-        if suspect is not None and _continues(suspect, item):
-            return self._after_clock_was_set(suspect, item)
+        if suspect is not None and item.continues(suspect):
+            if self._ahead(suspect):
+                return [*self._in_order(suspect), *self._in_order(item)]
+            self._behind = item
+            self._tally.skip('clock was set back', 2)
+            return []
         self._drop(suspect)
         self._suspect = item
         return []
@@ -115,13 +118,6 @@ class StampFilter:
         if suspect is not None:
             self._tally.skip('stamp jumps')
 
-    def _after_clock_was_set(self, suspect: Item, item: Item) -> list[Item]:
-        if self._ahead(suspect):
-            return [*self._in_order(suspect), *self._in_order(item)]
-        self._behind = item
-        self._tally.skip('clock was set back', 2)
-        return []
-
     def _in_order(self, item: Item) -> list[Item]:
         if self._ahead(item):
             self._last = item
@@ -131,45 +127,22 @@ class StampFilter:
         return []
 
 
-def _continues(before: Item | None, after: Item) -> bool:
-    """Whether stamps and receptions differ by about the same time between two messages."""
-    if before is None:
-        return False
-    moved, received = after.stamp_ns - before.stamp_ns, after.receive_ns - before.receive_ns
-    return abs(moved - received) <= CLOCK_JUMP_NS
-
-
+@dataclass(eq=False)
 class Stream:
     """One topic being read.
 
     `select` picks the part of a message that matters, or None, and `convert` turns that part into
-    a value. Messages of an opaque stream are not decoded: their value is None.
+    a value. Messages of an opaque stream are not decoded: their value is None. Without a usable
+    message a `required` one is an error.
     """
 
-    def __init__(
-        self,
-        topic: str,
-        select: Callable[[Any], Any],
-        convert: Callable[[Any], Any],
-        tally: Tally,
-    ) -> None:
-        self.topic, self.select, self.tally = topic, select, tally
-        self.received, self.required, self.opaque = 0, True, False
-        self._convert, self._stamps = convert, StampFilter(tally)
+    topic: str
+    select: Callable[[Any], Any]
+    convert: Callable[[Any], Any]
+    tally: Tally
+    received: int = 0
+    required: bool = True
+    opaque: bool = False
 
-    def push(self, stamp_ns: int, receive_ns: int, part: Any) -> list[tuple[int, Any]]:
-        """Stamps and values from this message and from one that was held back."""
-        try:
-            item = Item(stamp_ns, receive_ns, self._convert(part))
-        except LocalizationError as error:
-            self.tally.skip(str(error))
-            return []
-        return self._used(self._stamps.push(item))
-
-    def flush(self) -> list[tuple[int, Any]]:
-        """The rest, when the topic has ended."""
-        return self._used(self._stamps.flush())
-
-    def _used(self, items: list[Item]) -> list[tuple[int, Any]]:
-        self.tally.use(len(items))
-        return [(item.stamp_ns, item.value) for item in items]
+    def __post_init__(self) -> None:
+        self.stamps = StampFilter(self.tally)

@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import (
     Connection,
+    Nodetype,
     Qos,
     QosDurability,
     QosHistory,
@@ -23,6 +23,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores
+from rosbags.typesys.store import Typestore
 
 from sfa_localization.bags.decoding import typestore
 from sfa_localization.camera.encodings import encode_jpeg, encode_png
@@ -109,28 +110,16 @@ class BagWriter:
         quality: int = 90,
     ) -> None:
         """Write a BGR image (H, W, 3) as Image, or as CompressedImage ('jpeg' or 'png')."""
-        header = self._header(stamp_ns, frame_id)
         if compressed is not None:
-            data = _encoded(image, compressed, quality)
-            message = self._make(
-                'sensor_msgs/msg/CompressedImage', header=header, format=compressed, data=data
-            )
+            message = self._stamped('sensor_msgs/msg/CompressedImage', stamp_ns, frame_id)
+            data = encode_jpeg(image, quality) if compressed == 'jpeg' else encode_png(image)
+            message.format, message.data = compressed, np.frombuffer(data, np.uint8)
         else:
-            message = self._raw_image(header, image)
+            message = self._stamped('sensor_msgs/msg/Image', stamp_ns, frame_id)
+            message.height, message.width = image.shape[:2]
+            message.encoding, message.step = 'bgr8', 3 * message.width
+            message.data = np.ascontiguousarray(image, np.uint8).reshape(-1)
         self.message(topic, stamp_ns, message)
-
-    def _raw_image(self, header: Any, image: Image) -> Any:
-        height, width = image.shape[:2]
-        return self._make(
-            'sensor_msgs/msg/Image',
-            header=header,
-            height=height,
-            width=width,
-            encoding='bgr8',
-            is_bigendian=0,
-            step=3 * width,
-            data=np.ascontiguousarray(image, np.uint8).reshape(-1),
-        )
 
     def odometry(
         self,
@@ -143,47 +132,28 @@ class BagWriter:
         child_frame_id: str = 'base_link',
     ) -> None:
         """Write odometry: `pose` x m, y m, yaw rad; `twist` v m/s, omega rad/s; their variances."""
-        covariance = _diagonal({0: twist_variance[0], 35: twist_variance[1]}, 36)
-        velocity = self._twist(float(twist[0]), float(twist[1]))
-        message = self._make(
-            'nav_msgs/msg/Odometry',
-            header=self._header(stamp_ns, frame_id),
-            child_frame_id=child_frame_id,
-            pose=self._make(
-                'geometry_msgs/msg/PoseWithCovariance',
-                pose=self._pose(pose),
-                covariance=np.zeros(36),
-            ),
-            twist=self._make(
-                'geometry_msgs/msg/TwistWithCovariance', twist=velocity, covariance=covariance
-            ),
-        )
+        message = self._stamped('nav_msgs/msg/Odometry', stamp_ns, frame_id)
+        message.child_frame_id = child_frame_id
+        _place(message.pose.pose, pose)
+        message.twist.twist.linear.x, message.twist.twist.angular.z = map(float, twist)
+        message.twist.covariance[[0, 35]] = twist_variance
         self.message(topic, stamp_ns, message)
 
     def imu(
         self, topic: str, stamp_ns: int, omega: float, variance: float, frame_id: str = 'base_link'
     ) -> None:
         """Write a gyroscope's yaw rate (rad/s); orientation and acceleration are marked unknown."""
-        unknown = _diagonal({0: -1.0}, 9)
-        message = self._make(
-            'sensor_msgs/msg/Imu',
-            header=self._header(stamp_ns, frame_id),
-            orientation=self._quaternion(0.0),
-            orientation_covariance=unknown,
-            angular_velocity=self._vector(0.0, 0.0, float(omega)),
-            angular_velocity_covariance=_diagonal({8: variance}, 9),
-            linear_acceleration=self._vector(0.0, 0.0, 0.0),
-            linear_acceleration_covariance=unknown,
-        )
+        message = self._stamped('sensor_msgs/msg/Imu', stamp_ns, frame_id)
+        message.orientation.w = 1.0
+        message.angular_velocity.z = float(omega)
+        message.angular_velocity_covariance[8] = variance
+        message.orientation_covariance[0] = message.linear_acceleration_covariance[0] = -1.0
         self.message(topic, stamp_ns, message)
 
     def pose(self, topic: str, stamp_ns: int, pose: Array, frame_id: str = 'world') -> None:
         """Write a PoseStamped: `pose` x m, y m, yaw rad."""
-        message = self._make(
-            'geometry_msgs/msg/PoseStamped',
-            header=self._header(stamp_ns, frame_id),
-            pose=self._pose(pose),
-        )
+        message = self._stamped('geometry_msgs/msg/PoseStamped', stamp_ns, frame_id)
+        _place(message.pose, pose)
         self.message(topic, stamp_ns, message)
 
     def message(self, topic: str, stamp_ns: int, message: Any) -> None:
@@ -203,29 +173,26 @@ class BagWriter:
         except Exception as error:
             raise self._unwritable(error) from None
 
-    def _make(self, kind: str, **fields: Any) -> Any:
-        return self._types.types[kind](**fields)
+    def _stamped(self, kind: str, stamp_ns: int, frame_id: str) -> Any:
+        """A message of zeros with a header."""
+        message = blank(self._types, kind)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(int(stamp_ns), 10**9)
+        message.header.frame_id = frame_id
+        return message
 
-    def _header(self, stamp_ns: int, frame_id: str) -> Any:
-        sec, nanosec = divmod(int(stamp_ns), 10**9)
-        stamp = self._make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
-        return self._make('std_msgs/msg/Header', stamp=stamp, frame_id=frame_id)
 
-    def _pose(self, pose: Array) -> Any:
-        position = self._make('geometry_msgs/msg/Point', x=float(pose[0]), y=float(pose[1]), z=0.0)
-        orientation = self._quaternion(float(pose[2]))
-        return self._make('geometry_msgs/msg/Pose', position=position, orientation=orientation)
+def blank(types: Typestore, kind: str) -> Any:
+    """A message of zeros, empty texts and empty lists."""
 
-    def _quaternion(self, yaw_rad: float) -> Any:
-        z, w = float(np.sin(yaw_rad / 2)), float(np.cos(yaw_rad / 2))
-        return self._make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=z, w=w)
+    def value(node: Nodetype, detail: Any) -> Any:
+        if node == Nodetype.NAME:
+            return blank(types, detail)
+        if node == Nodetype.BASE:
+            return {'string': '', 'float64': 0.0}.get(detail[0], 0)
+        (inner, base), length = detail
+        return np.zeros(length, base[0]) if inner == Nodetype.BASE else []
 
-    def _vector(self, x: float, y: float, z: float) -> Any:
-        return self._make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)
-
-    def _twist(self, v: float, omega: float) -> Any:
-        linear, angular = self._vector(v, 0.0, 0.0), self._vector(0.0, 0.0, omega)
-        return self._make('geometry_msgs/msg/Twist', linear=linear, angular=angular)
+    return types.types[kind](**{name: value(*field) for name, field in types.fielddefs[kind][1]})
 
 
 def _open_writer(path: Path, storage: str) -> Writer:
@@ -237,13 +204,8 @@ def _open_writer(path: Path, storage: str) -> Writer:
     return writer
 
 
-def _encoded(image: Image, kind: str, quality: int) -> NDArray[np.uint8]:
-    """The bytes (N,) of an image file."""
-    data = encode_jpeg(image, quality) if kind == 'jpeg' else encode_png(image)
-    return np.frombuffer(data, np.uint8)
-
-
-def _diagonal(entries: dict[int, float], size: int) -> Array:
-    matrix = np.zeros(size)
-    matrix[list(entries)] = list(entries.values())
-    return matrix
+def _place(pose: Any, values: Array) -> None:
+    """Fill in a Pose from x m, y m, yaw rad."""
+    x, y, yaw_rad = map(float, values)
+    pose.position.x, pose.position.y = x, y
+    pose.orientation.z, pose.orientation.w = float(np.sin(yaw_rad / 2)), float(np.cos(yaw_rad / 2))

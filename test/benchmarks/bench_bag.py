@@ -3,7 +3,7 @@
 """Reading bags against bare rosbags: speed, and what is read of damaged bags.
 
 Each ratio compares two ways through the same bag, measured in turns, in one run: `python
-bench_bag.py`. The counts of `salvage` are the reason why bags/mcap.py and bags/sqlite.py exist.
+bench_bag.py`. The counts of `salvage` are the reason why damaged files are not left to rosbags.
 """
 
 from __future__ import annotations
