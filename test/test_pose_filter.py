@@ -249,6 +249,20 @@ def test_it_beats_images_and_odometry():
     assert np.mean(errors) < 0.7 * alone.mean() and errors[-1] < drive.error(blind, -1)[0]
 
 
+def test_stretches_of_images_that_lie_off_pull_less():
+    """Errors of images have heavy tails; with all their weight they would make 0.064 m."""
+    errors = []
+    for seed in range(4):
+        drive, rng = (
+            Drive(seconds=60, position_std=0.06, claimed_m=0.3, seed=seed),
+            np.random.default_rng(seed),
+        )
+        for start in rng.choice(len(drive.seen) - 10, 12, replace=False):
+            drive.seen[start : start + 10, :2] += rng.normal(0, 0.4, 2)
+        errors += [error for _, _, error, _ in drive.feed(PoseFilter(), True)]
+    assert np.mean(errors) < 0.05
+
+
 @pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6), (0.9, 1.0)])
 def test_another_models_errors_may_correlate_otherwise(share, length_m):
     fused, drive = known(), Drive(seconds=20, position_std=0.05, yaw_std=0.02)
@@ -293,8 +307,7 @@ def test_wrong_images_that_contradict_each_other_are_never_believed(heading):
 
 @either
 @pytest.mark.parametrize('outage', [5.0, 30.0])
-def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted(heading, outage):
-    """They may move the estimate where they agree; driving on has to confirm it."""
+def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(heading, outage):
     drive, fused = Drive(seconds=60, **NOISY), known()
     drive.feed(fused, heading, stop=15)
     first = int(np.searchsorted(drive.pictures, (15 + outage) * 50))
@@ -302,10 +315,9 @@ def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted(heading, outag
     for event in drive.events():
         if seconds_of(event) >= 15 and (event[1] == 0 or event[2] >= first):
             drive.give(fused, event, heading)
-            if event[1]:
-                error, _ = drive.error(fused, drive.pictures[event[2]])
-                assert fused.status.level is not Level.LOCALISED or error < 1.0
-    assert error < 0.5 and fused.status.level is Level.LOCALISED
+            if event[1] and event[2] < first + 5:
+                assert fused.status.level is not Level.LOCALISED
+    assert drive.error(fused, -1)[0] < 0.5 and fused.status.level is Level.LOCALISED
 
 
 # Start and recovery.
@@ -367,8 +379,10 @@ def test_while_lost_the_state_shows_it_and_the_covariance_covers_the_error():
 
 @pytest.mark.parametrize('every', [10, 100])
 @pytest.mark.parametrize('std', [0.35, 0.45])
-def test_a_robot_pushed_where_images_are_weak_is_never_localised_and_wrong(every, std):
-    """They show the place well, but claim little: the estimate does not follow, nor reject them."""
+def test_a_robot_pushed_where_images_are_weak_is_never_localised_and_far_off(every, std):
+    """They show the place well, but claim little: the estimate does not follow, nor reject them.
+    Beyond a meter by more than an image errs, each of them shows it.
+    """
     twists = winding(90.0, speed=0.6)
     twists[1500:] = [0.1, 0.0]
     drive = Drive(twists=twists, every=every, position_std=0.1, yaw_std=0.02, share=0.7)
@@ -379,7 +393,7 @@ def test_a_robot_pushed_where_images_are_weak_is_never_localised_and_wrong(every
         drive.give(fused, event, True)
         if event[1]:
             error, _ = drive.error(fused, drive.pictures[event[2]])
-            assert fused.status.level is not Level.LOCALISED or error < 1.0
+            assert fused.status.level is not Level.LOCALISED or error < 1.0 + 3 * 0.1
 
 
 # Poses from outside, and settings.
