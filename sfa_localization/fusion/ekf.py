@@ -15,7 +15,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
@@ -29,7 +29,7 @@ from sfa_localization.fusion.belief import (
 )
 from sfa_localization.fusion.inputs import lower_root, symmetric
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
-from sfa_localization.fusion.odometry import COAST_S, interval
+from sfa_localization.fusion.odometry import COAST_S, Interval, interval
 from sfa_localization.fusion.relocation import (
     FEW_IMAGES,
     Relocation,
@@ -109,7 +109,8 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
 def _residual(z: Array, predicted: Array) -> Array:
     """Innovation, its angle wrapped."""
     difference = z - predicted
-    difference[YAW:] = wrap_angle(difference[YAW:])
+    if len(difference) == 3:
+        difference[YAW] = wrap(float(difference[YAW]))
     return difference
 
 
@@ -170,8 +171,7 @@ class Ekf:
         step = motion.drive(belief.mean, twist, dt, noise, held.now)
         if held.unknown_s > 0:
             motion.add_unknown_motion(step.noise, twist, min(dt, held.unknown_s))
-        event = event._replace(twist=held.now or event.twist)
-        return self._moved(belief, event.stamp_ns, step, event, held.omega)
+        return self._moved(belief, event.stamp_ns, step, event, held)
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
         """The belief at a later stamp without new odometry: at the last speed, then unknown."""
@@ -195,7 +195,7 @@ class Ekf:
         stamp_ns: int,
         step: Step,
         event: OdometryEvent | None = None,
-        omega: float = 0.0,
+        held: Interval | None = None,
     ) -> Belief:
         """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
         before_x, before_y, before_yaw = belief.mean[:3].tolist()
@@ -214,14 +214,14 @@ class Ekf:
             located,
             reckoned,
             belief.traveled_m + math.hypot(dx, dy),
-            event.twist if event else belief.twist,
+            (held and held.now) or (event.twist if event else belief.twist),
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
             event.pose if event else belief.odometry_pose,
             _added(belief, step),
             belief.turns,
             belief.track.driven(stamp_ns, reckoned),
-            omega if event else belief.omega,
+            held.omega if held else belief.omega,
         )
 
     # Update.
@@ -230,16 +230,14 @@ class Ekf:
         """The belief, predicted to the event's stamp before, after a measurement."""
         image = _image(belief, event)
         belief = self._fused(self._turns_weighed(belief, event), event, image)
-        update, track = (
-            belief.memory.update,
-            belief.track.driven(event.stamp_ns, image.dead_reckoned),
-        )
-        if update and update.reason == ELSEWHERE:
+        update, track = belief.memory.update, belief.track
+        assert update is not None
+        if update.reason == ELSEWHERE:
             track = track.placed(event.stamp_ns, belief.traveled_m)
-        belief = belief._replace(track=track.seen(image))
-        if update and update.reason in STARTS:
-            return belief._replace(turns=self._turns_begun(belief))
-        return belief
+        track = track.driven(event.stamp_ns, image.dead_reckoned).seen(image)
+        if update.reason in STARTS:
+            return belief._replace(track=track, turns=self._turns_begun(belief))
+        return belief if track is belief.track else belief._replace(track=track)
 
     def _turns_begun(self, belief: Belief) -> TurnNoise:
         """What is known about the noise of turns, from another pose on."""
@@ -262,8 +260,6 @@ class Ekf:
         return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
 
     def _fused(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
-        period_s = _period_s(belief.memory, event.stamp_ns)
-        belief = belief._replace(memory=belief.memory._replace(period_s=period_s))
         if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
             return self._gated(belief, event, image)
         images = remembered(belief.memory.images, image)
@@ -288,25 +284,33 @@ class Ekf:
         if outlying > 1 and self._alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
-        memory = Memory(
-            support=belief.memory.support + 1,
-            images=remembered(belief.memory.images, image._replace(accepted=True)),
-            update=update,
-            # At most 1: an image that claims too little is not believed more than it claims.
-            scatter=min(max(_nearer(scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0),
-            period_s=belief.memory.period_s,
-        )
-        memory = self._with_accepted(memory, belief, event)
+        # At most 1: an image that claims too little is not believed more than it claims.
+        scatter = min(max(_nearer(scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0)
+        images = remembered(belief.memory.images, image.fused())
+        memory = self._accepted(belief, event, belief.memory.support + 1, images, update, scatter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
-    def _with_accepted(self, memory: Memory, belief: Belief, event: MeasurementEvent) -> Memory:
-        """With an image that was accepted; what makes weak ones weak is the same for all."""
-        std_m = motion.largest_std(event.covariance)
+    def _accepted(
+        self,
+        belief: Belief,
+        event: MeasurementEvent,
+        support: int,
+        images: tuple[Image, ...],
+        update: Update,
+        scatter: float,
+    ) -> Memory:
+        """The memory after an accepted image; what makes weak ones weak is the same for all."""
+        std_m, before = motion.largest_std(event.covariance), belief.memory
         weak = self._alike and std_m > self._config.degraded_std
-        return memory._replace(
+        return Memory(
+            support=support,
             accepted_ns=event.stamp_ns,
             accepted_m=belief.traveled_m,
-            precise_ns=belief.memory.precise_ns if weak else event.stamp_ns,
+            precise_ns=before.precise_ns if weak else event.stamp_ns,
+            images=images,
+            update=update,
+            scatter=scatter,
+            period_s=_period_s(before, event.stamp_ns),
         )
 
     # Start, and start anew.
@@ -339,6 +343,7 @@ class Ekf:
             gate_excess=update.d2 / update.threshold,
             images=images,
             update=update,
+            period_s=_period_s(memory, event.stamp_ns),
         )
         belief = belief._replace(memory=memory)
         return self._widened(belief) if outside and memory.rejected >= FEW_IMAGES else belief
@@ -349,10 +354,9 @@ class Ekf:
         """At the pose that several images show, or at the event's own."""
         pose, covariance = found[:2] if found else event[1:3]
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
-        scatter, period_s = belief.memory.scatter, belief.memory.period_s
-        memory = Memory(support=1, update=update, scatter=scatter, period_s=period_s)
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
-        return placed._replace(memory=self._with_accepted(memory, belief, event))
+        memory = self._accepted(belief, event, 1, (), update, belief.memory.scatter)
+        return placed._replace(memory=memory)
 
     def _widened(self, belief: Belief) -> Belief:
         """In doubt, the pose becomes less certain with every new place that contradicts it."""

@@ -216,7 +216,7 @@ def drive(
         step.jacobian[V, SCALE] += now.v - twist.v
         step.jacobian[V, LOSS] += slowed - by_loss
     white = (gain * np.array([twist.v_variance, twist.omega_variance])).dot(gain.T)
-    return step._replace(noise=white + step.noise)
+    return Step(step.mean, step.jacobian, white + step.noise)
 
 
 def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:

@@ -91,9 +91,11 @@ def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
     """The images with one more, without what lies far behind; of too many, the older half is
     thinned out.
     """
+    first, half = 0, CAPACITY // 2
     reach_m = max(3 * AGREEING_M, REMEMBERED_STDS * math.sqrt(newest.variance))
-    kept = (*(old for old in images if newest.traveled_m - old.traveled_m <= reach_m), newest)
-    half = CAPACITY // 2
+    while first < len(images) and newest.traveled_m - images[first].traveled_m > reach_m:
+        first += 1
+    kept = (*images[first:], newest)
     return kept if len(kept) <= CAPACITY else kept[:half:2] + kept[half:]
 
 
