@@ -161,6 +161,8 @@ class Ekf:
                 odometry_pose=event.pose,
             )
         held = interval(belief, event)
+        if held.now is None:
+            belief = belief._replace(track=belief.track.interrupted())
         if not held.bridged:  # most of so long a silence was spent somehow else
             belief = self.coast(belief, event.stamp_ns)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9

@@ -91,6 +91,10 @@ class Track(NamedTuple):
             first += 1
         return self._replace(images=(*images[first:], image))
 
+    def interrupted(self) -> Track:
+        """After a silence of the odometry: the path begins anew."""
+        return Track((), (), self.placings, self.since_m)
+
     def trusted(self) -> Track:
         """After the pose was set from outside, by somebody who knows."""
         return Track(self.knots, since_m=-math.inf)
