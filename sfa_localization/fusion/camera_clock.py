@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
 LONGEST_S = 2.5

@@ -145,8 +145,7 @@ class Ekf:
         belief = self.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-            memory = Memory(accepted_m=belief.traveled_m)
-            return placed._replace(memory=memory, track=belief.track.trusted())
+            return placed._replace(memory=Memory(), track=belief.track.trusted())
         return self._measured(belief, event)
 
     # Predict.
@@ -262,25 +261,32 @@ class Ekf:
         return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
 
     def _fused(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+        """Fuse, or start from one image with heading or the path along which several lie."""
         if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
             return self._gated(belief, event, image)
-        images = remembered(belief.memory.images, image)
-        started = self._started(belief, event, images)
-        if started is not None:
-            return started
-        reason = 'heading unknown yet' if event.value.size == 2 else 'too uncertain to start from'
+        images, config = remembered(belief.memory.images, image), self._config
+        if event.value.size == 3:
+            x, y, yaw = event.covariance.diagonal().tolist()
+            if max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2:
+                return self._restarted(belief, event, None, 'started')
+            reason = 'too uncertain to start from'
+        else:
+            found = relocate(images, self._correlation.distance_m)
+            if found is not None and found.shows_heading(len(images)):
+                return self._restarted(belief, event, found, 'started')
+            reason = 'heading unknown yet'
         update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
         return belief._replace(memory=belief.memory._replace(images=images, update=update))
 
     def _gated(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
-        """Accept what lies inside the gate, after an outage only when others confirm it."""
+        """Accept what lies inside the gate; what is outlying within loses weight."""
         mean, covariance, d2 = self._kalman.corrected(belief, event)
-        size, kalman = event.value.size, self._kalman
-        far = _lies_far(belief, event)
-        update = Update(event.stamp_ns, True, d2, _GATE[size], 'accepted', kalman.y, kalman.S, far)
-        if d2 > _GATE[size]:
-            rejected = update._replace(accepted=False, reason='outside the gate')
-            return self._rejected(belief, event, image, rejected)
+        size, kalman, inside = event.value.size, self._kalman, d2 <= _GATE[event.value.size]
+        reason, far = 'accepted' if inside else 'outside the gate', _lies_far(belief, event)
+        shown = kalman.y, kalman.S, far
+        update = Update(event.stamp_ns, inside, d2, _GATE[size], reason, *shown)
+        if not inside:
+            return self._rejected(belief, event, image, update)
         scatter = belief.memory.scatter
         outlying = d2 / (scatter * _OUTLYING[size])
         if outlying > 1 and self._alike:
@@ -307,7 +313,6 @@ class Ekf:
         return Memory(
             support=support,
             accepted_ns=event.stamp_ns,
-            accepted_m=belief.traveled_m,
             precise_ns=before.precise_ns if weak else event.stamp_ns,
             images=images,
             update=update,
@@ -317,38 +322,23 @@ class Ekf:
 
     # Start, and start anew.
 
-    def _started(
-        self, belief: Belief, event: MeasurementEvent, images: tuple[Image, ...]
-    ) -> Belief | None:
-        """Start from one image with heading, or from the path along which several lie; None yet."""
-        if event.value.size == 3:
-            x, y, yaw = event.covariance.diagonal().tolist()
-            config = self._config
-            lost = max(x, y) > config.lost_std**2 or yaw > config.lost_yaw_std**2
-            return None if lost else self._restarted(belief, event, None, 'started')
-        found = relocate(images, self._correlation.distance_m)
-        if found is None or not found.shows_heading(len(images)):
-            return None
-        return self._restarted(belief, event, found, 'started')
-
     def _rejected(
         self, belief: Belief, event: MeasurementEvent, image: Image, update: Update
     ) -> Belief:
         """After a rejected image: restarted where those rejected outweigh the estimate."""
-        memory, outside = belief.memory, update.d2 > update.threshold
+        memory = belief.memory
         images = remembered(memory.images, image)
         found = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
         if found is not None and found.outweighs(belief):
             return self._restarted(belief, event, found, ELSEWHERE)
         memory = memory._replace(
-            rejected=memory.rejected + int(outside),
-            gate_excess=update.d2 / update.threshold,
+            rejected=memory.rejected + 1,
             images=images,
             update=update,
             period_s=_period_s(memory, event.stamp_ns),
         )
         belief = belief._replace(memory=memory)
-        return self._widened(belief) if outside and memory.rejected >= FEW_IMAGES else belief
+        return self._widened(belief) if memory.rejected >= FEW_IMAGES else belief
 
     def _restarted(
         self, belief: Belief, event: MeasurementEvent, found: Relocation | None, reason: str
