@@ -54,6 +54,7 @@ _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _TINY = 1e-9  # part of an image's weight that is left, so that some path fits best
 _STEPS = 2  # of reweighting, from where the fit hardly changes
+_LEVER, _TURNED, _SCALE = 1, 2, 3  # kinds of rows
 _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 _BEFORE = 8  # images before it was placed anew, from which on the robot may have been elsewhere
 
@@ -113,7 +114,9 @@ def health_of(track: Track) -> Health:
     place = float(odds @ [item.off_m**2 for item in found]) / 2
     turned = float(odds @ [item.off_rad**2 for item in found])
     well, confirmed_m = 1.0 - float(odds.sum()), min(confirmed_m, window.unbroken_m)
-    return Health(well, worst.name, worst.size, (place, place, turned), confirmed_m, needed_m)
+    return Health(
+        well, worst.name, complex(worst.size), (place, place, turned), confirmed_m, needed_m
+    )
 
 
 def _confirmed(track: Track) -> tuple[float, float]:
@@ -171,23 +174,26 @@ class _Window:
     def hypotheses(self) -> list[_Hypothesis]:
         """All, with log odds up to a constant."""
         rows, yaws, delays = self._paths()
-        row, yaw = rows[:1], yaws[:1]
-        off_m, off_rad = np.abs(rows[:, -1] - row[:, -1]), np.abs(yaws[:, -1] - yaw[:, -1])
-        late = zip(self._fitted(rows, yaws)[0], delays, off_m, off_rad, strict=True)
-        prior = math.log(PRIOR['late'] / len(DELAYS))
-        found = [_Hypothesis('late', prior + log, complex(size), *off) for log, size, *off in late]
-        well = math.log(1 - sum(PRIOR.values())) - prior
-        found[0] = _Hypothesis('as it is', found[0].log_odds + well)
-        for name in ('lever', 'turned', 'scale'):
-            (log,), (size,) = self._fitted(row, yaw, name)
-            off = abs(size - 1) * AGREEING_M if name == 'scale' else abs(size)
-            offs = (0.0, off) if name == 'turned' else (off, 0.0)
-            found.append(_Hypothesis(name, math.log(PRIOR[name]) + log, complex(size), *offs))
+        kinds = np.append(np.zeros(len(rows)), [_LEVER, _TURNED, _SCALE])
+        rows, yaws = (np.concatenate([x, np.repeat(x[:1], 3, 0)]) for x in (rows, yaws))
+        logs, lever, turned, scale = self._fitted(rows, yaws, kinds)
+        off_m, off_rad = np.abs(rows[:-3, -1] - rows[0, -1]), np.abs(yaws[:-3, -1] - yaws[0, -1])
+        of_delays = zip(logs[:-3], delays, off_m, off_rad, strict=True)
+        late = [_Hypothesis('late', *each) for each in of_delays]
         nothing = self._power * len(self._places) * math.log(_ANYWHERE)
-        found.append(
-            _Hypothesis('unrelated', math.log(PRIOR['unrelated']) + nothing, 0j, AGREEING_M)
-        )
-        return found + self._carried(row, yaw)
+        found = [
+            late[0]._replace(name='as it is'),
+            _Hypothesis('lever', logs[-3], lever[-3], abs(lever[-3])),
+            _Hypothesis('turned', logs[-2], turned[-2], 0.0, abs(turned[-2])),
+            _Hypothesis('scale', logs[-1], scale[-1], abs(scale[-1] - 1) * AGREEING_M),
+            _Hypothesis('unrelated', nothing, 0j, AGREEING_M),
+            *self._carried(rows[:1], yaws[:1]),
+            *late[1:],
+        ]
+        shares = {**PRIOR, 'as it is': 1 - sum(PRIOR.values()), 'late': PRIOR['late'] / len(DELAYS)}
+        return [
+            item._replace(log_odds=item.log_odds + math.log(shares[item.name])) for item in found
+        ]
 
     def _paths(self) -> tuple[Complex, Array, Array]:
         """Places and headings (R, N) on the path by the delays (R,) at which all are known."""
@@ -209,60 +215,58 @@ class _Window:
             self.unbroken_m = 0.0
             return []
         before = np.arange(count) < breaks[:, None]
-        rows, yaws = np.repeat(row, len(breaks), 0), np.repeat(yaw, len(breaks), 0)
-        log = self._fitted(rows, yaws, used=before)[0] + self._fitted(rows, yaws, used=~before)[0]
-        best = int(np.argmax(log))
+        both = np.concatenate([before, ~before])
+        rows, yaws = np.repeat(row, len(both), 0), np.repeat(yaw, len(both), 0)
+        logs = self._fitted(rows, yaws, np.zeros(len(both)), both)[0].reshape(2, -1).sum(0)
+        best = int(np.argmax(logs))
         self.unbroken_m = float(self._way_m[-1] - self._way_m[breaks[best]])
-        return [_Hypothesis('carried', math.log(PRIOR['carried']) + float(log[best]))]
+        return [_Hypothesis('carried', float(logs[best]))]
 
     def _fitted(
-        self, rows: Complex, yaws: Array, nuisance: str = '', used: NDArray[np.bool_] | None = None
-    ) -> tuple[Array, Complex]:
-        """Log evidence (R,) of paths, of the images `used` (R, N), and the nuisance's size (R,).
+        self, rows: Complex, yaws: Array, kinds: Array, used: NDArray[np.bool_] | None = None
+    ) -> tuple[Array, Complex, Array, Array]:
+        """Log evidence (R,) of paths by the images `used` (R, N), and nuisances (R,): lever, angle
+        and factor, each where it is the kind of the row.
 
         With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
         """
-        look = np.exp(1j * (self._yaws - yaws))
-        arm = np.exp(1j * yaws) if nuisance == 'lever' else np.zeros(1)
-        counted = np.ones(rows.shape) if used is None else used.astype(float)
-        weight, lever, factor, bent = counted, np.zeros(1), np.ones(1), np.ones(1)
+        is_lever, is_turned, is_scale = (kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE))
+        look, arm = np.exp(1j * (self._yaws - yaws)), np.exp(1j * yaws)
+        weight = counted = np.ones(rows.shape) if used is None else used.astype(float)
+        lever, angle = np.zeros((len(rows), 1), complex), np.zeros((len(rows), 1))
+        factor: Array = np.ones((len(rows), 1))
         for step in range(_STEPS):
             w, w_yaw = weight / self._variance, weight / self._yaw_variance
             total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
             d, g, z = (x - (w * x).sum(1, keepdims=True) / total for x in (rows, arm, self._places))
-            seen = (w_yaw * look).sum(1, keepdims=True)
-            path = factor * d + lever * g
+            seen, path = (w_yaw * look).sum(1, keepdims=True), factor * d + lever * g
             u = (w * np.conj(path) * z).sum(1, keepdims=True)
-            if nuisance != 'turned' or step:
-                u = u + seen * np.conj(bent)
+            u = u + seen * np.exp(-1j * angle) * (1 - is_turned * (step == 0))
             u = u / np.maximum(np.abs(u), _TINY)
-            if nuisance == 'lever':
-                information = (w * np.abs(g) ** 2).sum(1, keepdims=True) + LEVER_STD_M**-2
-                lever = (w * np.conj(g) * (z * np.conj(u) - d)).sum(1, keepdims=True) / information
-            elif nuisance == 'scale':
-                information = (w * np.abs(d) ** 2).sum(1, keepdims=True) + SCALE_STD**-2
-                along = (w * (np.conj(u * d) * z).real).sum(1, keepdims=True)
-                factor = (along + SCALE_STD**-2) / information
-            elif nuisance == 'turned':
-                information = of_yaw + TURNED_STD_RAD**-2
-                bent = np.exp(1j * np.angle(seen * np.conj(u)) * of_yaw / information)
+            of_arm, of_path = (
+                (w * np.abs(x) ** 2).sum(1, keepdims=True) + std**-2
+                for x, std in ((g, LEVER_STD_M), (d, SCALE_STD))
+            )
+            reach = (w * np.conj(g) * (z * np.conj(u) - d)).sum(1, keepdims=True)
+            lever = is_lever * reach / of_arm
+            along = (w * (np.conj(u * d) * z).real).sum(1, keepdims=True) + SCALE_STD**-2
+            factor = np.where(is_scale, along / of_path, 1.0)
+            of_angle = of_yaw + TURNED_STD_RAD**-2
+            angle = is_turned * np.angle(seen * np.conj(u)) * of_yaw / of_angle
             path = factor * d + lever * g
             apart = np.abs(z - u * path) ** 2 / self._variance
-            apart += 2 * (1 - (look * np.conj(u * bent)).real) / self._yaw_variance
+            apart += 2 * (1 - (look * np.conj(u * np.exp(1j * angle))).real) / self._yaw_variance
             fits = self._peak * np.exp(-0.5 * apart)
             anything = fits + OUTLIERS * _ANYWHERE
             weight = counted * (fits / anything + _TINY)
-        square = (w * np.abs(path) ** 2).sum(1) + of_yaw[:, 0] + _TINY
-        log = (counted * np.log(anything)).sum(1) + math.log(_ANYWHERE * (2 * math.pi) ** 1.5)
-        log -= np.log(total[:, 0]) + 0.5 * np.log(square)
-        if not nuisance:
-            return self._power * log, np.zeros(len(rows), complex)
-        size, usual, std, count = {
-            'lever': (lever, 0.0, LEVER_STD_M, 2),
-            'scale': (factor, 1.0, SCALE_STD, 1),
-            'turned': (np.angle(bent), 0.0, TURNED_STD_RAD, 1),
-        }[nuisance]
-        log -= 0.5 * (np.abs(size - usual) / std)[:, 0] ** 2
-        log -= count / 2 * np.log(information[:, 0] * std**2)
-        return self._power * log, np.asarray(size[:, 0], complex)
+        square = (w * np.abs(path) ** 2).sum(1, keepdims=True) + of_yaw + _TINY
+        log = (counted * np.log(anything)).sum(1, keepdims=True) - np.log(total)
+        log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5) - 0.5 * np.log(square)
+        for it, size, std, known, count in (
+            (is_lever, lever, LEVER_STD_M, of_arm, 2),
+            (is_turned, angle, TURNED_STD_RAD, of_angle, 1),
+            (is_scale, factor - 1, SCALE_STD, of_path, 1),
+        ):
+            log -= it * ((np.abs(size) / std) ** 2 + count * np.log(known * std**2)) / 2
+        return (self._power * log)[:, 0], lever[:, 0], angle[:, 0], factor[:, 0]

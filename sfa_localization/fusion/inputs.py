@@ -43,6 +43,14 @@ class OpenLoop:
     def __init__(self) -> None:
         self._last, self._share = (0.0, 0.0), 0.0
 
+    @classmethod
+    def of(cls, twists: Array) -> OpenLoop:
+        """From the twists (N, 2) of a recorded drive."""
+        loop = cls()
+        for v, omega in twists.tolist():
+            loop.add(v, omega)
+        return loop
+
     def add(self, v: float, omega: float) -> None:
         """Take the next twist."""
         if v or omega:
