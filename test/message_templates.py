@@ -56,10 +56,19 @@ def is_sentence(text: str) -> bool:
 def error_templates() -> Iterator[tuple[str, str]]:
     """File and text of each error in the code."""
     for path in sorted(PACKAGE.rglob('*.py')):
-        for node in ast.walk(ast.parse(path.read_text('utf-8'))):
+        tree = ast.parse(path.read_text('utf-8'))
+        named = {
+            target.id: template(node.value)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+            if isinstance(target, ast.Name)
+        }
+        for node in ast.walk(tree):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
                 continue
-            text = template(node.args[0])
+            what = node.args[0]
+            text = named.get(what.id, '') if isinstance(what, ast.Name) else template(what)
             if node.func.id in ERRORS and is_sentence(text):
                 yield str(path.relative_to(PACKAGE)), text
 
