@@ -72,7 +72,7 @@ def measurement_event(
     """
     size = len(value)
     jacobian = _OBSERVED[:size].copy()
-    jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
+    jacobian[:, ERROR : ERROR + size] = lower_root(covariance.tolist(), math.sqrt(share))
     return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
 
 

@@ -100,16 +100,17 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
         size, matrix = 2, matrix[:2, :2]
     if not matrix.any():
         matrix = np.diag(np.square(_UNKNOWN_STDS[:size]))
-    checked = symmetric(matrix)
-    lower_root(checked, 1.0)
-    largest = float(checked.max())
-    if not largest < _LARGEST_ENTRY or np.abs(matrix - checked).max() > 1e-6 * largest:
+    rows = matrix.tolist()  # arrays of two or three cost more than what is done with them
+    lower_root(rows, 1.0)
+    largest = max(map(max, rows))
+    skew = max(abs(rows[i][j] - rows[j][i]) for i in range(size) for j in range(i))
+    if not largest < _LARGEST_ENTRY or skew > 1e-6 * largest:
         raise DataError(_NO_COVARIANCE)
-    if max(checked[0, 0], checked[1, 1]) >= LARGEST_VARIANCE:
+    if max(rows[0][0], rows[1][1]) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
-    noise = factor * checked
+    noise = factor * symmetric(matrix)
     for k in range(size):
-        noise[k, k] = max(noise[k, k], _LEAST_STDS[k] ** 2)
+        noise[k, k] = max(factor * rows[k][k], _LEAST_STDS[k] ** 2)
     return np.array(pose[:size]), noise
 
 
@@ -119,23 +120,26 @@ def _has_yaw(yaw: float, matrix: Array) -> bool:
     return bool(known and (variance > 0 or not matrix.any()))
 
 
-def lower_root(covariance: Array, factor: float) -> list[list[float]]:
+def lower_root(rows: list[list[float]], factor: float) -> list[list[float]]:
     """`factor` times the lower triangular root (Cholesky) of a covariance (2, 2) or (3, 3).
 
     Raises DataError where there is none; for NaN, comparisons are false.
     """
-    rows, root = covariance.tolist(), list[list[float]]()
-    for i, row in enumerate(rows):
-        done = [0.0] * len(row)
-        for j in range(i):
-            inner = sum(done[k] * root[j][k] for k in range(j))
-            done[j] = (row[j] - inner) / root[j][j]
-        left = row[i] - sum(done[k] ** 2 for k in range(i))
-        if not (row[i] > 0 and left > _SINGULAR * row[i]):
-            raise DataError(_NO_COVARIANCE)
-        done[i] = math.sqrt(left)
-        root.append(done)
-    return [[factor * number for number in row] for row in root]
+    xx, (xy, yy) = rows[0][0], rows[1][:2]
+    a = math.sqrt(xx) if xx > 0 else math.nan
+    b = xy / a
+    d = math.sqrt(yy - b * b) if yy - b * b > _SINGULAR * yy else math.nan
+    root = [[factor * a, 0.0], [factor * b, factor * d]]
+    if len(rows) == 3:
+        xt, yt, tt = rows[2]
+        c = xt / a
+        e = (yt - b * c) / d
+        left = tt - c * c - e * e
+        f = math.sqrt(left) if left > _SINGULAR * tt else math.nan
+        root = [[*root[0], 0.0], [*root[1], 0.0], [factor * c, factor * e, factor * f]]
+    if not math.isfinite(root[-1][-1]):
+        raise DataError(_NO_COVARIANCE)
+    return root
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
