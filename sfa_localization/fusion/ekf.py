@@ -233,8 +233,6 @@ class Ekf:
         belief = self._fused(self._turns_updated(belief, event), event, image)
         update, track = belief.memory.update, belief.track
         assert update is not None
-        if update.reason == ELSEWHERE:
-            track = track.placed(event.stamp_ns, belief.traveled_m)
         track = track.driven(event.stamp_ns, image.dead_reckoned).seen(image)
         if update.reason in STARTS:
             return belief._replace(track=track, turns=self._turns_restarted(belief))
@@ -330,7 +328,8 @@ class Ekf:
         images = remembered(memory.images, image)
         found = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
         if found is not None and found.outweighs(belief):
-            return self._restarted(belief, event, found, ELSEWHERE)
+            track = belief.track.placed(event.stamp_ns, belief.traveled_m - found.distance_m)
+            return self._restarted(belief._replace(track=track), event, found, ELSEWHERE)
         memory = memory._replace(
             rejected=memory.rejected + 1,
             images=images,
