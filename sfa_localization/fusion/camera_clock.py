@@ -61,8 +61,9 @@ _GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) *
 _NEAR_NS, _APART_NS, _PAUSE_NS = 150_000_000, 1_000_000_000, 500_000_000
 _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
 _WINDOW_NS = round(LONGEST_S * 1e9) + 100_000_000
-# Differences beyond a few of these are mismatches of images and count no more, rad.
-_SCALE_RAD, _OUTLIER = 0.05, 4.0
+# Differences beyond a few of these, rad, are mismatches of images and count no more; sums that
+# differ by one of them show no difference between delays.
+_SCALE_RAD, _OUTLIER, _ALIKE = 0.05, 4.0, 1.0
 # Smaller turns, rad, and fewer do not show how well images and odometry agree.
 _TURN_RAD, _TURNS_MIN = 0.05, 10
 # Neighboring pairs err alike: on a slow curve, things near the camera look like turns for seconds.
@@ -172,8 +173,8 @@ class CameraClockFinder:
         scale = max(left / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
         power = float(self._power[side, best])
         std = _CAUTION * scale / np.sqrt(power) if power > 0 else np.inf
-        # While a robot turns steadily, many delays fit as well as the best, but for a mismatch.
-        alike = _GRID[self._cost[side] <= self._cost[side, best] + _OUTLIER]
+        # While a robot turns steadily, many delays fit nearly as well as the best.
+        alike = _GRID[self._cost[side] <= self._cost[side, best] + _ALIKE]
         std = max(std, float(np.ptp(alike)) / 4)
         if std > _STD_MAX_S:
             return CameraClock()

@@ -51,7 +51,7 @@ def interval(belief: Belief, event: OdometryEvent) -> Interval:
     else:
         whole = _shown(belief, event, silence_s, event.twist) or event.twist
         twist, shown = _remaining(belief, event, whole), False
-        now, omega = event.twist if event.twist.v or event.twist.omega else whole, whole.omega
+        now, omega = _going_on(belief, whole, event.twist, silence_s), whole.omega
     unknown_s = 0.0 if shown else max(silence_s - COAST_S, 0.0)
     return Interval(twist, now, omega, unknown_s, silence_s <= _BRIDGED_S)
 
@@ -72,6 +72,17 @@ def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist)
     if seconds <= ODOMETRY_TIMEOUT_S and drives and abs(aside) > max(abs(ahead), _ROUNDED_M):
         return None
     return _twist(turn, ahead, seconds, fastest)
+
+
+def _going_on(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> Twist:
+    """The twist after an interval: the reading, or, where that is not filled, what the poses show:
+    little of it in messages stamped almost together.
+    """
+    if reading.v or reading.omega:
+        return reading
+    before, new = belief.twist, -math.expm1(-seconds / motion.ODOMETRY_CORRELATION_S)
+    v, omega = whole.v - before.v, whole.omega - before.omega
+    return whole._replace(v=before.v + new * v, omega=before.omega + new * omega)
 
 
 def _remaining(belief: Belief, event: OdometryEvent, whole: Twist) -> Twist:
