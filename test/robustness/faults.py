@@ -22,7 +22,7 @@ ANOTHER_ROBOT_S = 20.0
 """Seconds for which images of another robot in the same garden may be believed: they contradict
 nothing where its path is like this one's."""
 NOTICED_S = 1.0
-"""A robot, or camera, that is moved, or held, suddenly is noticed by the next few images: one alone may err."""
+"""A robot or camera that is moved, or held, is noticed by the next few images: one may err."""
 DOWN_S = 2.0
 """A node that was killed is back after so many seconds."""
 STANDING_HZ = 5
