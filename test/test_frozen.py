@@ -9,7 +9,7 @@ import json
 import math
 
 import pytest
-from robustness.faults import ANOTHER_ROBOT_S, FAULTS
+from robustness.faults import FAULTS, SAME_PLACE_S
 from robustness.frozen import LIE_S, LIES, LIGHTS, MEANS, Frozen, judged, totals
 
 pytestmark = pytest.mark.slow  # a minute for each light
@@ -36,7 +36,7 @@ def verdict(light, name):
 @pytest.mark.parametrize('name', FAULTS)
 def test_no_fault_is_believed_for_long_or_makes_the_estimate_worse(name, light):
     made, mean_m = verdict(light, name), json.loads(MEANS.read_text())[light][name]
-    assert made.false_s <= (ANOTHER_ROBOT_S if 'another robot' in name else WRONG_S), made
+    assert made.false_s <= (SAME_PLACE_S if 'another robot' in name else WRONG_S), made
     assert math.isnan(made.mean_m) if mean_m is None else made.mean_m <= mean_m + WORSE_M, made
 
 

@@ -172,6 +172,9 @@ class CameraClockFinder:
         scale = max(left / turns / _MEAN_OF_NORMAL, _SCALE_MIN_RAD)
         power = float(self._power[side, best])
         std = _CAUTION * scale / np.sqrt(power) if power > 0 else np.inf
+        # While a robot turns steadily, many delays fit as well as the best, but for a mismatch.
+        alike = _GRID[self._cost[side] <= self._cost[side, best] + _OUTLIER]
+        std = max(std, float(np.ptp(alike)) / 4)
         if std > _STD_MAX_S:
             return CameraClock()
         below, least, above = self._cost[side, best - 1 : best + 2]

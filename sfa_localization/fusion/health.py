@@ -46,9 +46,9 @@ OUTLIERS = 0.05
 CAUTION, FLOOR_M, FLOOR_RAD, YAW_DRIFT = 4.0, 0.05, 0.02, 0.02
 """Factor on the variances of images, their least standard deviations, and the odometry's error of
 the heading, rad per m: for what images of one place have in common."""
-DELAYS: Array = np.r_[-1.5:-0.5:0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
-"""Delays s that are told apart: the camera's clock compensates shorter ones."""
-LONGEST_M = 14.0
+DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3 : LONGEST_DELAY_S + 0.1 : 0.4]
+"""Delays s that are told apart, beside those that the camera's clock compensates."""
+LONGEST_M = 16.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
@@ -114,6 +114,8 @@ def health_of(track: Track) -> Health:
     place = float(odds @ [item.off_m**2 for item in found]) / 2
     turned = float(odds @ [item.off_rad**2 for item in found])
     well, confirmed_m = 1.0 - float(odds.sum()), min(confirmed_m, window.unbroken_m)
+    if well >= LIKELY:  # what nothing shows, as a delay on a circle, makes nobody doubt
+        place = turned = 0.0
     return Health(
         well, worst.name, complex(worst.size), (place, place, turned), confirmed_m, needed_m
     )
@@ -126,8 +128,8 @@ def _confirmed(track: Track) -> tuple[float, float]:
     times, traveled_m = len(track.placings), track.images[-1].traveled_m if track.images else 0.0
     if times == 0:
         return max(traveled_m - track.since_m, 0.0), AGREEING_M
-    driven_m = AGREEING_M + traveled_m - track.placings[-1].traveled_m
-    return driven_m, min(AGREEING_M * 2.0 ** (times - 1), AGREEING_M + LONGEST_M)
+    driven_m = traveled_m - track.placings[-1].traveled_m
+    return max(driven_m, 0.0), min(AGREEING_M * 2.0 ** (times - 1), LONGEST_M)
 
 
 class _Hypothesis(NamedTuple):

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief
+from sfa_localization.fusion.belief import Belief
 from sfa_localization.fusion.ekf import is_far
 from sfa_localization.fusion.health import Health
 from sfa_localization.fusion.motion import State
@@ -105,7 +105,7 @@ def _rejections(belief: Belief) -> list[str]:
         return []
     # An estimate that rests on one or two images is doubted by the first that contradicts it.
     few = FEW_IMAGES if memory.support >= FEW_IMAGES else 1
-    if (update.far or memory.rejected >= few) and memory.rejected < ENOUGH_IMAGES:
+    if (update.far or memory.rejected >= few) and not _contradictions(belief):
         one = 'an image did not match'
         return [one if memory.rejected <= 1 else f'{memory.rejected} images in a row did not match']
     return []
@@ -121,7 +121,8 @@ def _silences(belief: Belief, config: FilterConfig) -> list[str]:
     if memory.accepted_ns is None:
         reasons.append('no image has confirmed the start yet')
     elif images_s > limit_s:
-        reasons.append(f'no usable image for {images_s:.0f} s')
+        fits = 'fitting' if memory.rejected else 'usable'
+        reasons.append(f'no {fits} image for {images_s:.0f} s')
     elif precise_s > limit_s:
         reasons.append(f'single images show the position to no better than {config.degraded_std} m')
     if belief.odometry_ns is None:

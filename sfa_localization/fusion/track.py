@@ -20,7 +20,7 @@ WINDOW, WINDOW_M = 32, 12.0
 """Images that are compared, over this distance at most: then the odometry has drifted."""
 LONGEST_DELAY_S = 10.0
 """The path is remembered for so long before the first image: images may be late."""
-_KNOT_NS, _LONGEST_NS = 100_000_000, 60_000_000_000
+_KNOT_NS, _LASTING_NS, _LONGEST_NS = 100_000_000, 1_000_000_000, 60_000_000_000
 _FORGIVEN_M = 30.0
 """An estimate that was right for so long was not moved for nothing."""
 
@@ -45,7 +45,9 @@ class Image(NamedTuple):
 
 
 class Placing(NamedTuple):
-    """The filter was placed anew, by images that it had rejected."""
+    """The filter was placed anew at a stamp, by images that it had rejected; the first of those
+    that agreed came at `traveled_m`.
+    """
 
     stamp_ns: int
     traveled_m: float
@@ -100,14 +102,18 @@ class Track(NamedTuple):
         return Track(self.knots, since_m=-math.inf)
 
     def placed(self, stamp_ns: int, traveled_m: float) -> Track:
-        """After images placed the filter anew."""
+        """After images that agree from a distance traveled on placed the filter anew."""
         kept = (item for item in self.placings if traveled_m - item.traveled_m < _FORGIVEN_M)
         return self._replace(placings=(*kept, Placing(stamp_ns, traveled_m)))
 
 
 def _is_new(last: Image, image: Image) -> bool:
-    """Whether the robot moved between two images, by the odometry, or by more than they may err."""
+    """Whether the robot moved between two images, by the odometry, or, lasting longer than an
+    outlier does, by more than they may err.
+    """
+    if abs(image.traveled_m - last.traveled_m) >= SPACING_M:
+        return True
+    if abs(float(wrap_angle(image.dead_reckoned[2] - last.dead_reckoned[2]))) >= SPACING_RAD:
+        return True
     seen_m = abs(image.place - last.place) - 3 * math.sqrt(last.variance + image.variance)
-    turned = abs(float(wrap_angle(image.dead_reckoned[2] - last.dead_reckoned[2])))
-    way_m = max(abs(image.traveled_m - last.traveled_m), seen_m)
-    return way_m >= SPACING_M or turned >= SPACING_RAD
+    return seen_m >= SPACING_M and image.stamp_ns - last.stamp_ns >= _LASTING_NS

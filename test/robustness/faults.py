@@ -18,9 +18,9 @@ FROM_S, UNTIL_S = 15.0, 30.0
 CONSISTENT_LIE_S = 2.0
 """Seconds for which a lie that was there from the start, and contradicts nothing at first, may be
 believed."""
-ANOTHER_ROBOT_S = 20.0
-"""Seconds for which images of another robot in the same garden may be believed: they contradict
-nothing where its path is like this one's."""
+SAME_PLACE_S = 20.0
+"""Images of another robot in the same garden contradict nothing for as long as both drive alike:
+nothing promises that they are noticed."""
 NOTICED_S = 1.0
 """A robot or camera that is moved, or held, is noticed by the next few images: one may err."""
 DOWN_S = 2.0
@@ -336,7 +336,7 @@ enter_all(
         for part in (0.3, 0.6)
     },
     ends_s=NEVER,
-    allowed_s=ANOTHER_ROBOT_S,
+    allowed_s=SAME_PLACE_S,
 )
 enter_all({'images damaged': changed(Picture, damaged)})
 STANDING = {
