@@ -54,7 +54,7 @@ def drive(
     mapped=MAP, std_m=STD_M,
 ):  # fmt: skip
     """A track after a drive at 1 m/s along a path that winds, with an image every EVERY samples;
-    the filter is placed anew at samples `placed`.
+    the filter is placed anew at samples `placed`, by images that agree over two meters.
 
     `frame` is where the odometry was switched on, `mapped` where its frame lies in the map.
     """
@@ -68,7 +68,7 @@ def drive(
         way_m += math.hypot(*(poses[i, :2] - poses[max(i - 1, 0), :2]))
         track = track.driven(at_ns[i], reckoned)
         if i in placed:
-            track = track.placed(at_ns[i], way_m)
+            track = track.placed(at_ns[i], way_m - 2.0)
         if i % EVERY == 0 and (found := shown(poses, i)):
             place = mapped[0] + cmath.exp(1j * mapped[1]) * found[0]
             place += std_m * complex(*rng.standard_normal(2))
