@@ -14,7 +14,7 @@ import pytest
 
 from sfa_localization.camera import capture as capture_module
 from sfa_localization.camera import watch
-from sfa_localization.camera.capture import Feed, Lost, opener
+from sfa_localization.camera.capture import Device, Feed, Lost, opener
 from sfa_localization.camera.settings import CaptureConfig
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import CameraError, ConfigError
@@ -284,6 +284,27 @@ def test_sources_that_are_not_there_are_named(values, words, tmp_path, monkeypat
         opener(config(**values))()
 
 
-def test_a_device_is_asked_for_columns_and_rows():
+def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
+    asked = {}
+
+    class Capture:
+        def __init__(self, *_args):
+            pass
+
+        def isOpened(self):
+            return True
+
+        def set(self, what, value):
+            asked[what] = value
+
+    monkeypatch.setattr(cv2, 'VideoCapture', Capture)
+    (tmp_path / 'video0').touch()
+    path = str(tmp_path / 'video0')
+    Device(CaptureConfig(source_path=path, source_size=(1280.0, 720.0), source_rate=15.0))
+    wanted = {cv2.CAP_PROP_FRAME_WIDTH: 1280, cv2.CAP_PROP_FRAME_HEIGHT: 720, cv2.CAP_PROP_FPS: 15}
+    assert asked.items() >= wanted.items()
+    asked.clear()
+    Device(CaptureConfig(source_path=path))
+    assert not asked.keys() & wanted.keys(), 'a device keeps its own'
     with pytest.raises(ConfigError, match='columns and rows'):
         config(source_size=(640.0,))
