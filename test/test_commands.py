@@ -54,9 +54,9 @@ def words_for(action: argparse.Action) -> list[str]:
 
 def test_an_option_reaches_one_group_of_settings_at_most():
     """Whichever groups a command reads, an option meant for one never appears in another."""
+    every, wrong = options(), []
     groups = {group.__name__: group for group in Settings.__subclasses__()}
-    wrong = []
-    for name, option in options():
+    for name, option in every:
         parser = parser_of(name)
         (meant,) = (a for a in parser._actions if option in a.option_strings)
         needed = [a for a in parser._actions if a.required and a is not meant]

@@ -31,15 +31,7 @@ from bag_formats import (
 )
 from ros_domains import free_domain
 
-from sfa_localization.commands.pace import (
-    FASTER,
-    PAUSE,
-    SLOWER,
-    STEP,
-    Keyboard,
-    Pace,
-    PlayConfig,
-)
+from sfa_localization.commands.pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace, PlayConfig
 from sfa_localization.data.errors import BagError
 
 ROOT = Path(__file__).parents[1]
@@ -66,39 +58,22 @@ def until(condition: Callable[[], bool]) -> None:
 # The pace.
 
 
-class Seconds:
-    """A clock set by the test."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def test_the_pace_follows_the_clock_at_its_rate() -> None:
-    clock = Seconds()
-    pace = Pace(5_000_000_000, 2.0, clock)
+def test_the_pace_follows_the_clock_at_its_rate_and_stands_still_while_paused() -> None:
+    now = [100.0]
+    pace = Pace(5_000_000_000, 2.0, lambda: now[0])
     assert pace.delay(7_000_000_000) == 1.0
-    clock.now += 0.25
+    now[0] += 0.25
     assert pace.time_ns == 5_500_000_000
     assert pace.delay(7_000_000_000) == 0.75
     pace.scale(0.5)
     assert pace.delay(7_000_000_000) == 1.5
-
-
-def test_a_paused_pace_stands_still_and_continues_from_there() -> None:
-    clock = Seconds()
-    pace = Pace(0, 1.0, clock)
-    clock.now += 1.0
     pace.toggle_pause()
-    clock.now += 50.0
-    assert pace.time_ns == 1_000_000_000 and pace.delay(0) == math.inf
-    pace.jump(3_000_000_000)
-    assert pace.time_ns == 3_000_000_000
+    now[0] += 50.0
+    assert pace.time_ns == 5_500_000_000 and pace.delay(0) == math.inf
+    pace.jump(6_000_000_000)
     pace.toggle_pause()
-    clock.now += 1.0
-    assert pace.time_ns == 4_000_000_000
+    now[0] += 1.0
+    assert pace.time_ns == 7_000_000_000
 
 
 # The keys.
@@ -113,23 +88,14 @@ def terminal() -> Iterator[tuple[int, int]]:
     os.close(program)
 
 
-@pytest.mark.parametrize(
-    ('keys', 'action'),
-    [
-        (b' ', PAUSE),
-        (b's', STEP),
-        (b'\x1b[C', STEP),
-        (b'\x1b[A', FASTER),
-        (b'\x1b[B', SLOWER),
-        (b'x', ''),
-        (b'', ''),
-    ],
-)
-def test_keys_are_read_one_by_one(keys: bytes, action: str, terminal: tuple[int, int]) -> None:
+def test_keys_are_read_one_by_one(terminal: tuple[int, int]) -> None:
     user, program = terminal
+    keys = {b' ': PAUSE, b's': STEP, b'\x1b[C': STEP, b'\x1b[A': FASTER, b'\x1b[B': SLOWER,
+            b'x': '', b'': ''}  # fmt: skip
     with Keyboard(program) as keyboard:
-        os.write(user, keys)
-        assert keyboard.read(5.0 if action else 0.0) == action
+        for key, action in keys.items():
+            os.write(user, key)
+            assert keyboard.read(5.0 if action else 0.0) == action
 
 
 def test_the_terminal_is_left_as_it_was(terminal: tuple[int, int]) -> None:
@@ -198,40 +164,42 @@ LATCHED = offered(reliability=QosReliability.RELIABLE, durability=QosDurability.
 
 
 @ROS
-@pytest.mark.parametrize(
-    ('recorded', 'reliability', 'durability', 'depth'),
-    [
-        ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 10),
-        ((offered(),), ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE, 10),
-        ((STRONG,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
-        ((LATCHED,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL, 100),
-        ((offered(), STRONG), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
-        ((STRONG, LATCHED), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
-    ],
-)
-def test_quality_of_service_suits_the_recorded(
-    recorded: tuple[Qos, ...],
-    reliability: ReliabilityPolicy,
-    durability: DurabilityPolicy,
-    depth: int,
-) -> None:
-    profile = qos_profile(recorded)
-    assert (profile.reliability, profile.durability) == (reliability, durability)
-    assert profile.depth == depth
-
-
-@ROS
-def test_finite_times_of_the_recorded_qos_are_kept() -> None:
+def test_quality_of_service_suits_the_recorded() -> None:
+    weak, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+    volatile, latched = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
+    for recorded, expected in (
+        ([], (reliable, volatile, 10)), ([offered()], (weak, volatile, 10)),
+        ([STRONG], (reliable, volatile, 50)), ([LATCHED], (reliable, latched, 100)),
+        ([offered(), STRONG], (reliable, volatile, 50)),
+        ([STRONG, LATCHED], (reliable, volatile, 50)),
+    ):  # fmt: skip
+        profile = qos_profile(recorded)
+        assert (profile.reliability, profile.durability, profile.depth) == expected
     profile = qos_profile([offered(deadline=QosTime(2, 500_000_000))])
     assert profile.deadline.nanoseconds == 2_500_000_000
     assert qos_profile([offered()]).deadline == QoSProfile(depth=1).deadline
 
 
 @ROS
-def test_types_are_found_where_installed() -> None:
+def test_types_are_found_where_installed_and_nothing_else_is_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither packages of other kinds, nor anything from the folder of a bag."""
     assert message_class('sensor_msgs/msg/Imu') is Imu
-    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', '/msg/'):
+    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', '/msg/',
+                 'antigravity/msg/X', 'this/msg/X', 'sensor_msgs/msg/_imu'):  # fmt: skip
         assert message_class(kind) is None
+    assert not {'antigravity', 'this'} & set(sys.modules)
+    package = tmp_path / 'evil_msgs' / 'msg'
+    package.mkdir(parents=True)
+    for file in (package / '__init__.py', package.parent / '__init__.py'):
+        file.write_text('raise AssertionError("code of the folder ran")')
+    monkeypatch.chdir(tmp_path)
+    for place in ('', '.', str(tmp_path)):
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(place)
+            assert message_class('evil_msgs/msg/Imu') is None
+            assert message_class('sensor_msgs/msg/Imu') is Imu
 
 
 @pytest.fixture
@@ -311,33 +279,20 @@ def test_the_clock_runs_through_the_bag(
 
 
 @ROS
-def test_it_starts_at_the_offset(context: Any, tmp_path: Path, messages: list[Message]) -> None:
-    config = PlayConfig(rate=20.0, start_offset=0.55, wait=0.0)
-    path = reliable(messages, tmp_path / 'bag')
-    played = play(path, config=config, context=context)
-    assert played.messages['/image_raw'] == IMAGES - 6
-
-
-@ROS
-def test_an_offset_beyond_the_end_is_named_before_any_wait(
+def test_offset_and_topics_are_chosen(
     context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bag_player.Player, 'wait_for_subscribers', lambda *_: pytest.fail('waits'))
-    path = reliable(messages, tmp_path / 'bag')
-    with pytest.raises(BagError, match=r'nothing to play after 1e\+06 s'):
-        play(path, config=PlayConfig(start_offset=1e6), context=context)
-
-
-@ROS
-def test_only_named_topics_are_played(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
-    path = reliable(messages, tmp_path / 'bag')
-    config = PlayConfig(rate=50.0, wait=0.0)
+    """What cannot be played is named before any wait for subscribers."""
+    path, config = reliable(messages, tmp_path / 'bag'), PlayConfig(rate=50.0, wait=0.2)
+    late = PlayConfig(rate=50.0, start_offset=0.55, wait=0.0)
+    assert play(path, config=late, context=context).messages['/image_raw'] == IMAGES - 6
     played = play(path, config=config, context=context, topics=['/imu'])
     assert played.messages == {'/imu': COUNTS['/imu']}
+    monkeypatch.setattr(bag_player.Player, 'wait_for_subscribers', lambda *_: pytest.fail('waits'))
     with pytest.raises(BagError, match=r'has no topic /x; --topics can be: /ground_truth, /image'):
         play(path, config=config, context=context, topics=['/x'])
+    with pytest.raises(BagError, match=r'nothing to play after 1e\+06 s'):
+        play(path, config=PlayConfig(start_offset=1e6), context=context)
 
 
 @ROS
@@ -371,15 +326,6 @@ def test_a_late_subscriber_of_images_misses_none(
             thread.join(DEADLINE_S)
             until(lambda: len(late.heard['/image_raw']) == IMAGES)
     assert played[0].messages['/image_raw'] == IMAGES
-
-
-@ROS
-def test_it_plays_without_subscribers_after_the_wait(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
-    path = reliable(messages, tmp_path / 'bag')
-    config = PlayConfig(rate=50.0, wait=0.2)
-    assert play(path, config=config, context=context).messages['/odom'] == COUNTS['/odom']
 
 
 @ROS
@@ -473,41 +419,13 @@ def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[M
     assert result.stdout.count(' messages\n') == len(COUNTS)
 
 
-@ROS
-@pytest.mark.parametrize('place', ['', '.', 'folder'])
-def test_nothing_is_imported_from_the_folder_of_a_bag(
-    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ('evil_msgs', 'sensor_msgs_of_a_stranger'):
-        package = tmp_path / name / 'msg'
-        package.mkdir(parents=True)
-        for file in (package / '__init__.py', package.parent / '__init__.py'):
-            file.write_text('raise AssertionError("code of the folder ran")')
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path) if place == 'folder' else place)
-    assert message_class('evil_msgs/msg/Imu') is None
-    assert message_class('sensor_msgs/msg/Imu') is Imu
-
-
-@ROS
-@pytest.mark.parametrize('kind', ['antigravity/msg/X', 'this/msg/X', 'sensor_msgs/msg/_imu'])
-def test_what_is_no_package_of_messages_is_not_imported(kind: str) -> None:
-    package = kind.partition('/')[0]
-    loaded = package in sys.modules
-    assert message_class(kind) is None
-    assert (package in sys.modules) == loaded
-
-
 def test_a_command_in_a_downloaded_folder_runs_none_of_its_code(tmp_path: Path) -> None:
     for name in ('yaml', 'argparse', 'numpy', 'rosbags'):
         (tmp_path / f'{name}.py').write_text('raise AssertionError("code of the folder ran")')
     result = subprocess.run(
         [sys.executable, '-m', 'sfa_localization', 'inspect', 'nothing'],
-        cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
+        cwd=tmp_path, env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, text=True,
         timeout=120,
-    )
+    )  # fmt: skip
     assert result.returncode == 1
     assert result.stderr == 'error: nothing: no such bag; check the path\n'
