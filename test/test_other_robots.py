@@ -100,10 +100,9 @@ def errors(images, places, headings, truth):
     return off, wrap_angle(laid.apply_yaw(headings) - truth[images, 2])
 
 
-@pytest.mark.parametrize('seed', range(0, 100, 10))
-def test_the_odometry_frame_is_nothing_but_the_gauge(seed):
-    """Ten drives each: turned and shifted odometry turns and shifts the map, and nothing else."""
-    for draw in range(seed, seed + 10):
+def test_the_odometry_frame_is_nothing_but_the_gauge():
+    """Twenty drives: turned and shifted odometry turns and shifts the map, and nothing else."""
+    for draw in range(20):
         twists, start = criss_cross(8, seed=draw)
         run = drive(twists, start=start, bias=0.002, yaw_noise=0.01, seed=draw)
         robot = Robot.draw(draw, len(twists) / 50)
@@ -147,9 +146,9 @@ def reset_midway(draw, others):
 
 @pytest.mark.parametrize('drives', [two_drives, reset_midway])
 def test_any_robot_gives_nearly_as_good_a_map(drives):
-    """Thirty robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
+    """Twelve robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
     plain, other = [], []
-    for draw in range(30):
+    for draw in range(12):
         for others, found in ((False, plain), (True, other)):
             _, images, places, headings, truth = learn(drives(draw, others), draw)
             off, turned = errors(images, places, headings, truth)

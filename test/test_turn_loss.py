@@ -50,12 +50,12 @@ def found(loss, every=4, before=None, larger=1.0, **how):
     return track, way_of(track, Shown(times, places, yaw), before)
 
 
-@pytest.mark.parametrize('loss', [0.08, 0.15, 0.25, -0.1])
 @pytest.mark.parametrize('v', [0.3, -0.3])
-def test_the_loss_is_found_forward_and_backward(loss, v):
-    _, way = found(np.sign(v) * loss, v=v)
-    assert way.loss == pytest.approx(loss, abs=0.02)
-    assert way.scale == pytest.approx(1.0, abs=0.02)
+def test_the_loss_is_found_forward_and_backward(v):
+    for loss in (0.08, 0.15, 0.25, -0.1):
+        _, way = found(np.sign(v) * loss, v=v)
+        assert way.loss == pytest.approx(loss, abs=0.02)
+        assert way.scale == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_map_that_grew_or_shrank_shows_another_loss_but_no_other_scale():
