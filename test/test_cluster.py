@@ -3,7 +3,6 @@
 """Training over a Dask cluster gives the same network, also when a worker is lost."""
 
 import os
-import threading
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -147,18 +146,3 @@ def test_threads_give_the_same_bytes(on_disk, monkeypatch):
         networks.append(train_network(ARCHITECTURE, [replace(on_disk)], **PLAIN))
     for one, other in zip(networks[0].nodes, networks[1].nodes, strict=True):
         assert one.slow.tobytes() == other.slow.tobytes()
-
-
-def test_a_failing_shard_stops_the_others(on_disk):
-    started = []
-    lock = threading.Lock()
-
-    def work(shard):
-        with lock:
-            started.append(shard.start)
-        raise DataError('no')
-
-    shards = hierarchy.shards_of([on_disk], 0)
-    with pytest.raises(DataError, match='no'):
-        hierarchy.in_this_process(work, shards, lambda images: None)
-    assert len(started) < len(shards)

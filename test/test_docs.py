@@ -165,15 +165,6 @@ def test_the_readme_is_short_and_says_what_its_figures_are():
         assert re.match(r'\*(Rendered|Half-real|Real)\b', lines[k + 2]), lines[k]
 
 
-def test_the_cited_article_has_year_and_venue():
-    (article,) = yaml.safe_load((ROOT / 'CITATION.cff').read_text('utf-8'))['references']
-    assert isinstance(article['year'], int)
-    assert str(article['year']) in article['conference']['name']
-    assert f'Workshops, {article["year"]}' in (ROOT / 'README.md').read_text('utf-8').replace(
-        '\n', ' '
-    )
-
-
 def test_links_and_topics_exist():
     named = {path: path.read_text('utf-8') for path in [*DOCUMENTS, *ROOT.glob('config/*.rviz')]}
     broken = [

@@ -29,7 +29,6 @@ from nav_msgs.msg import Odometry  # noqa: E402
 from rcl_interfaces.msg import ParameterType  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -417,27 +416,3 @@ def test_nothing_that_is_not_finite_gets_out():
     with pytest.raises(MessageError, match='output'):
         convert.to_pose([math.nan, 0.0, 0.0], 1, 'map')
     assert convert.to_pose([1.0, 2.0, math.nan], 1, 'map').pose.orientation.w == 1.0
-
-
-def test_pictures_survive_the_round_trip_and_bad_ones_are_named():
-    image = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
-    message = convert.to_image(image, 9, 'camera')
-    stamp_ns, back = convert.read_image(message)
-    assert stamp_ns == 9 and np.array_equal(back, image)
-    message.step = 5
-    with pytest.raises(MessageError):
-        convert.read_image(message)
-    with pytest.raises(MessageError):
-        empty = Image()
-        empty.header.stamp.sec = 1
-        convert.read_image(empty)
-
-
-def test_odometry_message_carries_both_covariances():
-    message = convert.to_odometry(
-        [1, 2, 0.5], np.diag([1, 2, 3]), [0.4, 0.1], np.diag([5, 6]), 3, ('map', 'base_link')
-    )
-    pose, twist = (np.reshape(part.covariance, (6, 6)) for part in (message.pose, message.twist))
-    assert (pose[0, 0], pose[1, 1], pose[5, 5]) == (1, 2, 3)
-    assert (twist[0, 0], twist[5, 5]) == (5, 6)
-    assert message.child_frame_id == 'base_link' and message.twist.twist.linear.x == 0.4

@@ -355,25 +355,6 @@ def test_a_device_that_is_not_there_is_shown_and_awaited(bench):
     shown(run, 'no_such_camera', level=DiagnosticStatus.ERROR)
 
 
-def test_the_life_cycle_goes_round(bench):
-    run = bench()
-    run.hear('panorama')
-    run.start()
-    publisher = run.speak()
-    send_until(run, publisher, image_message(raw_picture()))
-    run.spinning = False
-    run.thread.join(PATIENCE_S)
-    run.node.trigger_deactivate()
-    run.node.trigger_cleanup()
-    run.node.trigger_configure()
-    run.node.trigger_activate()
-    run.spinning = True
-    run.thread = threading.Thread(target=run._spin, daemon=True)
-    run.thread.start()
-    run.wait(lambda: publisher.get_subscription_count() == 1)
-    send_until(run, publisher, image_message(raw_picture()))
-
-
 def test_of_images_that_come_too_fast_the_newest_is_used(bench):
     """A burst while the node is busy: no more than the depth of one waits for it."""
     run = bench()

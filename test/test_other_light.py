@@ -141,20 +141,3 @@ def test_the_pattern_is_a_mean_over_places():
         light.add(matched(near, (shown - known).astype(np.complex64), 0.3 * k), NOISE)
     assert np.abs(light.pattern.mean() - 1) < 0.15
     assert np.std(light.pattern) < 0.3
-
-
-def test_beside_all_keyframes_no_pattern_is_learned():
-    light = OtherLight()
-    light.add(matched(seen(0.1, 0.05, aside=0.7), LEFT), NOISE)
-    assert light.pattern is None
-
-
-def test_an_image_that_is_suddenly_unlike_adds_little():
-    found = []
-    for unlike in (0.0, 3.0):
-        light = OtherLight()
-        for k in range(100):
-            light.add(matched(seen(0.0, 0.05), 0 * LEFT, 0.3 * k), NOISE)
-        light.add(matched(seen(unlike, 0.05), LEFT, 100.0), NOISE)
-        found.append(np.abs(light.pattern).mean())
-    assert found[1] < 0.2 * found[0]

@@ -10,7 +10,6 @@ settings beside them, for parameters that need some. A new parameter is exercise
 import dataclasses
 import re
 from collections.abc import Callable, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, wander
 from filter_drives import START_NS, Drive
-from metric_worlds import criss_cross, drive, garden_features, lanes, meander, stand, straight, turn
 from test_commands import OPTIONS, parser_of
 
 from sfa_localization.bags.reader import Bag
@@ -35,15 +33,11 @@ from sfa_localization.camera.settings import (
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.commands.options import destination
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.run import Odometry, PanoramaArray, Run
 from sfa_localization.data.settings import Settings
 from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric import selection
-from sfa_localization.metric.learning import learn_metric, positions
-from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.nodes.settings import (
     EkfNodeConfig,
@@ -138,77 +132,9 @@ def of_filter(settings: FilterConfig) -> Any:
     return repr(seen)
 
 
-@cache
-def odd_drive() -> tuple[Any, Any]:
-    """A drive with lines, turns, curves, pauses and pictures near and far; and its gyroscope."""
-    parts = [
-        lanes(6.0, 1.5, 3),
-        stand(2.0),
-        meander(40.0, seed=3)[0],
-        straight(3.0, 0.5),
-        turn(2.0),
-        lanes(5.0, 0.6, 2),
-    ]
-    run = drive(np.vstack(parts), bias=0.01, speed_noise=0.02, yaw_noise=0.01, seed=3)
-    return run, run.gyro
-
-
-def of_segments(settings: SegmentConfig) -> Any:
-    """The segments of a drive whose odometry pauses and jumps, and whose pictures are uneven."""
-    run, gyro = odd_drive()
-    odometry = run.odometry
-    kept = np.ones(len(odometry.stamps_ns), bool)
-    kept[900:940] = False
-    poses = odometry.poses.copy()
-    poses[2000:, 0] += 0.5
-    variances = np.tile([1e-4, 0.0], (len(poses), 1))
-    odometry = Odometry(
-        odometry.stamps_ns[kept], poses[kept], odometry.twists[kept], variances[kept]
-    )
-    gyro = dataclasses.replace(gyro, omega=gyro.omega + 0.002)
-    stamps = np.delete(run.stamps_ns, [*range(60, 72), *range(150, 156)])
-    return plain(cut(odometry, stamps, settings, gyro))
-
-
-def plain(segments: Segments) -> str:
-    with np.printoptions(threshold=10**6, precision=12):
-        return repr(segments)
-
-
-@cache
-def garden() -> tuple[Any, Any]:
-    """Features and straight segments of a criss-cross drive with errors."""
-    twists, start = criss_cross(9)
-    run = drive(twists, start=start, bias=0.004, yaw_noise=0.01, speed_noise=0.02)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments='straight'))
-    return garden_features(run.poses[:, :2], noise=0.3, seed=2), segments
-
-
-def of_metric(settings: MetricConfig) -> Any:
-    """The map that is learnt, and how it does on what was left out."""
-    features, segments = garden()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selection, 'INDUCING_POINTS', 60)
-        result = learn_metric(features, segments, settings)
-    _, places = positions(result, segments)
-    return result.map.predict(features), places, result.left_out, result.history
-
-
-@cache
-def panoramas() -> Run:
-    """A short drive whose odometry is not even, with a pause and a jump in it."""
-    odometry = wander(60, 2, hz=4.0)
-    stamps = odometry.stamps_ns + np.where(np.arange(60) >= 30, 8 * 10**9, 0)
-    stamps += 3 * 10**7 * (np.arange(60) % 3)
-    poses = odometry.poses + np.where(np.arange(60) >= 45, 3.0, 0.0)[:, None] * [1, 0, 0]
-    run = run_in(Spheres.about(1), odometry, recipe().panorama)
-    moved = Odometry(stamps, poses, odometry.twists, odometry.variances)
-    return Run('run', PanoramaArray(stamps, run.panoramas.images), moved)
-
-
 def of_network(settings: NetworkConfig) -> Any:
     """The output of a network for the images that it was trained on."""
-    run = panoramas()
+    run = run_in(Spheres.about(1), wander(60, 2, hz=4.0), recipe().panorama)
     architecture = dataclasses.replace(PLACE_ARCHITECTURE, normalization=settings.normalization)
     network = train_network(architecture, [ImageSequence.of(run)], settings.seed)
     return network.maps(run.panoramas.read(0, 10))[-1]
@@ -226,12 +152,8 @@ OBSERVE: dict[type[Settings], Callable[..., Any]] = {
     BagConfig: of_bag,
     FilterConfig: of_filter,
     WatchConfig: of_watch,
-    SegmentConfig: of_segments,
-    MetricConfig: of_metric,
     NetworkConfig: of_network,
 }
-BESIDE: dict[type[Settings], dict[str, Any]] = {MetricConfig: {'slow_features': 6}}
-"""What is set for a whole group, where its default would be slow, or use little of it."""
 START = {'initial_pose': (0.0, 0.0, 0.0)}
 POLAR = {'camera_model': 'polar'}
 OCAM = {'camera_model': 'ocam', 'polynomial': (-150.0, 0.0, 1e-3), 'axis': 'down'}
@@ -253,7 +175,6 @@ SPECIAL: dict[type[Settings], dict[str, Other]] = {
         'axis': Other('up', {'camera_model': 'fisheye', 'axis': 'down'}),
         'mirrored': Other('no'),
     },
-    MetricConfig: {'anchor': Other((1.0, 2.0, 0.5))},
     FilterConfig: {
         'initial_pose': Other((1.0, -1.0, 0.5)),
         'initial_position_std': Other(1.0, START),
@@ -268,6 +189,8 @@ OBSERVED_BY: dict[type[Settings], dict[str, str]] = {
         **dict.fromkeys(('source', 'source_path', 'silence_timeout'), 'test_omnicam_node.py'),
         **dict.fromkeys(('source_rate', 'source_size'), 'test_sources.py'),
     },
+    SegmentConfig: {'yaw_source': 'test_segments.py', 'yaw_noise': 'test_map_noise.py'},
+    MetricConfig: dict.fromkeys(('slow_features', 'anchor'), 'test_metric.py'),
     OmnicamNodeConfig: dict.fromkeys(('image_transport', 'frame_id'), 'test_omnicam_node.py'),
     NodeConfig: {'autostart': 'test_nodes_base.py'},
     SfaNodeConfig: dict.fromkeys(
@@ -333,7 +256,7 @@ _OBSERVED: dict[type[Settings], dict[str, Any]] = {}
 
 def changes_something(kind: type[Settings], item: dataclasses.Field[Any], folder: Path) -> bool:
     other = SPECIAL.get(kind, {}).get(item.name) or Other(another(item))
-    before = kind(**{**BESIDE.get(kind, {}), **other.beside})
+    before = kind(**other.beside)
     after = dataclasses.replace(before, **{item.name: other.value})
     assert after != before
     first, then = folder / f'{item.name}_first', folder / f'{item.name}_then'
@@ -349,7 +272,7 @@ def test_every_parameter_changes_something(kind, tmp_path):
         elsewhere |= {'engine'} & options_of(kind)
     fields = [item for item in dataclasses.fields(kind) if item.name not in elsewhere]
     assert [item.name for item in fields if not changes_something(kind, item, tmp_path)] == []
-    settings = kind(**BESIDE.get(kind, {}))
+    settings = kind()
     first, then = tmp_path / 'first', tmp_path / 'then'
     first.mkdir(), then.mkdir()
     before = observed(settings, first)
@@ -369,7 +292,7 @@ def test_parameters_of_cameras_nodes_and_commands_are_set_in_their_tests():
                 seen.add(name)
         names = {item.name for item in dataclasses.fields(kind)}
         unseen += [f'{kind.__name__}.{name}' for name in names - seen - options_of(kind)]
-        for table in (SPECIAL, OBSERVED_BY, BESIDE):
+        for table in (SPECIAL, OBSERVED_BY):
             assert set(table.get(kind, {})) <= names
     assert unseen == [], 'nothing shows that these do anything'
 

@@ -47,7 +47,7 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     return drive(tmp_path_factory.mktemp('drive'))
 
 
-def until(condition: Callable[[], bool]) -> None:
+def until(condition: Callable[[], bool]):
     """Wait for a condition, with a deadline."""
     end = time.monotonic() + DEADLINE_S
     while not condition():
@@ -58,7 +58,7 @@ def until(condition: Callable[[], bool]) -> None:
 # The pace.
 
 
-def test_the_pace_follows_the_clock_at_its_rate_and_stands_still_while_paused() -> None:
+def test_the_pace_follows_the_clock_at_its_rate_and_stands_still_while_paused():
     now = [100.0]
     pace = Pace(5_000_000_000, 2.0, lambda: now[0])
     assert pace.delay(7_000_000_000) == 1.0
@@ -88,7 +88,7 @@ def terminal() -> Iterator[tuple[int, int]]:
     os.close(program)
 
 
-def test_keys_are_read_one_by_one(terminal: tuple[int, int]) -> None:
+def test_keys_are_read_one_by_one(terminal):
     user, program = terminal
     keys = {b' ': PAUSE, b's': STEP, b'\x1b[C': STEP, b'\x1b[A': FASTER, b'\x1b[B': SLOWER,
             b'x': '', b'': ''}  # fmt: skip
@@ -98,7 +98,7 @@ def test_keys_are_read_one_by_one(terminal: tuple[int, int]) -> None:
             assert keyboard.read(5.0 if action else 0.0) == action
 
 
-def test_the_terminal_is_left_as_it_was(terminal: tuple[int, int]) -> None:
+def test_the_terminal_is_left_as_it_was(terminal):
     _, program = terminal
     before = termios.tcgetattr(program)
     with pytest.raises(KeyboardInterrupt), Keyboard(program):
@@ -107,7 +107,7 @@ def test_the_terminal_is_left_as_it_was(terminal: tuple[int, int]) -> None:
     assert termios.tcgetattr(program) == before
 
 
-def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_there_are_no_keys(monkeypatch):
     monkeypatch.setattr(sys, 'stdin', None)
     with Keyboard() as keyboard:
         assert not keyboard.attached and keyboard.read(0.0) == ''
@@ -164,7 +164,7 @@ LATCHED = offered(reliability=QosReliability.RELIABLE, durability=QosDurability.
 
 
 @ROS
-def test_quality_of_service_suits_the_recorded() -> None:
+def test_quality_of_service_suits_the_recorded():
     weak, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
     volatile, latched = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
     for recorded, expected in (
@@ -181,9 +181,7 @@ def test_quality_of_service_suits_the_recorded() -> None:
 
 
 @ROS
-def test_types_are_found_where_installed_and_nothing_else_is_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_types_are_found_where_installed_and_nothing_else_is_imported(tmp_path, monkeypatch):
     """Neither packages of other kinds, nor anything from the folder of a bag."""
     assert message_class('sensor_msgs/msg/Imu') is Imu
     for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', '/msg/',
@@ -203,7 +201,7 @@ def test_types_are_found_where_installed_and_nothing_else_is_imported(
 
 
 @pytest.fixture
-def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def context(tmp_path, monkeypatch) -> Iterator[Any]:
     """Return an initialized context."""
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     context = rclpy.Context()
@@ -216,7 +214,7 @@ def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 class Listener:
     """Subscribes and keeps all messages, spinning in a thread."""
 
-    def __init__(self, context: Any, topics: dict[str, Any]) -> None:
+    def __init__(self, context, topics: dict[str, Any]):
         self.node = rclpy.create_node('listener', context=context)
         self.heard: dict[str, list[Any]] = {topic: [] for topic in topics}
         for topic, kind in topics.items():
@@ -227,7 +225,7 @@ class Listener:
     def __enter__(self) -> 'Listener':
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error: object):
         self._executor.shutdown()
         self.node.destroy_node()
 
@@ -236,7 +234,7 @@ class Listener:
         return [time.sec * 10**9 + time.nanosec for time in times]
 
 
-def reliable(messages: list[Message], path: Path) -> Path:
+def reliable(messages, path: Path) -> Path:
     return write_rosbags(path, messages, storage='mcap')
 
 
@@ -245,9 +243,7 @@ TOPICS = {'/image_raw': Image, '/imu': Imu}
 
 @ROS
 @pytest.mark.parametrize('ros1', [False, True])
-def test_every_message_arrives_as_recorded(
-    ros1: bool, context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_every_message_arrives_as_recorded(ros1, context, tmp_path, messages):
     path = tmp_path / 'bag'
     path = write_ros1(path / 'a.bag', messages) if ros1 else reliable(messages, path)
     with Listener(context, TOPICS) as listener:
@@ -264,9 +260,7 @@ def test_every_message_arrives_as_recorded(
 
 
 @ROS
-def test_the_clock_runs_through_the_bag(
-    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_clock_runs_through_the_bag(context, tmp_path, messages, monkeypatch):
     config = PlayConfig(rate=2.0, wait=20.0)
     monkeypatch.setattr(bag_player, 'CLOCK_RATE_HZ', 200.0)  # the bag is short
     with Listener(context, {**TOPICS, '/clock': Clock}) as listener:
@@ -279,9 +273,7 @@ def test_the_clock_runs_through_the_bag(
 
 
 @ROS
-def test_offset_and_topics_are_chosen(
-    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_offset_and_topics_are_chosen(context, tmp_path, messages, monkeypatch):
     """What cannot be played is named before any wait for subscribers."""
     path, config = reliable(messages, tmp_path / 'bag'), PlayConfig(rate=50.0, wait=0.2)
     late = PlayConfig(rate=50.0, start_offset=0.55, wait=0.0)
@@ -296,9 +288,7 @@ def test_offset_and_topics_are_chosen(
 
 
 @ROS
-def test_types_that_are_not_installed_are_named_and_skipped(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_types_that_are_not_installed_are_named_and_skipped(context, tmp_path, messages):
     kind = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
     write_database(tmp_path / 'a.db3', messages, kind=lambda name: kind.get(name, name))
     config = PlayConfig(rate=50.0, wait=0.0)
@@ -311,9 +301,7 @@ def test_types_that_are_not_installed_are_named_and_skipped(
 
 
 @ROS
-def test_a_late_subscriber_of_images_misses_none(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_a_late_subscriber_of_images_misses_none(context, tmp_path, messages):
     """The subscriber of odometry was there long before: nodes start one after another."""
     path, played = reliable(messages, tmp_path / 'bag'), []
     with Listener(context, {'/odom': Odometry}):
@@ -329,7 +317,7 @@ def test_a_late_subscriber_of_images_misses_none(
 
 
 @ROS
-def test_a_loop_ends_when_ros_does(context: Any, tmp_path: Path, messages: list[Message]) -> None:
+def test_a_loop_ends_when_ros_does(context, tmp_path, messages):
     path, played = reliable(messages, tmp_path / 'bag'), []
     config = PlayConfig(rate=100.0, wait=20.0)
     with Listener(context, TOPICS) as listener:
@@ -347,9 +335,7 @@ def test_a_loop_ends_when_ros_does(context: Any, tmp_path: Path, messages: list[
 
 
 @ROS
-def test_pause_and_step_from_the_keyboard(
-    context: Any, tmp_path: Path, messages: list[Message], terminal: tuple[int, int]
-) -> None:
+def test_pause_and_step_from_the_keyboard(context, tmp_path, messages, terminal):
     user, program = terminal
     node = rclpy.create_node('player', context=context)
     path = write_version(tmp_path / 'bag', messages, 5)
@@ -374,9 +360,7 @@ def test_pause_and_step_from_the_keyboard(
 
 @ROS
 @pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
-def test_signals_end_it_cleanly(
-    number: int, code: int, context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_signals_end_it_cleanly(number, code, context, tmp_path, messages):
     path = reliable(messages, tmp_path / 'bag')
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--loop', '--rate=9']
     command += ['--wait-for', *TOPICS]
@@ -398,9 +382,7 @@ def test_signals_end_it_cleanly(
 
 @ROS
 @pytest.mark.parametrize('step', ['Node', 'message_class'])
-def test_a_shutdown_while_it_starts_ends_it(
-    step: str, context: Any, tmp_path: Path, messages: list[Message], monkeypatch: Any
-) -> None:
+def test_a_shutdown_while_it_starts_ends_it(step, context, tmp_path, messages, monkeypatch):
     def shut_down(*args: Any, **how: Any) -> Any:
         rclpy.try_shutdown(context=context)
         return original(*args, **how)
@@ -411,7 +393,7 @@ def test_a_shutdown_while_it_starts_ends_it(
 
 
 @ROS
-def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[Message]) -> None:
+def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path, messages):
     path = write_version(tmp_path / '\udcff', messages, 5)
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--wait=0', '--rate=99']
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S)
@@ -419,7 +401,7 @@ def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[M
     assert result.stdout.count(' messages\n') == len(COUNTS)
 
 
-def test_a_command_in_a_downloaded_folder_runs_none_of_its_code(tmp_path: Path) -> None:
+def test_a_command_in_a_downloaded_folder_runs_none_of_its_code(tmp_path):
     for name in ('yaml', 'argparse', 'numpy', 'rosbags'):
         (tmp_path / f'{name}.py').write_text('raise AssertionError("code of the folder ran")')
     result = subprocess.run(

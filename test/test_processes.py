@@ -11,7 +11,7 @@ import time
 import psutil
 import pytest
 
-from sfa_localization.commands.processes import Processes, terminable
+from sfa_localization.commands.processes import Processes
 from sfa_localization.data.errors import NodeError
 
 DEADLINE_S = 60
@@ -105,12 +105,3 @@ with terminable(), Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as proces
         starter.kill()
     assert 'KeyboardInterrupt' in errors
     assert not node.is_running()
-
-
-def test_terminable_restores_the_handlers():
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), terminable():
-        assert signal.getsignal(signal.SIGTERM) is not before
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(DEADLINE_S)
-    assert signal.getsignal(signal.SIGTERM) is before

@@ -9,11 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_training import RECIPE, write_bag
 
 from sfa_localization import cli
 from sfa_localization.data import progress
-from sfa_localization.training import STEPS, train
 
 ROOT = Path(__file__).parents[1]
 
@@ -67,19 +65,6 @@ def test_a_terminal_gets_a_bar(monkeypatch):
     monkeypatch.setattr(sys, 'stderr', screen)
     assert list(progress.progress_over(range(4), 'read', 4, shown=True)) == [0, 1, 2, 3]
     assert '\r' in screen.getvalue() and 'read: 100%' in screen.getvalue()
-
-
-def test_a_training_says_what_it_does(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(progress, 'LOG_PERIOD_S', 0.0)
-    train([write_bag(tmp_path / 'garden')], tmp_path / 'model.npz', RECIPE, progress=True)
-    text = capsys.readouterr().err
-    for words in ('read garden: ', 'learn slow features in ', 'compute the slow features of all',
-                  'learn the map from ', 'learn the heading ', 'refine the map ',
-                  'choose keyframes, and check the map '):  # fmt: skip
-        assert words in text, text
-    for step in (2, 3, 4, 6, 7, 8, 9):
-        assert f'(step {step} of {STEPS})' in text
-    assert '100% of' in text and ' s left' in text
 
 
 def test_every_command_says_what_it_writes():

@@ -16,7 +16,6 @@ from sfa_localization.camera import capture as capture_module
 from sfa_localization.camera import watch
 from sfa_localization.camera.capture import Device, Feed, Lost, opener
 from sfa_localization.camera.settings import CaptureConfig
-from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import CameraError, ConfigError
 
 PATIENCE_S = 10.0
@@ -193,21 +192,6 @@ def test_nothing_is_delivered_after_stop(run_feed):
     feed.check()
     assert script.opened == 1
     assert received.qsize() == count
-
-
-def test_frozen_watch_by_hand(monkeypatch):
-    monkeypatch.setattr(watch, 'FROZEN_S', 2.0)
-    now = [0.0]
-    frozen = FrozenWatch(lambda: now[0])
-    assert frozen.add(picture(1))
-    assert (frozen.repeats, frozen.frozen_for_s()) == (0, 0.0)
-    for now[0] in (1.0, 2.0):
-        assert not frozen.add(picture(1))
-    assert (frozen.repeats, frozen.frozen_for_s()) == (2, 0.0), 'not long enough yet'
-    now[0] = 3.0
-    assert frozen.frozen_for_s() == 3.0
-    assert frozen.add(picture(2))
-    assert (frozen.repeats, frozen.frozen_for_s()) == (0, 0.0)
 
 
 def test_a_folder_in_order_of_names_with_the_unreadable_named(tmp_path, run_feed):
