@@ -14,8 +14,6 @@ from ros_domains import free_domain
 pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
 
-from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
@@ -230,19 +228,3 @@ def test_a_section_for_another_namespace_or_a_misspelt_one_is_warned_of(start, t
         assert code == 0, text
         warned = f'{path}: nothing of {key} is used: this node is /robot1/ekf_node'
         assert (warned in text) == ignored and ('/**/ekf_node:' in text) == ignored
-
-
-def test_an_impossible_transition_does_not_end_the_node(bench, start):
-    process = start('ekf_node')
-    assert running(bench)
-    client = bench.node.create_client(ChangeState, 'ekf_node/change_state')
-    assert client.wait_for_service(DEADLINE_S)
-    wrong = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-    client.call_async(wrong)
-    right = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-    answer = client.call_async(right)
-    assert until(answer.done) and answer.result().success
-    assert process.poll() is None
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=DEADLINE_S)
-    assert process.returncode == 0

@@ -6,9 +6,7 @@ import array
 import dataclasses
 import gc
 import math
-import threading
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import pytest
@@ -28,7 +26,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion  # noqa: E40
 from nav_msgs.msg import Odometry  # noqa: E402
 from rcl_interfaces.msg import ParameterType  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
@@ -277,45 +275,6 @@ def test_a_node_that_ends_leaves_ros_without_waiting_for_the_garbage_collection(
         gc.enable()
         running.close()
         watching.close()
-
-
-class Slow(LocalizationNode):
-    """A node that is in the middle of a callback until it is let go."""
-
-    def __init__(self, way, **options):
-        super().__init__('slow', [], **options)
-        self.way, self.called, self.let_go = way, threading.Event(), threading.Event()
-
-    def setup(self):
-        self.out = self.publisher(String, 'out')
-        if self.way == 'timer':
-            self.every(0.01, self._work)
-        else:
-            self.subscribe(Float64, 'in', lambda message: self._work())
-
-    def _work(self):
-        self.called.set()
-        self.let_go.wait(DEADLINE_S)
-        self.out.publish(String(data='done'))
-
-
-@pytest.mark.parametrize('way', ['timer', 'message'])
-def test_a_node_destroyed_amid_its_callback_does_not_end_the_others_of_its_executor(way):
-    bench = Bench(DOMAIN)
-    try:
-        other, node = bench.run(Timed), bench.run(partial(Slow, way))
-        if way == 'message':
-            bench.publish('in', Float64())
-        assert node.called.wait(DEADLINE_S)
-        bench.executor.remove_node(node)
-        bench.nodes.remove(node)
-        node.destroy_node()
-        node.let_go.set()
-        before = other.calls
-        assert until(lambda: other.calls > before + 5)
-        assert not any(monitor.refused for monitor in node.monitors.values())
-    finally:
-        bench.close()
 
 
 class Failing(LocalizationNode):

@@ -195,14 +195,6 @@ def test_contributing_shows_the_same_rooms_and_arrows():
     ] == []
 
 
-def test_contributing_names_files_and_folders_that_exist():
-    text = (ROOT / 'CONTRIBUTING.md').read_text('utf-8')
-    names = set(re.findall(r'`([\w.]*\w(?:/\w[\w.]*)*(?:\.(?:py|yaml|xml|md)|/|/run))`', text))
-    assert {'metric/phases.py', 'commands/', 'config.py', '.ci/run'} <= names
-    missing = {name for name in names if not any((top / name).exists() for top in (ROOT, PACKAGE))}
-    assert missing == set()
-
-
 LONGEST_FUNCTION, TYPICAL_FUNCTION = 40, 8
 """Lines, with signature and docstring: the most that one has, and the most that the median has."""
 
@@ -352,11 +344,6 @@ def test_commands_show_examples_before_their_options():
         text = cli.command_parser(name).format_help()
         examples = text[text.index('examples:') : text.index('options:')]
         assert ' '.join(summary.split()) in ' '.join(text.split()) and f'  {name}' in examples
-
-
-def test_module_runs_as_a_program():
-    done = run_python('-m', NAME, '--version')
-    assert (done.returncode, done.stdout) == (0, f'{sfa_localization.__version__}\n')
 
 
 @pytest.mark.parametrize('command', ['filter x.csv x.csv --output x.tum', 'inspect x --report y'])

@@ -31,7 +31,7 @@ from bag_formats import (
 )
 from ros_domains import free_domain
 
-from sfa_localization.commands.pace import FASTER, PAUSE, SLOWER, STEP, Keyboard, Pace, PlayConfig
+from sfa_localization.commands.pace import Keyboard, Pace, PlayConfig
 from sfa_localization.data.errors import BagError
 
 ROOT = Path(__file__).parents[1]
@@ -88,16 +88,6 @@ def terminal() -> Iterator[tuple[int, int]]:
     os.close(program)
 
 
-def test_keys_are_read_one_by_one(terminal):
-    user, program = terminal
-    keys = {b' ': PAUSE, b's': STEP, b'\x1b[C': STEP, b'\x1b[A': FASTER, b'\x1b[B': SLOWER,
-            b'x': '', b'': ''}  # fmt: skip
-    with Keyboard(program) as keyboard:
-        for key, action in keys.items():
-            os.write(user, key)
-            assert keyboard.read(5.0 if action else 0.0) == action
-
-
 def test_the_terminal_is_left_as_it_was(terminal):
     _, program = terminal
     before = termios.tcgetattr(program)
@@ -105,12 +95,6 @@ def test_the_terminal_is_left_as_it_was(terminal):
         assert termios.tcgetattr(program) != before
         raise KeyboardInterrupt
     assert termios.tcgetattr(program) == before
-
-
-def test_without_a_terminal_there_are_no_keys(monkeypatch):
-    monkeypatch.setattr(sys, 'stdin', None)
-    with Keyboard() as keyboard:
-        assert not keyboard.attached and keyboard.read(0.0) == ''
 
 
 # Through ROS.

@@ -72,21 +72,6 @@ def test_where_images_show_none_nothing_is_corrected():
     assert found(0.1, seconds=0.9 * PAIRS_MIN)[1] is None  # 0.3 m each
 
 
-def test_the_way_that_was_driven_has_the_same_turns():
-    poses, odometry = losing(0.1)
-    track = OdometryTrack.of(odometry, SegmentConfig(), None)
-    driven = track.driven(Way(1.0, 0.1))
-    assert np.hypot(*(driven.poses - poses)[:, :2].T).max() < 0.02
-    assert np.hypot(*(track.poses - poses)[:, :2].T).max() > 0.5
-    assert np.array_equal(driven.yaw, track.yaw) and np.array_equal(driven.part, track.part)
-    again = OdometryTrack.of(
-        dataclasses.replace(odometry, poses=driven.poses), SegmentConfig(), None
-    )
-    assert np.allclose(driven.sums, again.sums, atol=1e-6)
-    longer = track.driven(Way(1.1, 0.0))
-    assert np.allclose(longer.poses[:, :2], 1.1 * track.poses[:, :2])
-
-
 def errors(loss):
     """Mean error (m) of a map of images, with odometry that loses way; and the training."""
     config, true = recipe(), wander(400, 2, hz=4.0)
