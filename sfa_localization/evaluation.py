@@ -41,6 +41,7 @@ from sfa_localization.data.geometry import (
 from sfa_localization.data.progress import progress_bar, progress_over
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.pose_filter import PoseFilter
@@ -120,6 +121,8 @@ class _Located:
         clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
         if clock.delay_ns:
             counts['camera_delay_s'] = round(clock.delay_s, 3)
+        if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
+            clock = CameraClock()
         assert run.ground_truth is not None
         features = np.array([one.estimate.slow_features for one in usable])
         return cls(run, run.ground_truth, _images(usable, clock), features, counts)

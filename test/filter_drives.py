@@ -1,6 +1,8 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Drives for the filter's tests: a true path, odometry and pictures with known errors."""
+"""Drives for the filter's tests: a true path, odometry and pictures with known errors; and filters
+to give them to.
+"""
 
 import math
 from dataclasses import dataclass, field
@@ -9,8 +11,37 @@ import numpy as np
 
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.run import integrate
+from sfa_localization.fusion.pose_filter import PoseFilter
 
-START_NS = 1_700_000_000_000_000_000
+SECOND, START_NS = 1_000_000_000, 1_700_000_000_000_000_000
+NOISY = {
+    'v_std': 0.02, 'omega_std': 0.01, 'position_std': 0.2, 'yaw_std': 0.05, 'share': 0.7,
+    'bias': 0.002, 'scale': 1.01,
+}  # fmt: skip
+
+
+def known(pose=(0.0, 0.0, 0.0), std=0.05, **how):
+    """A filter that was told where it starts."""
+    fused = PoseFilter(**how)
+    fused.set_pose(START_NS, pose, std**2 * np.eye(3))
+    return fused
+
+
+def fed(fused, drive, events=None, heading=True):
+    """The filter after a drive, or after its events in this order."""
+    for event in drive.events() if events is None else events:
+        drive.give(fused, event, heading)
+    return fused
+
+
+def snapshot(fused):
+    state = fused.state
+    return state.stamp_ns, state.mean.tolist(), state.covariance.tolist()
+
+
+def seconds_of(event):
+    """Of the drive."""
+    return (event[0] - START_NS) * 1e-9
 
 
 def stamps(count, rate_hz, start_ns=START_NS):
@@ -36,7 +67,9 @@ def true_path(stamps_ns, twists, start=(0.0, 0.0, 0.0)):
 
 @dataclass
 class Drive:
-    """A drive to be fed to a filter: odometry in order, pictures every `every` samples."""
+    """A drive to be fed to a filter: odometry in order, pictures every `every` samples; they claim
+    a standard deviation of `claimed_m` and a tenth of it, or that which they have.
+    """
 
     seconds: float = 30.0
     rate_hz: float = 50.0
@@ -51,6 +84,7 @@ class Drive:
     scale: float = 1.0
     share: float = 0.0
     length: float = 0.6
+    claimed_m: float | None = None
     seed: int = 0
     stamps_ns: np.ndarray = field(init=False)
 
@@ -96,9 +130,11 @@ class Drive:
 
     def covariance(self, heading):
         position, yaw = max(self.position_std, 0.05), max(self.yaw_std, 0.02)
+        if self.claimed_m is not None:
+            position, yaw = self.claimed_m, self.claimed_m / 10
         return np.diag(np.square([position, position, yaw][: 3 if heading else 2]))
 
-    def events(self, heading=False):
+    def events(self):
         """(stamp, kind, index) in order; odometry before the picture of the same stamp."""
         listed = [(int(s), 0, i) for i, s in enumerate(self.stamps_ns)]
         listed += [(int(self.stamps_ns[i]), 1, k) for k, i in enumerate(self.pictures)]
@@ -118,7 +154,7 @@ class Drive:
         """Feed seconds [start, stop); per picture: (index, update, error, yaw error)."""
         found = []
         for event in self.events():
-            t = (event[0] - START_NS) * 1e-9
+            t = seconds_of(event)
             if t < start or (stop is not None and t >= stop) or (event[1] and not pictures):
                 continue
             update = self.give(fused, event, heading)

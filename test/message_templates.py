@@ -14,25 +14,16 @@ ERRORS = {name for name in vars(errors) if name.endswith('Error')}
 REASONS = {
     'fusion/status.py': (
         'status_of',
-        'uncertainty',
-        '_heading',
-        '_weakness',
+        '_known_to',
         '_rejections',
         '_missing',
         '_contradictions',
         '_silences',
     ),
-    'fusion/consistency.py': ('doubts', 'compared', 'stood', '_turned'),
-    'fusion/mounting.py': ('problem',),
-    'fusion/turn_watch.py': ('problem',),
-    'fusion/pose_filter.py': (
-        'status',
-        '_apart_in_time',
-        '_require_place',
-        '_require_others_ahead',
-    ),
-    'fusion/update.py': ('_fused', '_followed', '_gated'),
-    'fusion/recover.py': ('weighed',),
+    'fusion/health.py': ('problems', '_told'),
+    'fusion/timeline.py': ('problems', 'require_place', '_require_others_ahead'),
+    'fusion/pose_filter.py': ('status', '_require_place'),
+    'fusion/ekf.py': ('_fused', '_gated', '_rejected', '_started'),
     'camera/watch.py': ('judge', 'judge_novelty'),
     'localizer.py': ('_observation',),
     'nodes/discovery.py': ('_tell',),
@@ -65,10 +56,19 @@ def is_sentence(text: str) -> bool:
 def error_templates() -> Iterator[tuple[str, str]]:
     """File and text of each error in the code."""
     for path in sorted(PACKAGE.rglob('*.py')):
-        for node in ast.walk(ast.parse(path.read_text('utf-8'))):
+        tree = ast.parse(path.read_text('utf-8'))
+        named = {
+            target.id: template(node.value)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+            if isinstance(target, ast.Name)
+        }
+        for node in ast.walk(tree):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
                 continue
-            text = template(node.args[0])
+            what = node.args[0]
+            text = named.get(what.id, '') if isinstance(what, ast.Name) else template(what)
             if node.func.id in ERRORS and is_sentence(text):
                 yield str(path.relative_to(PACKAGE)), text
 

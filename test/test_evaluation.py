@@ -21,11 +21,11 @@ from sfa_localization.cli import main
 from sfa_localization.config import write_config
 from sfa_localization.data.geometry import rotation
 from sfa_localization.data.run import PanoramaArray, Trajectory
-from sfa_localization.fusion import recover
-from sfa_localization.fusion.belief import Trust
-from sfa_localization.fusion.lateness import Lateness
-from sfa_localization.fusion.predict import COAST_S
+from sfa_localization.fusion import pose_filter
+from sfa_localization.fusion.health import health_of
+from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.status import Level
+from sfa_localization.fusion.track import Track
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -135,8 +135,7 @@ def test_seconds_in_which_the_filter_was_sure_and_wrong_are_counted(
     assert 'an error of more than a meter' not in capsys.readouterr().out
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: Torn()))
     # Driving would notice it.
-    monkeypatch.setattr(recover, 'begun', lambda traveled_m: Trust())
-    monkeypatch.setattr(Lateness, 'untested', False)
+    monkeypatch.setattr(pose_filter, 'health_of', lambda track: health_of(Track().trusted()))
     counts = evaluated(bag, tmp_path)['counts']
     wrong, localised = counts['false_localised_s'], counts['states_s']['LOCALISED']
     assert 0.5 * localised < wrong <= localised

@@ -16,10 +16,15 @@ from scipy.stats import chi2
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose, wrap_angle
-from sfa_localization.fusion.motion import ODOMETRY_CORRELATION_S, TURN_RADIUS_M, YAW_PER_METER
+from sfa_localization.fusion.motion import (
+    CALIBRATION_STDS,
+    ODOMETRY_CORRELATION_S,
+    TURN_RADIUS_M,
+    YAW_PER_METER,
+)
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.fusion.recover import BIAS_STD, SCALE_STD
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.smoother import Smoother
 
 pytestmark = pytest.mark.slow  # trains, or replays many drives
 
@@ -71,8 +76,7 @@ class Robot:
                     strict=True)  # fmt: skip
         omega = sum(size * np.sin(rate * t + phase) for size, rate, phase in turns)
         planned = np.stack([np.full(count, world.speed), omega], 1)
-        bias = BIAS_STD * rng.standard_normal()
-        scale = 1 + SCALE_STD * rng.standard_normal()
+        bias, scale = CALIBRATION_STDS[:2] * rng.standard_normal(2) + [0.0, 1.0]
         self.stamps_ns = stamps(count, world.rate_hz)
         self.read = planned
         error = lasting(rng, count, dt) * [V_STD, OMEGA_STD]
@@ -92,10 +96,6 @@ class Robot:
             poses.append(compose(poses[-1], steps[k]) + drift)
         return np.array(poses)
 
-    def truth(self, k):
-        """The pose (3,) at the k-th stamp."""
-        return self.poses[k]
-
     def _seen(self, rng, error):
         poses = self.poses[self.pictures]
         moved = np.abs(self.true) @ [1, TURN_RADIUS_M]
@@ -107,6 +107,13 @@ class Robot:
             own = math.sqrt(1 - error.share) * rng.standard_normal(3)
             seen.append(pose + PICTURE_STD * (math.sqrt(error.share) * common + own))
         return np.array(seen)
+
+
+def nees_of(state, pose):
+    """Normalized estimation error squared of x, y and yaw."""
+    miss = state.pose - pose
+    miss[2] = wrap_angle(miss[2])
+    return miss @ np.linalg.solve(state.pose_covariance, miss)
 
 
 def judged(world, robot, fused):
@@ -124,9 +131,7 @@ def judged(world, robot, fused):
                 nis.append(update.d2)
                 refused += not update.accepted
         if k in checks:
-            miss = fused.state.pose - robot.truth(k)
-            miss[2] = wrap_angle(miss[2])
-            nees.append(miss @ np.linalg.solve(fused.state.pose_covariance, miss))
+            nees.append(nees_of(fused.state, robot.poses[k]))
     return nees, sum(nis), size * len(nis), refused / len(nis)
 
 
@@ -168,3 +173,15 @@ def test_without_the_models_knowledge_it_is_rather_too_modest():
         world = World(1.0, 20, 5, 20, ErrorCorrelation(0.6, 0.7))
         nees.append(judged(world, Robot(world, seed), PoseFilter(SHIPPED))[0])
     assert np.all(np.sum(nees, 0) < chi2.ppf(0.9995, 3 * SEEDS))
+
+
+@pytest.mark.parametrize('name', ['garden', 'slow, white', 'no heading'])
+def test_smoothed_estimates_err_as_they_say(name):
+    world, nees = WORLDS[name], []
+    for seed in range(SEEDS):
+        robot, fused = Robot(world, seed), Smoother(SHIPPED, world.error)
+        judged(world, robot, fused)
+        states, k = {state.stamp_ns: state for state in fused.smoothed()}, len(robot.read) // 2
+        nees.append(nees_of(states[int(robot.stamps_ns[k])], robot.poses[k]))
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * SEEDS)
+    assert low < sum(nees) < high

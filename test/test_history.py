@@ -22,14 +22,6 @@ def test_every_order_of_arrival_ends_alike():
         assert history.newest == tuple('abcde')
 
 
-def test_adding_tells_the_belief_right_after_the_event():
-    history = trail()
-    history.add((1, 0), 'a')
-    history.add((3, 0), 'c')
-    assert history.add((2, 0), 'b') == ('a', 'b')
-    assert history.newest == ('a', 'b', 'c')
-
-
 def test_events_that_lie_ahead_are_redone_when_they_are_asked_for_alone():
     stepped = []
     history = History(1000, (), lambda belief, event: stepped.append(event) or (*belief, event))

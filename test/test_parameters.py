@@ -87,7 +87,8 @@ def of_bag(settings: BagConfig, folder: Path) -> Any:
 
 def of_filter(settings: FilterConfig) -> Any:
     """What a filter believes along a drive with everything that may happen to one."""
-    fused, seen = PoseFilter(settings), []
+    fused, weak = PoseFilter(settings), PoseFilter(settings)
+    seen = [weak.add_measurement(START_NS, np.zeros(3), np.diag([9.0, 9.0, 0.1])).reason]
     rng = np.random.default_rng(1)
     moving = [(1.0, 0.5 * np.sin(0.05 * i)) for i in range(1200)]
     twists = np.array(moving[:300] + [(5e-4, 1e-3)] * 40 + moving[300:])

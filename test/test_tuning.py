@@ -14,7 +14,6 @@ from sfa_localization.config import load_changes, write_config
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import Odometry, Trajectory
-from sfa_localization.fusion import inputs
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.tuning import ImagePoses, Outcome, TuneConfig, TuningDrive
 
@@ -42,14 +41,10 @@ def test_the_likelihood_is_best_near_the_true_noise():
     assert costs[4.0] < costs[0.25] and costs[4.0] < costs[64.0]
 
 
-def test_rejecting_everything_is_not_likely(monkeypatch):
-    drives = [tuning_drive(claimed=0.2, true=0.2)]
-    monkeypatch.setattr(inputs, 'POSITION_STD_FLOOR', 1e-3)
-    monkeypatch.setattr(inputs, 'YAW_STD_FLOOR', 1e-3)
-    tiny = FilterConfig(measurement_factor=1e-3)
-    assert (
-        tuning.likelihood_cost(drives, tiny) > tuning.likelihood_cost(drives, FilterConfig()) + 0.5
-    )
+def test_rejecting_everything_is_not_likely():
+    drives = [tuning_drive(claimed=0.2, true=0.6)]
+    tiny, right = (FilterConfig(measurement_factor=factor) for factor in (1e-3, 9.0))
+    assert tuning.likelihood_cost(drives, tiny) > tuning.likelihood_cost(drives, right) + 0.5
 
 
 def test_the_optimizer_improves_and_needs_no_truth():

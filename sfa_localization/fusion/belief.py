@@ -75,19 +75,15 @@ class Update(NamedTuple):
 class Memory(NamedTuple):
     """The record of measurements since the last start.
 
-    `support` counts accepted images, `rejected` those outside the gate in a row, of which the last
-    has a d2 / threshold of `gate_excess`. `accepted_ns` and `accepted_m` are stamp and distance
-    traveled at the last accepted image, `precise_ns` is the stamp of the last that shows the place
-    well by itself. `outage`: those rejected followed a long time without images. `images` are the
-    latest. `scatter`, the usual squared distance of images over that expected, and `period_s`, the
-    usual time between images, outlive restarts.
+    `support` counts accepted images, `rejected` those outside the gate in a row. `accepted_ns` is
+    the stamp of the last accepted image, `precise_ns` of the last that shows the place well by
+    itself; `images` are the latest. `scatter`, the usual squared distance of images over that
+    expected, and `period_s`, the usual time between images, outlive restarts.
     """
 
     support: int = 0
     rejected: int = 0
-    gate_excess: float = 0.0
     accepted_ns: int | None = None
-    accepted_m: float = 0.0
     precise_ns: int | None = None
     images: tuple[Image, ...] = ()
     update: Update | None = None

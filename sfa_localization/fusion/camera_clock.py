@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps
 
 LONGEST_S = 2.5
@@ -52,30 +52,21 @@ class CameraClock:
         return CameraClock(self.delay_s, min(self.std_s, found.std_s), True)
 
 
-_SIGNIFICANT_STDS = 2.0
-# Mean absolute value of a standard normal variable: sqrt(2 / pi).
-_MEAN_OF_NORMAL = 0.798
+_SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.0, 0.798  # of |x|: sqrt(2 / pi)
 _STEP_S = 0.02
 _GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
-# Images farther apart in time are not compared, nor images with a pause of the odometry between.
-_APART_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
-# Images closer in time than this are skipped: turns between them are too small.
-_NEAR_NS = 150_000_000
-# An estimate applies to images stamped so much later: those already in transit keep the old one,
-# so that the result does not depend on which message came first.
-_IN_TRANSIT_NS = 1_000_000_000
+# Images nearer in time show turns that are too small; farther ones, or with a pause of the odometry
+# between, are not compared. An estimate is for images stamped so much later, so that those in
+# transit do not depend on which message came first.
+_NEAR_NS, _APART_NS, _PAUSE_NS = 150_000_000, 1_000_000_000, 500_000_000
+_IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
 _WINDOW_NS = round(LONGEST_S * 1e9) + 100_000_000
-_REMEMBERED_NS = 10_000_000_000
 # Differences beyond a few of these are mismatches of images and count no more, rad.
 _SCALE_RAD, _OUTLIER = 0.05, 4.0
-# A turn by less does not show how well images and odometry agree on turns, rad.
-_TURN_RAD = 0.05
-_TURNS_MIN = 10
-# Factor on the standard deviation, because neighboring pairs err alike: on a slow curve, things
-# that pass near the camera look like turns for seconds.
-_CAUTION = 4.0
-_SCALE_MIN_RAD = 1e-3
-_STD_MAX_S = 0.06
+# Smaller turns, rad, and fewer do not show how well images and odometry agree.
+_TURN_RAD, _TURNS_MIN = 0.05, 10
+# Neighboring pairs err alike: on a slow curve, things near the camera look like turns for seconds.
+_CAUTION, _SCALE_MIN_RAD, _STD_MAX_S = 4.0, 1e-3, 0.06
 
 
 class CameraClockFinder:
@@ -197,17 +188,12 @@ def camera_clock(odometry: Odometry, stamps_ns: Stamps, headings: Iterable[float
     either, because the one that agrees better with the odometry is taken.
     """
     finder, image_headings = CameraClockFinder(), iter(headings)
-    rates = _turn_rates(odometry).tolist()
+    # The poses' own turn rates: also where messages hold no twist.
+    seconds = np.maximum(np.diff(odometry.stamps_ns) * 1e-9, 1e-9)
+    rates = [0.0, *(np.diff(np.unwrap(odometry.poses[:, 2])) / seconds).tolist()]
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps_ns):
         if kind == ODOMETRY:
             finder.add_odometry(stamp_ns, rates[i])
         else:
             finder.add_heading(stamp_ns, next(image_headings))
     return finder.clock
-
-
-def _turn_rates(odometry: Odometry) -> Array:
-    """The poses' own turn rates (N,): also where messages hold no twist."""
-    turned = np.diff(np.unwrap(odometry.poses[:, 2]))
-    seconds = np.maximum(np.diff(odometry.stamps_ns) * 1e-9, 1e-9)
-    return np.concatenate([[0.0], turned / seconds])

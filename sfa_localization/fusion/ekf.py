@@ -15,7 +15,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.stats import chi2
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
@@ -29,7 +29,7 @@ from sfa_localization.fusion.belief import (
 )
 from sfa_localization.fusion.inputs import lower_root, symmetric
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
-from sfa_localization.fusion.odometry import COAST_S, interval
+from sfa_localization.fusion.odometry import COAST_S, Interval, interval
 from sfa_localization.fusion.relocation import (
     FEW_IMAGES,
     Relocation,
@@ -72,7 +72,7 @@ def measurement_event(
     """
     size = len(value)
     jacobian = _OBSERVED[:size].copy()
-    jacobian[:, ERROR : ERROR + size] = lower_root(covariance, math.sqrt(share))
+    jacobian[:, ERROR : ERROR + size] = lower_root(covariance.tolist(), math.sqrt(share))
     return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
 
 
@@ -109,7 +109,8 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
 def _residual(z: Array, predicted: Array) -> Array:
     """Innovation, its angle wrapped."""
     difference = z - predicted
-    difference[YAW:] = wrap_angle(difference[YAW:])
+    if len(difference) == 3:
+        difference[YAW] = wrap(float(difference[YAW]))
     return difference
 
 
@@ -144,8 +145,7 @@ class Ekf:
         belief = self.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-            memory = Memory(accepted_m=belief.traveled_m)
-            return placed._replace(memory=memory, track=belief.track.trusted())
+            return placed._replace(memory=Memory(), track=belief.track.trusted())
         return self._measured(belief, event)
 
     # Predict.
@@ -160,6 +160,8 @@ class Ekf:
                 odometry_pose=event.pose,
             )
         held = interval(belief, event)
+        if held.now is None:
+            belief = belief._replace(track=belief.track.interrupted())
         if not held.bridged:  # most of so long a silence was spent somehow else
             belief = self.coast(belief, event.stamp_ns)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
@@ -170,8 +172,7 @@ class Ekf:
         step = motion.drive(belief.mean, twist, dt, noise, held.now)
         if held.unknown_s > 0:
             motion.add_unknown_motion(step.noise, twist, min(dt, held.unknown_s))
-        event = event._replace(twist=held.now or event.twist)
-        return self._moved(belief, event.stamp_ns, step, event, held.omega)
+        return self._moved(belief, event.stamp_ns, step, event, held)
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
         """The belief at a later stamp without new odometry: at the last speed, then unknown."""
@@ -195,7 +196,7 @@ class Ekf:
         stamp_ns: int,
         step: Step,
         event: OdometryEvent | None = None,
-        omega: float = 0.0,
+        held: Interval | None = None,
     ) -> Belief:
         """Apply a prediction to mean, covariance, dead reckoning and the distance traveled."""
         before_x, before_y, before_yaw = belief.mean[:3].tolist()
@@ -214,14 +215,14 @@ class Ekf:
             located,
             reckoned,
             belief.traveled_m + math.hypot(dx, dy),
-            event.twist if event else belief.twist,
+            (held and held.now) or (event.twist if event else belief.twist),
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
             event.pose if event else belief.odometry_pose,
             _added(belief, step),
             belief.turns,
             belief.track.driven(stamp_ns, reckoned),
-            omega if event else belief.omega,
+            held.omega if held else belief.omega,
         )
 
     # Update.
@@ -230,16 +231,14 @@ class Ekf:
         """The belief, predicted to the event's stamp before, after a measurement."""
         image = _image(belief, event)
         belief = self._fused(self._turns_weighed(belief, event), event, image)
-        update, track = (
-            belief.memory.update,
-            belief.track.driven(event.stamp_ns, image.dead_reckoned),
-        )
-        if update and update.reason == ELSEWHERE:
+        update, track = belief.memory.update, belief.track
+        assert update is not None
+        if update.reason == ELSEWHERE:
             track = track.placed(event.stamp_ns, belief.traveled_m)
-        belief = belief._replace(track=track.seen(image))
-        if update and update.reason in STARTS:
-            return belief._replace(turns=self._turns_begun(belief))
-        return belief
+        track = track.driven(event.stamp_ns, image.dead_reckoned).seen(image)
+        if update.reason in STARTS:
+            return belief._replace(track=track, turns=self._turns_begun(belief))
+        return belief if track is belief.track else belief._replace(track=track)
 
     def _turns_begun(self, belief: Belief) -> TurnNoise:
         """What is known about the noise of turns, from another pose on."""
@@ -262,86 +261,84 @@ class Ekf:
         return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
 
     def _fused(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
-        period_s = _period_s(belief.memory, event.stamp_ns)
-        belief = belief._replace(memory=belief.memory._replace(period_s=period_s))
+        """Fuse, or start from one image with heading or the path along which several lie."""
         if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
             return self._gated(belief, event, image)
-        images = remembered(belief.memory.images, image)
-        started = self._started(belief, event, images)
-        if started is not None:
-            return started
-        reason = 'heading unknown yet' if event.value.size == 2 else 'too uncertain to start from'
+        images, config = remembered(belief.memory.images, image), self._config
+        if event.value.size == 3:
+            x, y, yaw = event.covariance.diagonal().tolist()
+            if max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2:
+                return self._restarted(belief, event, None, 'started')
+            reason = 'too uncertain to start from'
+        else:
+            found = relocate(images, self._correlation.distance_m)
+            if found is not None and found.shows_heading(len(images)):
+                return self._restarted(belief, event, found, 'started')
+            reason = 'heading unknown yet'
         update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
         return belief._replace(memory=belief.memory._replace(images=images, update=update))
 
     def _gated(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
-        """Accept what lies inside the gate, after an outage only when others confirm it."""
+        """Accept what lies inside the gate; what is outlying within loses weight."""
         mean, covariance, d2 = self._kalman.corrected(belief, event)
-        size, kalman = event.value.size, self._kalman
-        far = _lies_far(belief, event)
-        update = Update(event.stamp_ns, True, d2, _GATE[size], 'accepted', kalman.y, kalman.S, far)
-        if d2 > _GATE[size]:
-            rejected = update._replace(accepted=False, reason='outside the gate')
-            return self._rejected(belief, event, image, rejected)
+        size, kalman, inside = event.value.size, self._kalman, d2 <= _GATE[event.value.size]
+        reason, far = 'accepted' if inside else 'outside the gate', _lies_far(belief, event)
+        shown = kalman.y, kalman.S, far
+        update = Update(event.stamp_ns, inside, d2, _GATE[size], reason, *shown)
+        if not inside:
+            return self._rejected(belief, event, image, update)
         scatter = belief.memory.scatter
         outlying = d2 / (scatter * _OUTLYING[size])
         if outlying > 1 and self._alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
-        memory = Memory(
-            support=belief.memory.support + 1,
-            images=remembered(belief.memory.images, image._replace(accepted=True)),
-            update=update,
-            # At most 1: an image that claims too little is not believed more than it claims.
-            scatter=min(max(_nearer(scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0),
-            period_s=belief.memory.period_s,
-        )
-        memory = self._with_accepted(memory, belief, event)
+        # At most 1: an image that claims too little is not believed more than it claims.
+        scatter = min(max(_nearer(scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0)
+        images = remembered(belief.memory.images, image.fused())
+        memory = self._accepted(belief, event, belief.memory.support + 1, images, update, scatter)
         return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
-    def _with_accepted(self, memory: Memory, belief: Belief, event: MeasurementEvent) -> Memory:
-        """With an image that was accepted; what makes weak ones weak is the same for all."""
-        std_m = motion.largest_std(event.covariance)
+    def _accepted(
+        self,
+        belief: Belief,
+        event: MeasurementEvent,
+        support: int,
+        images: tuple[Image, ...],
+        update: Update,
+        scatter: float,
+    ) -> Memory:
+        """The memory after an accepted image; what makes weak ones weak is the same for all."""
+        std_m, before = motion.largest_std(event.covariance), belief.memory
         weak = self._alike and std_m > self._config.degraded_std
-        return memory._replace(
+        return Memory(
+            support=support,
             accepted_ns=event.stamp_ns,
-            accepted_m=belief.traveled_m,
-            precise_ns=belief.memory.precise_ns if weak else event.stamp_ns,
+            precise_ns=before.precise_ns if weak else event.stamp_ns,
+            images=images,
+            update=update,
+            scatter=scatter,
+            period_s=_period_s(before, event.stamp_ns),
         )
 
     # Start, and start anew.
-
-    def _started(
-        self, belief: Belief, event: MeasurementEvent, images: tuple[Image, ...]
-    ) -> Belief | None:
-        """Start from one image with heading, or from the path along which several lie; None yet."""
-        if event.value.size == 3:
-            x, y, yaw = event.covariance.diagonal().tolist()
-            config = self._config
-            lost = max(x, y) > config.lost_std**2 or yaw > config.lost_yaw_std**2
-            return None if lost else self._restarted(belief, event, None, 'started')
-        found = relocate(images, self._correlation.distance_m)
-        if found is None or not found.shows_heading(len(images)):
-            return None
-        return self._restarted(belief, event, found, 'started')
 
     def _rejected(
         self, belief: Belief, event: MeasurementEvent, image: Image, update: Update
     ) -> Belief:
         """After a rejected image: restarted where those rejected outweigh the estimate."""
-        memory, outside = belief.memory, update.d2 > update.threshold
+        memory = belief.memory
         images = remembered(memory.images, image)
         found = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
         if found is not None and found.outweighs(belief):
             return self._restarted(belief, event, found, ELSEWHERE)
         memory = memory._replace(
-            rejected=memory.rejected + int(outside),
-            gate_excess=update.d2 / update.threshold,
+            rejected=memory.rejected + 1,
             images=images,
             update=update,
+            period_s=_period_s(memory, event.stamp_ns),
         )
         belief = belief._replace(memory=memory)
-        return self._widened(belief) if outside and memory.rejected >= FEW_IMAGES else belief
+        return self._widened(belief) if memory.rejected >= FEW_IMAGES else belief
 
     def _restarted(
         self, belief: Belief, event: MeasurementEvent, found: Relocation | None, reason: str
@@ -349,10 +346,9 @@ class Ekf:
         """At the pose that several images show, or at the event's own."""
         pose, covariance = found[:2] if found else event[1:3]
         update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
-        scatter, period_s = belief.memory.scatter, belief.memory.period_s
-        memory = Memory(support=1, update=update, scatter=scatter, period_s=period_s)
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
-        return placed._replace(memory=self._with_accepted(memory, belief, event))
+        memory = self._accepted(belief, event, 1, (), update, belief.memory.scatter)
+        return placed._replace(memory=memory)
 
     def _widened(self, belief: Belief) -> Belief:
         """In doubt, the pose becomes less certain with every new place that contradicts it."""

@@ -52,8 +52,9 @@ LONGEST_M = 14.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
-_NEVER_ALL = 1e-9  # of an image's weight is left, so that some path fits best
+_TINY = 1e-9  # part of an image's weight that is left, so that some path fits best
 _STEPS = 2  # of reweighting, from where the fit hardly changes
+_LEVER, _TURNED, _SCALE = 1, 2, 3  # kinds of rows
 _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 _BEFORE = 8  # images before it was placed anew, from which on the robot may have been elsewhere
 
@@ -105,26 +106,22 @@ def health_of(track: Track) -> Health:
     if len(track.images) <= 3:  # so few always lie on some path
         return Health(1.0, '', 0j, (0.0, 0.0, 0.0), confirmed_m, needed_m)
     window = _Window(track)
-    table = window.hypotheses()
-    harmful = (table.off_m > HARMLESS_M) | (table.off_rad > HARMLESS_RAD)
-    odds = np.exp(table.log_odds - table.log_odds.max())
-    odds = np.where(harmful, odds, 0.0) / odds.sum()
-    worst = int(np.argmax(odds))
-    place, turned = float(odds @ table.off_m**2) / 2, float(odds @ table.off_rad**2)
+    found = window.hypotheses()
+    largest = max(item.log_odds for item in found)
+    odds = np.exp([item.log_odds - largest for item in found])
+    odds = np.where([item.is_harmful for item in found], odds, 0.0) / odds.sum()
+    worst = found[int(np.argmax(odds))]
+    place = float(odds @ [item.off_m**2 for item in found]) / 2
+    turned = float(odds @ [item.off_rad**2 for item in found])
+    well, confirmed_m = 1.0 - float(odds.sum()), min(confirmed_m, window.unbroken_m)
     return Health(
-        1.0 - float(odds.sum()),
-        table.names[worst],
-        complex(table.sizes[worst]),
-        (place, place, turned),
-        min(confirmed_m, window.unbroken_m),
-        needed_m,
+        well, worst.name, complex(worst.size), (place, place, turned), confirmed_m, needed_m
     )
 
 
 def _confirmed(track: Track) -> tuple[float, float]:
     """Meters driven from where the filter was placed to the newest image, and those needed: twice
-    as many each time that it was placed anew, by images that agreed over as many as the first time
-    needs.
+    as many each time that it was placed anew, by images that agreed over as many as the first time.
     """
     times, traveled_m = len(track.placings), track.images[-1].traveled_m if track.images else 0.0
     if times == 0:
@@ -133,18 +130,20 @@ def _confirmed(track: Track) -> tuple[float, float]:
     return driven_m, min(AGREEING_M * 2.0 ** (times - 1), AGREEING_M + LONGEST_M)
 
 
-class _Table(NamedTuple):
-    """What may be the matter (H,), with log odds up to a constant, its size, and how far from the
-    truth, m and rad, it lets images put the robot now.
-
-    Sizes are seconds, m ahead + i m to the left, rad, or a factor.
+class _Hypothesis(NamedTuple):
+    """What may be the matter, its size (seconds, m ahead + i m to the left, rad, or a factor), and
+    how far off it lets images put the robot now.
     """
 
-    names: list[str]
-    log_odds: Array
-    sizes: Complex
-    off_m: Array
-    off_rad: Array
+    name: str
+    log_odds: float
+    size: complex = 0j
+    off_m: float = 0.0
+    off_rad: float = 0.0
+
+    @property
+    def is_harmful(self) -> bool:
+        return self.off_m > HARMLESS_M or self.off_rad > HARMLESS_RAD
 
 
 class _Window:
@@ -153,62 +152,48 @@ class _Window:
     """
 
     def __init__(self, track: Track) -> None:
-        images = track.images
-        stamps = np.array([image.stamp_ns for image in images])
-        self._stamps, self._placings, newest_ns = stamps, track.placings, int(stamps[-1])
-        self._seconds = (stamps - newest_ns) * 1e-9
-        self._places = np.array([image.place for image in images])
-        yaws = np.array([image.yaw for image in images])
-        self._has_yaw = np.isfinite(yaws)
-        self._yaws = np.where(self._has_yaw, yaws, 0.0)
-        self._way_m = np.array([image.traveled_m for image in images])
-        behind_m = self._way_m[-1] - self._way_m
-        claimed = np.array([(image.variance, image.yaw_variance) for image in images]).T
-        floors = np.array([[FLOOR_M], [FLOOR_RAD]]) ** 2
-        drift = np.array([[ODOMETRY_DRIFT], [YAW_DRIFT]]) * behind_m
-        self._variance, self._yaw_variance = CAUTION * claimed + floors + drift**2
-        yaw_norm = np.sqrt(2 * np.pi * np.where(self._has_yaw, self._yaw_variance, 2 * np.pi))
-        self._peak = (1 - OUTLIERS) / (2 * np.pi * self._variance * yaw_norm)
+        images, newest_ns = track.images, track.images[-1].stamp_ns
+        columns = [(i.stamp_ns - newest_ns, i.yaw, i.traveled_m, i.variance) for i in images]
+        stamps, yaws, self._way_m, variance = np.array(columns).T
+        yaw_variance = np.array([image.yaw_variance for image in images])
+        self._seconds, self._places = stamps * 1e-9, np.array([image.place for image in images])
+        has_yaw, behind_m = np.isfinite(yaws), self._way_m[-1] - self._way_m
+        self._yaws = np.where(has_yaw, yaws, 0.0)
+        self._variance = CAUTION * variance + FLOOR_M**2 + (ODOMETRY_DRIFT * behind_m) ** 2
+        self._yaw_variance = CAUTION * yaw_variance + FLOOR_RAD**2 + (YAW_DRIFT * behind_m) ** 2
+        yaw_width = np.sqrt(2 * np.pi * np.where(has_yaw, self._yaw_variance, 2 * np.pi))
+        self._peak = (1 - OUTLIERS) / (2 * np.pi * self._variance * yaw_width)
         knots = np.array([(knot[0] - newest_ns, *knot[1:]) for knot in track.knots])
         self._times, (x, y, yaw) = knots[:, 0] * 1e-9, knots[:, 1:].T
         self._path, self._path_yaw = x + 1j * y, np.unwrap(yaw)
         self._power = min(1.0, max(1 + behind_m[0], 3.0) / len(images))
+        placed_ns = track.placings[-1].stamp_ns if track.placings else 0
+        self._placed = int(np.searchsorted(stamps, placed_ns - newest_ns))
         self.unbroken_m = math.inf
 
-    def hypotheses(self) -> _Table:
-        """All of them."""
+    def hypotheses(self) -> list[_Hypothesis]:
+        """All, with log odds up to a constant."""
         rows, yaws, delays = self._paths()
-        logs, _ = self._fitted(rows, yaws)
-        rest = 1 - sum(PRIOR.values())
-        count = len(delays) - 1
-        names = ['as it is', *['late'] * count]
-        priors = [rest, *[PRIOR['late'] / len(DELAYS)] * count]
-        sizes, off_m = list(delays), list(np.abs(rows[:, -1] - rows[0, -1]))
-        off_rad, logs = list(np.abs(yaws[:, -1] - yaws[0, -1])), list(logs)
-        for name in ('lever', 'turned', 'scale'):
-            (log,), (size,) = self._fitted(rows[:1], yaws[:1], name)
-            names.append(name)
-            logs.append(log)
-            sizes.append(size)
-            off = abs(size - 1) * AGREEING_M if name == 'scale' else abs(size)
-            off_m.append(0.0 if name == 'turned' else off)
-            off_rad.append(off if name == 'turned' else 0.0)
-        names.append('unrelated')
-        logs.append(self._power * len(self._places) * math.log(_ANYWHERE))
-        sizes.append(0.0)
-        off_m.append(AGREEING_M)
-        off_rad.append(0.0)
-        carried = self._carried(rows[:1], yaws[:1])
-        if carried is not None:
-            names.append('carried')
-            logs.append(carried)
-            sizes.append(0.0)
-            off_m.append(0.0)
-            off_rad.append(0.0)
-        priors += [PRIOR[name] for name in names[len(priors) :]]
-        return _Table(
-            names, np.log(priors) + logs, np.array(sizes), np.array(off_m), np.array(off_rad)
-        )
+        kinds = np.append(np.zeros(len(rows)), [_LEVER, _TURNED, _SCALE])
+        rows, yaws = (np.concatenate([x, np.repeat(x[:1], 3, 0)]) for x in (rows, yaws))
+        logs, lever, turned, scale = self._fitted(rows, yaws, kinds)
+        off_m, off_rad = np.abs(rows[:-3, -1] - rows[0, -1]), np.abs(yaws[:-3, -1] - yaws[0, -1])
+        of_delays = zip(logs[:-3], delays, off_m, off_rad, strict=True)
+        late = [_Hypothesis('late', *each) for each in of_delays]
+        nothing = self._power * len(self._places) * math.log(_ANYWHERE)
+        found = [
+            late[0]._replace(name='as it is'),
+            _Hypothesis('lever', logs[-3], lever[-3], abs(lever[-3])),
+            _Hypothesis('turned', logs[-2], turned[-2], 0.0, abs(turned[-2])),
+            _Hypothesis('scale', logs[-1], scale[-1], abs(scale[-1] - 1) * AGREEING_M),
+            _Hypothesis('unrelated', nothing, 0j, AGREEING_M),
+            *self._carried(rows[:1], yaws[:1]),
+            *late[1:],
+        ]
+        shares = {**PRIOR, 'as it is': 1 - sum(PRIOR.values()), 'late': PRIOR['late'] / len(DELAYS)}
+        return [
+            item._replace(log_odds=item.log_odds + math.log(shares[item.name])) for item in found
+        ]
 
     def _paths(self) -> tuple[Complex, Array, Array]:
         """Places and headings (R, N) on the path by the delays (R,) at which all are known."""
@@ -220,72 +205,68 @@ class _Window:
         places, yaws = (np.interp(at, self._times, x) for x in (self._path, self._path_yaw))
         return places, yaws, delays
 
-    def _carried(self, rows: Complex, yaws: Array) -> float | None:
-        """Log evidence of another T from some image on, before the filter was placed anew."""
-        if not self._placings or not self._stamps[0] < self._placings[-1].stamp_ns:
-            return None
-        at = int(np.searchsorted(self._stamps, self._placings[-1].stamp_ns))
-        self.unbroken_m = 0.0
-        breaks = np.arange(max(at - _BEFORE, 1), min(at, len(self._stamps) - 3) + 1)
-        if not len(breaks):
-            return None
-        before = np.arange(len(self._stamps)) < breaks[:, None]
-        rows, yaws = (np.broadcast_to(each, before.shape) for each in (rows, yaws))
-        logs = self._fitted(rows, yaws, used=before)[0] + self._fitted(rows, yaws, used=~before)[0]
+    def _carried(self, row: Complex, yaw: Array) -> list[_Hypothesis]:
+        """Another T from some image on, before the filter was placed anew."""
+        if self._placed == 0:
+            return []
+        count = len(self._places)
+        breaks = np.arange(max(self._placed - _BEFORE, 1), min(self._placed, count - 3) + 1)
+        if len(breaks) == 0:
+            self.unbroken_m = 0.0
+            return []
+        before = np.arange(count) < breaks[:, None]
+        both = np.concatenate([before, ~before])
+        rows, yaws = np.repeat(row, len(both), 0), np.repeat(yaw, len(both), 0)
+        logs = self._fitted(rows, yaws, np.zeros(len(both)), both)[0].reshape(2, -1).sum(0)
         best = int(np.argmax(logs))
         self.unbroken_m = float(self._way_m[-1] - self._way_m[breaks[best]])
-        return float(logs[best])
+        return [_Hypothesis('carried', float(logs[best]))]
 
     def _fitted(
-        self, rows: Complex, yaws: Array, nuisance: str = '', used: NDArray[np.bool_] | None = None
-    ) -> tuple[Array, Complex]:
-        """Log evidence (R,) of paths, of the images `used` (R, N), and the nuisance's size (R,).
+        self, rows: Complex, yaws: Array, kinds: Array, used: NDArray[np.bool_] | None = None
+    ) -> tuple[Array, Complex, Array, Array]:
+        """Log evidence (R,) of paths by the images `used` (R, N), and nuisances (R,): lever, angle
+        and factor, each where it is the kind of the row.
 
         With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
         """
-        look = np.exp(1j * (self._yaws - yaws))
-        arm = np.exp(1j * yaws) if nuisance == 'lever' else np.zeros(1)
-        likely = np.ones(rows.shape) if used is None else used.astype(float)
-        used = likely
-        lever, factor, bent = np.zeros(1), np.ones(1), np.ones(1)
+        is_lever, is_turned, is_scale = (kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE))
+        look, arm = np.exp(1j * (self._yaws - yaws)), np.exp(1j * yaws)
+        weight = counted = np.ones(rows.shape) if used is None else used.astype(float)
+        lever, angle = np.zeros((len(rows), 1), complex), np.zeros((len(rows), 1))
+        factor: Array = np.ones((len(rows), 1))
         for step in range(_STEPS):
-            w, w_yaw = likely / self._variance, likely / self._yaw_variance
+            w, w_yaw = weight / self._variance, weight / self._yaw_variance
             total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
             d, g, z = (x - (w * x).sum(1, keepdims=True) / total for x in (rows, arm, self._places))
-            seen = (w_yaw * look).sum(1, keepdims=True)
-            path = factor * d + lever * g
+            seen, path = (w_yaw * look).sum(1, keepdims=True), factor * d + lever * g
             u = (w * np.conj(path) * z).sum(1, keepdims=True)
-            if nuisance != 'turned' or step:
-                u = u + seen * np.conj(bent)
-            u = u / np.maximum(np.abs(u), 1e-12)
-            if nuisance == 'lever':
-                information = (w * np.abs(g) ** 2).sum(1, keepdims=True) + LEVER_STD_M**-2
-                lever = (w * np.conj(g) * (z * np.conj(u) - d)).sum(1, keepdims=True) / information
-            elif nuisance == 'scale':
-                information = (w * np.abs(d) ** 2).sum(1, keepdims=True) + SCALE_STD**-2
-                along = (w * (np.conj(u * d) * z).real).sum(1, keepdims=True)
-                factor = (along + SCALE_STD**-2) / information
-            elif nuisance == 'turned':
-                information = of_yaw + TURNED_STD_RAD**-2
-                angle = np.angle(seen * np.conj(u)) * of_yaw / information
-                bent = np.exp(1j * angle)
+            u = u + seen * np.exp(-1j * angle) * (1 - is_turned * (step == 0))
+            u = u / np.maximum(np.abs(u), _TINY)
+            of_arm, of_path = (
+                (w * np.abs(x) ** 2).sum(1, keepdims=True) + std**-2
+                for x, std in ((g, LEVER_STD_M), (d, SCALE_STD))
+            )
+            reach = (w * np.conj(g) * (z * np.conj(u) - d)).sum(1, keepdims=True)
+            lever = is_lever * reach / of_arm
+            along = (w * (np.conj(u * d) * z).real).sum(1, keepdims=True) + SCALE_STD**-2
+            factor = np.where(is_scale, along / of_path, 1.0)
+            of_angle = of_yaw + TURNED_STD_RAD**-2
+            angle = is_turned * np.angle(seen * np.conj(u)) * of_yaw / of_angle
             path = factor * d + lever * g
             apart = np.abs(z - u * path) ** 2 / self._variance
-            apart += 2 * (1 - (look * np.conj(u * bent)).real) / self._yaw_variance
+            apart += 2 * (1 - (look * np.conj(u * np.exp(1j * angle))).real) / self._yaw_variance
             fits = self._peak * np.exp(-0.5 * apart)
             anything = fits + OUTLIERS * _ANYWHERE
-            likely = used * (fits / anything + _NEVER_ALL)
-        square = (w * np.abs(path) ** 2).sum(1) + of_yaw[:, 0] + _NEVER_ALL
-        log = (used * np.log(anything)).sum(1) + math.log(_ANYWHERE * (2 * math.pi) ** 1.5)
-        log -= np.log(total[:, 0]) + 0.5 * np.log(square)
-        if not nuisance:
-            return self._power * log, np.zeros(len(rows))
-        size, off, std, count = {
-            'lever': (lever, lever, LEVER_STD_M, 2),
-            'scale': (factor, factor - 1, SCALE_STD, 1),
-            'turned': (np.angle(bent), np.angle(bent), TURNED_STD_RAD, 1),
-        }[nuisance]
-        log -= 0.5 * (np.abs(off) / std)[:, 0] ** 2
-        log -= count / 2 * np.log(information[:, 0] * std**2)
-        return self._power * log, size[:, 0]
+            weight = counted * (fits / anything + _TINY)
+        square = (w * np.abs(path) ** 2).sum(1, keepdims=True) + of_yaw + _TINY
+        log = (counted * np.log(anything)).sum(1, keepdims=True) - np.log(total)
+        log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5) - 0.5 * np.log(square)
+        for it, size, std, known, count in (
+            (is_lever, lever, LEVER_STD_M, of_arm, 2),
+            (is_turned, angle, TURNED_STD_RAD, of_angle, 1),
+            (is_scale, factor - 1, SCALE_STD, of_path, 1),
+        ):
+            log -= it * ((np.abs(size) / std) ** 2 + count * np.log(known * std**2)) / 2
+        return (self._power * log)[:, 0], lever[:, 0], angle[:, 0], factor[:, 0]

@@ -16,24 +16,23 @@ from sfa_localization.data.messages import LARGEST_TWIST_VARIANCE, LARGEST_VARIA
 from sfa_localization.fusion.motion import Twist
 from sfa_localization.fusion.settings import FilterConfig
 
-SPEED_STD_FLOOR, RATE_STD_FLOOR = 0.01, 0.005
-"""Least standard deviations of a reading (m/s, rad/s): drivers understate what encoders resolve."""
-POSITION_STD, _UNKNOWN_YAW_STD = 0.3, 0.2
-"""Standard deviations (m, rad) of a measurement whose message has no covariance."""
-POSITION_STD_FLOOR, YAW_STD_FLOOR = 0.05, 0.02
-"""Least standard deviations of a measurement (m, rad): no map from images is better everywhere."""
+POSITION_STD = 0.3
+"""Standard deviation (m) of a measurement whose message has no covariance."""
 YAW_STD_LIMIT = 1.0
 """A heading less certain than this (rad) is left out: its error is not Gaussian any more."""
 COMMAND_RATE_STD = 0.2
-"""Of a turn rate that was commanded, rad/s: small robots turn at half of it, by a third more or less."""
+"""Of a turn rate that was commanded, rad/s: robots turn at half of it, by a third more or less."""
+_UNKNOWN_STDS = np.array([POSITION_STD, POSITION_STD, 0.2])  # m, m, rad
+# Least standard deviations: drivers understate what encoders resolve (m/s, rad/s), and no map from
+# images is better everywhere (m, m, rad).
+_LEAST_TWIST_STDS, _LEAST_STDS = (0.01, 0.005), (0.05, 0.05, 0.02)
+# Twists, some seconds of them, of which so many are repeated by odometry that repeats commands:
+# 0.66 to 0.82 on four small robots.
 _COMMANDS, _REPEATED = 200, 0.5
-"""Twists, some seconds of them, of which so many are repeated by odometry that repeats commands:
-0.66 to 0.82 on four small robots."""
-_LARGEST_COORDINATE = 1e9  # m
-_LARGEST_TWIST = 100.0  # m/s and rad/s
-_LARGEST_YAW = 1e6  # rad, beyond which an angle has no digits left
-_LARGEST_ENTRY = 1e12  # of a covariance, beyond which products overflow
-_SINGULAR = 1e-10  # determinant over the product of the variances: a correlation of 1
+# m; m/s and rad/s; rad, beyond which an angle has no digits left; and of a covariance.
+_LARGEST_COORDINATE, _LARGEST_TWIST, _LARGEST_YAW, _LARGEST_ENTRY = 1e9, 100.0, 1e6, 1e12
+_SINGULAR = 1e-10  # part of a variance that is left where a correlation is 1
+_NO_COVARIANCE = 'covariance is not symmetric positive'
 
 
 class OpenLoop:
@@ -43,6 +42,14 @@ class OpenLoop:
 
     def __init__(self) -> None:
         self._last, self._share = (0.0, 0.0), 0.0
+
+    @classmethod
+    def of(cls, twists: Array) -> OpenLoop:
+        """From the twists (N, 2) of a recorded drive."""
+        loop = cls()
+        for v, omega in twists.tolist():
+            loop.add(v, omega)
+        return loop
 
     def add(self, v: float, omega: float) -> None:
         """Take the next twist."""
@@ -57,33 +64,22 @@ class OpenLoop:
 
 
 def read_twist(
-    v: float,
-    omega: float,
-    variances: Sequence[float] | Array,
-    config: FilterConfig,
-    open_loop: bool = False,
+    v: float, omega: float, variances: Sequence[float] | Array, config: FilterConfig, commands: bool
 ) -> Twist:
-    """A reading with the noise to expect of it, from the `variances` (2,) in its message.
-
-    Raises DataError, with the reason, for one that is impossible.
+    """A reading with the noise to expect of it, from the `variances` (2,) in its message, or of
+    `commands`. Raises DataError, with the reason, for one that is impossible.
     """
     v, omega = float(v), float(omega)
     if not (math.isfinite(v) and math.isfinite(omega)):
         raise DataError('not finite')
     if abs(v) > _LARGEST_TWIST or abs(omega) > _LARGEST_TWIST:
         raise DataError('absurdly fast')
-    v_variance, omega_variance = variances
-    factor = config.odometry_factor
-    rate_std = max(config.rate_std, COMMAND_RATE_STD) if open_loop else config.rate_std
-    return Twist(
-        v,
-        omega,
-        _variance(v_variance, factor, SPEED_STD_FLOOR, config.speed_std),
-        _variance(omega_variance, factor, RATE_STD_FLOOR, rate_std),
-    )
+    rate_std = max(config.rate_std, COMMAND_RATE_STD) if commands else config.rate_std
+    known = zip(variances, _LEAST_TWIST_STDS, (config.speed_std, rate_std), strict=True)
+    return Twist(v, omega, *(_variance(config.odometry_factor, *each) for each in known))
 
 
-def _variance(claimed: float, factor: float, floor: float, default: float) -> float:
+def _variance(factor: float, claimed: float, floor: float, default: float) -> float:
     if not (math.isfinite(claimed) and 0 < claimed < LARGEST_TWIST_VARIANCE):
         return default**2
     return max(factor * float(claimed), floor**2)
@@ -97,76 +93,53 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     given, matrix = np.asarray(value, float), np.asarray(covariance, float)
     if given.shape not in ((2,), (3,)) or matrix.shape != (given.size, given.size):
         raise DataError('shape is not that of a position or a pose')
-    # In plain numbers from here: arrays of two or three cost more than what is done with them.
-    pose, rows = given.tolist(), matrix.tolist()
+    pose, size = given.tolist(), given.size
     if not (abs(pose[0]) <= _LARGEST_COORDINATE and abs(pose[1]) <= _LARGEST_COORDINATE):
         raise DataError('position is not finite')
-    if len(pose) == 3 and not _has_yaw(pose[2], rows):
-        pose, rows = pose[:2], [row[:2] for row in rows[:2]]
-    if not any(map(any, rows)):
-        stds = [POSITION_STD, POSITION_STD, _UNKNOWN_YAW_STD][: len(rows)]
-        rows = np.diag(np.square(stds)).tolist()
-    if not _is_positive(rows):
-        raise DataError('covariance is not symmetric positive')
-    if rows[0][0] >= LARGEST_VARIANCE or rows[1][1] >= LARGEST_VARIANCE:
+    if size == 3 and not _has_yaw(pose[2], matrix):
+        size, matrix = 2, matrix[:2, :2]
+    if not matrix.any():
+        matrix = np.diag(np.square(_UNKNOWN_STDS[:size]))
+    rows = matrix.tolist()  # arrays of two or three cost more than what is done with them
+    lower_root(rows, 1.0)
+    largest = max(map(max, rows))
+    skew = max(abs(rows[i][j] - rows[j][i]) for i in range(size) for j in range(i))
+    if not largest < _LARGEST_ENTRY or skew > 1e-6 * largest:
+        raise DataError(_NO_COVARIANCE)
+    if max(rows[0][0], rows[1][1]) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
-    return np.array(pose), _conditioned(rows, factor)
+    noise = factor * symmetric(matrix)
+    for k in range(size):
+        noise[k, k] = max(factor * rows[k][k], _LEAST_STDS[k] ** 2)
+    return np.array(pose[:size]), noise
 
 
-def _has_yaw(yaw: float, rows: list[list[float]]) -> bool:
-    variance = rows[2][2]
-    if not (abs(yaw) < _LARGEST_YAW and variance <= YAW_STD_LIMIT**2):
-        return False
-    return variance > 0 or not any(map(any, rows))
+def _has_yaw(yaw: float, matrix: Array) -> bool:
+    variance = matrix[2, 2]
+    known = abs(yaw) < _LARGEST_YAW and variance <= YAW_STD_LIMIT**2
+    return bool(known and (variance > 0 or not matrix.any()))
 
 
-def _is_positive(rows: list[list[float]]) -> bool:
-    """Finite, symmetric, and with leading minors well above 0: positive definite (Sylvester)."""
-    if len(rows) == 2:
-        (a, b), (b2, d) = rows
-        largest, skew = max(a, d), abs(b - b2)
-        determinant = a * d - b * b
-        limit = _SINGULAR * a * d
-    else:
-        (a, b, c), (b2, d, e), (c2, e2, f) = rows
-        largest, skew = max(a, d, f), abs(b - b2) + abs(c - c2) + abs(e - e2)
-        if not (f > 0 and a * d - b * b > _SINGULAR * a * d):
-            return False
-        determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-        limit = _SINGULAR * a * d * f
-    # Comparisons with NaN are false, so that one anywhere ends here; so do infinities.
-    return a > 0 and d > 0 and determinant > limit and skew <= 1e-6 * largest < _LARGEST_ENTRY
+def lower_root(rows: list[list[float]], factor: float) -> list[list[float]]:
+    """`factor` times the lower triangular root (Cholesky) of a covariance (2, 2) or (3, 3).
 
-
-def _conditioned(rows: list[list[float]], factor: float) -> Array:
-    """Symmetric, with the factor applied, then what is below the floor raised to it."""
-    half, floor = factor / 2, POSITION_STD_FLOOR**2
-    xx = max((rows[0][0] + rows[0][0]) * half, floor)
-    xy = (rows[0][1] + rows[1][0]) * half
-    yy = max((rows[1][1] + rows[1][1]) * half, floor)
-    if len(rows) == 2:
-        return np.array([[xx, xy], [xy, yy]])
-    xt, yt = (rows[0][2] + rows[2][0]) * half, (rows[1][2] + rows[2][1]) * half
-    tt = max((rows[2][2] + rows[2][2]) * half, YAW_STD_FLOOR**2)
-    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
-
-
-def lower_root(covariance: Array, factor: float) -> list[list[float]]:
-    """`factor` times the lower triangular root (Cholesky) of a covariance (2, 2) or (3, 3)."""
-    rows = covariance.tolist()
-    a = math.sqrt(rows[0][0])
-    b = rows[1][0] / a
-    d = math.sqrt(rows[1][1] - b * b)
-    if len(rows) == 2:
-        return [[factor * a, 0.0], [factor * b, factor * d]]
-    c = rows[2][0] / a
-    e = (rows[2][1] - b * c) / d
-    f = math.sqrt(rows[2][2] - c * c - e * e)
-    return [
-        [factor * a, 0.0, 0.0],
-        [factor * b, factor * d, 0.0],
-        [factor * c, factor * e, factor * f],
-    ]
+    Raises DataError where there is none; for NaN, comparisons are false.
+    """
+    xx, (xy, yy) = rows[0][0], rows[1][:2]
+    a = math.sqrt(xx) if xx > 0 else math.nan
+    b = xy / a
+    d = math.sqrt(yy - b * b) if yy - b * b > _SINGULAR * yy else math.nan
+    root = [[factor * a, 0.0], [factor * b, factor * d]]
+    if len(rows) == 3:
+        xt, yt, tt = rows[2]
+        c = xt / a
+        e = (yt - b * c) / d
+        left = tt - c * c - e * e
+        f = math.sqrt(left) if left > _SINGULAR * tt else math.nan
+        root = [[*root[0], 0.0], [*root[1], 0.0], [factor * c, factor * e, factor * f]]
+    if not math.isfinite(root[-1][-1]):
+        raise DataError(_NO_COVARIANCE)
+    return root
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
@@ -176,19 +149,12 @@ def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
     if np.abs(value).max() > _LARGEST_COORDINATE:
         raise DataError(f'initial pose {pose!r} is absurdly far away')
-    if matrix.shape != (3, 3) or not _is_covariance(matrix):
-        raise DataError('covariance of the initial pose is not a symmetric positive (3, 3) one')
+    wrong = 'covariance of the initial pose is not a symmetric positive (3, 3) one'
+    if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, 1e-6, 1e-6 * abs(matrix[0, 0])):
+        raise DataError(wrong)
+    if not np.abs(matrix).max() < _LARGEST_ENTRY or np.linalg.eigvalsh(symmetric(matrix))[0] <= 0:
+        raise DataError(wrong)
     return value, symmetric(matrix)
-
-
-def _is_covariance(matrix: Array) -> bool:
-    """Finite, symmetric and positive definite."""
-    if not np.all(np.isfinite(matrix)):
-        return False
-    scale = float(np.abs(matrix).max())
-    if not 0 < scale < _LARGEST_ENTRY or float(np.abs(matrix - matrix.T).max()) > 1e-6 * scale:
-        return False
-    return bool(np.linalg.eigvalsh(symmetric(matrix))[0] > 0)
 
 
 def symmetric(matrix: Array) -> Array:

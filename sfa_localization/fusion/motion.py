@@ -216,7 +216,7 @@ def drive(
         step.jacobian[V, SCALE] += now.v - twist.v
         step.jacobian[V, LOSS] += slowed - by_loss
     white = (gain * np.array([twist.v_variance, twist.omega_variance])).dot(gain.T)
-    return step._replace(noise=white + step.noise)
+    return Step(step.mean, step.jacobian, white + step.noise)
 
 
 def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
@@ -250,10 +250,10 @@ def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
     step = _stand(mean)
     speed = add_unknown_motion(step.noise, twist, dt)
     fade = math.exp(-speed * dt / noise.decorrelation_m)
-    for i in range(ERROR, SIZE):
-        step.mean[i] *= fade
-        step.jacobian[i, i] = fade
-        step.noise[i, i] += 1 - fade * fade
+    errors = _DIAGONAL[ERROR:]
+    step.mean[errors] *= fade
+    step.jacobian[errors, errors] = fade
+    step.noise[errors, errors] += 1 - fade * fade
     step.noise[V, V] = speed**2
     step.noise[OMEGA, OMEGA] = UNKNOWN_RATE**2
     return step
@@ -262,9 +262,7 @@ def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
 def add_unknown_motion(covariance: Array, twist: Twist, dt: float) -> float:
     """Add to a covariance (11, 11) what a robot may have done unseen for `dt` s; its speed, m/s."""
     speed = max(UNKNOWN_SPEED, abs(twist.v))
-    variance = 2 * speed**2 * dt
-    covariance[X, X] += variance
-    covariance[Y, Y] += variance
+    covariance[[X, Y], [X, Y]] += 2 * speed**2 * dt
     covariance[YAW, YAW] += UNKNOWN_RATE**2 * dt
     return speed
 
@@ -319,15 +317,10 @@ def _add_drift(
     covariance: Array, meters: float, radians: float, dt: float, fade: float, noise: MotionNoise
 ) -> None:
     """Add slip in proportion to the distance, and the random walks of BIAS to ERROR."""
-    slip = noise.slip_per_meter**2 * meters
-    covariance[X, X] += slip
-    covariance[Y, Y] += slip
-    covariance[YAW, YAW] += YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
-    covariance[BIAS, BIAS] += BIAS_WALK**2 * dt
-    covariance[SCALE, SCALE] += SCALE_WALK**2 * meters
-    covariance[LOSS, LOSS] += LOSS_WALK**2 * radians
-    for i in range(ERROR, SIZE):
-        covariance[i, i] += 1 - fade * fade
+    slip, fresh = noise.slip_per_meter**2 * meters, 1 - fade * fade
+    yaw = YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
+    walks = BIAS_WALK**2 * dt, SCALE_WALK**2 * meters, LOSS_WALK**2 * radians
+    covariance[_DIAGONAL, _DIAGONAL] += (slip, slip, yaw, 0, 0, *walks, fresh, fresh, fresh)
 
 
 def wrap(angle: float) -> float:

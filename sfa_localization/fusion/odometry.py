@@ -27,7 +27,7 @@ _RESET = 0.4
 _ROUNDED_M = 2e-3
 """A pose moves less than this sideways by its rounding."""
 _JUMP = 0.05
-"""More motion than twice that of the speed, and this, m or rad, is that of longer than stamps say."""
+"""More motion than twice that of the speed, and this, m or rad, took longer than stamps say."""
 
 
 class Interval(NamedTuple):

@@ -69,6 +69,7 @@ class PoseFilter:
         self._nis = 0.0, 0
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
         self._ekf = Ekf(self.config, self.correlation)
+        self._history = self._fresh(self._ekf.blank(0))
         self._forget()
 
     def reset(self) -> None:
@@ -174,14 +175,14 @@ class PoseFilter:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
         self._unusable = 0
-        noise = noise + self._time_noise(taken_ns, stamp_ns, fused)
+        noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
         event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         update = self._history.add((taken_ns, MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1
         if update.d2 <= update.threshold:
             self._nis = self._nis[0] + update.d2 / len(fused), self._nis[1] + 1
-        return update._replace(stamp_ns=stamp_ns)
+        return update if taken_ns == stamp_ns else update._replace(stamp_ns=stamp_ns)
 
     def add_turned(self, stamp_ns: int, yaw_rad: float) -> None:
         """Take how far images have turned, from any start, at an image's stamp; NaN is left out.
@@ -214,6 +215,8 @@ class PoseFilter:
         delay_ns = self._camera.clock_at(stamp_ns).delay_ns
         if abs(delay_ns) > DELAY_LIMIT_NS:
             raise DataError('clocks of camera and odometry are more than 0.5 s apart')
+        if delay_ns == 0:
+            return stamp_ns
         taken_ns = max(stamp_ns - delay_ns, 1)
         if stalled(
             self._history.before(taken_ns), self._history.before(stamp_ns), taken_ns, stamp_ns
@@ -221,17 +224,17 @@ class PoseFilter:
             return stamp_ns
         return taken_ns
 
-    def _time_noise(self, taken_ns: int, stamp_ns: int, value: Array) -> Array:
-        """Covariance that a moving robot's pose has because the image's time is uncertain."""
+    def _with_time_noise(self, taken_ns: int, stamp_ns: int, pose: Array, noise: Array) -> Array:
+        """With what a moving robot's pose (2,) or (3,) errs by because the time is uncertain."""
         std_s = self._camera.clock_at(stamp_ns).std_s
-        twist = self._history.before(taken_ns).twist
         if not math.isfinite(std_s):
-            return np.zeros((len(value), len(value)))
-        if len(value) == 2:
-            return np.eye(2) * (std_s * twist.v) ** 2
-        yaw = float(value[2])
+            return noise
+        twist = self._history.before(taken_ns).twist
+        if len(pose) == 2:
+            return noise + np.eye(2) * (std_s * twist.v) ** 2
+        yaw = float(pose[2])
         moved = np.array([twist.v * math.cos(yaw), twist.v * math.sin(yaw), twist.omega])
-        return np.outer(moved, moved) * std_s**2
+        return noise + np.outer(moved, moved) * std_s**2
 
     def _require_place(self, stamp_ns: int, kind: int) -> None:
         """Raise DataError when a stamp cannot be used; start anew when the clock went back."""

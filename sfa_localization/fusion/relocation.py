@@ -72,12 +72,10 @@ class Relocation(NamedTuple):
             return False
         # A young estimate is overruled by one image more than it rests on.
         enough = images >= min(ENOUGH_IMAGES, max(2, memory.support + 1))
-        distance_m = max(AGREEING_M, OBVIOUS_STDS * self.position_std)
-        far = self.distance_m >= distance_m
-        established = memory.support >= ENOUGH_IMAGES
-        if math.isfinite(self.yaw_std) and (not established or self._displaced(belief.mean)):
+        if self.distance_m >= max(AGREEING_M, OBVIOUS_STDS * self.position_std):
             return enough
-        return far and (enough or images > FEW_IMAGES)
+        obvious = memory.support < ENOUGH_IMAGES or self._displaced(belief.mean)
+        return enough and obvious and math.isfinite(self.yaw_std)
 
     def _displaced(self, mean: Array) -> bool:
         """The robot is elsewhere, or turned, by so much that no error of images explains it."""
@@ -91,9 +89,11 @@ def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
     """The images with one more, without what lies far behind; of too many, the older half is
     thinned out.
     """
+    first, half = 0, CAPACITY // 2
     reach_m = max(3 * AGREEING_M, REMEMBERED_STDS * math.sqrt(newest.variance))
-    kept = (*(old for old in images if newest.traveled_m - old.traveled_m <= reach_m), newest)
-    half = CAPACITY // 2
+    while first < len(images) and newest.traveled_m - images[first].traveled_m > reach_m:
+        first += 1
+    kept = (*images[first:], newest)
     return kept if len(kept) <= CAPACITY else kept[:half:2] + kept[half:]
 
 

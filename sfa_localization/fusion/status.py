@@ -108,8 +108,6 @@ def _rejections(belief: Belief) -> list[str]:
     if (update.far or memory.rejected >= few) and memory.rejected < ENOUGH_IMAGES:
         one = 'an image did not match'
         return [one if memory.rejected <= 1 else f'{memory.rejected} images in a row did not match']
-    if not update.accepted and update.d2 <= update.threshold:
-        return ['images lie far from the estimate: others must confirm them']
     return []
 
 

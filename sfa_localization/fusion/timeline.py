@@ -32,42 +32,35 @@ class _Again(NamedTuple):
     among those, and the first and last stamp.
     """
 
-    among: int
-    first_ns: int
-    last_ns: int
-
-
-_NEVER = _Again(0, 0, 0)
+    among: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
 
 
 class Timeline:
     """Feed it the stamps of all messages; it tells which can be used."""
 
     def __init__(self) -> None:
-        self._behind, self._alone = 0, 0
+        self._behind, self._beyond = 0, 0
         self._ahead = self._apart = (0, 0)
-        self._again = _NEVER
+        self._again = _Again()
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack."""
-        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry_ns
-        keeps_time = kind == ODOMETRY or odometry_ns is None
-        if kind == MEASUREMENT:
-            self._note_apart(stamp_ns, newest_ns)
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
+        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry_ns
         if newest_ns is None:
             return
-        if stamp_ns > newest_ns + JUMP_NS:
-            self._require_others_ahead(stamp_ns)
-        elif keeps_time:
-            self._ahead = (0, 0)
-        if kind == MEASUREMENT and odometry_ns is not None:
-            self._require_same_clock(stamp_ns, newest_ns)
+        ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
+        if kind == MEASUREMENT:
+            beyond = abs(ahead_ns) > HISTORY_NS
+            self._apart = (self._apart[0] + 1, ahead_ns) if beyond else (0, 0)
+        self._require_near(stamp_ns, ahead_ns, keeps_time)
         reason = ''
-        if stamp_ns <= newest_ns and not history.reaches(stamp_ns):
+        if ahead_ns <= 0 and not history.reaches(stamp_ns):
             reason = 'too old'
-        elif stamp_ns <= newest_ns and history.holds((stamp_ns, kind)):
+        elif ahead_ns <= 0 and history.holds((stamp_ns, kind)):
             reason = 'duplicate stamp'
         if keeps_time:
             self._behind = self._behind + 1 if reason else 0
@@ -76,7 +69,7 @@ class Timeline:
         if reason:
             raise DataError(reason)
         if kind == ODOMETRY:
-            self._alone = 0
+            self._beyond = 0
             self._notice_again(stamp_ns, odometry_ns, history)
 
     @property
@@ -90,26 +83,21 @@ class Timeline:
         where = f'{abs(apart_ns) * 1e-9:.0f} s {"ahead of" if apart_ns > 0 else "behind"}'
         return [f'images are stamped {where} the odometry: are the clocks synchronized?']
 
-    def _note_apart(self, stamp_ns: int, newest_ns: int | None) -> None:
-        """Count images in a row beyond the history, and note how far from the newest message."""
-        apart_ns = 0 if newest_ns is None or stamp_ns <= 0 else stamp_ns - newest_ns
-        self._apart = (self._apart[0] + 1, apart_ns) if abs(apart_ns) > HISTORY_NS else (0, 0)
-
-    def _require_others_ahead(self, stamp_ns: int) -> None:
-        """One stamp far ahead is an error; several in a row that agree are a pause."""
-        last_ns, count = self._ahead
-        self._ahead = (stamp_ns, count + 1 if abs(stamp_ns - last_ns) <= JUMP_NS else 1)
-        if self._ahead[1] < FEW_AHEAD:
-            raise DataError('stamp far ahead')
-        self._ahead = (0, 0)
-
-    def _require_same_clock(self, stamp_ns: int, newest_ns: int) -> None:
-        """An image far ahead, of another clock, would make all odometry that follows too old; some
-        in a row are used where no odometry comes between them, which then has ended.
+    def _require_near(self, stamp_ns: int, ahead_ns: int, keeps_time: bool) -> None:
+        """One stamp far ahead is an error; several in a row that agree are a pause. An image of
+        another clock would make all odometry that follows too old, so that some in a row are used
+        where no odometry comes between them, which then has ended.
         """
-        if stamp_ns > newest_ns + HISTORY_NS:
-            self._alone += 1
-            if self._alone < FEW_AHEAD:
+        if ahead_ns > JUMP_NS:
+            last_ns, count = self._ahead
+            self._ahead = (stamp_ns, count + 1 if abs(stamp_ns - last_ns) <= JUMP_NS else 1)
+            if self._ahead[1] < FEW_AHEAD:
+                raise DataError('stamp far ahead')
+        if keeps_time or ahead_ns > JUMP_NS:
+            self._ahead = (0, 0)
+        if not keeps_time and ahead_ns > HISTORY_NS:
+            self._beyond += 1
+            if self._beyond < FEW_AHEAD:
                 raise DataError('stamp ahead of the odometry')
 
     def _notice_again(
@@ -120,8 +108,8 @@ class Timeline:
         """
         again = self._again
         if newest_ns is None or stamp_ns > newest_ns:
-            self._again = _NEVER
-        elif stamp_ns < again.last_ns or again is _NEVER:
+            self._again = _Again()
+        elif stamp_ns < again.last_ns or again.last_ns == 0:
             self._again = _Again(0, stamp_ns, stamp_ns)
         else:
             passed = (history.before(stamp_ns).odometry_ns or 0) > again.last_ns

@@ -13,7 +13,7 @@ Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
 Knot = tuple[int, float, float, float]
 """Stamp ns, x m, y m, yaw rad by dead reckoning."""
-SPACING_M, SPACING_RAD = 0.4, 0.1
+SPACING_M, SPACING_RAD = 0.5, 0.2
 """An image that shows less motion than this, as the odometry does, shows nothing new: neighboring
 images err alike."""
 WINDOW, WINDOW_M = 32, 12.0
@@ -38,6 +38,10 @@ class Image(NamedTuple):
     dead_reckoned: Pose
     traveled_m: float
     accepted: bool = False
+
+    def fused(self) -> Image:
+        """The image after it was accepted."""
+        return Image(*self[:-1], True)
 
 
 class Placing(NamedTuple):
@@ -86,6 +90,10 @@ class Track(NamedTuple):
         ):
             first += 1
         return self._replace(images=(*images[first:], image))
+
+    def interrupted(self) -> Track:
+        """After a silence of the odometry: the path begins anew."""
+        return Track((), (), self.placings, self.since_m)
 
     def trusted(self) -> Track:
         """After the pose was set from outside, by somebody who knows."""

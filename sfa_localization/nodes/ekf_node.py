@@ -353,14 +353,11 @@ class EkfNode(LocalizationNode):
                 added.append(f'nothing on {shown} for {silent:.0f} s')
         if self._paused:
             added.append('paused: images are not fused')
-        level = status.level
-        if added and level is Level.LOCALISED:
-            level = Level.DEGRADED
         lost = []
-        if level is Level.DEGRADED and by_now is not None:
+        if by_now is not None and (added or status.level is Level.DEGRADED):
             # The filter's time is that of its messages: by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self._filter.config)]
-        return Status(Level.LOST if lost else level, (*lost, *status.reasons, *added))
+        return status.with_reasons(lost, added)
 
     def _by_now(self) -> State | None:
         """The estimate; after a long silence, predicted to the present by the wall clock."""

@@ -3,6 +3,8 @@
 """What reaches the filter in each fault, recorded once, so that the filter is judged in seconds.
 
 PYTHONPATH=.:test python -m robustness.frozen           print the table, by day and in the evening
+PYTHONPATH=.:test python -m robustness.frozen --means   the same, and keep the mean errors, which
+                                                        test_frozen.py lets get no worse
 PYTHONPATH=.:test python -m robustness.frozen --record  locate all images anew: after training,
                                                         features or keyframes change; minutes
 """
@@ -10,6 +12,7 @@ PYTHONPATH=.:test python -m robustness.frozen --record  locate all images anew: 
 import argparse
 import dataclasses
 import io
+import json
 import lzma
 import math
 import sys
@@ -26,6 +29,8 @@ from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.fusion.pose_filter import PoseFilter
 
 FILE = Path(__file__).with_name('frozen.npz.xz')
+MEANS = Path(__file__).with_name('frozen_means.json')
+"""Mean errors in m by light and fault; null where there was no estimate."""
 LIGHTS = RECORDED, ('evening', 'summer')
 LIE_S = 5.0
 """Seconds for which a lie that contradicts nothing at first may be believed."""
@@ -318,34 +323,52 @@ def new_filter(drive):
     return made
 
 
-def table(light, names=None, lies=True):
-    """Rows (name, verdict, allowed seconds LOCALISED and wrong) of a light's drives."""
-    frozen = Frozen()
-    for name in names or FAULTS:
+def judged(frozen, light, name):
+    """The verdict on a light's fault, or on its drive without a fault under a lie."""
+    if name in FAULTS:
         drive = frozen.drive(light, name)
-        yield name, judge(fused(drive, drive.messages), FAULTS[name].ends_s)
+        return judge(fused(drive, drive.messages), FAULTS[name].ends_s)
     drive = frozen.drive(light, 'nothing')
-    for name, lie in LIES.items() if lies else ():
-        yield name, judge(fused(drive, lie(drive)), math.inf)
+    return judge(fused(drive, LIES[name](drive)), math.inf)
+
+
+def totals(verdicts):
+    """Seconds LOCALISED and wrong, and LOCALISED, of all together."""
+    verdicts = list(verdicts)
+    return sum(one.false_s for one in verdicts), sum(one.localised_s for one in verdicts)
+
+
+def keep(means):
+    """Write the mean errors by light and fault."""
+    rounded = {
+        light: {name: None if math.isnan(mean) else round(mean, 3) for name, mean in of.items()}
+        for light, of in means.items()
+    }
+    MEANS.write_text(json.dumps(rounded, indent=1) + '\n')
 
 
 def main():
     """Record, or print the table."""
     parser = argparse.ArgumentParser(prog='robustness.frozen', description=__doc__)
     parser.add_argument('--record', action='store_true', help='locate all images anew')
-    if parser.parse_args().record:
+    parser.add_argument('--means', action='store_true', help='keep the mean errors')
+    given = parser.parse_args()
+    if given.record:
         record()
         return
-    width = max(map(len, (*FAULTS, *LIES)))
+    frozen, means, width = Frozen(), {}, max(map(len, (*FAULTS, *LIES)))
     for light, _ in LIGHTS:
         sys.stdout.write(f'\n{light}\n{head(width)}\n')
-        rows = list(table(light))
-        for name, verdict in rows:
-            sys.stdout.write(row(name, verdict, width) + '\n')
-        for what, part in (('faults', rows[: len(FAULTS)]), ('lies', rows[len(FAULTS) :])):
-            false_s = sum(verdict.false_s for _, verdict in part)
-            localised_s = sum(verdict.localised_s for _, verdict in part)
+        rows = {}
+        for name in (*FAULTS, *LIES):
+            rows[name] = judged(frozen, light, name)
+            sys.stdout.write(row(name, rows[name], width) + '\n')
+        means[light] = {name: rows[name].mean_m for name in FAULTS}
+        for what, names in (('faults', FAULTS), ('lies', LIES)):
+            false_s, localised_s = totals(rows[name] for name in names)
             sys.stdout.write(f'{what}: wrong {false_s:.1f} s, LOCALISED {localised_s:.1f} s\n')
+    if given.means:
+        keep(means)
 
 
 if __name__ == '__main__':

@@ -1,0 +1,59 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where images that agree among themselves put the robot."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sfa_localization.fusion.relocation import CAPACITY, relocate, remembered
+from sfa_localization.fusion.track import Image
+
+STD_M, STD_RAD = 0.1, 0.05
+
+
+def along(count, step_m=0.2, heading=True, wrong=(), noise=0.0, turn=1.2):
+    """Images of a robot that dead reckoning moves along x, in a map that is turned by `turn`."""
+    rng, images = np.random.default_rng(0), []
+    for k in range(count):
+        way_m = k * step_m
+        place = way_m * np.exp(1j * turn) + (5 - 3j) + noise * complex(*rng.standard_normal(2))
+        place += complex(*rng.uniform(3, 9, 2)) if k in wrong else 0
+        yaw, variance = (turn, STD_RAD**2) if heading else (math.nan, math.inf)
+        images.append(Image(k, place, yaw, STD_M**2, variance, (way_m, 0.0, 0.0), way_m))
+    return images
+
+
+@pytest.mark.parametrize('heading', [True, False])
+@pytest.mark.parametrize('turn', [0.0, 1.2, math.pi])
+def test_images_along_the_odometry_show_the_pose(turn, heading):
+    found = relocate(along(21, heading=heading, wrong=(3, 4, 11), turn=turn), 1.0)
+    place = 4.0 * np.exp(1j * turn) + (5 - 3j)
+    assert found.pose[:2] == pytest.approx([place.real, place.imag], abs=1e-9)
+    assert abs(math.remainder(found.pose[2] - turn, 2 * math.pi)) < 1e-9
+    assert (found.images, found.dissenting, found.distance_m) == (18, 3, pytest.approx(4.0))
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+
+
+def test_a_place_without_heading_or_motion_shows_no_pose():
+    assert relocate(along(1, heading=False), 1.0) is None
+    assert relocate(along(30, step_m=0.0, heading=False), 1.0) is None
+
+
+def test_errors_are_as_large_as_claimed_and_neighbors_that_err_alike_count_as_fewer():
+    white, alike = (relocate(along(41, noise=STD_M), length_m) for length_m in (1e-3, 2.0))
+    place = 8.0 * np.exp(1.2j) + (5 - 3j)
+    miss = white.pose - [place.real, place.imag, 1.2]
+    assert miss @ np.linalg.solve(white.covariance, miss) < 16.3  # chi-square of 3, 99.9 %
+    assert np.allclose(alike.covariance, white.covariance * 41 / (1 + 8.0 / 2.0))
+
+
+def test_what_is_remembered_is_bounded_and_its_newer_half_complete():
+    kept = ()
+    for image in along(500, step_m=0.001):
+        kept = remembered(kept, image)
+        assert len(kept) <= CAPACITY
+    assert [image.stamp_ns for image in kept[-30:]] == list(range(470, 500))
+    far = along(2, step_m=100.0)
+    assert remembered(remembered((), far[0]), far[1]) == (far[1],)
