@@ -7,10 +7,11 @@ comes at any rate and with pauses, images are stamped late, and a second drive s
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, visit, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, place, recipe, run_in, visit, wander
 from metric_worlds import criss_cross, drive, garden_features
 
 from sfa_localization.data.geometry import align, compose, wrap_angle
@@ -158,6 +159,7 @@ def test_any_robot_gives_nearly_as_good_a_map(drives):
     assert np.all(other < 2.0 * plain + [0.3, 3.0])
 
 
+@cache
 def placed(delay_s, seed):
     """Mean error (m) of a place learnt from images stamped so late, after rigid alignment."""
     config = recipe()
@@ -167,8 +169,11 @@ def placed(delay_s, seed):
         exact.panoramas.stamps_ns + round(delay_s * 1e9), exact.panoramas.images
     )
     run = replace(exact, panoramas=shifted)
-    network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
-    trained = learn_place(network, [run], config)
+    if delay_s == 0.0 and seed == 1:
+        trained = place()
+    else:
+        network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
+        trained = learn_place(network, [run], config)
     seen = visit() if seed == 1 else exact
     estimates = trained.model.locate_all(seen.panoramas.read(0, len(seen.panoramas)))
     places = np.array([estimate.position for estimate in estimates])
