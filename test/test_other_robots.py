@@ -147,9 +147,9 @@ def reset_midway(draw, others):
 
 @pytest.mark.parametrize('drives', [two_drives, reset_midway])
 def test_any_robot_gives_nearly_as_good_a_map(drives):
-    """Twelve robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
+    """Eight robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
     plain, other = [], []
-    for draw in range(12):
+    for draw in range(8):
         for others, found in ((False, plain), (True, other)):
             _, images, places, headings, truth = learn(drives(draw, others), draw)
             off, turned = errors(images, places, headings, truth)
