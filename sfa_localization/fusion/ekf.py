@@ -38,7 +38,7 @@ from sfa_localization.fusion.relocation import (
 )
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.track import Image
-from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, begun, weighed
+from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, restarted, updated
 
 ELSEWHERE = 'restarted elsewhere'
 STARTS = ('started', ELSEWHERE)
@@ -230,31 +230,31 @@ class Ekf:
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
         image = _image(belief, event)
-        belief = self._fused(self._turns_weighed(belief, event), event, image)
+        belief = self._fused(self._turns_updated(belief, event), event, image)
         update, track = belief.memory.update, belief.track
         assert update is not None
         if update.reason == ELSEWHERE:
             track = track.placed(event.stamp_ns, belief.traveled_m)
         track = track.driven(event.stamp_ns, image.dead_reckoned).seen(image)
         if update.reason in STARTS:
-            return belief._replace(track=track, turns=self._turns_begun(belief))
+            return belief._replace(track=track, turns=self._turns_restarted(belief))
         return belief if track is belief.track else belief._replace(track=track)
 
-    def _turns_begun(self, belief: Belief) -> TurnNoise:
+    def _turns_restarted(self, belief: Belief) -> TurnNoise:
         """What is known about the noise of turns, from another pose on."""
         faded = belief.traveled_m / self._correlation.distance_m
         driven = Driven(belief.stamp_ns, belief.dead_reckoned, faded, *belief.added)
-        return begun(driven, belief.mean, belief.covariance, belief.turns)
+        return restarted(driven, belief.mean, belief.covariance, belief.turns)
 
-    def _turns_weighed(self, belief: Belief, event: MeasurementEvent) -> Belief:
+    def _turns_updated(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief with what a measurement shows about the noise of turns."""
         if not belief.located or self._heading_lost(belief):
             return belief
         last = belief.turns
         if last is not None and belief.stamp_ns < last.driven.stamp_ns + SPACING_NS:
             return belief
-        now = self._turns_begun(belief)
-        turns = weighed(last or now, now.driven, event.value, event.jacobian, event.white)
+        now = self._turns_restarted(belief)
+        turns = updated(last or now, now.driven, event.value, event.jacobian, event.white)
         return belief._replace(turns=turns)
 
     def _heading_lost(self, belief: Belief) -> bool:

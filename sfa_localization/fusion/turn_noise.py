@@ -26,7 +26,7 @@ as clearly as any test at 2 % asks."""
 SPACING_NS = 400_000_000
 """Measurements closer in time than this show no turn of their own: they are left out."""
 _FORGETTING = 0.999
-"""Share of the evidence left after each measurement: floors and loads change within minutes."""
+"""Share of the log likelihoods left after each measurement: floors change within minutes."""
 _OUTLIER_D2 = 12.0
 """A d2 beyond this counts as this, and moves no filter: it is an outlier."""
 _STATE = (X, Y, YAW, ERROR, ERROR + 1, ERROR + 2)
@@ -46,7 +46,7 @@ class Driven(NamedTuple):
 
 
 class TurnNoise(NamedTuple):
-    """The filters (K, 6), (K, 6, 6) at the last measurement, and their evidence (K,).
+    """The filters (K, 6), (K, 6, 6) at the last measurement, and their log likelihoods (K,).
 
     `factor` on the standard deviation of turns is the root of the mean variance.
     """
@@ -54,32 +54,34 @@ class TurnNoise(NamedTuple):
     driven: Driven
     mean: Array
     covariance: Array
-    evidence: Array
+    likelihood: Array
     factor: float
 
 
-def begun(driven: Driven, mean: Array, covariance: Array, before: TurnNoise | None) -> TurnNoise:
+def restarted(
+    driven: Driven, mean: Array, covariance: Array, before: TurnNoise | None
+) -> TurnNoise:
     """All filters at the state of the large one, mean (11,) and covariance (11, 11), with the
-    evidence from `before`.
+    log likelihoods from `before`.
     """
     count = len(FACTORS)
-    evidence = np.zeros(count) if before is None else before.evidence
+    likelihood = np.zeros(count) if before is None else before.likelihood
     return TurnNoise(
         driven,
         np.tile(mean[list(_STATE)], (count, 1)),
         np.tile(covariance[np.ix_(_STATE, _STATE)], (count, 1, 1)),
-        evidence,
-        _factor(evidence),
+        likelihood,
+        _factor(likelihood),
     )
 
 
-def _factor(evidence: Array) -> float:
-    score = evidence + _PRIOR
+def _factor(likelihood: Array) -> float:
+    score = likelihood + _PRIOR
     weight = np.exp(score - score.max())
     return math.sqrt(float(weight @ FACTORS**2) / float(weight.sum()))
 
 
-def weighed(
+def updated(
     noise: TurnNoise, driven: Driven, value: Array, jacobian: Array, white: Array
 ) -> TurnNoise:
     """The filters after a measurement (2,) or (3,), with the `jacobian` (11 columns) and `white`
@@ -94,13 +96,13 @@ def weighed(
     if len(value) == 3:
         miss[:, 2] = wrap_angle(miss[:, 2])
     d2 = np.einsum('ki,kij,kj->k', miss, inverse, miss)
-    evidence = -(np.minimum(d2, _OUTLIER_D2) + np.linalg.slogdet(innovation)[1]) / 2
+    likelihood = -(np.minimum(d2, _OUTLIER_D2) + np.linalg.slogdet(innovation)[1]) / 2
     gain = cross @ inverse * (d2 <= _OUTLIER_D2)[:, None, None]
     mean = mean + (gain @ miss[:, :, None])[:, :, 0]
     covariance = covariance - gain @ cross.transpose(0, 2, 1)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
-    evidence = _FORGETTING * noise.evidence + evidence - evidence[0]
-    return TurnNoise(driven, mean, covariance, evidence, _factor(evidence))
+    likelihood = _FORGETTING * noise.likelihood + likelihood - likelihood[0]
+    return TurnNoise(driven, mean, covariance, likelihood, _factor(likelihood))
 
 
 def _predicted(noise: TurnNoise, driven: Driven) -> tuple[Array, Array]:

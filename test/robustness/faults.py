@@ -18,6 +18,9 @@ FROM_S, UNTIL_S = 15.0, 30.0
 CONSISTENT_LIE_S = 2.0
 """Seconds for which a lie that was there from the start, and contradicts nothing at first, may be
 believed."""
+SAME_PLACE_S = 20.0
+"""Images of another robot in the same garden contradict nothing for as long as both drive alike:
+nothing promises that they are noticed."""
 NOTICED_S = 1.0
 """A robot that is moved, or held, suddenly is noticed by the next few images: one alone may err."""
 DOWN_S = 2.0
@@ -333,7 +336,7 @@ enter_all(
         for part in (0.3, 0.6)
     },
     ends_s=NEVER,
-    allowed_s=CONSISTENT_LIE_S,
+    allowed_s=SAME_PLACE_S,
 )
 enter_all({'images damaged': changed(Picture, damaged)})
 STANDING = {
