@@ -50,10 +50,11 @@ soak: $(READY)  ## run the three nodes for an hour at 20x; nothing may grow (ARG
 bench: $(READY)  ## compare speeds, write bench.json (ARGS=--quick); with the nodes after a demo
 	PYTHONPATH=. $(PY) test/benchmarks/bench_all.py $(addprefix --model ,$(wildcard demo/model.npz)) $(ARGS)
 
-lint: $(READY)  ## ruff, ruff format, mypy
+lint: $(READY)  ## ruff, ruff format, mypy, lines of each room beside its budget
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy sfa_localization
+	$(PY) .ci/budgets
 
 format: $(READY)  ## sort imports and format the code with ruff
 	$(VENV)/bin/ruff check --fix .

@@ -50,3 +50,38 @@ def pytest_collection_modifyitems(config, items):
             seen.add(test)
         items[:] = first
         config.hook.pytest_deselected(items=others)
+
+
+@pytest.fixture(scope='module')
+def gardens():
+    """Build a garden once for all drives in it: seed, area, light and season make it."""
+    from sfa_localization.simulation import drive
+
+    garden = drive.Garden
+
+    def again(seed, settings):
+        place = (seed, settings.area, settings.light, settings.season)
+        if place not in _GARDENS:
+            _GARDENS[place] = garden(seed, settings)
+        return _GARDENS[place]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drive, 'Garden', again)
+        yield
+
+
+_GARDENS = {}
+
+
+@pytest.fixture(scope='module')
+def small_network():
+    """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
+    from sfa_localization.features import network
+    from sfa_localization.metric import selection
+
+    layer = network.Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, 'STANDARD_NETWORKS', {(16, 160): (layer,)})
+        patch.setattr(selection, '_SEARCH_POINTS', 60)
+        patch.setattr(selection, 'INDUCING_POINTS', 100)
+        yield

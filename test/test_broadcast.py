@@ -36,17 +36,17 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize('ahead_s', [0.0, 0.01, 0.1, 0.137, 1.0])
 @pytest.mark.parametrize('case', CASES)
-def test_a_lookup_at_odometry_is_what_was_right_then_at_once_and_later(case, ahead_s):
-    rng = np.random.default_rng(4)
-    stamps_ns = START_NS + np.cumsum(CASES[case](200, rng))
-    poses = corrections(200, rng)
-    buffer, at_once = sent(stamps_ns, poses, round(ahead_s * SECOND_NS))
-    assert np.allclose(at_once, poses, atol=1e-9)
-    kept = stamps_ns > buffer.newest_ns - 9 * SECOND_NS
-    later = [buffer.lookup(stamp_ns) for stamp_ns in stamps_ns[kept].tolist()]
-    assert np.allclose(later, poses[kept], atol=1e-9)
+def test_a_lookup_at_odometry_is_what_was_right_then_at_once_and_later(case):
+    for ahead_s in (0.0, 0.01, 0.1, 0.137, 1.0):
+        rng = np.random.default_rng(4)
+        stamps_ns = START_NS + np.cumsum(CASES[case](200, rng))
+        poses = corrections(200, rng)
+        buffer, at_once = sent(stamps_ns, poses, round(ahead_s * SECOND_NS))
+        assert np.allclose(at_once, poses, atol=1e-9)
+        kept = stamps_ns > buffer.newest_ns - 9 * SECOND_NS
+        later = [buffer.lookup(stamp_ns) for stamp_ns in stamps_ns[kept].tolist()]
+        assert np.allclose(later, poses[kept], atol=1e-9)
 
 
 def test_between_two_odometries_it_is_between_their_corrections():
@@ -96,4 +96,3 @@ def test_what_waits_to_be_corrected_stays_bounded():
     for step in range(1000):
         count = len(broadcast.add(START_NS + step * 20_000_000, np.zeros(3), 100_000_000))
         assert count <= 4
-    assert len(broadcast._future_ns) <= 6

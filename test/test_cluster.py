@@ -3,7 +3,6 @@
 """Training over a Dask cluster gives the same network, also when a worker is lost."""
 
 import os
-import threading
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -68,24 +67,17 @@ def assert_same(one, other, images):
 
 
 def test_a_cluster_learns_the_same(local, on_disk):
-    told = []
+    seen = []
     with cluster.dask_executor(local.scheduler_address) as executor:
-        theirs = train_network(
-            ARCHITECTURE, [on_disk], **PLAIN, executor=executor, on_shard=told.append
+        theirs, again = (
+            train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=executor, on_shard=how)
+            for how in (seen.append, lambda _: None)
         )
-    assert sum(told) == 6 * 40
+    assert sum(seen) == 6 * 40
+    assert all(a.slow.tobytes() == b.slow.tobytes() for a, b in zip(theirs.nodes, again.nodes,
+                                                                    strict=True))  # fmt: skip
     assert_same(
         train_network(ARCHITECTURE, [on_disk], **PLAIN), theirs, on_disk.panoramas.read(0, 40)
-    )
-
-
-def test_a_cluster_learns_the_same_bytes_again(local, on_disk):
-    with cluster.dask_executor(local.scheduler_address) as executor:
-        one, other = (
-            train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=executor) for _ in range(2)
-        )
-    assert all(
-        a.slow.tobytes() == b.slow.tobytes() for a, b in zip(one.nodes, other.nodes, strict=True)
     )
 
 
@@ -125,50 +117,26 @@ def test_a_lost_worker_is_survived(on_disk, tmp_path):
 
 def test_workers_that_cannot_read_the_pictures(local, on_disk):
     Path(on_disk.panoramas.images.filename).unlink()
-    with (
-        cluster.dask_executor(local.scheduler_address) as executor,
-        pytest.raises(DataError, match=r'cannot read .*panoramas\.u8.*folder'),
-    ):
-        train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=executor)
+    with cluster.dask_executor(local.scheduler_address) as executor:
+        with pytest.raises(DataError, match=r'cannot read .*panoramas\.u8.*folder'):
+            train_network(ARCHITECTURE, [on_disk], **PLAIN, executor=executor)
+        with pytest.raises(DataError, match='in a file'):
+            train_network(ARCHITECTURE, [drive(8)], **PLAIN, executor=executor)
 
 
-def test_pictures_in_memory_are_refused(local):
-    with (
-        cluster.dask_executor(local.scheduler_address) as executor,
-        pytest.raises(DataError, match='in a file'),
-    ):
-        train_network(ARCHITECTURE, [drive(8)], **PLAIN, executor=executor)
-
-
-def test_nobody_answers(monkeypatch):
+def test_nobody_answers_or_nobody_works(monkeypatch):
     monkeypatch.setattr(cluster, '_CONNECT_TIMEOUT_S', 0.5)
     with (
         pytest.raises(ConfigError, match=r'no Dask scheduler answers at tcp://127\.0\.0\.1:9'),
         cluster.dask_executor('tcp://127.0.0.1:9'),
     ):
         pytest.fail('connected')
-
-
-def test_a_scheduler_without_workers():
     with (
         cluster_of(0) as made,
         pytest.raises(ConfigError, match='no worker'),
         cluster.dask_executor(made.scheduler_address),
     ):
         pytest.fail('went on')
-
-
-def test_without_an_address_this_process_trains():
-    with cluster.executor_at(None) as executor:
-        assert executor is hierarchy.in_this_process
-
-
-def test_a_file_of_panoramas(on_disk):
-    shard = hierarchy.shards_of([on_disk], 0)[2]
-    file = cluster._portable(shard).sequence.panoramas
-    assert np.array_equal(file.read(5, 9), on_disk.panoramas.read(5, 9))
-    assert np.array_equal(np.concatenate(list(file.batches(16))), on_disk.panoramas.read(0, 40))
-    assert (len(file), file.shape) == (40, on_disk.panoramas.shape)
 
 
 def test_threads_give_the_same_bytes(on_disk, monkeypatch):
@@ -178,18 +146,3 @@ def test_threads_give_the_same_bytes(on_disk, monkeypatch):
         networks.append(train_network(ARCHITECTURE, [replace(on_disk)], **PLAIN))
     for one, other in zip(networks[0].nodes, networks[1].nodes, strict=True):
         assert one.slow.tobytes() == other.slow.tobytes()
-
-
-def test_a_failing_shard_stops_the_others(on_disk):
-    started = []
-    lock = threading.Lock()
-
-    def work(shard):
-        with lock:
-            started.append(shard.start)
-        raise DataError('no')
-
-    shards = hierarchy.shards_of([on_disk], 0)
-    with pytest.raises(DataError, match='no'):
-        hierarchy.in_this_process(work, shards, lambda images: None)
-    assert len(started) < len(shards)

@@ -23,12 +23,9 @@ from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
 from sfa_localization.commands.options import given
 from sfa_localization.data.settings import Settings
-from sfa_localization.features import cluster, network
-from sfa_localization.features.network import Layer
-from sfa_localization.metric import selection
+from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
-from sfa_localization.simulation.settings import SimulationConfig
 
 parser_of = cli.command_parser
 
@@ -52,20 +49,22 @@ def words_for(action: argparse.Action) -> list[str]:
     return [one] * count
 
 
-@pytest.mark.parametrize(('name', 'option'), options())
-def test_an_option_reaches_one_group_of_settings_at_most(name, option):
+def test_an_option_reaches_one_group_of_settings_at_most():
     """Whichever groups a command reads, an option meant for one never appears in another."""
-    parser = parser_of(name)
-    (meant,) = (a for a in parser._actions if option in a.option_strings)
-    needed = [a for a in parser._actions if a.required and a is not meant]
-    needed.sort(key=lambda action: bool(action.option_strings))  # BAG before --topics takes it
-    words = [word for a in needed for word in [*a.option_strings[:1], *words_for(a)]]
-    words += [option, *words_for(meant)]
-    arguments = parser.parse_args(words)
+    every, wrong = options(), []
     groups = {group.__name__: group for group in Settings.__subclasses__()}
-    reached = {n: found for n, group in groups.items() if (found := given(group, arguments))}
-    group, _, setting = meant.dest.partition('.')
-    assert reached == ({group: {setting: vars(arguments)[meant.dest]}} if setting else {})
+    for name, option in every:
+        parser = parser_of(name)
+        (meant,) = (a for a in parser._actions if option in a.option_strings)
+        needed = [a for a in parser._actions if a.required and a is not meant]
+        needed.sort(key=lambda action: bool(action.option_strings))  # BAG before --topics takes it
+        words = [word for a in needed for word in [*a.option_strings[:1], *words_for(a)]]
+        arguments = parser.parse_args([*words, option, *words_for(meant)])
+        reached = {n: got for n, group in groups.items() if (got := given(group, arguments))}
+        group, _, setting = meant.dest.partition('.')
+        if reached != ({group: {setting: vars(arguments)[meant.dest]}} if setting else {}):
+            wrong.append((name, option, reached))
+    assert wrong == []
 
 
 # Each option alone, on small inputs: what a command is given without it, and what comes of it.
@@ -212,152 +211,138 @@ BASE = {
     'config': '',
     'demo': '--out {out}/demo',
 }
-DAMAGED = {
-    'train': '{data}/cut --output {out}/model.npz --config {data}/small.yaml',
-    'play': '{data}/cut --rate 1000 --wait 0',
-    'inspect': '{data}/cut',
-}
+DAMAGED = {name: BASE[name].replace('/bag', '/cut').replace('/test', '/cut') for name in BASE}
 QUALITY = differ(lambda o: o.model().quality['left_out_error_m'])
 PRINTED = differ(lambda o: o.text)
 POSES = differ(lambda o: (o.folder / 'poses.tum').read_text())
-OPTIONS: dict[str, dict[str, Case]] = {
-    'simulate': {
-        '--size': Case('--size 40x12', lambda a, b: b.bag()['pictures'].shape[1:3] == (12, 40)),
-        '--compressed': Case(
-            '--compressed', lambda a, b: '/panorama/compressed' in {*b.bag()['topics']}
+CASES: dict[str, list[Case]] = {
+    'simulate': [
+        Case('--size 40x12', lambda a, b: b.bag()['pictures'].shape[1:3] == (12, 40)),
+        Case('--compressed', lambda a, b: '/panorama/compressed' in {*b.bag()['topics']}),
+        Case('--trajectory curves', another_drive),
+        Case('--seed 2', another_drive),
+        Case('--world 2', differ(lambda o: o.bag()['pictures'][0])),
+        Case('--light evening', of_pictures),
+        Case('--season winter', of_pictures),
+        Case('--area 9x7', lambda a, b: width(b) > width(a), beside='--length 20'),
+        Case('--length 8', lambda a, b: metres(b) > metres(a) + 2),
+        Case('--images raw', lambda a, b: '/image_raw' in b.bag()['topics']),
+        Case(
+            '--images-every 0.5', lambda a, b: len(b.bag()['pictures']) > len(a.bag()['pictures'])
         ),
-        '--trajectory': Case('--trajectory curves', another_drive),
-        '--seed': Case('--seed 2', another_drive),
-        '--world': Case('--world 2', differ(lambda o: o.bag()['pictures'][0])),
-        '--light': Case('--light evening', of_pictures),
-        '--season': Case('--season winter', of_pictures),
-        '--area': Case('--area 9x7', lambda a, b: width(b) > width(a), beside='--length 20'),
-        '--length': Case('--length 8', lambda a, b: metres(b) > metres(a) + 2),
-        '--images': Case('--images raw', lambda a, b: '/image_raw' in b.bag()['topics']),
-        '--images-every': Case(
-            '--images-every 0.5',
-            lambda a, b: len(b.bag()['pictures']) > len(a.bag()['pictures']),
-        ),
-        '--images-every-turn': Case(
+        Case(
             '--images-every-turn 5',
             lambda a, b: len(b.bag()['pictures']) > len(a.bag()['pictures']),
         ),
-        '--compression': Case(
+        Case(
             '--compression png',
             lambda a, b: b.bag()['topics']['/panorama/compressed'].endswith('CompressedImage'),
         ),
-        '--storage': Case('--storage sqlite3', lambda a, b: bool([*b.folder.glob('bag/*.db3')])),
-        '--image-noise': Case('--image-noise 0', of_pictures),
-        '--illumination': Case('--illumination 1', of_pictures),
-        '--speed': Case('--speed 0.5', lambda a, b: seconds(b) > seconds(a) + 2),
-        '--odometry-rate': Case(
-            '--odometry-rate 20',
-            lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns']),
+        Case('--storage sqlite3', lambda a, b: bool([*b.folder.glob('bag/*.db3')])),
+        Case('--image-noise 0', of_pictures),
+        Case('--illumination 1', of_pictures),
+        Case('--speed 0.5', lambda a, b: seconds(b) > seconds(a) + 2),
+        Case(
+            '--odometry-rate 20', lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns'])
         ),
-        '--odometry-frame': Case('--odometry-frame start', of_wheels),
-        '--test-drift': Case('--test-drift 1', of_wheels, beside='--trajectory test'),
-        '--scale-error': Case('--scale-error 0.1', of_wheels),
-        '--slip': Case('--slip 0.3', of_wheels),
-        '--speed-noise': Case('--speed-noise 0.5', of_wheels),
-        '--gyro-bias': Case('--gyro-bias 0.05', of_turns),
-        '--gyro-noise': Case('--gyro-noise 0.1', of_turns),
-    },
-    'train': {
-        '--output': Case(
-            '--output {out}/other.npz',
-            written('other.npz'),
-        ),
-        '--config': Case(
+        Case('--odometry-frame start', of_wheels),
+        Case('--test-drift 1', of_wheels, beside='--trajectory test'),
+        Case('--scale-error 0.1', of_wheels),
+        Case('--slip 0.3', of_wheels),
+        Case('--speed-noise 0.5', of_wheels),
+        Case('--gyro-bias 0.05', of_turns),
+        Case('--gyro-noise 0.1', of_turns),
+    ],
+    'train': [
+        Case('--output {out}/other.npz', written('other.npz')),
+        Case(
             '--config {data}/fewer.yaml',
             lambda a, b: b.model().quality['features_used'] < a.model().quality['features_used'],
         ),
-        '--update': Case('--update {data}/model.npz', says('the model')),
-        '--report': Case('--report {out}/report', written('report/index.html')),
-        '--resume': Case(
+        Case('--update {data}/model.npz', says('the model')),
+        Case('--report {out}/report', written('report/index.html')),
+        Case(
             '--resume',
             refuses('train without --resume'),
             prepare=lambda out: (out / '.model.npz.checkpoint.npz').write_bytes(b'of another'),
         ),
-        '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['train']),
-        '--dask': Case('--dask {dask}', noted('on the cluster')),
-        '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
-        '--odom-topic': Case('--odom-topic /ground_truth', QUALITY),
-        '--imu-topic': Case('--imu-topic /nothing', refuses('/nothing')),
-        '--segments': Case('--segments straight', QUALITY),
-        '--solver': Case('--solver paper', refuses('needs straight lines')),
-        '--metric-map': Case('--metric-map monomials', QUALITY),
-        '--engine': Case('--engine mdp', lambda a, b: 'pip install MDP' in b.text or QUALITY(a, b)),
-        '--normalization': Case(
-            '--normalization grey',
-            differ(lambda o: o.model().network.architecture.normalization),
+        Case('--strict', refuses('read without --strict'), base=DAMAGED['train']),
+        Case('--dask {dask}', noted('on the cluster')),
+        Case('--image-topic /nothing', refuses('/nothing')),
+        Case('--odom-topic /ground_truth', QUALITY),
+        Case('--imu-topic /nothing', refuses('/nothing')),
+        Case('--segments straight', QUALITY),
+        Case('--solver paper', refuses('needs straight lines')),
+        Case('--metric-map monomials', QUALITY),
+        Case('--engine mdp', lambda a, b: 'pip install MDP' in b.text or QUALITY(a, b)),
+        Case(
+            '--normalization grey', differ(lambda o: o.model().network.architecture.normalization)
         ),
-    },
-    'evaluate': {
-        '--align': Case('--align {data}/bag', differ(lambda o: o.text.splitlines()[-1])),
-        '--config': Case('--config {data}/start.yaml', PRINTED),
-        '--smooth': Case('--smooth', PRINTED),
-        '--report': Case('--report {out}/report', written('report/index.html')),
-        '--json': Case('--json {out}/figures.json', written('figures.json')),
-        '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
-        '--odom-topic': Case('--odom-topic /ground_truth', PRINTED),
-        '--imu-topic': Case('--imu-topic /nothing', refuses('/nothing')),
-        '--ground-truth-topic': Case('--ground-truth-topic /odom', PRINTED),
-    },
-    'play': {
-        '--loop': Case('--loop', PRINTED),
-        '--clock': Case('--clock', noted('/clock')),
-        '--topics': Case(
+    ],
+    'evaluate': [
+        Case('--align {data}/bag', differ(lambda o: o.text.splitlines()[-1])),
+        Case('--config {data}/start.yaml', PRINTED),
+        Case('--smooth', PRINTED),
+        Case('--report {out}/report', written('report/index.html')),
+        Case('--json {out}/figures.json', written('figures.json')),
+        Case('--image-topic /nothing', refuses('/nothing')),
+        Case('--odom-topic /ground_truth', PRINTED),
+        Case('--imu-topic /nothing', refuses('/nothing')),
+        Case('--ground-truth-topic /odom', PRINTED),
+    ],
+    'play': [
+        Case('--loop', PRINTED),
+        Case('--clock', noted('/clock')),
+        Case(
             '--topics /odom', lambda a, b: b.text.count('messages') == 1 < a.text.count('messages')
         ),
-        '--wait-for': Case('--wait-for /odom', noted(('wait for', ['/odom']))),
-        '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['play']),
-        '--rate': Case('--rate 500', noted(('rate', 500.0))),
-        '--start-offset': Case('--start-offset 10', PRINTED),
-        '--wait': Case('--wait 0.01', noted(('wait', 0.01))),
-    },
-    'inspect': {
-        '--json': Case('--json {out}/found.json', written('found.json')),
-        '--report': Case('--report {out}/report', written('report/index.html')),
-        '--strict': Case('--strict', refuses('read without --strict'), base=DAMAGED['inspect']),
-        '--image-topic': Case('--image-topic /nothing', lambda a, b: '/nothing' in b.text),
-        '--odom-topic': Case('--odom-topic /ground_truth', says('by /ground_truth')),
-        '--min-pictures': Case('--min-pictures 9999', says('drive until there are 9999')),
-        '--max-spacing': Case('--max-spacing 0.1', PRINTED),
-        '--reach': Case('--reach 0.2', PRINTED),
-    },
-    'calibrate': {
-        '--calibration': Case('--calibration {data}/info.yaml', says('fisheye')),
-        '--center': Case(
-            '--center 300x200', lambda a, b: (b.camera()['cx'], b.camera()['cy']) == (300, 200)
-        ),
-        '--radii': Case(
+        Case('--wait-for /odom', noted(('wait for', ['/odom']))),
+        Case('--strict', refuses('read without --strict'), base=DAMAGED['play']),
+        Case('--rate 500', noted(('rate', 500.0))),
+        Case('--start-offset 10', PRINTED),
+        Case('--wait 0.01', noted(('wait', 0.01))),
+    ],
+    'inspect': [
+        Case('--json {out}/found.json', written('found.json')),
+        Case('--report {out}/report', written('report/index.html')),
+        Case('--strict', refuses('read without --strict'), base=DAMAGED['inspect']),
+        Case('--image-topic /nothing', lambda a, b: '/nothing' in b.text),
+        Case('--odom-topic /ground_truth', says('by /ground_truth')),
+        Case('--min-pictures 9999', says('drive until there are 9999')),
+        Case('--max-spacing 0.1', PRINTED),
+        Case('--reach 0.2', PRINTED),
+    ],
+    'calibrate': [
+        Case('--calibration {data}/info.yaml', says('fisheye')),
+        Case('--center 300x200', lambda a, b: (b.camera()['cx'], b.camera()['cy']) == (300, 200)),
+        Case(
             '--radii 50x180',
             lambda a, b: (b.camera()['radius_min'], b.camera()['radius_max']) == (50, 180),
         ),
-        '--output': Case('--output {out}/camera.yaml', written('camera.yaml')),
-        '--check': Case('--check {out}/check.png', written('check.png')),
-        '--model': Case('--model fisheye', says('fisheye')),
-        '--field-of-view': Case('--field-of-view 150', PRINTED, beside='--model fisheye'),
-        '--angle-min': Case('--angle-min 70', lambda a, b: b.camera()['angle_min'] == 70),
-        '--angle-max': Case('--angle-max 100', lambda a, b: b.camera()['angle_max'] == 100),
-        '--axis': Case('--axis up', lambda a, b: b.camera()['axis'] == 'up'),
-        '--mirrored': Case('--mirrored no', lambda a, b: b.camera()['mirrored'] == 'no'),
-        '--mount-rpy': Case(
+        Case('--output {out}/camera.yaml', written('camera.yaml')),
+        Case('--check {out}/check.png', written('check.png')),
+        Case('--model fisheye', says('fisheye')),
+        Case('--field-of-view 150', PRINTED, beside='--model fisheye'),
+        Case('--angle-min 70', lambda a, b: b.camera()['angle_min'] == 70),
+        Case('--angle-max 100', lambda a, b: b.camera()['angle_max'] == 100),
+        Case('--axis up', lambda a, b: b.camera()['axis'] == 'up'),
+        Case('--mirrored no', lambda a, b: b.camera()['mirrored'] == 'no'),
+        Case(
             '--mount-rpy 0x0x90',
             lambda a, b: check_image(a) != check_image(b) and '[0.0, 0.0, 90.0]' in b.text,
             beside='--check {out}/check.png',
         ),
-    },
-    'filter': {
-        '--config': Case('--config {data}/start.yaml', POSES),
-        '--initial-pose': Case('--initial-pose 1 2 3', POSES),
-        '--smooth': Case('--smooth', POSES),
-        '--truth': Case('--truth {data}/positions.csv', says('inside 95 % regions')),
-        '--output': Case('--output {out}/other.tum', written('other.tum')),
-    },
-    'tune': {
-        '--model': Case('--model {data}/other.npz', PRINTED),
-        '--config': Case(
+    ],
+    'filter': [
+        Case('--config {data}/start.yaml', POSES),
+        Case('--initial-pose 1 2 3', POSES),
+        Case('--smooth', POSES),
+        Case('--truth {data}/positions.csv', says('inside 95 % regions')),
+        Case('--output {out}/other.tum', written('other.tum')),
+    ],
+    'tune': [
+        Case('--model {data}/other.npz', PRINTED),
+        Case(
             '--config {data}/robot.yaml',
             lambda a, b: (
                 b.code == 0
@@ -367,52 +352,24 @@ OPTIONS: dict[str, dict[str, Case]] = {
                 and b.text.splitlines()[-1] != a.text.splitlines()[-1]
             ),
         ),
-        '--output': Case('--output {out}/tuned.yaml', written('tuned.yaml')),
-        '--method': Case('--method grid', says('m mean error')),
-        '--trials': Case('--trials 14', PRINTED),
-        '--image-topic': Case('--image-topic /nothing', refuses('/nothing')),
-        '--odom-topic': Case('--odom-topic /ground_truth', PRINTED),
-        '--imu-topic': Case('--imu-topic /nothing', refuses('/nothing')),
-        '--ground-truth-topic': Case(
-            '--ground-truth-topic /nothing', refuses('/nothing'), beside='--method grid'
-        ),
-    },
-    'config': {'--output': Case('--output {out}/out.yaml', written('out.yaml'))},
-    'demo': {
-        '--out': Case('--out {out}/elsewhere', written('elsewhere/.sfa_localization_demo.json')),
-        '--world': Case('--world 3', noted(('world', 3))),
-        '--seed': Case('--seed 4', noted(('seed', 4))),
-        '--rate': Case('--rate 2', noted(('--rate', '2.0'))),
-    },
+        Case('--output {out}/tuned.yaml', written('tuned.yaml')),
+        Case('--method grid', says('m mean error')),
+        Case('--trials 14', PRINTED),
+        Case('--image-topic /nothing', refuses('/nothing')),
+        Case('--odom-topic /ground_truth', PRINTED),
+        Case('--imu-topic /nothing', refuses('/nothing')),
+        Case('--ground-truth-topic /nothing --method grid', refuses('/nothing')),
+    ],
+    'config': [Case('--output {out}/out.yaml', written('out.yaml'))],
+    'demo': [
+        Case('--out {out}/elsewhere', written('elsewhere/.sfa_localization_demo.json')),
+        Case('--world 3', noted(('world', 3))),
+        Case('--seed 4', noted(('seed', 4))),
+        Case('--rate 2', noted(('--rate', '2.0'))),
+    ],
 }
-SMALL_LAYER = Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
-
-
-@pytest.fixture(scope='module', autouse=True)
-def small_network() -> Iterator[None]:
-    """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network, 'STANDARD_NETWORKS', {(16, 160): (SMALL_LAYER,)})
-        patch.setattr(selection, '_SEARCH_POINTS', 60)
-        patch.setattr(selection, 'INDUCING_POINTS', 100)
-        yield
-
-
-@pytest.fixture(scope='module', autouse=True)
-def gardens() -> Iterator[None]:
-    """Build a garden once for all drives in it: seed, area, light and season make it."""
-    made: dict[Any, simulation.Garden] = {}
-    garden = simulation.Garden
-
-    def again(seed: int, settings: SimulationConfig) -> simulation.Garden:
-        place = (seed, settings.area, settings.light, settings.season)
-        if place not in made:
-            made[place] = garden(seed, settings)
-        return made[place]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, 'Garden', again)
-        yield
+OPTIONS = {name: {case.words.split()[0]: case for case in cases} for name, cases in CASES.items()}
+pytestmark = pytest.mark.usefixtures('gardens', 'small_network')
 
 
 @contextlib.contextmanager
@@ -564,20 +521,23 @@ def without(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..
     return outcome
 
 
-@pytest.mark.parametrize(('name', 'option'), options())
-def test_an_option_alone_has_its_effect(name, option, data, without, tmp_path, request):
-    case = OPTIONS[name][option]
-    words = f'{BASE[name] if case.base is None else case.base} {case.beside}'
+@pytest.mark.parametrize('name', cli.COMMANDS)
+def test_each_option_alone_has_its_effect(name, data, without, tmp_path, request):
     if name in ('play', 'demo'):
         pytest.importorskip('rclpy')
-    places = {'data': data}
-    if '{dask}' in case.words:
-        places['dask'] = request.getfixturevalue('scheduler')
-    plain = without(name, words, case)
-    case.prepare(tmp_path)
-    changed = run(name, f'{words} {case.words}', tmp_path, **places)
-    assert changed.code in (0, 1)
-    assert case.differs(plain, changed), f'{plain.text}\n-- with {case.words}:\n{changed.text}'
+    failed = []
+    for option, case in OPTIONS[name].items():
+        words = f'{BASE[name] if case.base is None else case.base} {case.beside}'
+        places, folder = {'data': data}, tmp_path / option
+        folder.mkdir()
+        if '{dask}' in case.words:
+            places['dask'] = request.getfixturevalue('scheduler')
+        plain = without(name, words, case)
+        case.prepare(folder)
+        changed = run(name, f'{words} {case.words}', folder, **places)
+        if changed.code not in (0, 1) or not case.differs(plain, changed):
+            failed.append(f'{plain.text}\n-- with {case.words}:\n{changed.text}')
+    assert not failed, '\n'.join(failed)
 
 
 @pytest.fixture(scope='module')

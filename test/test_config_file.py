@@ -13,13 +13,7 @@ from ros_domains import free_domain
 from sfa_localization import config as config_file
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.cli import main
-from sfa_localization.config import (
-    SECTIONS,
-    ignored_sections,
-    load_settings,
-    render,
-    write_config,
-)
+from sfa_localization.config import SECTIONS, ignored_sections, load_settings, render, write_config
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes.settings import NodeConfig
@@ -40,40 +34,26 @@ def key(section):
     return section if section == 'training' else f'/**/{section}'
 
 
-def test_the_shipped_file_is_what_the_settings_say():
+def test_the_shipped_file_is_what_the_settings_say_and_reads_back_to_them():
     remedy = 'python -m sfa_localization config > config/localization.yaml'
     assert SHIPPED.read_text() == render(), f'regenerate it: {remedy}'
+    assert [k for section, k in EVERY if load_settings(SHIPPED, section, k) != k()] == []
 
 
-@pytest.mark.parametrize(('section', 'kind'), EVERY)
-def test_the_shipped_file_reads_back_to_the_defaults(section, kind):
-    assert load_settings(SHIPPED, section, kind) == kind()
-
-
-@pytest.mark.parametrize('section', SECTIONS)
-def test_names_of_a_section_do_not_clash_and_all_are_explained(section):
-    names = [item.name for kind in SECTIONS[section] for item in dataclasses.fields(kind)]
-    assert len(names) == len(set(names))
-    lines = render().splitlines()
-    for name in names:
-        places = [i for i, line in enumerate(lines) if line.startswith(f'    {name}: ')]
-        assert places and all(lines[i - 1].startswith('    # ') for i in places)
-    assert max(map(len, lines)) <= 100
-
-
-def test_units_and_ranges_are_written():
+def test_every_parameter_is_explained_and_has_the_type_that_ros_needs():
     text = render()
+    lines, document = text.splitlines(), yaml.safe_load(text)
     assert '# columns of the panorama [px]; 16..8192\n    width: 600\n' in text
     assert 'may change while running' in text
-
-
-def test_every_value_has_the_type_that_ros_needs():
-    document = yaml.safe_load(render())
-    for section, kind in EVERY:
+    for section, kinds in SECTIONS.items():
+        items = [item for kind in kinds for item in dataclasses.fields(kind)]
+        assert len({item.name for item in items}) == len(items), 'names do not clash'
         values = document[key(section)]['ros__parameters']
-        for item in dataclasses.fields(kind):
+        for item in items:
+            places = [i for i, line in enumerate(lines) if line.startswith(f'    {item.name}: ')]
+            assert places and all(lines[i - 1].startswith('    # ') for i in places), item.name
             default = list(item.default) if isinstance(item.default, tuple) else item.default
-            assert type(values[item.name]) is type(default)
+            assert type(values[item.name]) is type(default), item.name
 
 
 def test_changes_are_written_and_the_rest_stays(tmp_path):
@@ -82,16 +62,6 @@ def test_changes_are_written_and_the_rest_stays(tmp_path):
     assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(slip_per_metre=1.5e-7)
     assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
     assert config_file.load_changes(path)['ekf_node']['slip_per_metre'] == 1.5e-7
-
-
-def test_missing_parameters_have_defaults_and_those_of_ros_are_ignored(tmp_path):
-    path = saved(
-        tmp_path,
-        'ekf_node:\n  ros__parameters:\n    lost_std: 3\n    use_sim_time: true\n'
-        '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n',
-    )
-    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(lost_std=3.0)
-    assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig()
 
 
 def test_parameters_of_ros_are_kept(tmp_path):
@@ -118,17 +88,14 @@ def test_parameters_of_ros_are_kept(tmp_path):
     assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
 
 
-def test_numbers_without_a_decimal_point(tmp_path):
-    path = saved(tmp_path, 'ekf_node:\n  ros__parameters:\n    slip_per_metre: 1e-3\n')
-    assert load_settings(path, 'ekf_node', FilterConfig).slip_per_metre == 1e-3
-
-
 def test_parameters_of_all_nodes_apply_to_the_sections_that_have_them(tmp_path):
     path = saved(tmp_path, '/**:\n  ros__parameters:\n    autostart: false\n    width: 300\n'
-                           '/ekf_node:\n  ros__parameters:\n    lost_std: 3.0\n')  # fmt: skip
+                           '/ekf_node:\n  ros__parameters:\n    lost_std: 3\n'
+                           '    slip_per_metre: 1e-3\n')  # fmt: skip
     assert not load_settings(path, 'ekf_node', NodeConfig).autostart
-    assert load_settings(path, 'ekf_node', FilterConfig).lost_std == 3.0
-    assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
+    found = load_settings(path, 'ekf_node', FilterConfig)
+    assert found == FilterConfig(lost_std=3.0, slip_per_metre=1e-3), 'whole numbers, no points'
+    assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig(width=300)
 
 
 VALUES = '{ros__parameters: {lost_std: 3.0}}'
@@ -146,35 +113,30 @@ SPELLINGS = {
 """A section, and which of these nodes ROS gives it to."""
 
 
-@pytest.mark.parametrize('text', SPELLINGS)
-def test_commands_read_a_section_of_any_namespace(tmp_path, text):
-    assert load_settings(saved(tmp_path, text), 'ekf_node', FilterConfig).lost_std == 3.0
-
-
-@pytest.mark.parametrize('text', SPELLINGS)
-def test_the_sections_that_ros_ignores_are_those_it_gives_no_node(tmp_path, text):
-    path = saved(tmp_path, text)
-    for node in ('/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'):
-        assert bool(ignored_sections(path, node)) == (node not in SPELLINGS[text])
-    assert ignored_sections(path, '/robot2/sfa_node') == []
-
-
-@pytest.mark.parametrize('text', SPELLINGS)
-def test_ros_agrees_on_which_nodes_a_section_is_for(tmp_path, text):
+def test_commands_and_ros_agree_on_which_nodes_a_section_is_for(tmp_path):
+    """Commands read a section of any namespace, and know which nodes ROS gives it to."""
+    for text, nodes in SPELLINGS.items():
+        path = saved(tmp_path, text)
+        assert load_settings(path, 'ekf_node', FilterConfig).lost_std == 3.0
+        for node in ('/ekf_node', '/robot1/ekf_node', '/a/robot1/ekf_node'):
+            assert bool(ignored_sections(path, node)) == (node not in nodes)
+        assert ignored_sections(path, '/robot2/sfa_node') == []
     rclpy = pytest.importorskip('rclpy')
-    path, context = saved(tmp_path, text), rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN, args=['--ros-args', '--params-file', str(path)])
-    taken = []
-    for namespace in ('', 'robot1', 'a/robot1'):
-        node = rclpy.create_node(
-            'ekf_node', namespace=namespace, context=context,
-            automatically_declare_parameters_from_overrides=True,
-        )  # fmt: skip
-        if node.has_parameter('lost_std'):
-            taken.append(node.get_fully_qualified_name())
-        node.destroy_node()
-    rclpy.try_shutdown(context=context)
-    assert taken == SPELLINGS[text]
+    for text, nodes in SPELLINGS.items():
+        context, arguments = rclpy.Context(), ['--ros-args', '--params-file']
+        arguments.append(str(saved(tmp_path, text)))
+        rclpy.init(context=context, domain_id=DOMAIN, args=arguments)
+        taken = []
+        for namespace in ('', 'robot1', 'a/robot1'):
+            node = rclpy.create_node(
+                'ekf_node', namespace=namespace, context=context,
+                automatically_declare_parameters_from_overrides=True,
+            )  # fmt: skip
+            if node.has_parameter('lost_std'):
+                taken.append(node.get_fully_qualified_name())
+            node.destroy_node()
+        rclpy.try_shutdown(context=context)
+        assert taken == nodes, text
 
 
 def test_a_robot_of_its_own_comes_before_all_robots(tmp_path):
@@ -185,7 +147,7 @@ def test_a_robot_of_its_own_comes_before_all_robots(tmp_path):
     assert (settings.lost_std, settings.speed_std, settings.rate_std) == (3.0, 0.5, 0.5)
 
 
-@pytest.mark.parametrize(('text', 'why'), [
+INVALID = [
     ('ekf_node: [1', 'is not YAML'), ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
     ('efk_node: {}\n', "unknown section 'efk_node'"),
     ('ekf_node: {lost_std: 3}\n', 'ros__parameters'),
@@ -200,12 +162,15 @@ def test_a_robot_of_its_own_comes_before_all_robots(tmp_path):
     ('robot1: {ekf_node: {lost_std: 3}}\n', "'robot1/ekf_node' must hold 'ros__parameters'"),
     ('robot1: {ekf_node: {ros__parameters: {lost_std: 3}}}\n'
      '/robot2/ekf_node: {ros__parameters: {lost_std: 4}}\n', 'a file of one robot'),
-])  # fmt: skip
-def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path, text, why):
-    path = saved(tmp_path, text)
-    with pytest.raises(ConfigError, match=why) as raised:
-        load_settings(path, 'ekf_node', FilterConfig)
-    assert str(path) in str(raised.value) and '\n' not in str(raised.value)
+]  # fmt: skip
+
+
+def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path):
+    for text, why in INVALID:
+        path = saved(tmp_path, text)
+        with pytest.raises(ConfigError, match=why) as raised:
+            load_settings(path, 'ekf_node', FilterConfig)
+        assert str(path) in str(raised.value) and '\n' not in str(raised.value), text
 
 
 def test_a_missing_file_and_an_unwritable_one_are_named(tmp_path):

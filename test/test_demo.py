@@ -7,13 +7,11 @@ The nodes are tested in test_demo_nodes.py; the complete demo by `make demo` in 
 
 import json
 
-import numpy as np
 import pytest
 
 from sfa_localization.commands import demo
 from sfa_localization.commands.demo import DemoConfig
 from sfa_localization.data.errors import LocalizationError
-from sfa_localization.data.run import Trajectory
 
 OURS = ('coverage', 'test', 'logs', 'report')
 
@@ -50,15 +48,8 @@ def test_bags_of_other_settings_are_removed(tmp_path, changed):
     assert json.loads((tmp_path / demo.MARKER).read_text())['world'] == changed.world
 
 
-@pytest.mark.parametrize('name', ['file', 'file/demo'])
-def test_a_folder_that_cannot_be_created_is_named(tmp_path, name):
+def test_a_folder_that_cannot_be_created_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
-    with pytest.raises(LocalizationError, match='cannot be written'):
-        demo.prepare_folder(tmp_path / name, DemoConfig())
-
-
-def test_distance_of_two_paths_by_hand():
-    stamps = np.array([0, 10, 20], np.int64)
-    a = Trajectory(stamps, np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], float))
-    b = Trajectory(stamps[:2], np.array([[0, 3, 0], [1, 5, 0]], float))
-    assert demo.mean_distance(a, b) == pytest.approx(4.0)
+    for name in ('file', 'file/demo'):
+        with pytest.raises(LocalizationError, match='cannot be written'):
+            demo.prepare_folder(tmp_path / name, DemoConfig())

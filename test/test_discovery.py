@@ -81,7 +81,7 @@ def test_images_of_another_name_are_found(bench):
         (['/one', '/two'], []),
         (['/one', '/odom'], []),
         (['/one'], ['--ros-args', '-r', 'odom:=/mine']),
-        ([], []),
+        (['/robot2/wheels'], ['--ros-args', '-r', '__ns:=/robot1']),
     ],
 )
 def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
@@ -92,23 +92,14 @@ def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
     assert len(publishers) == len(others)
 
 
-def test_a_topic_of_another_robot_is_not_taken(bench):
-    bench.node.create_publisher(Odometry, '/robot2/wheels', 10)
-    node = bench.run(EkfNode, options={'namespace': 'robot1'})
-    assert until(lambda: node.count_publishers('/robot2/wheels'))
-    assert not takes_another(node, 'odom')
-
-
 @pytest.mark.parametrize(
     ('kind', 'robot', 'there', 'remedy'),
     [
-        (EkfNode, '/robot1', ['/robot1/ekf/odometry'], 'odom:=NAME'),
         (OmnicamNode, '/robot1', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
         # The driver is in the namespace, or its topic alone, because a bridge has none.
         (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
         # Played from a bag, of another namespace, and of the node's own.
         (OmnicamNode, '', ['/panorama'], 'image:=NAME or panorama:=NAME'),
-        (EkfNode, '', ['/robot1/ekf/odometry'], 'odom:=NAME'),
         (OmnicamNode, '', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
     ],
 )
@@ -129,18 +120,18 @@ def hint_of(node):
     return node._discovery.hint
 
 
-@pytest.mark.parametrize('transport', ['raw', 'compressed'])
-@pytest.mark.parametrize(
-    ('kind', 'settings'), [(OmnicamNode, {'silence_timeout': 0.05}), (SfaNode, {'model': 'a.npz'})]
-)
+@pytest.mark.parametrize(('kind', 'settings'), [
+    (OmnicamNode, {'silence_timeout': 0.05, 'image_transport': 'compressed'}),
+    (SfaNode, {'model': 'a.npz'}),
+])  # fmt: skip
 def test_without_images_the_diagnostics_name_those_that_there_are(
-    bench, monkeypatch, kind, settings, transport
+    bench, monkeypatch, kind, settings
 ):
     """Of both types: another `image_transport` may be all that is wrong."""
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
     there = {'/a': Image, '/b': Image, '/a/packed': CompressedImage, '/b/packed': CompressedImage}
     publishers = [bench.node.create_publisher(made, name, 1) for name, made in there.items()]
-    node = bench.run(kind, image_transport=transport, **settings)
+    node = bench.run(kind, **settings)
     bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
     words = [f'{name} (sensor_msgs/msg/{made.__name__})' for name, made in there.items()]
     assert until(lambda: all(word in node.health()[1] for word in words))

@@ -79,31 +79,14 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: {**a, 'network/1/slow': spoilt(a['network/1/slow'], np.nan)},
         'not finite',
     ),
-    'infinite points': (
-        lambda a: {**a, 'metric/points': spoilt(a['metric/points'], np.inf)},
-        'not finite',
-    ),
-    'no variance of a point': (
-        lambda a: {**a, 'metric/scalars': a['metric/scalars'] * [0, 1, 1]},
-        'metric/scalars.*must be positive',
-    ),
     'no variance at all': (
         lambda a: {**a, 'metric/scalars': a['metric/scalars'] * [1, 0, 1]},
         'metric/scalars.*must be positive',
-    ),
-    'negative agreement': (
-        lambda a: {**a, 'agreement/numbers': np.array([1.0, -1.0, 1.0])},
-        'agreement/numbers.*must be positive',
-    ),
-    'keyframes that are never unfamiliar': (
-        lambda a: {**a, 'keyframes/noise': 0 * a['keyframes/noise']},
-        'keyframes/noise.*must be positive',
     ),
     'keyframes of other images': (
         lambda a: {**a, 'keyframes/textures': a['keyframes/textures'][:, 1:]},
         'damaged',
     ),
-    'no keyframes of the training': (lambda a: driven(a, drive=1), 'too few for keyframes'),
     'keyframes of more drives than there are': (
         lambda a: driven(a, drive=2**40),
         'keyframes/drives holds a number beyond 1e',
@@ -112,76 +95,23 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         lambda a: driven(a, trained=0),
         'keyframes/trained.*must be positive',
     ),
-    'drives without their number in the training': (
-        lambda a: {k: v for k, v in driven(a).items() if k != 'keyframes/trained'},
-        'keyframes/',
-    ),
-    'too few keyframes': (
-        lambda a: {
-            **a,
-            'keyframes/textures': a['keyframes/textures'][:2],
-            'keyframes/poses': a['keyframes/poses'][:2],
-        },
-        'too few for keyframes',
-    ),
-    'scale of zero': (
-        lambda a: {**a, 'compass/feature_scale': 0 * a['compass/feature_scale']},
-        'compass/feature_scale.*must be positive',
-    ),
     'enormous weights': (
         lambda a: {**a, 'metric/linear': 1e30 * a['metric/linear'] + 1e31},
         'beyond 1e',
     ),
-    'a place that few images see, out of the world': (
-        lambda a: {**a, 'keyframes/poses': spoilt(a['keyframes/poses'], 1e308)},
-        'beyond 1e',
-    ),
-    'keyframes beyond the horizon': (
-        lambda a: {**a, 'keyframes/poses': 1e12 + a['keyframes/poses']},
-        'keyframes/poses holds a number beyond 1e',
-    ),
-    'a map that rises without bound': (
-        lambda a: {**a, 'metric/linear': 1e12 * a['metric/linear']},
-        'metric/linear holds a number beyond 1e',
-    ),
     'text for numbers': (lambda a: {**a, 'compass/weights': np.array('x')}, 'is of type'),
-    'integers for numbers': (
-        lambda a: {**a, 'keyframes/poses': a['keyframes/poses'].astype(int)},
-        'keyframes/poses is of type',
-    ),
-    'booleans': (lambda a: {**a, 'compass/weights': np.array([True])}, 'is of type'),
     'transposed': (lambda a: {**a, 'network/0/slow': a['network/0/slow'].T}, 'has the shape'),
-    'a row less': (lambda a: {**a, 'compass/features': a['compass/features'][1:]}, 'the shape'),
     'other network': (lambda a: {**a, 'network/0/linear': a['network/0/linear'][:9]}, 'not fit'),
-    'fewer weights': (lambda a: {**a, 'metric/linear': a['metric/linear'][1:]}, 'the shape'),
     'unknown array': (lambda a: {**a, 'extra/one': np.zeros(3)}, 'extra/one is unknown'),
-    'unknown name': (lambda a: {**a, 'compass/one': np.zeros(3)}, 'compass/one is unknown'),
     'a thousandth layer': (
         lambda a: {**a, **{k.replace('/0/', '/999/'): v for k, v in a.items() if '/0/' in k}},
         'damaged',
     ),
     'unknown map': (lambda a: {**a, 'metric/kind': np.array('?')}, 'damaged'),
-    'no triangle': (lambda a: {**a, 'metric/factor': a['metric/factor'][1:]}, 'damaged'),
-    'a smaller triangle': (lambda a: {**a, 'compass/factor': a['compass/factor'][:3]}, 'damaged'),
-    'a larger triangle': (
-        lambda a: {**a, 'refinement/metric_factor': np.ones(10**6)},
-        'damaged',
-    ),
+    'a larger triangle': (lambda a: {**a, 'refinement/metric_factor': np.ones(10**6)}, 'damaged'),
     'a refinement that turns neither way': (
         lambda a: {**a, 'refinement/scalars': a['refinement/scalars'] * [0, 1]},
         'turns neither way',
-    ),
-    'components of other maps': (
-        lambda a: {
-            **a,
-            'refinement/mean': a['refinement/mean'][1:],
-            'refinement/axes': a['refinement/axes'][1:],
-        },
-        'damaged',
-    ),
-    'fewer components': (
-        lambda a: {**a, 'refinement/axes': a['refinement/axes'][:, 1:]},
-        'the shape',
     ),
     'huge panorama': (
         lambda a: changed_header(a, panorama={'width': 10**9, 'height': 60}),
@@ -197,31 +127,14 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
         ),
         'elevation_min of the panorama must be below',
     ),
-    'a panorama of other properties': (
-        lambda a: changed_header(a, panorama={'width': 300, 'high': 30}),
-        "panorama: unknown parameter 'high'",
-    ),
     'no stride': (lambda a: first_layer(a, stride=[0, 1]), 'sizes are from 1'),
-    'negative field': (lambda a: first_layer(a, field=[-4, 4]), 'sizes are from 1'),
-    'huge layer': (lambda a: first_layer(a, outputs=10**12), 'sizes are from 1'),
-    'text stride': (lambda a: first_layer(a, stride='ab'), 'sizes are from 1'),
-    'no layers': (lambda a: architecture(a, layers=[]), 'sizes are from 1'),
     'no grid': (lambda a: architecture(a, grid=[0, 40]), 'sizes are from 1'),
-    'text grid': (lambda a: architecture(a, grid='ab'), 'sizes are from 1'),
     'NaN limit': (lambda a: first_layer(a, clip=float('nan')), 'clip'),
-    'other brightness': (lambda a: architecture(a, normalization='x'), 'normalization'),
     'layers beyond': (lambda a: changed_header(a, heading_layers=[99]), 'damaged'),
-    'layers of text': (lambda a: changed_header(a, heading_layers='ab'), 'damaged'),
-    'no quality': (lambda a: changed_header(a, quality=7), 'damaged'),
     'NaN delay': (
         lambda a: changed_header(a, quality={'camera_delay_s': [float('nan')]}),
         'delay is not that of a camera',
     ),
-    'a delay of years': (
-        lambda a: changed_header(a, quality={'camera_delay_s': [1e9]}),
-        'delay is not that of a camera',
-    ),
-    'text delay': (lambda a: changed_header(a, quality={'camera_delay_s': 'now'}), 'damaged'),
     'impossible correlation': (
         lambda a: changed_header(a, error_correlation={'share': 2.0, 'distance_m': 1.0}),
         'impossible',
@@ -231,23 +144,21 @@ CHANGES: dict[str, tuple[Callable[[dict], dict], str]] = {
 }
 
 
-@pytest.mark.parametrize('name', CHANGES)
-def test_wrong_content_with_a_right_checksum(name, arrays, tmp_path):
-    change, reason = CHANGES[name]
-    write_arrays(tmp_path / 'bad.npz', change(arrays))
-    rejected(tmp_path / 'bad.npz', reason)
+def test_wrong_content_with_a_right_checksum(arrays, tmp_path):
+    for name, (change, reason) in CHANGES.items():
+        path = tmp_path / f'{name}.npz'
+        write_arrays(path, change(arrays))
+        rejected(path, reason)
 
 
-def test_other_numbers_than_were_saved(arrays, tmp_path):
-    """The zip is whole; only the checksum of the header shows the change."""
-    np.savez(tmp_path / 'bad.npz', **{**arrays, 'metric/scalars': 9 * arrays['metric/scalars']})
-    rejected(tmp_path / 'bad.npz', 'checksum')
-
-
-@pytest.mark.parametrize('text', ['[' * 100_000, '9' * 5001, '[]', '7', '{"format": [' + '[' * 900])
-def test_headers_that_json_does_not_survive(text, arrays, tmp_path):
-    np.savez(tmp_path / 'bad.npz', **{**arrays, 'header': np.array(text)})
-    rejected(tmp_path / 'bad.npz', 'not a sfa_localization place model')
+def test_other_numbers_than_were_saved_and_headers_that_json_does_not_survive(arrays, tmp_path):
+    """The zip is whole; only the checksum of the header shows the change of numbers."""
+    path = tmp_path / 'bad.npz'
+    np.savez(path, **{**arrays, 'metric/scalars': 9 * arrays['metric/scalars']})
+    rejected(path, 'checksum')
+    for text in ('[' * 100_000, '9' * 5001, '[]', '7', '{"format": [' + '[' * 900):
+        np.savez(path, **{**arrays, 'header': np.array(text)})
+        rejected(path, 'not a sfa_localization place model')
 
 
 def npy(shape: str, dtype: str = '<f8', data: bytes = b'') -> bytes:
@@ -285,31 +196,24 @@ BOMBS = {
 
 
 @pytest.mark.filterwarnings('ignore:Duplicate name')
-@pytest.mark.parametrize('name', BOMBS)
-def test_bombs_end_before_anything_is_allocated(name, tmp_path, monkeypatch):
-    path = tmp_path / 'bad.npz'
-    path.write_bytes(BOMBS[name])
-    rejected(path, 'not a sfa_localization place model')
-
-
-def test_a_file_larger_than_any_model_is_not_read(tmp_path):
-    path = tmp_path / 'sparse.npz'
-    with path.open('wb') as file:
+def test_bombs_end_before_anything_is_allocated(tmp_path):
+    for name, data in BOMBS.items():
+        path = tmp_path / f'{name}.npz'
+        path.write_bytes(data)
+        rejected(path, 'not a sfa_localization place model')
+    with (tmp_path / 'sparse.npz').open('wb') as file:
         file.truncate(array_files.LARGEST_FILE + 1)
-    rejected(path, 'more than')
+    rejected(tmp_path / 'sparse.npz', 'more than')
 
 
-@pytest.mark.parametrize('kind', ['pipe', 'folder', 'long name', 'zero byte', 'device'])
-def test_paths_that_are_no_file(kind, tmp_path):
-    path = tmp_path / 'model.npz'
-    if kind == 'pipe':
-        os.mkfifo(path)
-    elif kind == 'folder':
-        path.mkdir()
-    else:
-        path = Path({'long name': 300 * 'x', 'zero byte': 'a\0b', 'device': '/dev/zero'}[kind])
-    what = {'pipe': 'is no regular file', 'device': 'is no regular file', 'folder': 'is a folder'}
-    rejected(path, f'{what.get(kind, "no such file")}: train it')
+def test_paths_that_are_no_file(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')
+    for path, what in {
+        tmp_path / 'pipe': 'is no regular file', tmp_path: 'is a folder',
+        Path(300 * 'x'): 'no such file', Path('a\0b'): 'no such file',
+        Path('/dev/zero'): 'is no regular file',
+    }.items():  # fmt: skip
+        rejected(path, f'{what}: train it')
 
 
 def test_damaged_models_give_one_kind_of_error(whole, tmp_path):

@@ -144,16 +144,3 @@ def test_each_robot_gets_its_own_parameters_of_one_file(robots):
     values = {name: nodes[2].get_parameter('lost_std').value for name, nodes in robots.items()}
     assert values == {'robot1': 1.5, 'robot2': 1.8}
     assert all(nodes[0].get_parameter('width').value == SIZE.width for nodes in robots.values())
-
-
-def test_a_remapped_input_is_shown_by_the_name_that_it_has(bench):
-    node = bench.run(EkfNode, options={'cli_args': ['--ros-args', '-r', 'odom:=/wheels/odometry']})
-    heard = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.publish('/wheels/odometry', standing(0))
-    assert until(lambda: node.monitor('odom').received)
-
-    def keys():
-        return {v.key for m in list(heard) for v in m.status[0].values}
-
-    assert until(lambda: any(key.startswith('/wheels/odometry: refused') for key in keys()))
-    assert not any(key.startswith('odom:') for key in keys())

@@ -6,9 +6,7 @@ import array
 import dataclasses
 import gc
 import math
-import threading
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import pytest
@@ -28,15 +26,13 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion  # noqa: E40
 from nav_msgs.msg import Odometry  # noqa: E402
 from rcl_interfaces.msg import ParameterType  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
+from ros_bench import Bench, until  # noqa: E402
 from std_msgs.msg import Float64, String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from sfa_localization.nodes import conversions as convert  # noqa: E402
 from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
 from sfa_localization.nodes.lifecycle import LocalizationNode  # noqa: E402
-from sfa_localization.nodes.monitor import Monitor  # noqa: E402
 
 DOMAIN = free_domain()
 
@@ -104,19 +100,13 @@ def test_every_setting_is_a_described_ranged_parameter(make):
     assert 'a, b' in node.describe_parameter('mode').additional_constraints
 
 
-def test_overrides_reach_the_settings_and_an_integer_serves_as_a_real(make):
+def test_a_wrong_parameter_is_rejected_at_start_by_name(make):
     settings = knobs(make, gain=2, count=4, corner=[3, 4], mode='b').settings(Knobs)
-    assert settings == Knobs(gain=2.0, count=4, corner=(3.0, 4.0), mode='b')
-
-
-@pytest.mark.parametrize(
-    'wrong',
-    [{'gain': 3.0}, {'gain': 3}, {'gain': 'x'}, {'mode': 'c'}, {'count': 0}, {'count': 1.5},
-     {'offset': math.nan}, {'corner': ['x']}, {'count': 1, 'gain': 1.5}],
-)  # fmt: skip
-def test_a_wrong_parameter_is_rejected_at_start_by_name(make, wrong):
-    with pytest.raises(ConfigError, match=next(reversed(wrong))):
-        knobs(make, **wrong)
+    assert settings == Knobs(gain=2.0, count=4, corner=(3.0, 4.0), mode='b'), 'integers serve'
+    for wrong in ({'gain': 3.0}, {'gain': 'x'}, {'mode': 'c'}, {'count': 0}, {'count': 1.5},
+                  {'offset': math.nan}, {'corner': ['x']}, {'count': 1, 'gain': 1.5}):  # fmt: skip
+        with pytest.raises(ConfigError, match=next(reversed(wrong))):
+            knobs(make, **wrong)
 
 
 def test_live_changes_are_checked_together_and_applied(make):
@@ -153,34 +143,25 @@ def test_a_list_has_real_numbers_also_while_it_is_empty(make):
     assert node.describe_parameter('corner').type == DOUBLES
 
 
-@pytest.mark.parametrize('change', [{'fixed': 2.0}, {'offset': math.nan}, {'mode': 'c'},
-                                    {'gain': 'x'}])  # fmt: skip
-def test_a_wrong_live_change_is_rejected_and_changes_nothing(make, change):
+def test_a_wrong_live_change_is_rejected_and_changes_nothing(make):
     node = knobs(make)
-    (name, value), *_ = change.items()
-    assert not node.set_parameters([Parameter(name, value=value)])[0].successful
-    assert node.settings(Knobs) == Knobs()
+    for name, value in (('fixed', 2.0), ('offset', math.nan), ('mode', 'c'), ('gain', 'x')):
+        assert not node.set_parameters([Parameter(name, value=value)])[0].successful
+        assert node.settings(Knobs) == Knobs()
 
 
-def test_a_misspelt_parameter_is_warned_of_with_the_nearest_name(make, monkeypatch):
+def test_a_misspelt_or_older_parameter_is_warned_of_with_the_nearest_name(make, monkeypatch):
     said = []
     monkeypatch.setattr(LocalizationNode, 'get_logger', lambda _: type('L', (), {
         'warning': lambda *a, **k: said.append(a[1])})())  # fmt: skip
     given = {'gian': 0.7, 'zzz': 1, 'use_sim_time': False, 'qos_overrides./in.depth': 3}
     # Another node's: a section `/**` of the parameter file is given to all.
     knobs(make, publish_tf=False, **given)
-    assert said == ["unknown parameter 'gian'; did you mean 'gain'?", "unknown parameter 'zzz'"]
-
-
-def test_a_parameter_of_an_older_version_is_warned_of_with_its_successor(make, monkeypatch):
-    said = []
-    monkeypatch.setattr(EkfNode, 'get_logger', lambda _: type('L', (), {
-        'warning': lambda *a, **k: said.append(a[1])})())  # fmt: skip
-    make(EkfNode, set_initial_pose=True, gate_probability=0.9)
+    make(EkfNode, set_initial_pose=True)
     assert said == [
-        "unknown parameter 'gate_probability'",
+        "unknown parameter 'gian'; did you mean 'gain'?", "unknown parameter 'zzz'",
         "unknown parameter 'set_initial_pose'; did you mean 'initial_pose'?",
-    ]
+    ]  # fmt: skip
 
 
 class Echo(LocalizationNode):
@@ -204,15 +185,19 @@ def test_a_node_starts_itself_unless_told_not_to(make):
     assert waiting.start() and not waiting.active
 
 
-def test_rejected_messages_and_defects_are_counted_and_end_nothing(make):
-    node = make(Echo)
-    node.start()
-    receive = node._guarded('in', node.take)
-    for value in (-1.0, 0.0, 2.0):
-        receive(Float64(data=value))
-    monitor = node.monitor('in')
-    assert (monitor.received, monitor.used) == (3, 1)
-    assert monitor.refused == {'negative': 1, 'internal error: ZeroDivisionError': 1}
+def test_rejected_messages_and_defects_are_counted_and_end_nothing():
+    bench = Bench(DOMAIN)
+    try:
+        node, heard = bench.run(Echo), bench.listen(String, 'out')
+        for value in (-1.0, 0.0, 2.0):
+            bench.publish('in', Float64(data=value))
+        assert until(lambda: heard)
+        monitor = node.monitor('in')
+        assert (monitor.received, monitor.used) == (3, 1)
+        assert monitor.refused == {'negative': 1, 'internal error: ZeroDivisionError': 1}
+        assert math.isfinite(monitor.silent_for_s()) and monitor.latency_ms(50) >= 0
+    finally:
+        bench.close()
 
 
 class Timed(LocalizationNode):
@@ -240,33 +225,25 @@ class Timed(LocalizationNode):
         raise ZeroDivisionError
 
 
-def test_a_timer_goes_on_after_an_error_which_is_counted():
+def test_defects_in_timers_health_and_services_are_shown_and_end_nothing():
     bench = Bench(DOMAIN)
     try:
         node = bench.run(Timed)
-        told = bench.listen(DiagnosticArray, '/diagnostics')
+        heard = bench.listen(DiagnosticArray, '/diagnostics')
         assert until(lambda: node.calls > 5)
         assert node.monitor('timer tick').refused == {
             'not ready': 1, 'internal error: ZeroDivisionError': 1,
         }  # fmt: skip
         # What the node cannot say of itself is an error, with the counts beside it.
-        assert until(lambda: told)
-        status = told[-1].status[0]
+        assert until(lambda: heard)
+        status = heard[-1].status[0]
         assert status.level == DiagnosticStatus.ERROR and 'cannot be determined' in status.message
         keys = {value.key for value in status.values}
         assert 'timer tick: refused: internal error: ZeroDivisionError' in keys
-        assert until(lambda: len(told) > 2)
-    finally:
-        bench.close()
-
-
-def test_a_defect_in_a_service_is_its_answer_and_ends_nothing():
-    bench = Bench(DOMAIN)
-    try:
-        bench.run(Timed)
         for _ in range(2):
             answer = bench.call(Trigger, 'timed/fail', Trigger.Request())
-            assert not answer.success and answer.message == 'internal error: KeyError'
+            assert not answer.success and 'KeyError' in answer.message
+        assert until(lambda: len(heard) > 2)
     finally:
         bench.close()
 
@@ -300,45 +277,6 @@ def test_a_node_that_ends_leaves_ros_without_waiting_for_the_garbage_collection(
         watching.close()
 
 
-class Slow(LocalizationNode):
-    """A node that is in the middle of a callback until it is let go."""
-
-    def __init__(self, way, **options):
-        super().__init__('slow', [], **options)
-        self.way, self.called, self.let_go = way, threading.Event(), threading.Event()
-
-    def setup(self):
-        self.out = self.publisher(String, 'out')
-        if self.way == 'timer':
-            self.every(0.01, self._work)
-        else:
-            self.subscribe(Float64, 'in', lambda message: self._work())
-
-    def _work(self):
-        self.called.set()
-        self.let_go.wait(DEADLINE_S)
-        self.out.publish(String(data='done'))
-
-
-@pytest.mark.parametrize('way', ['timer', 'message'])
-def test_a_node_destroyed_amid_its_callback_does_not_end_the_others_of_its_executor(way):
-    bench = Bench(DOMAIN)
-    try:
-        other, node = bench.run(Timed), bench.run(partial(Slow, way))
-        if way == 'message':
-            bench.publish('in', Float64())
-        assert node.called.wait(DEADLINE_S)
-        bench.executor.remove_node(node)
-        bench.nodes.remove(node)
-        node.destroy_node()
-        node.let_go.set()
-        before = other.calls
-        assert until(lambda: other.calls > before + 5)
-        assert not any(monitor.refused for monitor in node.monitors.values())
-    finally:
-        bench.close()
-
-
 class Failing(LocalizationNode):
     def setup(self):
         self.publisher(String, 'out')
@@ -350,18 +288,6 @@ def test_a_node_that_cannot_start_says_why_and_leaves_nothing(make):
     assert not node.start()
     assert node.failure == 'no model; give one'
     assert node.count_publishers('/out') == 0
-
-
-def test_monitor_counts_rates_and_latency():
-    monitor = Monitor()
-    assert monitor.silent_for_s() == math.inf and monitor.rate_hz() == 0
-    for _ in range(3):
-        monitor.use(monitor.receive())
-    monitor.refuse('late')
-    told = monitor.values('in: ')
-    assert told['in: received'] == '3' and told['in: refused: late'] == '1'
-    assert 0 <= monitor.latency_ms(50) <= monitor.latency_ms(99)
-    assert monitor.silent_for_s() < math.inf
 
 
 # Conversions.
@@ -380,20 +306,14 @@ def odometry(**changes):
     return message
 
 
-@pytest.mark.parametrize('stamp_ns', [1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789])
-def test_stamps_survive_the_round_trip(stamp_ns):
-    assert read_stamp(convert.to_stamp(stamp_ns)) == stamp_ns
-
-
-@pytest.mark.parametrize('yaw', [0.0, 1.0, -3.0, math.pi, -math.pi + 1e-9])
-def test_yaw_survives_the_round_trip(yaw):
-    back = read_yaw(convert.to_quaternion(yaw))
-    assert abs(math.remainder(back - yaw, 2 * math.pi)) < 1e-12
-
-
-def test_turns_of_images_survive_the_round_trip():
-    stamp_ns, yaw = convert.read_turned(convert.to_turned(-2.5, 1_700_000_000_123_456_789, 'first'))
-    assert stamp_ns == 1_700_000_000_123_456_789 and abs(yaw + 2.5) < 1e-12
+def test_stamps_headings_and_turns_survive_the_round_trip():
+    for stamp_ns in (1, 999_999_999, 1_000_000_000, 1_700_000_000_123_456_789):
+        assert read_stamp(convert.to_stamp(stamp_ns)) == stamp_ns
+        for yaw in (0.0, 1.0, -3.0, math.pi, -math.pi + 1e-9):
+            back = read_yaw(convert.to_quaternion(yaw))
+            assert abs(math.remainder(back - yaw, 2 * math.pi)) < 1e-12
+            read_ns, read = convert.read_turned(convert.to_turned(yaw, stamp_ns, 'map'))
+            assert read_ns == stamp_ns and abs(math.remainder(read - yaw, 2 * math.pi)) < 1e-9
 
 
 def test_odometry_is_read():
@@ -404,23 +324,23 @@ def test_odometry_is_read():
     assert motion.twist == (0.5, -0.2) and motion.variances == (4e-4, 0.0)
 
 
-@pytest.mark.parametrize(
-    ('changes', 'reason'),
-    [
-        ({'twist__twist__linear__x': math.nan}, 'twist is not finite'),
-        ({'twist__twist__angular__z': math.inf}, 'twist is not finite'),
-        ({'pose__pose__orientation__w': 0.0}, 'quaternion is zero'),
-        ({'pose__pose__orientation__w': 1e200}, 'quaternion is absurdly large'),
-        ({'pose__pose__orientation__w': math.nan}, 'quaternion is not finite'),
-        ({'pose__pose__position__x': math.inf}, 'pose is not finite'),
-        ({'header__stamp__sec': 0}, 'zero or negative stamp'),
-        ({'header__stamp__nanosec': 1_000_000_000}, 'impossible stamp'),
-        ({'twist__twist__linear__x': 1e308}, 'twist is absurdly large'),
-    ],
-)
-def test_malformed_odometry_is_named(changes, reason):
-    with pytest.raises(MessageError, match=reason):
-        convert.read_odometry(odometry(**changes))
+MALFORMED = [
+    ({'twist__twist__linear__x': math.nan}, 'twist is not finite'),
+    ({'twist__twist__angular__z': math.inf}, 'twist is not finite'),
+    ({'pose__pose__orientation__w': 0.0}, 'quaternion is zero'),
+    ({'pose__pose__orientation__w': 1e200}, 'quaternion is absurdly large'),
+    ({'pose__pose__orientation__w': math.nan}, 'quaternion is not finite'),
+    ({'pose__pose__position__x': math.inf}, 'pose is not finite'),
+    ({'header__stamp__sec': 0}, 'zero or negative stamp'),
+    ({'header__stamp__nanosec': 1_000_000_000}, 'impossible stamp'),
+    ({'twist__twist__linear__x': 1e308}, 'twist is absurdly large'),
+]
+
+
+def test_malformed_odometry_is_named():
+    for changes, reason in MALFORMED:
+        with pytest.raises(MessageError, match=reason):
+            convert.read_odometry(odometry(**changes))
 
 
 def test_pose_and_covariance_survive_the_round_trip():
@@ -431,18 +351,15 @@ def test_pose_and_covariance_survive_the_round_trip():
     assert np.allclose(pose, [1, -2, 3]) and np.allclose(back, covariance)
 
 
-@pytest.mark.parametrize(
-    ('index', 'value', 'reason'),
-    [(0, math.nan, 'not finite'), (0, -1.0, 'negative'), (1, 0.5, 'symmetric'),
-     (35, 1e308, 'absurdly')],
-)  # fmt: skip
-def test_a_malformed_covariance_is_named(index, value, reason):
-    message = PoseWithCovarianceStamped()
-    message.header.stamp.sec = 1
-    message.pose.pose.orientation = Quaternion(w=1.0)
-    message.pose.covariance[index] = value
-    with pytest.raises(MessageError, match=reason):
-        convert.read_pose(message)
+def test_a_malformed_covariance_is_named():
+    for index, value, reason in ((0, math.nan, 'not finite'), (0, -1.0, 'negative'),
+                                 (1, 0.5, 'symmetric'), (35, 1e308, 'absurdly')):  # fmt: skip
+        message = PoseWithCovarianceStamped()
+        message.header.stamp.sec = 1
+        message.pose.pose.orientation = Quaternion(w=1.0)
+        message.pose.covariance[index] = value
+        with pytest.raises(MessageError, match=reason):
+            convert.read_pose(message)
 
 
 def test_the_declaration_of_a_panorama_survives_the_round_trip_and_bad_ones_are_named():
@@ -458,40 +375,3 @@ def test_nothing_that_is_not_finite_gets_out():
     with pytest.raises(MessageError, match='output'):
         convert.to_pose([math.nan, 0.0, 0.0], 1, 'map')
     assert convert.to_pose([1.0, 2.0, math.nan], 1, 'map').pose.orientation.w == 1.0
-
-
-def test_pictures_survive_the_round_trip_and_bad_ones_are_named():
-    image = np.random.default_rng(0).integers(0, 256, (4, 6, 3), dtype=np.uint8)
-    message = convert.to_image(image, 9, 'camera')
-    stamp_ns, back = convert.read_image(message)
-    assert stamp_ns == 9 and np.array_equal(back, image)
-    message.step = 5
-    with pytest.raises(MessageError):
-        convert.read_image(message)
-    with pytest.raises(MessageError):
-        empty = Image()
-        empty.header.stamp.sec = 1
-        convert.read_image(empty)
-
-
-def test_odometry_message_carries_both_covariances():
-    message = convert.to_odometry(
-        [1, 2, 0.5], np.diag([1, 2, 3]), [0.4, 0.1], np.diag([5, 6]), 3, ('map', 'base_link')
-    )
-    pose, twist = (np.reshape(part.covariance, (6, 6)) for part in (message.pose, message.twist))
-    assert (pose[0, 0], pose[1, 1], pose[5, 5]) == (1, 2, 3)
-    assert (twist[0, 0], twist[5, 5]) == (5, 6)
-    assert message.child_frame_id == 'base_link' and message.twist.twist.linear.x == 0.4
-
-
-def test_an_array_names_its_dimension():
-    message = convert.to_array([1, 2, 3], 'slow features')
-    assert message.layout.dim[0].label == 'slow features' and message.layout.dim[0].size == 3
-    assert list(message.data) == [1.0, 2.0, 3.0]
-
-
-@pytest.mark.parametrize('yaw', [0.0, 0.7, -3.0])
-def test_turns_of_images_are_read_as_they_were_written(yaw):
-    stamp_ns = 1_700_000_000_123_456_789
-    read_ns, read = convert.read_turned(convert.to_turned(yaw, stamp_ns, 'map'))
-    assert read_ns == stamp_ns and read == pytest.approx(yaw)

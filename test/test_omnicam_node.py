@@ -19,7 +19,6 @@ from sfa_localization.camera.encodings import decode_compressed, encode_jpeg
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
 from sfa_localization.config import load_settings, write_config
-from sfa_localization.data.errors import ConfigError
 
 rclpy = pytest.importorskip('rclpy')
 pytestmark = pytest.mark.ros
@@ -40,7 +39,7 @@ from std_msgs.msg import String  # noqa: E402
 
 from sfa_localization.nodes.conversions import read_info  # noqa: E402
 from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
-from sfa_localization.nodes.omnicam_node import _JPEG_QUALITY, OmnicamNode  # noqa: E402
+from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
 from sfa_localization.nodes.settings import OmnicamNodeConfig  # noqa: E402
 
 DOMAIN = free_domain()
@@ -97,15 +96,9 @@ def test_what_the_panorama_shows_is_declared_for_those_who_come_late_and_after_a
 def test_frame_and_quality_of_service_by_parameter(bench):
     run = bench(frame_id='mast').start()
     run.hear('panorama')
-    assert send_until(run, run.speak(), image_message(raw_picture())).header.frame_id == 'mast'
+    message = image_message(raw_picture())
+    assert send_until(run, run.speak(), message).header.frame_id == 'mast'
     assert run.node.get_parameter('qos_overrides./image_raw.subscription.depth').value == 1
-
-
-def test_a_picture_without_a_frame_gets_one(bench):
-    run = bench().start()
-    run.hear('panorama')
-    message = send_until(run, run.speak(), image_message(raw_picture(), frame=''))
-    assert message.header.frame_id == 'omnicam'
 
 
 def test_compressed_pictures_in_and_out(bench):
@@ -119,7 +112,13 @@ def test_compressed_pictures_in_and_out(bench):
     heard = send_until(run, publisher, message, 'panorama/compressed')
     assert heard.header.stamp.sec == 5
     expected = Unwrapper(CameraConfig(), PANORAMA)(decode_compressed(data))
-    assert heard.data.tobytes() == encode_jpeg(expected, _JPEG_QUALITY)
+    shown = decode_compressed(heard.data.tobytes())
+    assert np.corrcoef(shown.ravel(), expected.ravel())[0, 1] > 0.6
+    message.data = array.array('B', b'no picture')
+    monitor = run.node.monitor('image_raw/compressed')
+    run.wait(lambda: publisher.publish(message) or monitor.refused)
+    message.data = array.array('B', data)
+    send_until(run, publisher, message, 'panorama/compressed')
 
 
 def test_nobody_listens_nothing_is_done(bench):
@@ -140,72 +139,28 @@ def test_nobody_listens_nothing_is_done(bench):
     send_until(run, publisher, image_message(raw_picture()))
 
 
-def bad_pictures():
-    good = raw_picture()
-    cases = {}
-    for name, change in {
-        'encoding': {'encoding': 'hsv9'},
-        'no rows': {'height': 0},
-        'no columns': {'width': 0},
-        'step': {'step': 7},
-        'too wide': {'width': 641},
-        'too high': {'height': 641},
-    }.items():
-        message = image_message(good)
-        for field, value in change.items():
-            setattr(message, field, value)
-        cases[name] = message
-    cases['no data'] = image_message(good)
-    cases['no data'].data = array.array('B')
-    cases['other shape'] = image_message(good[:480])
-    cases['zero stamp'] = image_message(good, stamp=(0, 0))
-    cases['impossible stamp'] = image_message(good, stamp=(1, 4_000_000_000))
-    return cases
-
-
 def test_it_outlives_every_bad_image_and_counts_each(bench):
+    """What is wrong with images is tested in test_pictures.py."""
     run = bench().start()
     run.hear('panorama')
     run.hear('/diagnostics', DiagnosticArray)
-    publisher = run.speak()
-    send_until(run, publisher, image_message(raw_picture()))
-    count = len(run.received['panorama'])
-    monitor = run.node.monitor('image_raw')
-    for name, message in bad_pictures().items():
+    publisher, good = run.speak(), image_message(raw_picture())
+    send_until(run, publisher, good)
+    count, monitor = len(run.received['panorama']), run.node.monitor('image_raw')
+    empty = image_message(raw_picture())
+    empty.height = 0
+    bad = [empty, image_message(raw_picture()[:480]), image_message(raw_picture(), stamp=(0, 0))]
+    for message in bad:
         before = sum(monitor.refused.values())
-        deadline = time.monotonic() + PATIENCE_S
-        while sum(monitor.refused.values()) == before:
-            assert time.monotonic() < deadline, name
-            publisher.publish(message)
-            time.sleep(0.02)
-    assert not any('internal error' in reason for reason in monitor.refused)
-    assert len(monitor.refused) >= 6
+        run.wait(lambda m=message, b=before: (
+            publisher.publish(m) or sum(monitor.refused.values()) > b
+        ))  # fmt: skip
+    assert len(monitor.refused) == 3 and not any('internal' in why for why in monitor.refused)
     assert len(run.received['panorama']) == count
-    send_until(run, publisher, image_message(raw_picture()))
-
-    def counted():
-        values = {
-            pair.key: pair.value for pair in run.received['/diagnostics'][-1].status[0].values
-        }
-        return '/image_raw: refused: empty image' in values
-
-    run.wait(counted)
-
-
-def test_bad_compressed_images(bench):
-    run = bench(image_transport='compressed').start()
-    run.hear('panorama')
-    publisher = run.speak('image_raw/compressed', CompressedImage)
-    message = CompressedImage(format='jpeg', data=array.array('B', b'no picture'))
-    message.header.stamp.sec = 1
-    deadline = time.monotonic() + PATIENCE_S
-    monitor = run.node.monitor('image_raw/compressed')
-    while not monitor.refused:
-        assert time.monotonic() < deadline
-        publisher.publish(message)
-        time.sleep(0.02)
-    message.data = array.array('B', encode_jpeg(raw_picture(), 90))
-    send_until(run, publisher, message)
+    send_until(run, publisher, good)
+    run.wait(lambda: '/image_raw: refused: empty image' in {
+        pair.key for pair in run.received['/diagnostics'][-1].status[0].values
+    })  # fmt: skip
 
 
 def test_masks_elevation_and_mount_change_while_running(bench):
@@ -225,32 +180,19 @@ def test_masks_elevation_and_mount_change_while_running(bench):
         assert time.monotonic() < deadline
 
 
-def test_masks_are_taken_away_again(bench):
-    run = bench(blind_sectors=[10.0, 20.0])
-    assert run.node.start()
-    assert run.set(blind_sectors=[]).successful
-    assert run.node.settings(CameraConfig).blind_sectors == ()
-
-
-def test_a_parameter_cannot_be_removed(bench):
-    run = bench(blind_sectors=[10.0, 20.0])
-    assert run.node.start()
-    (answer,) = run.node.set_parameters([Parameter('blind_sectors', Parameter.Type.NOT_SET)])
-    assert not answer.successful
-    assert 'cannot be undeclared' in answer.reason
-    assert run.set(blind_sectors=[30.0, 40.0]).successful
-
-
-def test_sectors_are_set_by_message(bench):
+def test_sectors_are_set_by_message_and_taken_away_but_not_removed(bench):
     """As `ros2 param set` does: numbers arrive as array.array, or as integers."""
-    run = bench()
+    run = bench(blind_sectors=[10.0, 20.0])
     assert run.node.start()
     for sent in ([170.0, 190.0], [10, 20]):
         message = Parameter('blind_sectors', value=sent).to_parameter_msg()
         (answer,) = run.node.set_parameters([Parameter.from_parameter_msg(message)])
         assert answer.successful, answer.reason
         assert run.node.settings(CameraConfig).blind_sectors == tuple(sent)
-        assert run.node._unwrapper.camera.blind_sectors == tuple(sent)
+    assert run.set(blind_sectors=[]).successful
+    assert run.node.settings(CameraConfig).blind_sectors == ()
+    (answer,) = run.node.set_parameters([Parameter('blind_sectors', Parameter.Type.NOT_SET)])
+    assert not answer.successful and 'cannot be undeclared' in answer.reason
 
 
 @pytest.fixture
@@ -271,44 +213,31 @@ def remapped():
         rclpy.try_shutdown(context=node.context)
 
 
-@pytest.mark.parametrize(
-    ('rules', 'heard'),
-    [
+def test_a_remap_of_the_base_topic_holds_for_its_transports(remapped):
+    for rules, heard in (
         ([], '/image_raw/compressed'),
         (['image_raw:=/cam/image_raw'], '/cam/image_raw/compressed'),
-        (['image_raw/compressed:=/jpegs'], '/jpegs'),
         (['image_raw:=/cam/image_raw', 'image_raw/compressed:=/jpegs'], '/jpegs'),
         (['__ns:=/robot1', 'image_raw:=front'], '/robot1/front/compressed'),
-    ],
-)
-def test_a_remap_of_the_base_topic_holds_for_its_transports(remapped, rules, heard):
-    node = remapped(*rules, image_transport='compressed')
-    assert node.start(), node.failure
-    assert node.shown(node._input) == heard
-
-
-def test_a_remap_of_the_panorama_takes_its_companions_along(remapped):
+    ):
+        node = remapped(*rules, image_transport='compressed')
+        assert node.start(), node.failure
+        assert node.shown(node._input) == heard
     node = remapped('panorama:=/top/view')
     assert node.start(), node.failure
-    made = node._panoramas, node._compressed, node._info
-    assert [publisher.topic_name for publisher in made] == [
-        '/top/view', '/top/view/compressed', '/top/view/info',
-    ]  # fmt: skip
+    made = {publisher.topic_name for publisher in node.publishers}
+    assert {'/top/view', '/top/view/compressed', '/top/view/info'} <= made
 
 
-@pytest.mark.parametrize(
-    ('rules', 'transport'),
-    [
-        (['image_raw:=panorama'], 'raw'),
-        (['panorama:=/image_raw'], 'raw'),
-        (['image_raw:=panorama'], 'compressed'),
-        (['image_raw/compressed:=panorama/compressed'], 'compressed'),
-    ],
-)
-def test_a_node_that_would_hear_itself_is_not_configured(remapped, rules, transport):
-    node = remapped(*rules, image_transport=transport)
-    assert not node.start()
-    assert 'which this node itself publishes' in node.failure and 'remap' in node.failure
+def test_a_node_that_would_hear_itself_is_not_configured(remapped):
+    for rule, transport in (
+        ('image_raw:=panorama', 'raw'), ('panorama:=/image_raw', 'raw'),
+        ('image_raw:=panorama', 'compressed'),
+        ('image_raw/compressed:=panorama/compressed', 'compressed'),
+    ):  # fmt: skip
+        node = remapped(rule, image_transport=transport)
+        assert not node.start()
+        assert 'which this node itself publishes' in node.failure and 'remap' in node.failure
 
 
 @contextlib.contextmanager
@@ -341,26 +270,18 @@ def test_what_ros2_param_dump_writes_can_be_loaded_again(tmp_path):
     assert [load_settings(path, 'omnicam_node', type(each)) for each in settings] == settings
 
 
-@pytest.mark.parametrize(
-    ('change', 'words'),
-    [
-        ({'elevation_max': -40.0}, 'elevation_min'),
-        ({'mask_file': 'nowhere.png'}, 'nowhere.png'),
-        ({'blind_sectors': [10.0]}, 'a start and an end'),
-        ({'blind_sectors': [0.0, float('nan')]}, 'finite'),
-        ({'elevation_max': float('nan')}, ''),
-        ({'camera_model': 'panorama'}, ''),
-        ({'mount_rpy': [1.0, 2.0]}, 'roll, pitch and yaw'),
-        ({'normalization': 'magic'}, 'magic'),
-    ],
-)
-def test_impossible_changes_are_rejected_with_the_reason(bench, change, words):
+def test_impossible_changes_are_rejected_with_the_reason(bench):
     run = bench()
     assert run.node.start()
     before = run.node.get_parameter('elevation_max').value
-    result = run.set(**change)
-    assert not result.successful
-    assert words in result.reason
+    for change, words in (
+        ({'elevation_max': -40.0}, 'elevation_min'),
+        ({'mask_file': 'nowhere.png'}, 'nowhere.png'),
+        ({'blind_sectors': [10.0]}, 'a start and an end'),
+        ({'mount_rpy': [1.0, 2.0]}, 'roll, pitch and yaw'),
+    ):
+        result = run.set(**change)
+        assert not result.successful and words in result.reason
     assert run.node.get_parameter('elevation_max').value == before
 
 
@@ -378,71 +299,34 @@ def test_an_impossible_camera_says_so_and_does_not_start(bench, parameters, word
     assert words in run.node.failure
 
 
-def test_an_empty_range_of_elevations_is_a_wrong_parameter(bench):
-    with pytest.raises(ConfigError, match="'omnicam_node': elevation_min of the panorama"):
-        bench(elevation_min=50.0)
-
-
-@pytest.mark.parametrize(
-    ('given', 'expected'), [('[]', ()), ('[170, 190]', (170.0, 190.0)), ('[1.5, 2.5]', (1.5, 2.5))]
-)
-def test_lists_in_a_parameter_file(bench, tmp_path, given, expected):
-    path = tmp_path / 'parameters.yaml'
-    path.write_text(f'omnicam_node:\n  ros__parameters:\n    blind_sectors: {given}\n')
-    arguments = ['--ros-args', '--params-file', str(path)]
-    node = OmnicamNode(context=bench().context, cli_args=arguments)
-    assert node.settings(CameraConfig).blind_sectors == expected
-    node.destroy_node()
-
-
-def test_every_parameter_is_described(bench):
-    run = bench()
-    for name in ('source', 'camera_model', 'blind_sectors', 'elevation_max', 'mount_rpy'):
-        assert len(run.node.describe_parameter(name).description) > 10
-    assert run.node.describe_parameter('camera_model').read_only
-    assert not run.node.describe_parameter('blind_sectors').read_only
+def shown(run, *words, level=None):
+    """Wait until a diagnosis says something."""
+    run.wait(lambda: any(
+        all(word in each.status[0].message for word in words)
+        and level in (None, each.status[0].level)
+        for each in run.received['/diagnostics']
+    ))  # fmt: skip
 
 
 def test_a_silent_camera_shows_in_diagnostics(bench):
     run = bench(silence_timeout=0.2).start()
     run.hear('panorama')
     run.hear('/diagnostics', DiagnosticArray)
-    run.wait(
-        lambda: any(
-            'no image' in message.status[0].message for message in run.received['/diagnostics']
-        )
-    )
-    publisher = run.speak()
-    send_until(run, publisher, image_message(raw_picture()))
+    shown(run, 'no image')
+    send_until(run, run.speak(), image_message(raw_picture()))
 
 
-def test_a_frozen_camera_shows_in_diagnostics(bench, monkeypatch):
+def test_a_frozen_and_a_masked_camera_show_in_diagnostics(bench, monkeypatch):
     monkeypatch.setattr(watch, 'FROZEN_S', 0.2)
-    run = bench().start()
-    run.hear('panorama')
-    run.hear('/diagnostics', DiagnosticArray)
-    publisher = run.speak()
-    message = image_message(raw_picture())
-
-    def told():
-        publisher.publish(message)
-        return any('repeated' in each.status[0].message for each in run.received['/diagnostics'])
-
-    run.wait(told)
-    assert run.received['panorama']
-
-
-def test_a_masked_camera_shows_in_diagnostics(bench):
     run = bench(blind_sectors=[-100.0, 100.0]).start()
     run.hear('panorama')
     run.hear('/diagnostics', DiagnosticArray)
-    publisher = run.speak()
-    send_until(run, publisher, image_message(raw_picture()))
-    run.wait(
-        lambda: any(
-            'sees only 4' in each.status[0].message for each in run.received['/diagnostics']
-        )
-    )
+    publisher, message = run.speak(), image_message(raw_picture())
+    send_until(run, publisher, message)
+    shown(run, 'sees only 4')
+    run.wait(lambda: publisher.publish(message) or any(
+        'repeated' in each.status[0].message for each in run.received['/diagnostics']
+    ))  # fmt: skip
 
 
 def test_a_folder_of_pictures(bench, tmp_path):
@@ -468,32 +352,7 @@ def test_a_device_that_is_not_there_is_shown_and_awaited(bench):
     run.hear('/diagnostics', DiagnosticArray)
     run.start()
     assert run.started
-    run.wait(
-        lambda: any(
-            each.status[0].level == DiagnosticStatus.ERROR
-            and 'no_such_camera' in each.status[0].message
-            for each in run.received['/diagnostics']
-        )
-    )
-
-
-def test_the_life_cycle_goes_round(bench):
-    run = bench()
-    run.hear('panorama')
-    run.start()
-    publisher = run.speak()
-    send_until(run, publisher, image_message(raw_picture()))
-    run.spinning = False
-    run.thread.join(PATIENCE_S)
-    run.node.trigger_deactivate()
-    run.node.trigger_cleanup()
-    run.node.trigger_configure()
-    run.node.trigger_activate()
-    run.spinning = True
-    run.thread = threading.Thread(target=run._spin, daemon=True)
-    run.thread.start()
-    run.wait(lambda: publisher.get_subscription_count() == 1)
-    send_until(run, publisher, image_message(raw_picture()))
+    shown(run, 'no_such_camera', level=DiagnosticStatus.ERROR)
 
 
 def test_of_images_that_come_too_fast_the_newest_is_used(bench):

@@ -50,28 +50,16 @@ def test_the_light_may_change():
     assert after([*images(0.5, 200), *images(0.0, 300)]) < 0.1
 
 
-def test_keyframes_that_are_far_are_no_other_light():
-    """A drive beside all tracks: images are unlike, and keyframes vary."""
-    far = [seen(0.8, 0.4)] * 100
-    assert after(far) < 0.05
-
-
-def test_beside_all_keyframes_nothing_is_learned_of_the_light():
+def test_what_is_no_other_light():
+    """A drive beside all tracks, an excursion beyond the keyframes (the place seems to be among
+    those at the border, which cannot show how far it is), images that are more alike than usual.
+    """
+    assert after([seen(0.8, 0.4)] * 100) < 0.05
     assert after([seen(1.5, 0.05, aside=0.7)] * 100) == 0.0
-
-
-def test_an_excursion_beyond_the_keyframes_is_no_other_light():
-    """The place seems to be among those at the border, which cannot show how far it is."""
     away = [seen(unlike, 0.05) for unlike in (0.2, 0.5, 0.9, *[1.4] * 60)]
     assert after([*images(0.0, 150), *away]) < 0.15
-
-
-def test_images_that_are_more_alike_than_usual_are_no_negative_light():
     assert after([seen(0.0, 0.3)] * 50) == 0.0
-
-
-def test_no_light_hides_the_place():
-    assert after([seen(1e6, 0.05)] * 500) <= 1.0
+    assert after([seen(1e6, 0.05)] * 500) <= 1.0, 'no light hides the place'
 
 
 def repainted(world: Spheres, share: float) -> Spheres:
@@ -121,19 +109,13 @@ def drive_in_other_light(config, share, seed=1, number=150):
 
 
 @pytest.mark.parametrize('config', [CONFIG, COUNTER])
-@pytest.mark.parametrize('seed', [1, 2])
-def test_what_the_light_adds_everywhere_moves_no_place(config, seed):
-    (plain, known), light = drive_in_other_light(config, 0.3, seed)
+def test_what_the_light_adds_everywhere_moves_no_place(config):
+    """In the light of the training nothing changes."""
+    (plain, known), light = drive_in_other_light(config, 0.3)
     assert known < 0.75 * plain
-    assert light.pattern is not None and light.pattern.any()
-
-
-def test_in_the_light_of_the_training_nothing_changes():
-    (plain, known), light = drive_in_other_light(CONFIG, 0.0)
+    (plain, known), same = drive_in_other_light(config, 0.0)
     assert known < 1.1 * plain
-    assert np.linalg.norm(light.pattern) < 0.2 * np.linalg.norm(
-        drive_in_other_light(CONFIG, 0.3)[1].pattern
-    )
+    assert np.linalg.norm(same.pattern) < 0.2 * np.linalg.norm(light.pattern)
 
 
 LEFT = np.ones((3, 4), np.complex64)
@@ -159,20 +141,3 @@ def test_the_pattern_is_a_mean_over_places():
         light.add(matched(near, (shown - known).astype(np.complex64), 0.3 * k), NOISE)
     assert np.abs(light.pattern.mean() - 1) < 0.15
     assert np.std(light.pattern) < 0.3
-
-
-def test_beside_all_keyframes_no_pattern_is_learned():
-    light = OtherLight()
-    light.add(matched(seen(0.1, 0.05, aside=0.7), LEFT), NOISE)
-    assert light.pattern is None
-
-
-def test_an_image_that_is_suddenly_unlike_adds_little():
-    found = []
-    for unlike in (0.0, 3.0):
-        light = OtherLight()
-        for k in range(100):
-            light.add(matched(seen(0.0, 0.05), 0 * LEFT, 0.3 * k), NOISE)
-        light.add(matched(seen(unlike, 0.05), LEFT, 100.0), NOISE)
-        found.append(np.abs(light.pattern).mean())
-    assert found[1] < 0.2 * found[0]

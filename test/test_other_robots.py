@@ -7,10 +7,11 @@ comes at any rate and with pauses, images are stamped late, and a second drive s
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, visit, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, place, recipe, run_in, visit, wander
 from metric_worlds import criss_cross, drive, garden_features
 
 from sfa_localization.data.geometry import align, compose, wrap_angle
@@ -100,10 +101,9 @@ def errors(images, places, headings, truth):
     return off, wrap_angle(laid.apply_yaw(headings) - truth[images, 2])
 
 
-@pytest.mark.parametrize('seed', range(0, 100, 10))
-def test_the_odometry_frame_is_nothing_but_the_gauge(seed):
-    """Ten drives each: turned and shifted odometry turns and shifts the map, and nothing else."""
-    for draw in range(seed, seed + 10):
+def test_the_odometry_frame_is_nothing_but_the_gauge():
+    """Twenty drives: turned and shifted odometry turns and shifts the map, and nothing else."""
+    for draw in range(20):
         twists, start = criss_cross(8, seed=draw)
         run = drive(twists, start=start, bias=0.002, yaw_noise=0.01, seed=draw)
         robot = Robot.draw(draw, len(twists) / 50)
@@ -147,9 +147,9 @@ def reset_midway(draw, others):
 
 @pytest.mark.parametrize('drives', [two_drives, reset_midway])
 def test_any_robot_gives_nearly_as_good_a_map(drives):
-    """Thirty robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
+    """Eight robots each, beside the simulator's on the same way: rates, gaps, frames, resets."""
     plain, other = [], []
-    for draw in range(30):
+    for draw in range(8):
         for others, found in ((False, plain), (True, other)):
             _, images, places, headings, truth = learn(drives(draw, others), draw)
             off, turned = errors(images, places, headings, truth)
@@ -159,6 +159,7 @@ def test_any_robot_gives_nearly_as_good_a_map(drives):
     assert np.all(other < 2.0 * plain + [0.3, 3.0])
 
 
+@cache
 def placed(delay_s, seed):
     """Mean error (m) of a place learnt from images stamped so late, after rigid alignment."""
     config = recipe()
@@ -168,8 +169,11 @@ def placed(delay_s, seed):
         exact.panoramas.stamps_ns + round(delay_s * 1e9), exact.panoramas.images
     )
     run = replace(exact, panoramas=shifted)
-    network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
-    trained = learn_place(network, [run], config)
+    if delay_s == 0.0 and seed == 1:
+        trained = place()
+    else:
+        network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
+        trained = learn_place(network, [run], config)
     seen = visit() if seed == 1 else exact
     estimates = trained.model.locate_all(seen.panoramas.read(0, len(seen.panoramas)))
     places = np.array([estimate.position for estimate in estimates])

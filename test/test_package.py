@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The package as a whole: imports between rooms, one version, docstrings, executables."""
+"""The package as a whole: imports between rooms, one version, what is installed, exit codes."""
 
 import ast
 import os
@@ -11,7 +11,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -160,32 +160,27 @@ def wrong_imports(module: str, imported: Iterable[str]) -> set[str]:
     return wrong
 
 
-@pytest.mark.parametrize('module', sorted(MODULES))
-def test_module_imports_only_what_its_room_may(module):
-    assert wrong_imports(module, imports(module)) == set()
+def test_modules_import_only_what_their_rooms_may():
+    """And nothing runs code from files that it reads; only nodes and commands know ROS."""
+    assert set(ROOMS) == {room(module) for module in MODULES}
+    assert {m: wrong for m in MODULES if (wrong := wrong_imports(m, imports(m)))} == {}
+    assert [m for m in MODULES if {name.split('.')[0] for name in imports(m)} & UNSAFE] == []
+    with_ros = {room(module) for module in MODULES if foreign(module) & ROS}
+    assert with_ros == {'nodes', 'commands'}
 
 
-@pytest.mark.parametrize(
-    ('module', 'imported'),
-    [
-        (f'{NAME}.metric.phases', f'{NAME}.bags.run_loader.load_run'),
-        (f'{NAME}.camera.capture', f'{NAME}.nodes.settings.NodeConfig'),
-        (f'{NAME}.config', f'{NAME}.nodes.lifecycle.BaseNode'),
-        (f'{NAME}.data.run', 'scipy.linalg'),
-        (f'{NAME}.localizer', f'{NAME}.training.train'),
-    ],
-)
-def test_a_wrong_import_is_found(module, imported):
-    assert wrong_imports(module, [imported]) == {imported}
-
-
-def test_a_module_without_a_room_is_found():
+def test_a_wrong_import_is_found():
+    for module, imported in {
+        'metric.phases': f'{NAME}.bags.run_loader.load_run',
+        'camera.capture': f'{NAME}.nodes.settings.NodeConfig',
+        'config': f'{NAME}.nodes.lifecycle.BaseNode',
+        'data.run': 'scipy.linalg',
+        'localizer': f'{NAME}.training.train',
+        'cli': 'study.tables.Work',
+    }.items():
+        assert wrong_imports(f'{NAME}.{module}', [imported]) == {imported}
     with pytest.raises(KeyError):
         wrong_imports(f'{NAME}.helpers', ['numpy'])
-
-
-def test_every_room_is_there():
-    assert set(ROOMS) == {room(module) for module in MODULES}
 
 
 def test_contributing_shows_the_same_rooms_and_arrows():
@@ -198,14 +193,6 @@ def test_contributing_shows_the_same_rooms_and_arrows():
     assert [
         name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', diagram)
     ] == []
-
-
-def test_contributing_names_files_and_folders_that_exist():
-    text = (ROOT / 'CONTRIBUTING.md').read_text('utf-8')
-    names = set(re.findall(r'`([\w.]*\w(?:/\w[\w.]*)*(?:\.(?:py|yaml|xml|md)|/|/run))`', text))
-    assert {'metric/phases.py', 'commands/', 'config.py', '.ci/run'} <= names
-    missing = {name for name in names if not any((top / name).exists() for top in (ROOT, PACKAGE))}
-    assert missing == set()
 
 
 LONGEST_FUNCTION, TYPICAL_FUNCTION = 40, 8
@@ -238,23 +225,10 @@ def test_the_parameter_file_stays_readable():
     assert 0 < len(names) <= MOST_PARAMETERS
 
 
-@pytest.mark.parametrize('module', sorted(MODULES))
-def test_nothing_runs_code_from_files(module):
-    assert not {name.split('.')[0] for name in imports(module)} & UNSAFE
-
-
-@pytest.mark.parametrize('module', sorted(MODULES))
-def test_core_does_not_know_ros(module):
-    assert room(module) in {'nodes', 'commands'} or not foreign(module) & ROS
-
-
-@pytest.mark.parametrize('node', NODES)
-def test_robot_needs_no_training_code(node):
-    modules = reached(f'{NAME}.nodes.{node}')
+def test_robot_needs_no_training_code():
+    modules = set().union(*(reached(f'{NAME}.nodes.{node}') for node in NODES))
     assert not modules & OWN_NOT_ON_THE_ROBOT
-    assert {
-        m: foreign(m) & NOT_ON_THE_ROBOT for m in modules if foreign(m) & NOT_ON_THE_ROBOT
-    } == {}
+    assert {m: bad for m in modules if (bad := foreign(m) & NOT_ON_THE_ROBOT)} == {}
 
 
 def test_no_module_imports_itself_through_others():
@@ -262,20 +236,9 @@ def test_no_module_imports_itself_through_others():
     assert circles == []
 
 
-STUDY_LINES = 4500
-"""Of all studies, at most."""
-
-
-def test_studies_stay_outside_of_the_package():
-    """They are not installed, and small; what is installed knows none (see ROOMS)."""
-    assert not [name for name in setup_arguments()['packages'] if 'study' in name]
-    files = list((ROOT / 'test/study').glob('*.py'))
-    assert 0 < sum(len(path.read_text('utf-8').splitlines()) for path in files) <= STUDY_LINES
-    assert wrong_imports(f'{NAME}.cli', ['study.tables.Work']) == {'study.tables.Work'}
-
-
 def test_one_version():
     manifest = ET.parse(ROOT / 'package.xml').getroot()
+    assert (manifest.get('format'), manifest.findtext('export/build_type')) == ('3', 'ament_python')
     assert manifest.findtext('version') == setup_arguments()['version']
     assert setup_arguments()['version'] == sfa_localization.__version__
     assert f'## {sfa_localization.__version__}' in (ROOT / 'CHANGELOG.md').read_text('utf-8')
@@ -300,34 +263,39 @@ def executables(command: str) -> dict[str, str]:
     return dict(line.split(' = ') for line in lines)
 
 
-@pytest.mark.parametrize('command', ['bdist_wheel', 'editable_wheel', 'dist_info'])
-def test_pip_puts_one_command_and_the_nodes_on_the_path(command):
+def test_pip_installs_one_command_and_the_nodes_and_colcon_every_command_for_ros2_run():
     nodes = {node: f'{NAME}.nodes.entry:{node}' for node in NODES}
-    assert executables(command) == {NAME: f'{NAME}.cli:main', **nodes}
-
-
-@pytest.mark.parametrize('command', ['install', 'develop'])
-def test_colcon_installs_every_command_for_ros2_run(command):
+    for command in ('bdist_wheel', 'editable_wheel', 'dist_info'):
+        assert executables(command) == {NAME: f'{NAME}.cli:main', **nodes}
+        assert not [name for name in setup_arguments(command)['packages'] if 'study' in name]
     commands = dict.fromkeys(COMMANDS, f'{NAME}.cli:executable')
-    scripts = {Path(name).name for name in setup_arguments(command)['scripts']}
-    assert scripts == (set(NODES) if command == 'install' else set())
-    expected = executables('bdist_wheel') | commands
-    assert executables(command) == {n: e for n, e in expected.items() if n not in scripts}
+    for command, starting in {'install': set(NODES), 'develop': set()}.items():
+        scripts = {Path(name).name for name in setup_arguments(command)['scripts']}
+        assert scripts == starting
+        expected = executables('bdist_wheel') | commands
+        assert executables(command) == {n: e for n, e in expected.items() if n not in scripts}
+
+
+def run_python(*words, cwd=ROOT, **environment):
+    """Run a program of Python until it ends."""
+    return subprocess.run(
+        [sys.executable, *map(str, words)], cwd=cwd, env={**os.environ, **environment},
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
 
 
 ENTRY = 'import os, signal\nos.kill(os.getpid(), signal.{})\n{} = lambda: 7\n'
 
 
-@pytest.mark.parametrize(('name', 'code'), [('SIGINT', 0), ('SIGTERM', 0), ('SIGCONT', 7)])
-@pytest.mark.parametrize('node', NODES)
-def test_a_signal_ends_a_node_of_a_workspace_before_its_imports(node, name, code, tmp_path):
+def test_a_signal_ends_a_node_of_a_workspace_before_its_imports(tmp_path):
     nodes = tmp_path / NAME / 'nodes'
     nodes.mkdir(parents=True)
-    (nodes / 'entry.py').write_text(ENTRY.format(name, node))
-    script = ROOT / 'resource' / 'start' / node
-    environment = {**os.environ, 'PYTHONPATH': str(tmp_path)}
-    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (code, '')
+    for node in NODES:
+        for name, code in {'SIGINT': 0, 'SIGTERM': 0, 'SIGCONT': 7}.items():
+            (nodes / 'entry.py').write_text(ENTRY.format(name, node))
+            done = run_python(ROOT / 'resource/start' / node, PYTHONPATH=str(tmp_path),
+                              PYTHONDONTWRITEBYTECODE='1')  # fmt: skip
+            assert (done.returncode, done.stderr) == (code, ''), (node, name)
 
 
 def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
@@ -336,36 +304,24 @@ def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
     assert 'ekf_node:' in capsys.readouterr().out
 
 
-def test_every_command_has_its_module():
-    modules = {path.stem for path in (PACKAGE / 'commands').glob('*.py')}
-    assert set(COMMANDS) <= modules
-
-
-def test_the_overview_of_the_commands_imports_none_of_them():
-    code = (
-        'import sys\nfrom sfa_localization import cli\n'
-        'try:\n    cli.main(["--help"])\nexcept SystemExit:\n'
-        '    print([name for name in ("numpy", "cv2", "rclpy") if name in sys.modules])'
+def test_commands_import_only_what_they_need():
+    """The overview imports none of them; an inspection without a report imports no figures."""
+    code = 'import sys\nfrom sfa_localization import cli\ntry:\n    cli.main({})\nfinally:\n'
+    code += (
+        '    print([name for name in ("matplotlib", "rclpy", "mdp", {}) if name in sys.modules])'
     )
-    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
-    assert all(f'    {name} ' in done.stdout for name in COMMANDS)
+    shown = run_python('-c', code.format(['--help'], '"numpy", "cv2"')).stdout
+    assert all(f'    {name} ' in shown for name in COMMANDS)
+    assert shown.splitlines()[-1] == '[]'
+    done = run_python('-c', code.format(['inspect', 'bags/sample'], ''))
     assert done.stdout.splitlines()[-1] == '[]', done.stderr
 
 
-def test_an_inspection_without_a_report_imports_no_figures():
-    code = (
-        'import sys\nfrom sfa_localization import cli\ncli.main(["inspect", "bags/sample"])\n'
-        'print("matplotlib" in sys.modules)'
-    )
-    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == 'False', done.stderr
-
-
-@pytest.mark.parametrize('words', [[], ['trian'], ['--', 'train']])
-def test_a_wrong_command_ends_with_exit_code_2(words):
-    with pytest.raises(SystemExit) as raised:
-        sys.exit(cli.main(words))
-    assert raised.value.code == 2
+def test_a_wrong_command_ends_with_exit_code_2():
+    for words in ([], ['trian'], ['--', 'train']):
+        with pytest.raises(SystemExit) as raised:
+            sys.exit(cli.main(words))
+        assert raised.value.code == 2
 
 
 def test_installed_files_exist():
@@ -383,74 +339,6 @@ def test_rosdep_keys_cover_the_messages_used():
     assert used <= keys
 
 
-def public_definitions(module: str):
-    """Yield the public classes, functions and methods of a module with their qualified names."""
-    tree = ast.parse(MODULES[module].read_text(encoding='utf-8'))
-    for node in tree.body:
-        if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and not node.name.startswith('_'):
-            yield f'{module}.{node.name}', node
-        if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
-            for method in node.body:
-                if isinstance(method, ast.FunctionDef) and not method.name.startswith('_'):
-                    yield f'{module}.{node.name}.{method.name}', method
-
-
-@cache
-def documented_names() -> frozenset[str]:
-    """Return the names of all methods with a docstring, in any class: the interfaces."""
-    definitions = (item for module in MODULES for item in public_definitions(module))
-    return frozenset(name.split('.')[-1] for name, node in definitions if ast.get_docstring(node))
-
-
-def needs_no_docstring(name: str, node: ast.AST) -> bool:
-    """Return whether this is very short, or implements an interface that is documented."""
-    if isinstance(node, ast.ClassDef):
-        return False
-    short = name.split('.')[-1]
-    of_lifecycle = short.startswith('on_') and '.nodes.' in name
-    return node.end_lineno - node.lineno < 4 or short in documented_names() or of_lifecycle
-
-
-@pytest.mark.parametrize('module', sorted(MODULES))
-def test_public_names_have_docstrings(module):
-    assert ast.get_docstring(ast.parse(MODULES[module].read_text(encoding='utf-8')))
-    missing = [
-        name
-        for name, node in public_definitions(module)
-        if not ast.get_docstring(node) and not needs_no_docstring(name, node)
-    ]
-    assert missing == []
-
-
-ARRAY = re.compile(r'\b(Array|NDArray)\b(?! \| float)')
-NAMES_SHAPE = re.compile(
-    r'\([^()]*\b[A-Z0-9]\w*\s*(,[^()]*)?\)|picture|image|panorama|pixel|stamp', re.IGNORECASE
-)
-"""A shape such as (N, 2), or a word that names an array the whole package shares."""
-SHAPES_BY_NAME = {'pose', 'start', 'dock', 'foot', 'mean', 'covariance', 'matrix', 'yaw_rad'}
-"""Arguments of one shape everywhere: poses (3,), places (2,), the filter's state, matrices."""
-
-
-@pytest.mark.parametrize('module', sorted(MODULES))
-def test_docstrings_of_array_functions_give_shapes(module):
-    """The docstring of a function with array arguments, or of its class, gives their shapes."""
-    missing = []
-    tree = dict(public_definitions(module))
-    for name, node in tree.items():
-        if isinstance(node, ast.ClassDef) or not ast.get_docstring(node):
-            continue
-        taken = ' '.join(
-            ast.unparse(a.annotation)
-            for a in node.args.args
-            if a.annotation and a.arg not in SHAPES_BY_NAME
-        )
-        owner = tree.get(name.rpartition('.')[0])
-        text = ast.get_docstring(node) + (ast.get_docstring(owner) or '' if owner else '')
-        if ARRAY.search(taken) and not NAMES_SHAPE.search(text):
-            missing.append(name)
-    assert missing == []
-
-
 def test_commands_show_examples_before_their_options():
     for name, summary in COMMANDS.items():
         text = cli.command_parser(name).format_help()
@@ -458,36 +346,25 @@ def test_commands_show_examples_before_their_options():
         assert ' '.join(summary.split()) in ' '.join(text.split()) and f'  {name}' in examples
 
 
-def test_module_runs_as_a_program():
-    done = subprocess.run(
-        [sys.executable, '-m', NAME, '--version'], cwd=ROOT, capture_output=True, text=True
-    )
-    assert (done.returncode, done.stdout) == (0, f'{sfa_localization.__version__}\n')
-
-
-@pytest.mark.parametrize('variable', [
-    {'SOURCE_DATE_EPOCH': 'abc'}, {'SOURCE_DATE_EPOCH': '99999999999999999'}, {'MPLBACKEND': 'abc'},
-])  # fmt: skip
 @pytest.mark.parametrize('command', ['filter x.csv x.csv --output x.tum', 'inspect x --report y'])
-def test_a_wrong_variable_that_nothing_needs_is_ignored(variable, command, tmp_path):
-    done = subprocess.run(
-        [sys.executable, '-m', NAME, *command.split()],
-        cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, 'PYTHONPATH': str(ROOT), **variable},
-    )  # fmt: skip
+def test_a_wrong_variable_that_nothing_needs_is_ignored(command, tmp_path):
+    variables = {'SOURCE_DATE_EPOCH': '99999999999999999', 'MPLBACKEND': 'abc'}
+    done = run_python('-m', NAME, *command.split(), cwd=tmp_path, PYTHONPATH=str(ROOT), **variables)
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     assert 'no such' in done.stderr.lower()
 
 
-@pytest.mark.parametrize('package', ['trimesh', 'mdp', 'rclpy'])
-def test_a_missing_optional_package_is_named_with_its_remedy(package, capsys):
-    def run():
-        raise ModuleNotFoundError(f'No module named {package!r}', name=f'{package}.inner')
+def test_a_missing_package_is_named_with_its_remedy_if_it_is_optional(capsys):
+    def run(name):
+        raise ModuleNotFoundError(f'No module named {name!r}', name=name)
 
-    assert cli.guarded(run) == 1
-    error = capsys.readouterr().err
-    assert error.startswith(f'error: {package} is not installed') and 'pip install' in error
-    assert error.count('\n') == 1
+    for package in ('trimesh', 'mdp', 'rclpy'):
+        assert cli.guarded(partial(run, f'{package}.inner')) == 1
+        error = capsys.readouterr().err
+        assert error.startswith(f'error: {package} ') and 'pip install' in error
+        assert error.count('\n') == 1
+    with pytest.raises(ModuleNotFoundError):
+        cli.guarded(partial(run, 'numpy'))
 
 
 @pytest.mark.parametrize('cause', [None, KeyboardInterrupt()])
@@ -503,25 +380,16 @@ def test_ctrl_c_while_a_command_is_imported_is_one_line(cause, monkeypatch, caps
         assert capsys.readouterr().err == 'interrupted\n'
 
 
-@pytest.mark.parametrize('module', ['play', 'bag_player'])
-def test_sigterm_while_play_is_imported_is_one_line(module):
-    code = f"""
+def test_sigterm_while_play_is_imported_is_one_line():
+    code = """
 import os, signal, sys
 from sfa_localization import cli
 class Finder:
     def find_spec(self, name, *_):
-        if name == 'sfa_localization.commands.{module}':
+        if name == 'sfa_localization.commands.bag_player':
             os.kill(os.getpid(), signal.SIGTERM)
 sys.meta_path.insert(0, Finder())
 sys.exit(cli.main(['play', 'bag']))
 """
-    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    done = run_python('-c', code)
     assert (done.returncode, done.stderr) == (130, 'interrupted\n')
-
-
-def test_a_missing_part_of_the_package_is_no_users_error():
-    def run():
-        raise ModuleNotFoundError('No module named numpy', name='numpy')
-
-    with pytest.raises(ModuleNotFoundError):
-        cli.guarded(run)

@@ -3,7 +3,6 @@
 """YAML from a stranger: plain data, or one line that says which limit it exceeds."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 import yaml
@@ -33,10 +32,7 @@ HOSTILE = {
     'brackets': ('a: ' + '[' * 30_000, TOO_DEEP),
     'closed brackets': ('a: ' + '[' * 30_000 + ']' * 30_000, TOO_DEEP),
     'braces': ('{a: ' * 5000, TOO_DEEP),
-    'indentation': (
-        ''.join(f'{" " * i}a:\n' for i in range(100)),
-        TOO_DEEP,
-    ),
+    'indentation': (''.join(f'{" " * i}a:\n' for i in range(100)), TOO_DEEP),
     'the same key twice': ('a: 1\nb: 2\na: 3', "the key 'a' twice, again in line 3"),
     'the same key below': ('a:\n  b: 1\n  b: 2', "the key 'b' twice, again in line 3"),
     'a key that cannot be': ('? [a, b]\n: 1', 'unhashable'),
@@ -47,49 +43,40 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize('name', HOSTILE)
-@pytest.mark.parametrize('pure', [False, True])
-def test_hostile_text_is_one_short_error(name, pure, monkeypatch):
-    if pure:
-        monkeypatch.setattr(plain_yaml, 'YamlLoader', yaml.SafeLoader)
-    text, reason = HOSTILE[name]
-    with pytest.raises(ValueError, match=reason) as raised:
-        load_yaml(text, plain_yaml.YamlLoader)
-    assert '\n' not in str(raised.value) and len(str(raised.value)) < 500
+@pytest.mark.parametrize('loader', {plain_yaml.YamlLoader, yaml.SafeLoader})
+def test_hostile_text_is_one_short_error(loader, monkeypatch):
+    monkeypatch.setattr(plain_yaml, 'YamlLoader', loader)
+    for text, reason in HOSTILE.values():
+        with pytest.raises(ValueError, match=reason) as raised:
+            load_yaml(text, plain_yaml.YamlLoader)
+        assert '\n' not in str(raised.value) and len(str(raised.value)) < 500
+    with pytest.raises(ValueError, match='characters, more than'):
+        load_yaml('#' * (plain_yaml.LONGEST + 1))
 
 
-@pytest.mark.parametrize('name', HOSTILE)
-def test_a_hostile_parameter_file_is_one_line(name, tmp_path, capsys):
+def test_a_hostile_parameter_file_or_calibration_is_one_line(tmp_path, capsys):
     path = tmp_path / 'bad.yaml'
-    path.write_text(HOSTILE[name][0])
-    bag = str(tmp_path / 'bag')
-    assert main(['train', bag, '--output', str(tmp_path / 'm.npz'), '--config', str(path)]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith(f'error: {path}: ') and error.count('\n') == 1
-    assert len(error) < LONGEST_ERROR + 100
+    words = ['train', str(tmp_path / 'bag'), '--output', str(tmp_path / 'm.npz'), '--config']
+    for name in ('alias bomb', 'date that is none', 'brackets', 'the same key twice', 'code'):
+        path.write_text(HOSTILE[name][0])
+        assert main([*words, str(path)]) == 1
+        error = capsys.readouterr().err
+        assert error.startswith(f'error: {path}: ') and error.count('\n') == 1
+        assert len(error) < LONGEST_ERROR + 100
+        with pytest.raises(CameraError, match=HOSTILE[name][1]) as raised:
+            read_calibration(path)
+        assert '\n' not in str(raised.value)
 
 
-@pytest.mark.parametrize('name', ['brackets', 'alias bomb', 'date that is none'])
-def test_a_hostile_calibration_is_one_line(name, tmp_path):
+def test_a_hostile_value_is_quoted_in_part(tmp_path):
     path = tmp_path / 'bad.yaml'
-    path.write_text(HOSTILE[name][0])
-    with pytest.raises(CameraError, match=HOSTILE[name][1]) as raised:
-        read_calibration(path)
-    assert '\n' not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    'value',
-    ['"' + 'x' * 10**6 + '"', '[' + '1, ' * 10**5 + ']', '1' + '0' * 60, '.nan', '.inf', '-1e999'],
-)
-def test_a_hostile_value_is_quoted_in_part(value, tmp_path):
-    path = tmp_path / 'bad.yaml'
-    for name in ('elevation_min', 'width', 'source'):
-        path.write_text(f'omnicam_node:\n  ros__parameters:\n    {name}: {value}\n')
-        with pytest.raises(ConfigError, match=name) as raised:
-            for kind in (PanoramaConfig, CaptureConfig):
-                load_settings(path, 'omnicam_node', kind)
-        assert len(str(raised.value)) < 600
+    for value in ('"' + 'x' * 10**6 + '"', '[' + '1, ' * 10**5 + ']', '1' + '0' * 60, '-1e999'):
+        for name in ('elevation_min', 'width', 'source'):
+            path.write_text(f'omnicam_node:\n  ros__parameters:\n    {name}: {value}\n')
+            with pytest.raises(ConfigError, match=name) as raised:
+                for kind in (PanoramaConfig, CaptureConfig):
+                    load_settings(path, 'omnicam_node', kind)
+            assert len(str(raised.value)) < 600
 
 
 def test_names_of_any_length_are_quoted_in_part(tmp_path):
@@ -108,8 +95,3 @@ def test_whole_files_are_read_as_before(tmp_path):
     assert load_yaml(shared)['c'] == {'k': 1, 'm': 2}
     assert load_yaml('') is None
     assert load_yaml('a: 1\n---\nb: [', first=True) == {'a': 1}
-
-
-def test_a_text_of_any_size_is_not_read(tmp_path: Path):
-    with pytest.raises(ValueError, match='characters, more than'):
-        load_yaml('#' * (plain_yaml.LONGEST + 1))

@@ -31,15 +31,7 @@ from bag_formats import (
 )
 from ros_domains import free_domain
 
-from sfa_localization.commands.pace import (
-    FASTER,
-    PAUSE,
-    SLOWER,
-    STEP,
-    Keyboard,
-    Pace,
-    PlayConfig,
-)
+from sfa_localization.commands.pace import Keyboard, Pace, PlayConfig
 from sfa_localization.data.errors import BagError
 
 ROOT = Path(__file__).parents[1]
@@ -55,7 +47,7 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     return drive(tmp_path_factory.mktemp('drive'))
 
 
-def until(condition: Callable[[], bool]) -> None:
+def until(condition: Callable[[], bool]):
     """Wait for a condition, with a deadline."""
     end = time.monotonic() + DEADLINE_S
     while not condition():
@@ -66,39 +58,22 @@ def until(condition: Callable[[], bool]) -> None:
 # The pace.
 
 
-class Seconds:
-    """A clock set by the test."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def test_the_pace_follows_the_clock_at_its_rate() -> None:
-    clock = Seconds()
-    pace = Pace(5_000_000_000, 2.0, clock)
+def test_the_pace_follows_the_clock_at_its_rate_and_stands_still_while_paused():
+    now = [100.0]
+    pace = Pace(5_000_000_000, 2.0, lambda: now[0])
     assert pace.delay(7_000_000_000) == 1.0
-    clock.now += 0.25
+    now[0] += 0.25
     assert pace.time_ns == 5_500_000_000
     assert pace.delay(7_000_000_000) == 0.75
     pace.scale(0.5)
     assert pace.delay(7_000_000_000) == 1.5
-
-
-def test_a_paused_pace_stands_still_and_continues_from_there() -> None:
-    clock = Seconds()
-    pace = Pace(0, 1.0, clock)
-    clock.now += 1.0
     pace.toggle_pause()
-    clock.now += 50.0
-    assert pace.time_ns == 1_000_000_000 and pace.delay(0) == math.inf
-    pace.jump(3_000_000_000)
-    assert pace.time_ns == 3_000_000_000
+    now[0] += 50.0
+    assert pace.time_ns == 5_500_000_000 and pace.delay(0) == math.inf
+    pace.jump(6_000_000_000)
     pace.toggle_pause()
-    clock.now += 1.0
-    assert pace.time_ns == 4_000_000_000
+    now[0] += 1.0
+    assert pace.time_ns == 7_000_000_000
 
 
 # The keys.
@@ -113,38 +88,13 @@ def terminal() -> Iterator[tuple[int, int]]:
     os.close(program)
 
 
-@pytest.mark.parametrize(
-    ('keys', 'action'),
-    [
-        (b' ', PAUSE),
-        (b's', STEP),
-        (b'\x1b[C', STEP),
-        (b'\x1b[A', FASTER),
-        (b'\x1b[B', SLOWER),
-        (b'x', ''),
-        (b'', ''),
-    ],
-)
-def test_keys_are_read_one_by_one(keys: bytes, action: str, terminal: tuple[int, int]) -> None:
-    user, program = terminal
-    with Keyboard(program) as keyboard:
-        os.write(user, keys)
-        assert keyboard.read(5.0 if action else 0.0) == action
-
-
-def test_the_terminal_is_left_as_it_was(terminal: tuple[int, int]) -> None:
+def test_the_terminal_is_left_as_it_was(terminal):
     _, program = terminal
     before = termios.tcgetattr(program)
     with pytest.raises(KeyboardInterrupt), Keyboard(program):
         assert termios.tcgetattr(program) != before
         raise KeyboardInterrupt
     assert termios.tcgetattr(program) == before
-
-
-def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, 'stdin', None)
-    with Keyboard() as keyboard:
-        assert not keyboard.attached and keyboard.read(0.0) == ''
 
 
 # Through ROS.
@@ -198,44 +148,44 @@ LATCHED = offered(reliability=QosReliability.RELIABLE, durability=QosDurability.
 
 
 @ROS
-@pytest.mark.parametrize(
-    ('recorded', 'reliability', 'durability', 'depth'),
-    [
-        ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 10),
-        ((offered(),), ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE, 10),
-        ((STRONG,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
-        ((LATCHED,), ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL, 100),
-        ((offered(), STRONG), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
-        ((STRONG, LATCHED), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE, 50),
-    ],
-)
-def test_quality_of_service_suits_the_recorded(
-    recorded: tuple[Qos, ...],
-    reliability: ReliabilityPolicy,
-    durability: DurabilityPolicy,
-    depth: int,
-) -> None:
-    profile = qos_profile(recorded)
-    assert (profile.reliability, profile.durability) == (reliability, durability)
-    assert profile.depth == depth
-
-
-@ROS
-def test_finite_times_of_the_recorded_qos_are_kept() -> None:
+def test_quality_of_service_suits_the_recorded():
+    weak, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+    volatile, latched = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
+    for recorded, expected in (
+        ([], (reliable, volatile, 10)), ([offered()], (weak, volatile, 10)),
+        ([STRONG], (reliable, volatile, 50)), ([LATCHED], (reliable, latched, 100)),
+        ([offered(), STRONG], (reliable, volatile, 50)),
+        ([STRONG, LATCHED], (reliable, volatile, 50)),
+    ):  # fmt: skip
+        profile = qos_profile(recorded)
+        assert (profile.reliability, profile.durability, profile.depth) == expected
     profile = qos_profile([offered(deadline=QosTime(2, 500_000_000))])
     assert profile.deadline.nanoseconds == 2_500_000_000
     assert qos_profile([offered()]).deadline == QoSProfile(depth=1).deadline
 
 
 @ROS
-def test_types_are_found_where_installed() -> None:
+def test_types_are_found_where_installed_and_nothing_else_is_imported(tmp_path, monkeypatch):
+    """Neither packages of other kinds, nor anything from the folder of a bag."""
     assert message_class('sensor_msgs/msg/Imu') is Imu
-    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', '/msg/'):
+    for kind in ('sensor_msgs/msg/Nothing', 'nowhere_msgs/msg/Imu', '', '/msg/',
+                 'antigravity/msg/X', 'this/msg/X', 'sensor_msgs/msg/_imu'):  # fmt: skip
         assert message_class(kind) is None
+    assert not {'antigravity', 'this'} & set(sys.modules)
+    package = tmp_path / 'evil_msgs' / 'msg'
+    package.mkdir(parents=True)
+    for file in (package / '__init__.py', package.parent / '__init__.py'):
+        file.write_text('raise AssertionError("code of the folder ran")')
+    monkeypatch.chdir(tmp_path)
+    for place in ('', '.', str(tmp_path)):
+        with monkeypatch.context() as patch:
+            patch.syspath_prepend(place)
+            assert message_class('evil_msgs/msg/Imu') is None
+            assert message_class('sensor_msgs/msg/Imu') is Imu
 
 
 @pytest.fixture
-def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def context(tmp_path, monkeypatch) -> Iterator[Any]:
     """Return an initialized context."""
     monkeypatch.setenv('ROS_LOG_DIR', str(tmp_path / 'log'))
     context = rclpy.Context()
@@ -248,7 +198,7 @@ def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 class Listener:
     """Subscribes and keeps all messages, spinning in a thread."""
 
-    def __init__(self, context: Any, topics: dict[str, Any]) -> None:
+    def __init__(self, context, topics: dict[str, Any]):
         self.node = rclpy.create_node('listener', context=context)
         self.heard: dict[str, list[Any]] = {topic: [] for topic in topics}
         for topic, kind in topics.items():
@@ -259,7 +209,7 @@ class Listener:
     def __enter__(self) -> 'Listener':
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *error: object):
         self._executor.shutdown()
         self.node.destroy_node()
 
@@ -268,7 +218,7 @@ class Listener:
         return [time.sec * 10**9 + time.nanosec for time in times]
 
 
-def reliable(messages: list[Message], path: Path) -> Path:
+def reliable(messages, path: Path) -> Path:
     return write_rosbags(path, messages, storage='mcap')
 
 
@@ -277,9 +227,7 @@ TOPICS = {'/image_raw': Image, '/imu': Imu}
 
 @ROS
 @pytest.mark.parametrize('ros1', [False, True])
-def test_every_message_arrives_as_recorded(
-    ros1: bool, context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_every_message_arrives_as_recorded(ros1, context, tmp_path, messages):
     path = tmp_path / 'bag'
     path = write_ros1(path / 'a.bag', messages) if ros1 else reliable(messages, path)
     with Listener(context, TOPICS) as listener:
@@ -296,9 +244,7 @@ def test_every_message_arrives_as_recorded(
 
 
 @ROS
-def test_the_clock_runs_through_the_bag(
-    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_clock_runs_through_the_bag(context, tmp_path, messages, monkeypatch):
     config = PlayConfig(rate=2.0, wait=20.0)
     monkeypatch.setattr(bag_player, 'CLOCK_RATE_HZ', 200.0)  # the bag is short
     with Listener(context, {**TOPICS, '/clock': Clock}) as listener:
@@ -311,39 +257,22 @@ def test_the_clock_runs_through_the_bag(
 
 
 @ROS
-def test_it_starts_at_the_offset(context: Any, tmp_path: Path, messages: list[Message]) -> None:
-    config = PlayConfig(rate=20.0, start_offset=0.55, wait=0.0)
-    path = reliable(messages, tmp_path / 'bag')
-    played = play(path, config=config, context=context)
-    assert played.messages['/image_raw'] == IMAGES - 6
-
-
-@ROS
-def test_an_offset_beyond_the_end_is_named_before_any_wait(
-    context: Any, tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_offset_and_topics_are_chosen(context, tmp_path, messages, monkeypatch):
+    """What cannot be played is named before any wait for subscribers."""
+    path, config = reliable(messages, tmp_path / 'bag'), PlayConfig(rate=50.0, wait=0.2)
+    late = PlayConfig(rate=50.0, start_offset=0.55, wait=0.0)
+    assert play(path, config=late, context=context).messages['/image_raw'] == IMAGES - 6
+    played = play(path, config=config, context=context, topics=['/imu'])
+    assert played.messages == {'/imu': COUNTS['/imu']}
     monkeypatch.setattr(bag_player.Player, 'wait_for_subscribers', lambda *_: pytest.fail('waits'))
-    path = reliable(messages, tmp_path / 'bag')
+    with pytest.raises(BagError, match=r'has no topic /x; --topics can be: /ground_truth, /image'):
+        play(path, config=config, context=context, topics=['/x'])
     with pytest.raises(BagError, match=r'nothing to play after 1e\+06 s'):
         play(path, config=PlayConfig(start_offset=1e6), context=context)
 
 
 @ROS
-def test_only_named_topics_are_played(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
-    path = reliable(messages, tmp_path / 'bag')
-    config = PlayConfig(rate=50.0, wait=0.0)
-    played = play(path, config=config, context=context, topics=['/imu'])
-    assert played.messages == {'/imu': COUNTS['/imu']}
-    with pytest.raises(BagError, match=r'has no topic /x; --topics can be: /ground_truth, /image'):
-        play(path, config=config, context=context, topics=['/x'])
-
-
-@ROS
-def test_types_that_are_not_installed_are_named_and_skipped(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_types_that_are_not_installed_are_named_and_skipped(context, tmp_path, messages):
     kind = {'sensor_msgs/msg/Imu': 'nowhere_msgs/msg/Imu'}
     write_database(tmp_path / 'a.db3', messages, kind=lambda name: kind.get(name, name))
     config = PlayConfig(rate=50.0, wait=0.0)
@@ -356,9 +285,7 @@ def test_types_that_are_not_installed_are_named_and_skipped(
 
 
 @ROS
-def test_a_late_subscriber_of_images_misses_none(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_a_late_subscriber_of_images_misses_none(context, tmp_path, messages):
     """The subscriber of odometry was there long before: nodes start one after another."""
     path, played = reliable(messages, tmp_path / 'bag'), []
     with Listener(context, {'/odom': Odometry}):
@@ -374,16 +301,7 @@ def test_a_late_subscriber_of_images_misses_none(
 
 
 @ROS
-def test_it_plays_without_subscribers_after_the_wait(
-    context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
-    path = reliable(messages, tmp_path / 'bag')
-    config = PlayConfig(rate=50.0, wait=0.2)
-    assert play(path, config=config, context=context).messages['/odom'] == COUNTS['/odom']
-
-
-@ROS
-def test_a_loop_ends_when_ros_does(context: Any, tmp_path: Path, messages: list[Message]) -> None:
+def test_a_loop_ends_when_ros_does(context, tmp_path, messages):
     path, played = reliable(messages, tmp_path / 'bag'), []
     config = PlayConfig(rate=100.0, wait=20.0)
     with Listener(context, TOPICS) as listener:
@@ -401,9 +319,7 @@ def test_a_loop_ends_when_ros_does(context: Any, tmp_path: Path, messages: list[
 
 
 @ROS
-def test_pause_and_step_from_the_keyboard(
-    context: Any, tmp_path: Path, messages: list[Message], terminal: tuple[int, int]
-) -> None:
+def test_pause_and_step_from_the_keyboard(context, tmp_path, messages, terminal):
     user, program = terminal
     node = rclpy.create_node('player', context=context)
     path = write_version(tmp_path / 'bag', messages, 5)
@@ -428,9 +344,7 @@ def test_pause_and_step_from_the_keyboard(
 
 @ROS
 @pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
-def test_signals_end_it_cleanly(
-    number: int, code: int, context: Any, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_signals_end_it_cleanly(number, code, context, tmp_path, messages):
     path = reliable(messages, tmp_path / 'bag')
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--loop', '--rate=9']
     command += ['--wait-for', *TOPICS]
@@ -452,9 +366,7 @@ def test_signals_end_it_cleanly(
 
 @ROS
 @pytest.mark.parametrize('step', ['Node', 'message_class'])
-def test_a_shutdown_while_it_starts_ends_it(
-    step: str, context: Any, tmp_path: Path, messages: list[Message], monkeypatch: Any
-) -> None:
+def test_a_shutdown_while_it_starts_ends_it(step, context, tmp_path, messages, monkeypatch):
     def shut_down(*args: Any, **how: Any) -> Any:
         rclpy.try_shutdown(context=context)
         return original(*args, **how)
@@ -465,7 +377,7 @@ def test_a_shutdown_while_it_starts_ends_it(
 
 
 @ROS
-def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[Message]) -> None:
+def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path, messages):
     path = write_version(tmp_path / '\udcff', messages, 5)
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--wait=0', '--rate=99']
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S)
@@ -473,41 +385,13 @@ def test_a_bag_may_have_a_name_that_is_not_utf8(tmp_path: Path, messages: list[M
     assert result.stdout.count(' messages\n') == len(COUNTS)
 
 
-@ROS
-@pytest.mark.parametrize('place', ['', '.', 'folder'])
-def test_nothing_is_imported_from_the_folder_of_a_bag(
-    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ('evil_msgs', 'sensor_msgs_of_a_stranger'):
-        package = tmp_path / name / 'msg'
-        package.mkdir(parents=True)
-        for file in (package / '__init__.py', package.parent / '__init__.py'):
-            file.write_text('raise AssertionError("code of the folder ran")')
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path) if place == 'folder' else place)
-    assert message_class('evil_msgs/msg/Imu') is None
-    assert message_class('sensor_msgs/msg/Imu') is Imu
-
-
-@ROS
-@pytest.mark.parametrize('kind', ['antigravity/msg/X', 'this/msg/X', 'sensor_msgs/msg/_imu'])
-def test_what_is_no_package_of_messages_is_not_imported(kind: str) -> None:
-    package = kind.partition('/')[0]
-    loaded = package in sys.modules
-    assert message_class(kind) is None
-    assert (package in sys.modules) == loaded
-
-
-def test_a_command_in_a_downloaded_folder_runs_none_of_its_code(tmp_path: Path) -> None:
+def test_a_command_in_a_downloaded_folder_runs_none_of_its_code(tmp_path):
     for name in ('yaml', 'argparse', 'numpy', 'rosbags'):
         (tmp_path / f'{name}.py').write_text('raise AssertionError("code of the folder ran")')
     result = subprocess.run(
         [sys.executable, '-m', 'sfa_localization', 'inspect', 'nothing'],
-        cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
+        cwd=tmp_path, env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, text=True,
         timeout=120,
-    )
+    )  # fmt: skip
     assert result.returncode == 1
     assert result.stderr == 'error: nothing: no such bag; check the path\n'

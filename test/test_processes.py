@@ -11,7 +11,7 @@ import time
 import psutil
 import pytest
 
-from sfa_localization.commands.processes import Processes, terminable
+from sfa_localization.commands.processes import Processes
 from sfa_localization.data.errors import NodeError
 
 DEADLINE_S = 60
@@ -53,13 +53,6 @@ def test_all_have_ended_afterwards(tmp_path, children, code):
     assert children() == []
 
 
-def test_all_have_ended_after_an_error(tmp_path, children):
-    with pytest.raises(ZeroDivisionError), Processes(tmp_path, os.environ, 5.0) as processes:
-        processes.start('one', python(WAIT))
-        raise ZeroDivisionError
-    assert children() == []
-
-
 def test_a_dead_program_is_named_with_its_last_words(tmp_path):
     code = 'import sys; [print("line", i) for i in range(9)]; sys.exit("no model")'
     with Processes(tmp_path, os.environ, 5.0) as processes:
@@ -73,19 +66,18 @@ def test_a_dead_program_is_named_with_its_last_words(tmp_path):
     assert 'line 8' in text and 'no model' in text and 'line 3' not in text
 
 
-def test_a_program_that_should_end_may(tmp_path):
-    with Processes(tmp_path, os.environ, 5.0) as processes:
+def test_a_program_that_should_end_may_and_a_killed_one_shows_its_signal(tmp_path, children):
+    with pytest.raises(ZeroDivisionError), Processes(tmp_path, os.environ, 5.0) as processes:
         processes.start('player', python('print("done")'))
         wait_until(lambda: processes.ended('player'))
-
-
-def test_a_killed_program_is_told_by_its_signal(tmp_path, children):
-    with Processes(tmp_path, os.environ, 5.0) as processes:
-        processes.start('player', python(WAIT))
-        wait_until(ready(processes, 'player'))
-        children()[0].kill()
+        processes.start('killed', python(WAIT))
+        wait_until(ready(processes, 'killed'))
+        children()[-1].kill()
         with pytest.raises(NodeError, match='SIGKILL'):
-            wait_until(lambda: processes.ended('player'))
+            wait_until(lambda: processes.ended('killed'))
+        processes.start('other', python(WAIT))
+        raise ZeroDivisionError
+    assert children() == [], 'all have ended also after an error'
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
@@ -113,12 +105,3 @@ with terminable(), Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as proces
         starter.kill()
     assert 'KeyboardInterrupt' in errors
     assert not node.is_running()
-
-
-def test_terminable_restores_the_handlers():
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), terminable():
-        assert signal.getsignal(signal.SIGTERM) is not before
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(DEADLINE_S)
-    assert signal.getsignal(signal.SIGTERM) is before

@@ -16,6 +16,7 @@ SAVED = SavedPose(7, 'map', np.array([1.0, -2.0, 3.0]), np.diag([0.04, 0.01, 0.0
 
 def test_what_is_written_is_read_back(tmp_path):
     path = tmp_path / 'new folder' / 'pose.json'
+    assert load_pose(path, 'map') is None
     save_pose(path, SAVED)
     read = load_pose(path, 'map')
     assert (read.stamp_ns, read.frame) == (7, 'map')
@@ -27,10 +28,6 @@ def test_what_is_written_is_read_back(tmp_path):
 def test_a_robot_that_was_off_may_have_been_moved_a_little():
     assert np.sqrt(SAVED.moved()[0, 0]) == pytest.approx(np.hypot(0.2, 0.5))
     assert np.sqrt(SAVED.moved()[2, 2]) == pytest.approx(np.hypot(0.05, 0.3))
-
-
-def test_no_file_is_no_pose(tmp_path):
-    assert load_pose(tmp_path / 'pose.json', 'map') is None
 
 
 GOOD = {'version': 1, 'stamp_ns': 7, 'frame': 'map', 'pose': [0, 0, 0],
@@ -53,32 +50,25 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize('name', ['other version', 'other frame', 'two numbers', 'empty'])
-def test_a_pose_of_another_version_or_frame_is_written_over(tmp_path, name):
+def test_a_file_that_is_none_is_rejected_by_name(tmp_path):
     path = tmp_path / 'pose.json'
-    path.write_text(BAD[name])
-    save_pose(path, SAVED)
-    assert load_pose(path, 'map').stamp_ns == 7
-
-
-@pytest.mark.parametrize('name', ['binary', 'a list', 'nested', 'huge', 'no pose'])
-def test_a_file_that_holds_something_else_stays(tmp_path, name):
-    """As where the parameter names the model by mistake."""
-    path = tmp_path / 'model.npz'
-    path.write_text(BAD[name])
-    with pytest.raises(DataError, match=r'model\.npz: holds no saved pose, and stays'):
-        save_pose(path, SAVED)
-    assert path.read_text() == BAD[name]
-
-
-@pytest.mark.parametrize('text', BAD.values(), ids=BAD)
-def test_a_file_that_is_none_is_rejected_by_name(tmp_path, text):
-    path = tmp_path / 'pose.json'
-    path.write_text(text)
-    with pytest.raises(DataError, match=r'pose\.json: '):
-        load_pose(path, 'map')
-
-
-def test_a_folder_is_rejected(tmp_path):
+    for text in BAD.values():
+        path.write_text(text)
+        with pytest.raises(DataError, match=r'pose\.json: '):
+            load_pose(path, 'map')
     with pytest.raises(DataError, match='no regular file'):
         load_pose(tmp_path, 'map')
+
+
+def test_only_what_holds_a_pose_or_nothing_is_written_over(tmp_path):
+    """Not the model, which the parameter may name by mistake."""
+    path = tmp_path / 'model.npz'
+    for name in ('other version', 'other frame', 'two numbers', 'empty'):
+        path.write_text(BAD[name])
+        save_pose(path, SAVED)
+        assert load_pose(path, 'map').stamp_ns == 7
+    for name in ('binary', 'a list', 'nested', 'huge', 'no pose'):
+        path.write_text(BAD[name])
+        with pytest.raises(DataError, match=r'model\.npz: holds no saved pose, and stays'):
+            save_pose(path, SAVED)
+        assert path.read_text() == BAD[name]

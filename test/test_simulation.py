@@ -15,28 +15,21 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.cli import main
-from sfa_localization.data.errors import BagError, ConfigError
+from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import differences, integrate
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.simulation.drive import (
-    START_NS,
-    drive,
-    lights,
-    render_images,
-    simulate,
-    wandering,
-)
+from sfa_localization.simulation.drive import START_NS, drive, lights, render_images, simulate
 from sfa_localization.simulation.garden import Garden, panel
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view
 from sfa_localization.simulation.routes import CLEARANCE_M, ROUTES, Lawn
 from sfa_localization.simulation.settings import SimulationConfig
 
+pytestmark = pytest.mark.usefixtures('gardens')
 TINY = SimulationConfig(area=(8.0, 8.0), length=20.0, images='panorama', images_every=0.4)
 SMALL = PanoramaConfig(width=300, height=30)
 TRAJECTORIES = list(ROUTES)
@@ -96,14 +89,8 @@ def test_turning_shifts_columns(tiny):
     turned = tiny.render_panorama(pose + np.array([0, 0, np.pi / 3]), SMALL).astype(int)
     assert np.mean(np.abs(turned - np.roll(ahead, 50, axis=1)) <= 1) > 0.995
     assert np.mean(np.abs(turned - np.roll(ahead, -50, axis=1)) <= 1) < 0.5
-
-
-def test_counter_clockwise_panorama_is_the_mirror_image(tiny):
-    pose = np.array([1.0, 1.0, 2.0])
-    mirrored = dataclasses.replace(SMALL, clockwise=False)
-    assert np.array_equal(
-        tiny.render_panorama(pose, SMALL)[:, ::-1], tiny.render_panorama(pose, mirrored)
-    )
+    mirrored = tiny.render_panorama(pose, dataclasses.replace(SMALL, clockwise=False))
+    assert np.array_equal(ahead[:, ::-1], mirrored)
 
 
 @pytest.mark.parametrize(
@@ -137,11 +124,6 @@ def test_pictures_differ_by_place_world_and_light(tiny):
     assert np.abs(dimmed / np.maximum(here, 20) - 0.7)[here > 60].max() < 0.02
 
 
-def test_area_that_is_no_rectangle_is_refused():
-    with pytest.raises(ConfigError, match='area'):
-        Garden(1, SimulationConfig(area=(8.0,)))
-
-
 def test_noise_and_illumination(tiny):
     """Noise has the deviation asked for; without illumination all light is the same."""
     config = dataclasses.replace(TINY, illumination=0.0, length=6.0)
@@ -161,11 +143,9 @@ def test_noise_and_illumination(tiny):
 
 
 @pytest.mark.parametrize('trajectory', TRAJECTORIES)
-@pytest.mark.parametrize('world', [1, 2])
-def test_robot_keeps_clear(trajectory, world):
+def test_robot_keeps_clear(trajectory, garden):
     """Nothing solid at hull height lies within the clearance, looking all around."""
-    config = SimulationConfig(trajectory=trajectory, world=world, seed=3)
-    garden = garden_of(world)
+    config = SimulationConfig(trajectory=trajectory, seed=3)
     poses = drive(garden, config).truth.poses[::20]
     assert (np.abs(poses[:, :2]) <= garden.half + 0.02).all()
     solid = garden.scene.triangles[(garden.scene.triangles[..., 2] < 0.6).any(1)]
@@ -174,16 +154,18 @@ def test_robot_keeps_clear(trajectory, world):
     assert min(gaps) > CLEARANCE_M - 0.05
 
 
-@pytest.mark.parametrize('trajectory', TRAJECTORIES)
-def test_pictures_are_spaced_as_asked(garden, trajectory):
-    recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=5))
-    poses = recorded.image_poses
-    gaps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    turns = np.abs(wrap_angle(np.diff(poses[:, 2])))
-    assert np.all(np.diff(recorded.image_stamps_ns) > 0)
-    straight = (turns < 0.02) & (gaps < 0.5)
-    assert np.median(gaps[straight]) == pytest.approx(0.2, abs=1e-3)
-    assert np.percentile(gaps[straight], 99) < 0.201
+def test_pictures_are_spaced_as_asked_and_every_drive_starts_at_the_dock(garden):
+    for trajectory in TRAJECTORIES:
+        recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=5))
+        assert np.allclose(recorded.truth.poses[0], garden.dock)
+        assert recorded.truth.stamps_ns[0] == START_NS
+        poses = recorded.image_poses
+        gaps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        turns = np.abs(wrap_angle(np.diff(poses[:, 2])))
+        assert np.all(np.diff(recorded.image_stamps_ns) > 0)
+        straight = (turns < 0.02) & (gaps < 0.5)
+        assert np.median(gaps[straight]) == pytest.approx(0.2, abs=1e-3)
+        assert np.percentile(gaps[straight], 99) < 0.201
 
 
 def test_coverage_reaches_everywhere_in_many_directions(garden):
@@ -209,14 +191,6 @@ def test_lines_are_long_straight_and_spread(garden):
     assert np.diff(np.append(spread, spread[0] + np.pi)).max() < 0.6
 
 
-def test_mower_drives_along_the_axes(garden):
-    recorded = drive(garden, SimulationConfig(trajectory='mower', seed=4))
-    v = recorded.odometry.twists[:, 0]
-    lane = recorded.truth.poses[v > 0.9]
-    off = np.abs(wrap_angle(lane[:, 2] * 4)) / 4
-    assert np.mean(off < 1e-6) > 0.9
-
-
 def test_test_curve_is_smooth_and_closed(garden):
     poses = drive(garden, SimulationConfig(trajectory='test', seed=7)).truth.poses
     assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.1
@@ -228,26 +202,10 @@ def test_test_curve_is_smooth_and_closed(garden):
     assert 55 < length.sum() < 75
 
 
-def test_curves_have_no_straight_line(garden):
-    recorded = drive(garden, SimulationConfig(trajectory='curves', seed=7, length=100.0))
-    poses = recorded.image_poses
-    turned = np.abs(np.unwrap(poses[:, 2])[5:] - np.unwrap(poses[:, 2])[:-5])
-    # A bend may cross zero between two arcs; a straight metre may not occur often.
-    assert np.mean(turned > 0.03) > 0.9
-    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() == pytest.approx(100, abs=3)
-
-
-def test_every_drive_starts_at_the_dock(garden):
-    for trajectory in TRAJECTORIES:
-        recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=1))
-        assert np.allclose(recorded.truth.poses[0], garden.dock)
-        assert recorded.truth.stamps_ns[0] == START_NS
-
-
 def test_the_odometry_frame_lies_anywhere_or_at_the_start(garden):
     """Frames differ from drive to drive; nothing else of the drive changes with them."""
     starts = []
-    for seed in range(8):
+    for seed in range(3):
         config = SimulationConfig(trajectory='test', seed=seed)
         recorded = drive(garden, config)
         same = drive(garden, replace(config, odometry_frame='start'))
@@ -279,19 +237,19 @@ def test_exact_twists_lead_to_the_truth_through_the_filter_and_by_sums(garden, r
 
 
 def test_odometry_drifts_like_the_papers_robot(garden):
-    """0.31 m mean on every test curve, 1 to 3 m on coverage; over twenty seeds."""
+    """0.31 m mean on every test curve, 1 to 3 m on coverage; over some seeds."""
     errors = {'test': [], 'coverage': []}
     for trajectory, means in errors.items():
-        for seed in range(20):
+        for seed in range(6):
             recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=seed))
             off = world_odometry(garden, recorded) - recorded.truth.poses
             means.append(np.hypot(*off[:, :2].T).mean())
-    assert errors['test'] == pytest.approx([0.31] * 20, rel=0.05)
+    assert errors['test'] == pytest.approx([0.31] * 6, rel=0.05)
     assert 1.0 < np.mean(errors['coverage']) < 3.0
-    assert len(set(np.round(errors['coverage'], 6))) == 20
+    assert len(set(np.round(errors['coverage'], 6))) == 6
 
 
-def test_drift_can_be_left_as_drawn(garden):
+def test_drift_can_be_left_as_drawn_and_perfect_sensors_measure_the_truth(garden):
     drifts = []
     for seed in range(5):
         drawn = SimulationConfig(trajectory='test', seed=seed, test_drift=0.0)
@@ -299,14 +257,10 @@ def test_drift_can_be_left_as_drawn(garden):
         off = world_odometry(garden, recorded) - recorded.truth.poses
         drifts.append(np.hypot(*off[:, :2].T).mean())
     assert min(drifts) > 0.05 and max(drifts) < 1.5 and np.std(drifts) > 0.02
-
-
-def test_perfect_sensors_measure_the_truth(garden):
-    for trajectory in ('coverage', 'test'):
-        recorded = drive(garden, SimulationConfig(trajectory=trajectory, seed=2, **EXACT))
-        off = world_odometry(garden, recorded) - recorded.truth.poses
-        assert np.abs(off[:, :2]).max() < 1e-6
-        assert np.abs(wrap_angle(off[:, 2])).max() < 1e-9
+    recorded = drive(garden, SimulationConfig(trajectory='coverage', seed=2, **EXACT))
+    off = world_odometry(garden, recorded) - recorded.truth.poses
+    assert np.abs(off[:, :2]).max() < 1e-6
+    assert np.abs(wrap_angle(off[:, 2])).max() < 1e-9
 
 
 def test_twist_variance_is_honest(garden):
@@ -319,13 +273,6 @@ def test_twist_variance_is_honest(garden):
         moving = recorded.odometry.twists[:, 0] > 0.5
         ratios.append((errors**2 / recorded.odometry.variances)[moving].mean(0))
     assert np.mean(ratios, 0) == pytest.approx([1, 1], abs=0.2)
-
-
-def test_wandering_has_unit_variance_and_its_time():
-    values = wandering(200_000, 0.1, 2.0, np.random.default_rng(0))
-    assert values.std() == pytest.approx(1, abs=0.05)
-    correlation = np.mean(values[20:] * values[:-20]) / values.var()
-    assert correlation == pytest.approx(np.exp(-1), abs=0.05)
 
 
 # Bags
@@ -368,12 +315,6 @@ def test_bag_holds_every_message_in_order(tmp_path, options, topic):
     assert image_stamps == list(recorded.image_stamps_ns)
 
 
-def test_an_open_lawn_has_no_trees():
-    config = dataclasses.replace(TINY, area=(16.0, 18.0))
-    assert len(Garden(1, config).obstacles) == 3
-    assert len(Garden(1, config, open_lawn=True).obstacles) == 0
-
-
 def test_existing_bag_is_left_alone(tmp_path):
     (tmp_path / 'bag').mkdir()
     with pytest.raises(BagError, match='exists'):
@@ -381,31 +322,14 @@ def test_existing_bag_is_left_alone(tmp_path):
     assert list((tmp_path / 'bag').iterdir()) == []
 
 
-def test_every_route_is_a_choice():
-    field = next(f for f in dataclasses.fields(SimulationConfig) if f.name == 'trajectory')
-    assert field.metadata['choices'] == tuple(ROUTES)
-
-
-def test_command_records_what_it_is_told(tmp_path, capsys):
-    options = '--area 8x7 --length 4 --images panorama --size 120x12 --images-every 0.5 --seed 3'
-    assert main(['simulate', str(tmp_path / 'bag'), *options.split(), '--compressed']) == 0
-    assert 'images' in capsys.readouterr().out
-    with AnyReader([tmp_path / 'bag']) as reader:
-        connections = [c for c in reader.connections if c.topic == '/panorama/compressed']
-        _, _, raw = next(reader.messages(connections))
-        message = reader.deserialize(raw, connections[0].msgtype)
-    assert decode_compressed(message.data, message.format).shape == (12, 120, 3)
-
-
-@pytest.mark.parametrize(
-    ('options', 'named'),
-    [(['--area', '3x3'], 'area'), (['--size', '300'], '--size'), (['--size', '1x1'], 'width')],
-)
-def test_command_refuses_senseless_settings(tmp_path, capsys, options, named):
-    assert main(['simulate', str(tmp_path / 'bag'), *options]) == 1
-    text = capsys.readouterr().err
-    assert named in text and text.count('\n') == 1
-    assert list(tmp_path.iterdir()) == []
+def test_command_refuses_senseless_settings(tmp_path, capsys):
+    for option, value, named in (
+        ('--area', '3x3', 'area'), ('--size', '300', '--size'), ('--size', '1x1', 'width')
+    ):  # fmt: skip
+        assert main(['simulate', str(tmp_path / 'bag'), option, value]) == 1
+        text = capsys.readouterr().err
+        assert named in text and text.count('\n') == 1
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_leaves_nothing(tmp_path):

@@ -15,7 +15,7 @@ DRIVE = SimulationConfig(area=(6.0, 6.0), length=25.0, images='panorama', images
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('size', [(120, 25), (320, 40), (720, 150), (1024, 128)])
+@pytest.mark.parametrize('size', [(120, 25), (720, 150)])
 def test_a_drive_with_panoramas_of_any_size_trains_and_is_judged(size, tmp_path):
     simulate(DRIVE, tmp_path / 'bag', PanoramaConfig(width=size[0], height=size[1]))
     train([tmp_path / 'bag'], tmp_path / 'model.npz')

@@ -14,9 +14,8 @@ import pytest
 
 from sfa_localization.camera import capture as capture_module
 from sfa_localization.camera import watch
-from sfa_localization.camera.capture import Feed, Lost, opener
+from sfa_localization.camera.capture import Device, Feed, Lost, opener
 from sfa_localization.camera.settings import CaptureConfig
-from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import CameraError, ConfigError
 
 PATIENCE_S = 10.0
@@ -125,16 +124,6 @@ def test_the_reason_is_shown_while_a_camera_is_away(run_feed):
     assert feed.status().problem == 'not there'
 
 
-def test_pauses_double_up_to_the_longest(run_feed):
-    script = Script(CameraError('not there'))
-    feed, _ = run_feed(script)
-    wait_for(lambda: script.opened == 6)
-    waits = []
-    feed._stopped.wait = waits.append  # what is asked for, whatever the machine makes of it
-    wait_for(lambda: len(waits) >= 2)
-    assert set(waits) == {0.04}
-
-
 def test_a_silent_camera_is_abandoned_and_opened_again(run_feed):
     released = threading.Event()
     script = Script([1, released], [2, 3, None])
@@ -178,23 +167,6 @@ def test_a_defect_in_the_thread_is_shown_and_the_source_opened_again(run_feed):
     assert rejected == ['internal error: ZeroDivisionError'] * 2
 
 
-def test_what_takes_the_pictures_may_fail_too():
-    script, lost = Script([1, 2, None], live=False), []
-
-    def deliver(image):
-        if not lost:
-            lost.append(1)
-            raise KeyError('a defect')
-
-    feed = Feed(script, deliver, config())
-    feed.start()
-    try:
-        wait_for(lambda: feed.status().state == 'ended')
-        assert feed.status().lost == 1 and script.opened == 2
-    finally:
-        feed.stop()
-
-
 def test_files_wait_until_they_are_wanted():
     wanted, received = threading.Event(), queue.Queue()
     script = Script([1, 2, None], live=False)
@@ -222,34 +194,17 @@ def test_nothing_is_delivered_after_stop(run_feed):
     assert received.qsize() == count
 
 
-def test_frozen_watch_by_hand(monkeypatch):
-    monkeypatch.setattr(watch, 'FROZEN_S', 2.0)
-    now = [0.0]
-    frozen = FrozenWatch(lambda: now[0])
-    assert frozen.add(picture(1))
-    assert (frozen.repeats, frozen.frozen_for_s()) == (0, 0.0)
-    for now[0] in (1.0, 2.0):
-        assert not frozen.add(picture(1))
-    assert (frozen.repeats, frozen.frozen_for_s()) == (2, 0.0), 'not long enough yet'
-    now[0] = 3.0
-    assert frozen.frozen_for_s() == 3.0
-    assert frozen.add(picture(2))
-    assert (frozen.repeats, frozen.frozen_for_s()) == (0, 0.0)
-
-
-class TestFolder:
-    def test_in_order_of_names_with_the_unreadable_named(self, tmp_path, run_feed):
-        for name, level in (('b.png', 2), ('a.png', 1), ('d.bmp', 4)):
-            cv2.imwrite(str(tmp_path / name), picture(level))
-        (tmp_path / 'c.png').write_bytes(b'no picture')
-        (tmp_path / 'notes.txt').write_text('ignored')
-        rejected = []
-        values = {'source': 'folder', 'source_path': str(tmp_path), 'source_rate': 1000.0}
-        feed, received = run_feed(opener(config(**values)), rejected.append, **values)
-        wait_for(lambda: feed.status().state == 'ended')
-        assert list(received.queue) == [1, 2, 4]
-        assert len(rejected) == 1
-        assert 'c.png' in rejected[0]
+def test_a_folder_in_order_of_names_with_the_unreadable_named(tmp_path, run_feed):
+    for name, level in (('b.png', 2), ('a.png', 1), ('d.bmp', 4)):
+        cv2.imwrite(str(tmp_path / name), picture(level))
+    (tmp_path / 'c.png').write_bytes(b'no picture')
+    (tmp_path / 'notes.txt').write_text('ignored')
+    rejected = []
+    values = {'source': 'folder', 'source_path': str(tmp_path), 'source_rate': 1000.0}
+    feed, received = run_feed(opener(config(**values)), rejected.append, **values)
+    wait_for(lambda: feed.status().state == 'ended')
+    assert list(received.queue) == [1, 2, 4]
+    assert len(rejected) == 1 and 'c.png' in rejected[0]
 
 
 def test_video(tmp_path, run_feed):
@@ -267,23 +222,39 @@ def test_video(tmp_path, run_feed):
     wait_for(lambda: feed.status().state == 'ended')
 
 
-@pytest.mark.parametrize(
-    ('values', 'words'),
-    [
-        ({'source': 'device'}, 'source_path is empty'),
-        ({'source': 'topic'}, 'topic'),
-        ({'source': 'device', 'source_path': '/dev/no_such_camera'}, 'no_such_camera'),
-        ({'source': 'video', 'source_path': 'no_such.mp4'}, r'no_such\.mp4'),
-        ({'source': 'folder', 'source_path': 'no_such_folder'}, 'no_such_folder'),
-        ({'source': 'folder', 'source_path': '.'}, 'no images'),
-    ],
-)
-def test_sources_that_are_not_there_are_named(values, words, tmp_path, monkeypatch):
+def test_sources_that_are_not_there_are_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CameraError, match=words):
-        opener(config(**values))()
+    for source, path, words in (
+        ('device', '', 'source_path is empty'), ('topic', '', 'topic'),
+        ('device', '/dev/no_such_camera', 'no_such_camera'),
+        ('video', 'no_such.mp4', r'no_such\.mp4'), ('folder', 'no_such_folder', 'no_such_folder'),
+        ('folder', '.', 'no images'),
+    ):  # fmt: skip
+        with pytest.raises(CameraError, match=words):
+            opener(config(source=source, source_path=path))()
 
 
-def test_a_device_is_asked_for_columns_and_rows():
+def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
+    asked = {}
+
+    class Capture:
+        def __init__(self, *_args):
+            pass
+
+        def isOpened(self):
+            return True
+
+        def set(self, what, value):
+            asked[what] = value
+
+    monkeypatch.setattr(cv2, 'VideoCapture', Capture)
+    (tmp_path / 'video0').touch()
+    path = str(tmp_path / 'video0')
+    Device(CaptureConfig(source_path=path, source_size=(1280.0, 720.0), source_rate=15.0))
+    wanted = {cv2.CAP_PROP_FRAME_WIDTH: 1280, cv2.CAP_PROP_FRAME_HEIGHT: 720, cv2.CAP_PROP_FPS: 15}
+    assert asked.items() >= wanted.items()
+    asked.clear()
+    Device(CaptureConfig(source_path=path))
+    assert not asked.keys() & wanted.keys(), 'a device keeps its own'
     with pytest.raises(ConfigError, match='columns and rows'):
         config(source_size=(640.0,))

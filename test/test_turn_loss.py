@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, recipe, run_in, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, place, recipe, run_in, wander
 
 from sfa_localization.data.geometry import align
 from sfa_localization.data.run import Odometry, integrate
@@ -50,12 +50,12 @@ def found(loss, every=4, before=None, larger=1.0, **how):
     return track, way_of(track, Shown(times, places, yaw), before)
 
 
-@pytest.mark.parametrize('loss', [0.08, 0.15, 0.25, -0.1])
 @pytest.mark.parametrize('v', [0.3, -0.3])
-def test_the_loss_is_found_forward_and_backward(loss, v):
-    _, way = found(np.sign(v) * loss, v=v)
-    assert way.loss == pytest.approx(loss, abs=0.02)
-    assert way.scale == pytest.approx(1.0, abs=0.02)
+def test_the_loss_is_found_forward_and_backward(v):
+    for loss in (0.08, 0.15, 0.25, -0.1):
+        _, way = found(np.sign(v) * loss, v=v)
+        assert way.loss == pytest.approx(loss, abs=0.02)
+        assert way.scale == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_map_that_grew_or_shrank_shows_another_loss_but_no_other_scale():
@@ -72,21 +72,6 @@ def test_where_images_show_none_nothing_is_corrected():
     assert found(0.1, seconds=0.9 * PAIRS_MIN)[1] is None  # 0.3 m each
 
 
-def test_the_way_that_was_driven_has_the_same_turns():
-    poses, odometry = losing(0.1)
-    track = OdometryTrack.of(odometry, SegmentConfig(), None)
-    driven = track.driven(Way(1.0, 0.1))
-    assert np.hypot(*(driven.poses - poses)[:, :2].T).max() < 0.02
-    assert np.hypot(*(track.poses - poses)[:, :2].T).max() > 0.5
-    assert np.array_equal(driven.yaw, track.yaw) and np.array_equal(driven.part, track.part)
-    again = OdometryTrack.of(
-        dataclasses.replace(odometry, poses=driven.poses), SegmentConfig(), None
-    )
-    assert np.allclose(driven.sums, again.sums, atol=1e-6)
-    longer = track.driven(Way(1.1, 0.0))
-    assert np.allclose(longer.poses[:, :2], 1.1 * track.poses[:, :2])
-
-
 def errors(loss):
     """Mean error (m) of a map of images, with odometry that loses way; and the training."""
     config, true = recipe(), wander(400, 2, hz=4.0)
@@ -96,8 +81,11 @@ def errors(loss):
     )
     odometry = Odometry(true.stamps_ns, integrate(true.stamps_ns, read), read, np.zeros((400, 2)))
     run = dataclasses.replace(run, odometry=odometry)
-    network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
-    trained = learn_place(network, [run], config)
+    if loss:
+        network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
+        trained = learn_place(network, [run], config)
+    else:
+        trained = place()
     estimates = trained.model.locate_all(run.panoramas.read(0, len(run.panoramas)))
     places, truth = np.array([one.position for one in estimates]), true.poses[:, :2]
     placed = align(places, truth).apply(places)

@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from test_commands import data, gardens, run, small_network  # noqa: F401
+from test_commands import data, run  # noqa: F401
 
 from sfa_localization import updating
 from sfa_localization.place_model import PlaceModel
