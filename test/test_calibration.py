@@ -9,6 +9,7 @@ import tracemalloc
 import cv2
 import numpy as np
 import pytest
+from real_cameras import DESK_CENTER, DESK_RADII, desk_mirror, ordinary
 
 from sfa_localization import cli
 from sfa_localization.camera.calibration import (
@@ -37,10 +38,12 @@ def scene(seed, background=10.0, center=CENTER, radii=RADII, size=(480, 640)):
     return np.clip(picture + rng.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
 
 
-def assert_found(circles, center=CENTER, radii=RADII, atol=1.0):
+def assert_found(circles, center=CENTER, radii=RADII, atol=1.0, hole_atol=2.0):
     rim, hole = circles.rim, circles.hole
     np.testing.assert_allclose((rim.column, rim.row, rim.radius), (*center, radii[1]), atol=atol)
-    np.testing.assert_allclose((hole.column, hole.row, hole.radius), (*center, radii[0]), atol=2.0)
+    np.testing.assert_allclose(
+        (hole.column, hole.row, hole.radius), (*center, radii[0]), atol=hole_atol
+    )
 
 
 def test_one_image_on_a_dark_background():
@@ -79,6 +82,37 @@ def test_noise_without_a_mirror_is_rejected():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     with pytest.raises(CameraError, match='stands out'):
         find_circles([noise])
+
+
+@pytest.mark.parametrize('side', [480, 1440, 2880])
+@pytest.mark.parametrize('soft', [0.03, 0.1])
+def test_a_soft_rim_is_found_at_any_resolution(side, soft):
+    center, radius = (240.7, 239.0), 245.8  # the border cuts it off by 2 %
+    rows, columns = np.mgrid[:480, :480]
+    off = np.hypot(columns - center[0], rows - center[1]) / radius - 1
+    texture = np.random.default_rng(0).uniform(40, 230, (24, 24, 3)).astype(np.float32)
+    light = 1 / (1 + np.exp(np.clip(4 * off / soft, -50, 50)))
+    picture = cv2.resize(texture, (480, 480), interpolation=cv2.INTER_CUBIC) * light[..., None]
+    shown = cv2.resize(np.clip(picture, 0, 255).astype(np.uint8), (side, side))
+    rim = find_circles([shown]).rim
+    scale = side / 480
+    found = rim.column / scale, rim.row / scale, rim.radius / scale
+    np.testing.assert_allclose(found, (*center, radius), atol=0.015 * radius)
+
+
+@pytest.mark.parametrize('turns', ['mirror', 'picture'])
+@pytest.mark.parametrize('count', [1, 8])
+def test_a_real_mirror_in_its_housing(count, turns):
+    """Around it lie a dark tube and bright walls, and it shows dark things, too."""
+    circles = find_circles(list(desk_mirror(count, turns=turns)))
+    assert_found(circles, DESK_CENTER, DESK_RADII, atol=3.0, hole_atol=3.0)
+
+
+@pytest.mark.parametrize('count', [1, 8])
+@pytest.mark.parametrize('size', [(240, 320), (320, 320)])
+def test_an_ordinary_camera_has_no_circle(count, size):
+    with pytest.raises(CameraError, match='3 or more, not 1' if count == 1 else 'others'):
+        find_circles(list(ordinary(count, size=size)))
 
 
 @pytest.mark.parametrize('size', [(6000, 6001), (3, 9000)])
