@@ -54,7 +54,7 @@ def ordinary(count, step_deg=25.0, size=(240, 320), field_deg=80.0):
 
 
 def fisheye(size, soft, cut=0.0, count=1, step_deg=25.0):
-    """Pictures (H, W, 3) of a fisheye that looks up from the street, and its center and radius.
+    """Pictures (H, W, 3) of a fisheye that looks up from the street.
 
     Its light falls off over the share `soft` of the radius, and the border cuts it off by `cut`.
     """
@@ -73,4 +73,4 @@ def fisheye(size, soft, cut=0.0, count=1, step_deg=25.0):
         )
         seen = cv2.remap(picture, *(part.astype(np.float32) for part in maps), cv2.INTER_LINEAR)
         pictures.append((seen * light[..., None] + 3).astype(np.uint8))
-    return pictures, center, radius
+    return pictures

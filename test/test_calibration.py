@@ -9,9 +9,11 @@ import tracemalloc
 import cv2
 import numpy as np
 import pytest
+import yaml
 from real_cameras import DESK_CENTER, DESK_RADII, desk_mirror, ordinary
 
 from sfa_localization import cli
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.calibration import (
     check_image,
     find_circles,
@@ -169,6 +171,26 @@ def test_from_images_to_a_calibration_file(tmp_path, picture, capsys):
     assert sorted(entry.name for entry in output.parent.iterdir()) == ['camera.yaml']
 
 
+def test_from_a_bag_to_a_calibration_file_and_a_look(tmp_path, capsys):
+    """The circle of a real mirror; where the horizon lies nobody knows, so a look is asked for."""
+    output, check = tmp_path / 'camera.yaml', tmp_path / 'check.png'
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index, picture in enumerate(desk_mirror(20)):
+            bag.image('/images', (index + 1) * 10**8, picture, 'camera', 'jpeg')
+    words = ['calibrate', str(tmp_path / 'bag'), '--output', str(output)]
+    assert cli.main([*words, '--check', str(check)]) == 0
+    shown, asked = capsys.readouterr()
+    assert yaml.safe_load(shown)['radius_max'] == pytest.approx(DESK_RADII[1], abs=2.0)
+    assert asked.splitlines()[-1] == f'look at {check}: does the horizon lie on its line?'
+    strip = cv2.imread(str(check))[270:].astype(int)
+    green = (strip[..., 1] > 150) & (strip[..., 2] < 120)
+    lines = np.flatnonzero(green.mean(axis=1) > 0.7) / len(strip) * 36 - 24  # degrees down
+    assert [np.abs(lines - angle).min() < 0.5 for angle in (-20, -10, 0, 10)] == [True] * 4
+    assert cli.main([*words, '--image-topic', '/nothing']) == 1
+    assert cli.main([*words, str(tmp_path / 'bag')]) == 1
+    assert 'give one bag, or images' in capsys.readouterr().err
+
+
 def test_a_fisheye_from_its_rim(tmp_path, picture):
     output = tmp_path / 'camera.yaml'
     arguments = ['--model', 'fisheye', '--field-of-view', '200', '--output', str(output)]
@@ -214,6 +236,7 @@ def test_from_a_calibration_file(tmp_path):
         (['--calibration', 'missing.yaml'], 'missing.yaml'),
         (['filled.png'], 'inner circle'),
         (['raw.png', '--angle-min', '120', '--angle-max', '80'], 'angle'),
+        (['raw.png', '--calibration', 'other.yaml'], 'add the columns and rows cut off'),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys, arguments, words):
@@ -222,11 +245,15 @@ def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys
     cv2.imwrite('small.png', scene(1)[:100])
     cv2.imwrite('filled.png', scene(1, radii=(0.0, 200.0)))
     (tmp_path / 'notes.txt').write_text('no picture')
+    (tmp_path / 'other.yaml').write_text(
+        'cam0:\n  camera_model: omni\n  intrinsics: [0.8, 233, 230, 373, 253]\n'
+        '  resolution: [480, 480]\n'
+    )
     output = tmp_path / 'camera.yaml'
     assert cli.main(['calibrate', *arguments, '--output', str(output)]) == 1
-    error = capsys.readouterr().err.strip()
-    assert words in error
-    assert '\n' not in error
+    printed, error = capsys.readouterr()
+    assert words in error and printed == ''
+    assert '\n' not in error.strip()
     assert not output.exists()
 
 

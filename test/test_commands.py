@@ -104,8 +104,8 @@ class Outcome:
         )
 
     def camera(self) -> dict[str, Any]:
-        """Return the calibration that was printed."""
-        return yaml.safe_load(self.text)
+        """Return the calibration that was printed, before it asks for a look."""
+        return yaml.safe_load(self.text.partition('look at ')[0])
 
 
 @dataclass(frozen=True)
@@ -326,6 +326,9 @@ OPTIONS: dict[str, dict[str, Case]] = {
         '--reach': Case('--reach 0.2', PRINTED),
     },
     'calibrate': {
+        '--image-topic': Case(
+            '--image-topic /nothing', lambda a, b: '/nothing' in b.text, base='{data}/bag'
+        ),
         '--calibration': Case('--calibration {data}/info.yaml', says('fisheye')),
         '--center': Case(
             '--center 300x200', lambda a, b: (b.camera()['cx'], b.camera()['cy']) == (300, 200)

@@ -428,14 +428,17 @@ def _write(drawn: Image, text: str, place: Array, color: tuple[int, int, int]) -
 
 
 def _label(strip: Image, panorama: PanoramaConfig) -> None:
-    """Draw the directions and the horizon into a panorama."""
+    """Draw the directions, the horizon, and every ten degrees above and below it."""
     height, width = strip.shape[:2]
     left_to_right = ('BACK', 'LEFT', 'FRONT', 'RIGHT')
     sides = left_to_right if panorama.clockwise else ('BACK', 'RIGHT', 'FRONT', 'LEFT')
-    span = panorama.elevation_max - panorama.elevation_min
-    horizon = panorama.elevation_max / span * height - 0.5
-    if 0 <= horizon < height:
-        cv2.line(strip, (0, round(horizon)), (width, round(horizon)), _GREEN, 1)
+    low, high = panorama.elevation_min, panorama.elevation_max
+    for elevation in range(-80, 90, 10):
+        row = round((high - elevation) / (high - low) * height - 0.5)
+        if 0 <= row < height:
+            cv2.line(strip, (0, row), (width, row), _GREEN, 1 if elevation else 2)
+            name = f'{elevation:+d} deg' if elevation else 'HORIZON'
+            _write(strip, name, np.array([width // 8, row - 3]), _GREEN)
     for quarter, name in enumerate(sides):
         column = quarter * width // 4
         cv2.line(strip, (column, 0), (column, height), _RED, 1)
