@@ -40,10 +40,10 @@ def picture():
         ('rgba8', [1, 2, 3, 4], (3, 2, 1)),
         ('mono16', [9, 200], (200, 200, 200)),
         ('16UC1', [9, 200], (200, 200, 200)),
-        ('bgr16', [0, 1, 0, 2, 0, 3], (1, 2, 3)),
-        ('rgb16', [0, 1, 0, 2, 0, 3], (3, 2, 1)),
-        ('bgra16', [0, 1, 0, 2, 0, 3, 0, 4], (1, 2, 3)),
-        ('rgba16', [0, 1, 0, 2, 0, 3, 0, 4], (3, 2, 1)),
+        ('bgr16', [0, 64, 0, 2, 0, 3], (64, 2, 3)),
+        ('rgb16', [0, 64, 0, 2, 0, 3], (3, 2, 64)),
+        ('bgra16', [0, 64, 0, 2, 0, 3, 0, 4], (64, 2, 3)),
+        ('rgba16', [0, 64, 0, 2, 0, 3, 0, 4], (3, 2, 64)),
     ],
 )
 def test_pixels_arrive_where_they_belong(encoding, pixel, expected):
@@ -56,6 +56,23 @@ def test_pixels_arrive_where_they_belong(encoding, pixel, expected):
 
 def test_big_endian_pictures_swap_their_bytes():
     assert (decode_image(bytes([200, 9] * 4), 2, 2, 4, 'mono16', True) == 200).all()
+
+
+@pytest.mark.parametrize('bits', [10, 12, 14, 16])
+def test_of_16_bits_those_count_that_the_sensor_has(bits, picture):
+    """In a message and in a PNG, gray and in color; a dark image stays dark."""
+    picture[0, 0] = 255
+    words = picture.astype(np.uint16) << (bits - 8)
+    color = decode_image(words.tobytes(), 6, 8, 48, 'bgr16')
+    swapped = decode_image(words.byteswap().tobytes(), 6, 8, 48, 'bgr16', True)
+    packed = decode_compressed(encode_png(words), 'bgr16; png compressed bgr16')
+    for image in (color, swapped, packed):
+        np.testing.assert_array_equal(image, picture)
+    gray = np.repeat(picture[..., :1], 3, 2)
+    mono = np.ascontiguousarray(words[..., 0])
+    np.testing.assert_array_equal(decode_image(mono.tobytes(), 6, 8, 16, 'mono16'), gray)
+    np.testing.assert_array_equal(decode_compressed(encode_png(mono), 'mono16; png'), gray)
+    assert decode_image((mono // mono.max() * 40).tobytes(), 6, 8, 16, 'mono16').max() <= 10
 
 
 @pytest.mark.parametrize(
