@@ -141,7 +141,8 @@ def _cues(images: Sequence[Image], scale: float) -> list[Array]:
     if len(images) < _ENOUGH_FOR_MOTION:
         return [brightness]
     variance = squares / len(images) - brightness**2
-    return [brightness, cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)]
+    change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)
+    return [brightness, np.asarray(change, float)]
 
 
 def _shrunk(image: Image, scale: float) -> Array:
