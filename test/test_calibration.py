@@ -274,7 +274,7 @@ def test_what_is_read_is_not_replaced(tmp_path, monkeypatch, capsys, picture, op
 
 def test_the_check_image_marks_the_directions():
     """Red spokes leave the center upwards (front) and to the right (left, in a mirror)."""
-    unwrapper = Unwrapper(CameraConfig(), PanoramaConfig())
+    unwrapper = Unwrapper(CameraConfig(camera_model='mirror'), PanoramaConfig())
     drawn = check_image(np.zeros((640, 640, 3), np.uint8), unwrapper)
     assert drawn.shape[1] == 1200
     raw = drawn[:640, 280:920].astype(int)

@@ -21,7 +21,9 @@ from test_calibration import scene
 
 from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.commands.options import given
+from sfa_localization.config import write_config
 from sfa_localization.data.settings import Settings
 from sfa_localization.features import cluster, network
 from sfa_localization.features.network import Layer
@@ -591,3 +593,23 @@ def scheduler() -> Iterator[str]:
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as local:
         yield local.scheduler_address
+
+
+@pytest.mark.parametrize(('size', 'entry'), [
+    ((98, 98), None), ((48, 96), 'equirectangular'), ((48, 96), None),
+])  # fmt: skip
+def test_raw_images_are_trained_on_only_with_a_description(tmp_path, capsys, size, entry):
+    """What train asks for is what helps: square images of any camera, and equirectangular ones."""
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(1, 4):
+            picture = rng.integers(0, 256, (*size, 3), np.uint8)
+            bag.image('/image_raw', k * 10**9, picture, 'camera')
+            bag.odometry('/odom', k * 10**9, [0.2 * k, 0.0, 0.0], [0.2, 0.0], [0.01, 0.01])
+    write_config(tmp_path / 'own.yaml', {'omnicam_node': {'camera_model': entry or ''}})
+    words = ['train', str(tmp_path / 'bag'), '--config', str(tmp_path / 'own.yaml')]
+    assert cli.main([*words, '--output', str(tmp_path / 'model.npz')]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    asked = 'no camera is described: in the parameter file set calibration_file' in error
+    assert asked == (entry is None) and ('equirectangular' in error) == asked, error
+    assert not (tmp_path / 'model.npz').exists()

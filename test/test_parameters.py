@@ -89,11 +89,12 @@ def unwrapped(*settings: Any) -> Any:
 
 
 def of_camera(settings: CameraConfig) -> Any:
-    return unwrapped(settings, PanoramaConfig())
+    model = settings.camera_model or 'mirror'  # without one there is no panorama
+    return unwrapped(dataclasses.replace(settings, camera_model=model), PanoramaConfig())
 
 
 def of_panorama(settings: PanoramaConfig) -> Any:
-    return unwrapped(CameraConfig(), settings)
+    return unwrapped(CameraConfig(camera_model='mirror'), settings)
 
 
 def of_lens(settings: LensCalibration) -> Any:
@@ -259,6 +260,7 @@ TWO = {'camera_model': 'dual_fisheye', 'fx': 95.0, 'fy': 95.0, 'cx': 160.0, 'sec
        'second_cy': 319.5}  # fmt: skip
 SPECIAL: dict[type[Settings], dict[str, Other]] = {
     CameraConfig: {
+        'camera_model': Other('equirectangular'),
         'mount_rpy': Other((0.0, 0.0, 30.0)),
         'blind_sectors': Other((10.0, 60.0)),
     },

@@ -53,9 +53,18 @@ _HEAD = f"""\
 
 
 def calibration_of(camera: CameraConfig) -> LensCalibration:
-    """The lens that the camera's parameters name: its calibration_file, or its camera_model."""
+    """The lens that the camera's parameters name: its calibration_file, or its camera_model.
+
+    Raises CameraError where they name none.
+    """
     if camera.calibration_file:
         return read_calibration(Path(camera.calibration_file))
+    if not camera.camera_model:
+        raise CameraError(
+            'images are no panoramas, and no camera is described: in the parameter file set '
+            'calibration_file (see the command calibrate), or camera_model to equirectangular or '
+            'panorama, in the section /**/omnicam_node; inspect prints what to write'
+        )
     return LensCalibration(camera_model=camera.camera_model)
 
 

@@ -65,7 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--calibration',
         type=Path,
-        help='camera_info, OpenCV, Kalibr or camodocal YAML, or OCamCalib calib_results.txt',
+        help='OCamCalib calib_results.txt, or the file of camera_info, OpenCV, Kalibr, camodocal, '
+        'stella_vslam or ORB-SLAM3',
     )
     parser.add_argument(
         '--center', type=numbers, help='COLUMNxROW of the mirror (px); default: detected'
