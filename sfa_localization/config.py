@@ -279,7 +279,7 @@ def _described(item: dataclasses.Field[Any]) -> str:
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     parts = [f'{meta["doc"]}{unit}']
     if meta['choices']:
-        parts.append('one of ' + ', '.join(meta['choices']))
+        parts.append('one of ' + ', '.join(filter(None, meta['choices'])))
     if meta['low'] is not None or meta['high'] is not None:
         low = '' if meta['low'] is None else f'{meta["low"]:g}'
         high = '' if meta['high'] is None else f'{meta["high"]:g}'

@@ -19,10 +19,11 @@ from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.camera.calibration import MirrorCircles, find_circles
 from sfa_localization.camera.panorama import looks_like_panorama
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
-from sfa_localization.data.errors import BagError
+from sfa_localization.data.errors import BagError, CameraError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
@@ -31,8 +32,18 @@ from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.segments import PIECE_LENGTH_M
 from sfa_localization.metric.sufficiency import ROUTE, is_one_route
 
-PANORAMA, OMNIDIRECTIONAL, FISHEYE = 'panorama', 'omnidirectional', 'fisheye'
-DUAL_FISHEYE, ORDINARY = 'dual fisheye', 'ordinary camera'
+PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
+MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'
+# Parameters of omnicam_node to start from; a strip needs none.
+_CALIBRATE = 'calibration_file: camera.yaml  # by: sfa_localization calibrate {bag}'
+_OUTPUTS = '--output camera.yaml --check check.png'
+_ENTRIES = {
+    MIRROR: f'{_CALIBRATE} {_OUTPUTS}',
+    FISHEYE: f'{_CALIBRATE} --model fisheye --field-of-view 185 {_OUTPUTS}',
+    DUAL_FISHEYE: 'calibration_file: camera.yaml  # with camera_model: dual_fisheye',
+    EQUIRECTANGULAR: 'camera_model: equirectangular',
+    PANORAMA: 'camera_model: panorama',
+}
 SAMPLES, SAMPLE_SIDE = 16, 640
 """Images on the contact sheet, and their longer side (pixels)."""
 SECTORS = 6
@@ -122,17 +133,27 @@ class TopicReport:
 
 @dataclass
 class ImageTopic:
-    """A topic of images: size, guessed geometry, and samples from all over the drive."""
+    """A topic of images: size, guessed geometry, and samples from all over the drive.
+
+    `seen` is what shows the geometry.
+    """
 
     topic: str
     width: int
     height: int
     geometry: str
+    seen: str
     stamps_ns: Stamps
     samples: list[Image]
 
+    def entry(self, bag: str) -> str:
+        """The parameter that describes the camera of a bag to omnicam_node; '' if none does."""
+        needed = self.geometry in _ENTRIES and not looks_like_panorama(self.height, self.width)
+        return _ENTRIES[self.geometry].format(bag=bag) if needed else ''
+
     def as_dict(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ('topic', 'width', 'height', 'geometry')}
+        names = ('topic', 'width', 'height', 'geometry', 'seen')
+        return {name: getattr(self, name) for name in names}
 
 
 @dataclass
@@ -190,7 +211,8 @@ class BagReport:
         """Camera, drive and clocks, in words."""
         facts = {}
         if self.images is not None:
-            facts['images'] = f'{self.images.width}x{self.images.height}, {self.images.geometry}'
+            images = self.images
+            facts['images'] = f'{images.width}x{images.height}, {images.geometry}: {images.seen}'
         if self.drive is not None:
             found = self.drive.as_dict()
             facts['drive'] = (
@@ -228,6 +250,9 @@ class BagReport:
         lines += [f'  {name}: {fact}' for name, fact in self.facts.items()]
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
+        if entry := self.images and self.images.entry(self.path):
+            lines += ['  start my_localization.yaml with:', '    /**/omnicam_node:']
+            lines += ['      ros__parameters:', f'        {entry}']
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
         return '\n'.join(lines if self.lacks else [*lines, '  enough to train on'])
 
@@ -330,9 +355,9 @@ class _Survey:
         if not self._samples or self._image is None:
             return None
         ((height, width), _), *_ = self._sizes.most_common(1)
-        geometry = guess_geometry([s for s in self._samples if s.shape == self._samples[0].shape])
+        alike = [s for s in self._samples if s.shape == self._samples[0].shape]
         stamps = self._stamps(self._image)
-        return ImageTopic(self._image, width, height, geometry, stamps, self._samples)
+        return ImageTopic(self._image, width, height, *guess_geometry(alike), stamps, self._samples)
 
     def drive(self) -> DrivenPath | None:
         """The path, and the delay of the camera's clock at images in the order of their stamps."""
@@ -367,35 +392,45 @@ def _unrolled(image: Image) -> Image:
     return np.ascontiguousarray(polar[:, _INNER:].transpose(1, 0, 2))
 
 
-def guess_geometry(samples: Sequence[Image]) -> str:
-    """The kind of camera that took images (H, W, 3) of one size, by shape and dark parts."""
+def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
+    """The kind of camera that took images (H, W, 3) of one size, and what shows it."""
     height, width = samples[0].shape[:2]
     if looks_like_panorama(height, width):
-        return PANORAMA
+        return PANORAMA, f'{width / height:.1f} times as wide as high'
+    twice = abs(width / height - 2) < 0.02
+    halves = np.arange(2) * (width // 2)
+    if twice and all(_circles([s[:, at : at + height] for s in samples]) for at in halves):
+        return DUAL_FISHEYE, 'two circles'
+    if circles := None if twice else _circles(samples):
+        if circles.hole is None:
+            return FISHEYE, 'a circle'
+        share = circles.hole.radius / circles.rim.radius
+        return MIRROR, f'a circle, and the camera itself in its middle, {share:.0%} as wide'
+    if width > height and _closes(samples):
+        kind = EQUIRECTANGULAR if twice else PANORAMA
+        return (
+            kind,
+            f'{width / height:.1f} times as wide as high, the right edge goes on at the left',
+        )
+    return ORDINARY, 'no circle, and edges that do not go on at the other side'
+
+
+def _circles(samples: Sequence[Image]) -> MirrorCircles | None:
+    try:
+        return find_circles(samples)
+    except CameraError:
+        return None
+
+
+def _closes(samples: Sequence[Image]) -> bool:
+    """Whether the first column goes on where the last one ends: more than a half turn away."""
     gray = np.stack([sample.mean(-1) for sample in samples])
-    if abs(width / height - 2) < 0.02:
-        return DUAL_FISHEYE if _dark_corners(gray[:, :, : width // 2]) else PANORAMA
-    if not _dark_corners(gray):
-        return ORDINARY
-    return OMNIDIRECTIONAL if _is_center_constant(gray) else FISHEYE
 
+    def differs(columns: int) -> Array:
+        return np.asarray(np.abs(gray - np.roll(gray, columns, axis=2)).mean((0, 1)))
 
-def _dark_corners(gray: Array) -> bool:
-    """Whether the image is a circle: gray levels (N, H, W) with black corners."""
-    brightest, side = gray.max(0), max(min(gray.shape[1:]) // 20, 1)
-    ends = (slice(None, side), slice(-side, None))
-    corners = [np.median(brightest[rows, columns]) for rows in ends for columns in ends]
-    return bool(max(corners) < max(DARK, 0.15 * np.median(gray)))
-
-
-def _is_center_constant(gray: Array) -> bool:
-    """Whether the center shows the camera itself: it changes much less than its surroundings."""
-    height, width = gray.shape[1:]
-    rows, columns = np.mgrid[:height, :width]
-    radius = np.hypot(rows - height / 2, columns - width / 2) / (min(height, width) / 2)
-    change = gray.std(0) if len(gray) > 1 else np.abs(gray[0] - gray[0].mean())
-    inner, ring = change[radius < 0.12].mean(), change[(radius > 0.4) & (radius < 0.8)].mean()
-    return bool(inner < 0.4 * ring)
+    near, far = np.median(differs(1)), np.median(differs(gray.shape[2] // 2))
+    return bool(differs(1)[0] < np.sqrt(near * far))
 
 
 def path_length(poses: Array) -> float:
@@ -466,7 +501,10 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
             'record both all the time, stamped by one clock'
         )
     if images.geometry == ORDINARY:
-        yield 'the images do not show all directions: an omnidirectional camera is needed'
+        yield (
+            'the images do not show all directions: an omnidirectional camera is needed (one it '
+            'is all the same: describe it with calibration_file)'
+        )
     if float(np.mean([sample.mean() for sample in images.samples])) < DARK:
         yield 'the images are dark: open the lens or wait for daylight'
     yield from _lacks_of_drive(drive.places, config) if used > 1 else ()

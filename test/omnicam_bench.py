@@ -18,7 +18,7 @@ from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 
 PATIENCE_S = 60.0
-SMALL = {'width': 120, 'height': 12}
+SMALL = {'width': 120, 'height': 12, 'camera_model': 'mirror'}
 RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 
 

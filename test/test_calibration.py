@@ -9,8 +9,11 @@ import tracemalloc
 import cv2
 import numpy as np
 import pytest
+import yaml
+from real_cameras import DESK_CENTER, DESK_RADII, desk_mirror, ordinary
 
 from sfa_localization import cli
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.calibration import (
     check_image,
     find_circles,
@@ -37,10 +40,12 @@ def scene(seed, background=10.0, center=CENTER, radii=RADII, size=(480, 640)):
     return np.clip(picture + rng.normal(0, 3, picture.shape), 0, 255).astype(np.uint8)
 
 
-def assert_found(circles, center=CENTER, radii=RADII, atol=1.0):
+def assert_found(circles, center=CENTER, radii=RADII, atol=1.0, hole_atol=2.0):
     rim, hole = circles.rim, circles.hole
     np.testing.assert_allclose((rim.column, rim.row, rim.radius), (*center, radii[1]), atol=atol)
-    np.testing.assert_allclose((hole.column, hole.row, hole.radius), (*center, radii[0]), atol=2.0)
+    np.testing.assert_allclose(
+        (hole.column, hole.row, hole.radius), (*center, radii[0]), atol=hole_atol
+    )
 
 
 def test_one_image_on_a_dark_background():
@@ -79,6 +84,37 @@ def test_noise_without_a_mirror_is_rejected():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
     with pytest.raises(CameraError, match='stands out'):
         find_circles([noise])
+
+
+@pytest.mark.parametrize('side', [480, 1440, 2880])
+@pytest.mark.parametrize('soft', [0.03, 0.1])
+def test_a_soft_rim_is_found_at_any_resolution(side, soft):
+    center, radius = (240.7, 239.0), 245.8  # the border cuts it off by 2 %
+    rows, columns = np.mgrid[:480, :480]
+    off = np.hypot(columns - center[0], rows - center[1]) / radius - 1
+    texture = np.random.default_rng(0).uniform(40, 230, (24, 24, 3)).astype(np.float32)
+    light = 1 / (1 + np.exp(np.clip(4 * off / soft, -50, 50)))
+    picture = cv2.resize(texture, (480, 480), interpolation=cv2.INTER_CUBIC) * light[..., None]
+    shown = cv2.resize(np.clip(picture, 0, 255).astype(np.uint8), (side, side))
+    rim = find_circles([shown]).rim
+    scale = side / 480
+    found = rim.column / scale, rim.row / scale, rim.radius / scale
+    np.testing.assert_allclose(found, (*center, radius), atol=0.015 * radius)
+
+
+@pytest.mark.parametrize('turns', ['mirror', 'picture'])
+@pytest.mark.parametrize('count', [1, 8])
+def test_a_real_mirror_in_its_housing(count, turns):
+    """Around it lie a dark tube and bright walls, and it shows dark things, too."""
+    circles = find_circles(list(desk_mirror(count, turns=turns)))
+    assert_found(circles, DESK_CENTER, DESK_RADII, atol=3.0, hole_atol=3.0)
+
+
+@pytest.mark.parametrize('count', [1, 8])
+@pytest.mark.parametrize('size', [(240, 320), (320, 320)])
+def test_an_ordinary_camera_has_no_circle(count, size):
+    with pytest.raises(CameraError, match='3 or more, not 1' if count == 1 else 'others'):
+        find_circles(list(ordinary(count, size=size)))
 
 
 @pytest.mark.parametrize('size', [(6000, 6001), (3, 9000)])
@@ -135,6 +171,26 @@ def test_from_images_to_a_calibration_file(tmp_path, picture, capsys):
     assert sorted(entry.name for entry in output.parent.iterdir()) == ['camera.yaml']
 
 
+def test_from_a_bag_to_a_calibration_file_and_a_look(tmp_path, capsys):
+    """The circle of a real mirror; where the horizon lies nobody knows, so a look is asked for."""
+    output, check = tmp_path / 'camera.yaml', tmp_path / 'check.png'
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index, picture in enumerate(desk_mirror(20)):
+            bag.image('/images', (index + 1) * 10**8, picture, 'camera', 'jpeg')
+    words = ['calibrate', str(tmp_path / 'bag'), '--output', str(output)]
+    assert cli.main([*words, '--check', str(check)]) == 0
+    shown, asked = capsys.readouterr()
+    assert yaml.safe_load(shown)['radius_max'] == pytest.approx(DESK_RADII[1], abs=2.0)
+    assert asked.splitlines()[-1] == f'look at {check}: does the horizon lie on its line?'
+    strip = cv2.imread(str(check))[270:].astype(int)
+    green = (strip[..., 1] > 150) & (strip[..., 2] < 120)
+    lines = np.flatnonzero(green.mean(axis=1) > 0.7) / len(strip) * 36 - 24  # degrees down
+    assert [np.abs(lines - angle).min() < 0.5 for angle in (-20, -10, 0, 10)] == [True] * 4
+    assert cli.main([*words, '--image-topic', '/nothing']) == 1
+    assert cli.main([*words, str(tmp_path / 'bag')]) == 1
+    assert 'give one bag, or images' in capsys.readouterr().err
+
+
 def test_a_fisheye_from_its_rim(tmp_path, picture):
     output = tmp_path / 'camera.yaml'
     arguments = ['--model', 'fisheye', '--field-of-view', '200', '--output', str(output)]
@@ -180,6 +236,7 @@ def test_from_a_calibration_file(tmp_path):
         (['--calibration', 'missing.yaml'], 'missing.yaml'),
         (['filled.png'], 'inner circle'),
         (['raw.png', '--angle-min', '120', '--angle-max', '80'], 'angle'),
+        (['raw.png', '--calibration', 'other.yaml'], 'add the columns and rows cut off'),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys, arguments, words):
@@ -188,11 +245,15 @@ def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys
     cv2.imwrite('small.png', scene(1)[:100])
     cv2.imwrite('filled.png', scene(1, radii=(0.0, 200.0)))
     (tmp_path / 'notes.txt').write_text('no picture')
+    (tmp_path / 'other.yaml').write_text(
+        'cam0:\n  camera_model: omni\n  intrinsics: [0.8, 233, 230, 373, 253]\n'
+        '  resolution: [480, 480]\n'
+    )
     output = tmp_path / 'camera.yaml'
     assert cli.main(['calibrate', *arguments, '--output', str(output)]) == 1
-    error = capsys.readouterr().err.strip()
-    assert words in error
-    assert '\n' not in error
+    printed, error = capsys.readouterr()
+    assert words in error and printed == ''
+    assert '\n' not in error.strip()
     assert not output.exists()
 
 
@@ -213,7 +274,7 @@ def test_what_is_read_is_not_replaced(tmp_path, monkeypatch, capsys, picture, op
 
 def test_the_check_image_marks_the_directions():
     """Red spokes leave the center upwards (front) and to the right (left, in a mirror)."""
-    unwrapper = Unwrapper(CameraConfig(), PanoramaConfig())
+    unwrapper = Unwrapper(CameraConfig(camera_model='mirror'), PanoramaConfig())
     drawn = check_image(np.zeros((640, 640, 3), np.uint8), unwrapper)
     assert drawn.shape[1] == 1200
     raw = drawn[:640, 280:920].astype(int)

@@ -219,6 +219,92 @@ def test_camodocal(tmp_path):
     assert (lens.fx, lens.fy) == (200.0, 201.0)
 
 
+@pytest.mark.parametrize('name', ['distortion_model', 'camera_model'])
+@pytest.mark.parametrize(
+    ('model', 'read_as'),
+    [('plumb_bob', 'mirror'), ('equidistant', 'fisheye'), ('fisheye', 'fisheye')],
+)
+def test_ost_yaml_of_camera_calibration(tmp_path, name, model, read_as):
+    """Its releases name the distortion in two ways."""
+    text = CAMERA_INFO.format(model=model, n=4, coefficients=[0.1, 0.2, 0.3, 0.4])
+    lens = read(tmp_path, text.replace('distortion_model', name), 'ost.yaml')
+    assert (lens.camera_model, lens.fx, lens.image_width) == (read_as, 400.5, 640)
+    assert lens.distortion == (0.1, 0.2, 0.3, 0.4)
+
+
+STELLA = """Camera:
+  name: "a fisheye"
+  setup: "monocular"
+  model: "{model}"
+  fx: 285.5
+  fy: 286.5
+  cx: 424.0
+  cy: 400.0
+  k1: 0.1
+  k2: 0.2
+  k3: 0.3
+  k4: 0.4
+  fps: 30.0
+  cols: 848
+  rows: 800
+  color_order: "RGB"
+Feature:
+  scale_factor: 1.2
+"""
+ORB = """%YAML:1.0
+
+#--------------------------------------------------------------------------------------------
+# Camera Parameters. Adjust them!
+#--------------------------------------------------------------------------------------------
+File.version: "1.0"
+Camera.type: "{model}"
+Camera1.fx: 285.5
+Camera1.fy: 286.5
+Camera1.cx: 424.0
+Camera1.cy: 400.0
+Camera1.k1: 0.1
+Camera1.k2: 0.2
+Camera1.k3: 0.3
+Camera1.k4: 0.4
+Camera.width: 848
+Camera.height: 800
+"""
+
+
+@pytest.mark.parametrize(
+    'text', [
+        STELLA.format(model='fisheye'),
+        ORB.format(model='KannalaBrandt8'),
+        ORB.format(model='KannalaBrandt8').replace('Camera1.', 'Camera.'),
+    ],
+)  # fmt: skip
+def test_fisheyes_of_slam_programs(tmp_path, text):
+    lens = read(tmp_path, text)
+    assert (lens.camera_model, lens.distortion) == ('fisheye', (0.1, 0.2, 0.3, 0.4))
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (285.5, 286.5, 424.0, 400.0)
+    assert (lens.image_width, lens.image_height) == (848, 800)
+
+
+def test_other_cameras_of_slam_programs(tmp_path):
+    pinhole = ORB.format(model='PinHole').replace('k3: 0.3', 'p1: 0.3').replace('k4', 'p2')
+    assert read(tmp_path, pinhole).distortion == (0.1, 0.2, 0.3, 0.4)
+    assert read(tmp_path, STELLA.format(model='equirectangular')).camera_model == 'equirectangular'
+
+
+def test_opencv_xml(tmp_path):
+    path = tmp_path / 'out_camera_data.xml'
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write('image_width', 640)
+    storage.write('image_height', 480)
+    storage.write('camera_matrix', np.array([[300.0, 0, 320], [0, 301.0, 240], [0, 0, 1]]))
+    storage.write('distortion_coefficients', np.array([[0.1, 1e-5, 0.0, 0.001]]))
+    storage.write('xi', np.array([[1.25]]))
+    storage.release()
+    lens = read_calibration(path)
+    assert (lens.camera_model, lens.xi, lens.fx, lens.image_height) == ('mirror', 1.25, 300.0, 480)
+    assert lens.distortion == (0.1, 1e-5, 0.0, 0.001)
+
+
 def test_opencv_file_storage(tmp_path):
     path = tmp_path / 'opencv.yml'
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
@@ -286,6 +372,13 @@ def test_what_is_written_is_read_again(tmp_path, model):
         ('camera_model: panorama\nimage_width: -1', 'image_width'),
         (MEI.replace('gamma1', 'gamma'), "'gamma1' is missing"),
         ('model_type: SCARAMUZZA', "'projection_parameters' is missing"),
+        (STELLA.format(model='radial_division'), "'radial_division' of a SLAM program"),
+        (STELLA.format(model='fisheye').replace('fx', 'f'), "'fx' is missing"),
+        ('Camera: 3', 'no camera calibration'),
+        ('Camera.3: 3', 'of a SLAM program'),
+        ('<opencv_storage><a>', 'is not XML'),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', 'definitions of its own'),
+        ('<opencv_storage><camera_matrix/></opencv_storage>', 'has 0 numbers'),
     ],
 )
 def test_unusable_files_are_named_with_the_reason(tmp_path, text, words):

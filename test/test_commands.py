@@ -21,7 +21,9 @@ from test_calibration import scene
 
 from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.commands.options import given
+from sfa_localization.config import write_config
 from sfa_localization.data.settings import Settings
 from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel
@@ -103,8 +105,8 @@ class Outcome:
         )
 
     def camera(self) -> dict[str, Any]:
-        """Return the calibration that was printed."""
-        return yaml.safe_load(self.text)
+        """Return the calibration that was printed, before it asks for a look."""
+        return yaml.safe_load(self.text.partition('look at ')[0])
 
 
 @dataclass(frozen=True)
@@ -313,6 +315,7 @@ CASES: dict[str, list[Case]] = {
         Case('--reach 0.2', PRINTED),
     ],
     'calibrate': [
+        Case('--image-topic /nothing', lambda a, b: '/nothing' in b.text, base='{data}/bag'),
         Case('--calibration {data}/info.yaml', says('fisheye')),
         Case('--center 300x200', lambda a, b: (b.camera()['cx'], b.camera()['cy']) == (300, 200)),
         Case(
@@ -548,3 +551,23 @@ def scheduler() -> Iterator[str]:
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as local:
         yield local.scheduler_address
+
+
+@pytest.mark.parametrize(('size', 'entry'), [
+    ((98, 98), None), ((48, 96), 'equirectangular'), ((48, 96), None),
+])  # fmt: skip
+def test_raw_images_are_trained_on_only_with_a_description(tmp_path, capsys, size, entry):
+    """What train asks for is what helps: square images of any camera, and equirectangular ones."""
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(1, 4):
+            picture = rng.integers(0, 256, (*size, 3), np.uint8)
+            bag.image('/image_raw', k * 10**9, picture, 'camera')
+            bag.odometry('/odom', k * 10**9, [0.2 * k, 0.0, 0.0], [0.2, 0.0], [0.01, 0.01])
+    write_config(tmp_path / 'own.yaml', {'omnicam_node': {'camera_model': entry or ''}})
+    words = ['train', str(tmp_path / 'bag'), '--config', str(tmp_path / 'own.yaml')]
+    assert cli.main([*words, '--output', str(tmp_path / 'model.npz')]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    asked = 'no camera is described: in the parameter file set calibration_file' in error
+    assert asked == (entry is None) and ('equirectangular' in error) == asked, error
+    assert not (tmp_path / 'model.npz').exists()

@@ -7,9 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
+from sfa_localization.bags.decoding import IMAGE
 from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import MessageError
 from sfa_localization.data.messages import (
     read_planar,
@@ -18,6 +22,7 @@ from sfa_localization.data.messages import (
     read_yaw,
     read_yaw_rate,
 )
+from sfa_localization.inspection import inspect
 
 
 def quaternion(yaw, length=1.0, roll=0.0):
@@ -117,3 +122,35 @@ def test_bags_and_topics_take_and_refuse_the_same_quaternions(tmp_path):
     assert sorted(live) == sorted(recorded) and len(live) == 5
     for stamp_ns, pose in live.items():
         assert np.allclose(pose, recorded[stamp_ns], atol=1e-12)
+
+
+@pytest.mark.parametrize('bits', [10, 12])
+def test_of_a_camera_of_few_bits_inspect_training_and_nodes_see_the_same(tmp_path, bits):
+    """And it is not dark."""
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(0, 256, (8, 60), np.uint16) << (bits - 8) for _ in range(20)]
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    kinds = typestore.types
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k, words in enumerate(pictures, 1):
+            header = kinds['std_msgs/msg/Header'](
+                kinds['builtin_interfaces/msg/Time'](k, 0), 'camera'
+            )
+            data = words.astype('<u2').view(np.uint8).ravel()
+            message = kinds[IMAGE](header, 8, 60, 'mono16', 0, 120, data)
+            bag.message('/images', k * 10**9, message)
+            bag.odometry('/odom', k * 10**9, [0.2 * k, 0.0, 0.0], [0.2, 0.0], [0.01, 0.01])
+    assert not [lack for lack in inspect(tmp_path / 'bag').lacks if 'dark' in lack]
+    run = load_run(tmp_path / 'bag', cache=tmp_path)
+    for image, words in zip(run.panoramas.images, pictures, strict=True):
+        np.testing.assert_array_equal(image[..., 0], words >> (bits - 8))
+        assert ImageWatch().judge(np.asarray(image)) == ''
+    pytest.importorskip('rclpy')
+    from sensor_msgs.msg import Image
+
+    from sfa_localization.nodes.conversions import read_image
+
+    live = Image(height=8, width=60, step=120, encoding='mono16')
+    live.header.stamp.sec = 1
+    live.data = pictures[0].astype('<u2').tobytes()
+    np.testing.assert_array_equal(read_image(live)[1], run.panoramas.images[0])

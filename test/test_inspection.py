@@ -4,21 +4,25 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import yaml
+from real_cameras import desk_mirror, fisheye, ordinary, street
 
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.storage import ZSTD_MAGIC
 from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
     DUAL_FISHEYE,
+    EQUIRECTANGULAR,
     FISHEYE,
-    OMNIDIRECTIONAL,
+    MIRROR,
     ORDINARY,
     PANORAMA,
     SAMPLES,
@@ -118,6 +122,7 @@ def test_a_good_drive_is_enough(tmp_path: Path) -> None:
         'width': 60,
         'height': 8,
         'geometry': PANORAMA,
+        'seen': '7.5 times as wide as high',
     }
     assert report.images is not None and len(report.images.samples) == SAMPLES
     assert 'enough to train on' in report.as_text()
@@ -324,6 +329,11 @@ def test_spacing_ignores_images_taken_standing() -> None:
 
 # The camera.
 
+CALIBRATE = (
+    'calibration_file: camera.yaml  # by: sfa_localization calibrate {bag} '
+    '--output camera.yaml --check check.png'
+)
+
 
 def views(shape: tuple[int, int], count: int = 6) -> list[np.ndarray]:
     """Pictures whose contents all change."""
@@ -337,32 +347,73 @@ def disc(shape: tuple[int, int], center: tuple[float, float], radius: float) -> 
     return np.hypot(rows - center[0], columns - center[1]) < radius
 
 
+def kind(pictures: Iterable[np.ndarray]) -> str:
+    return guess_geometry(list(pictures))[0]
+
+
 def test_a_wide_strip_is_a_panorama() -> None:
-    assert guess_geometry(views((60, 600))) == PANORAMA
-    assert guess_geometry(views((200, 400))) == PANORAMA
+    assert kind(views((60, 600))) == PANORAMA
 
 
-def test_an_ordinary_image_is_recognized() -> None:
-    assert guess_geometry(views((240, 320))) == ORDINARY
+def test_an_image_that_closes_on_itself_is_a_panorama() -> None:
+    assert kind(street(6)) == kind(street(1)) == EQUIRECTANGULAR
+    assert kind(picture[60:240] for picture in street(6)) == PANORAMA
+    assert kind(picture[:, :400] for picture in street(6)) == ORDINARY
+    assert kind(views((200, 400))) == ORDINARY
+
+
+@pytest.mark.parametrize('size', [(240, 320), (240, 240), (200, 400)])
+def test_an_ordinary_image_is_recognized(size: tuple[int, int]) -> None:
+    assert kind(views(size)) == kind(ordinary(6, size=size)) == ORDINARY
 
 
 @pytest.mark.parametrize('shape', [(240, 240), (240, 320)])
 def test_a_bright_circle_is_a_fisheye(shape: tuple[int, int]) -> None:
     circle_mask = disc(shape, (120, shape[1] / 2), 115)[..., None]
-    assert guess_geometry([view * circle_mask for view in views(shape)]) == FISHEYE
+    assert kind(view * circle_mask for view in views(shape)) == FISHEYE
+    assert kind(fisheye(shape, 0.05, count=6)) == FISHEYE
 
 
 def test_a_circle_whose_middle_never_changes_is_a_mirror() -> None:
     shape = (240, 240)
     ring, camera = disc(shape, (120, 120), 115)[..., None], disc(shape, (120, 120), 25)[..., None]
-    pictures = [np.where(camera, 90, view * ring).astype(np.uint8) for view in views(shape)]
-    assert guess_geometry(pictures) == OMNIDIRECTIONAL
+    assert kind(np.where(camera, 90, view * ring).astype(np.uint8) for view in views(shape)) == (
+        MIRROR
+    )
 
 
 def test_two_circles_are_a_dual_fisheye() -> None:
     shape = (200, 400)
     mask = disc(shape, (100, 100), 95) | disc(shape, (100, 300), 95)
-    assert guess_geometry([view * mask[..., None] for view in views(shape)]) == DUAL_FISHEYE
+    assert kind(view * mask[..., None] for view in views(shape)) == DUAL_FISHEYE
+
+
+@pytest.mark.parametrize(
+    ('pictures', 'told', 'entry'),
+    [
+        (desk_mirror, 'mirror: a circle, and the camera itself in its middle', CALIBRATE),
+        (street, 'equirectangular: 2.0 times as wide as high', 'camera_model: equirectangular'),
+        (ordinary, 'ordinary camera: no circle', ''),
+    ],
+)
+def test_a_real_camera_is_named_and_described(
+    pictures: Callable, told: str, entry: str, tmp_path: Path
+) -> None:
+    """Its bag says what to write into the parameter file, which can be read as YAML."""
+    with BagWriter(tmp_path / 'bag') as bag:
+        for index, picture in enumerate(pictures(12)):
+            bag.image('/images', START + index * STEP, picture, 'camera', 'jpeg')
+    report = inspect(tmp_path / 'bag')
+    assert report.images is not None
+    assert report.facts['images'].split(', ', 1)[1].startswith(told)
+    _, _, lines = report.as_text().partition('start my_localization.yaml with:')
+    lines = lines.partition('  not enough')[0]
+    assert entry.format(bag=tmp_path / 'bag') in lines and bool(lines) == bool(entry)
+    if entry:
+        (parameters,) = yaml.safe_load(lines).values()
+        (name,) = parameters['ros__parameters']
+        CameraConfig.from_mapping(parameters['ros__parameters'], 'bag')
+        assert entry.startswith(name)
 
 
 # The command.

@@ -78,7 +78,7 @@ def test_the_panorama_has_the_stamp_and_frame_of_the_picture(bench):
     assert message.header.frame_id == 'camera'
     assert (message.height, message.width, message.step) == (12, 120, 360)
     assert message.encoding == 'bgr8'
-    expected = Unwrapper(CameraConfig(), PANORAMA)(raw_picture())
+    expected = Unwrapper(CameraConfig(camera_model='mirror'), PANORAMA)(raw_picture())
     np.testing.assert_array_equal(pixels(message), expected)
 
 
@@ -111,7 +111,7 @@ def test_compressed_pictures_in_and_out(bench):
     publisher = run.speak('image_raw/compressed', CompressedImage)
     heard = send_until(run, publisher, message, 'panorama/compressed')
     assert heard.header.stamp.sec == 5
-    expected = Unwrapper(CameraConfig(), PANORAMA)(decode_compressed(data))
+    expected = Unwrapper(CameraConfig(camera_model='mirror'), PANORAMA)(decode_compressed(data))
     shown = decode_compressed(heard.data.tobytes())
     assert np.corrcoef(shown.ravel(), expected.ravel())[0, 1] > 0.6
     message.data = array.array('B', b'no picture')
@@ -172,7 +172,9 @@ def test_masks_elevation_and_mount_change_while_running(bench):
     assert run.set(
         elevation_max=10.0, blind_sectors=[170.0, 190.0], mount_rpy=[0.0, 0.0, 30.0]
     ).successful
-    camera = CameraConfig(blind_sectors=(170.0, 190.0), mount_rpy=(0.0, 0.0, 30.0))
+    camera = CameraConfig(
+        camera_model='mirror', blind_sectors=(170.0, 190.0), mount_rpy=(0.0, 0.0, 30.0)
+    )
     panorama = PanoramaConfig(width=120, height=12, elevation_max=10.0)
     expected = Unwrapper(camera, panorama)(raw_picture())
     deadline = time.monotonic() + PATIENCE_S
@@ -337,7 +339,7 @@ def test_a_folder_of_pictures(bench, tmp_path):
     run.hear('panorama')
     run.start()
     run.wait_for('panorama', 3)
-    unwrap = Unwrapper(CameraConfig(), PANORAMA)
+    unwrap = Unwrapper(CameraConfig(camera_model='mirror'), PANORAMA)
     for number, message in enumerate(run.received['panorama'][:3]):
         np.testing.assert_array_equal(pixels(message), unwrap(raw_picture(number)))
         assert message.header.frame_id == 'omnicam'

@@ -24,6 +24,13 @@ from sfa_localization.data.errors import CameraError, ConfigError
 
 SIZE = (400, 400)
 SMALL = PanoramaConfig(width=180, height=24)
+
+
+def mirror(**settings):
+    """The simulator's."""
+    return CameraConfig(camera_model='mirror', **settings)
+
+
 LENSES = {
     'mirror': LensCalibration(),
     'fisheye': LensCalibration(camera_model='fisheye', fx=150.0, fy=150.0, radius_min=0.0),
@@ -200,6 +207,15 @@ class TestPanoramaInput:
             assert not np.shares_memory(result, picture)
 
 
+def test_raw_images_need_a_description():
+    """And are told of it: another camera's would be taken for the simulator's mirror."""
+    unwrapper = Unwrapper(CameraConfig(), SMALL)
+    assert unwrapper(np.zeros((24, 180, 3), np.uint8)).shape == (24, 180, 3)
+    for size in ((640, 640), (988, 988), (100, 200)):
+        with pytest.raises(CameraError, match='no camera is described: in the parameter file set'):
+            unwrapper(np.zeros((*size, 3), np.uint8))
+
+
 def test_shapes_of_panoramas():
     assert looks_like_panorama(60, 600)
     assert looks_like_panorama(100, 350)
@@ -226,8 +242,8 @@ class TestMasks:
         assert np.count_nonzero(_in_sectors(rays, sector)) == hidden
 
     def test_a_blind_sector_repeats_its_neighbors(self):
-        config = CameraConfig(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
-        unwrapper, plain = Unwrapper(config, SMALL), Unwrapper(CameraConfig(), SMALL)
+        config = mirror(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
+        unwrapper, plain = Unwrapper(config, SMALL), Unwrapper(mirror(), SMALL)
         picture = picture_of(smooth)
         seen = unwrapper.visible(SIZE)
         np.testing.assert_array_equal(
@@ -243,7 +259,7 @@ class TestMasks:
         mask[: SIZE[0] // 2] = 0  # the upper half of the picture looks forward
         path = tmp_path / 'mask.png'
         cv2.imwrite(str(path), mask)
-        seen = Unwrapper(CameraConfig(mask_file=str(path)), SMALL).visible(SIZE)
+        seen = Unwrapper(mirror(mask_file=str(path)), SMALL).visible(SIZE)
         assert not seen[:, 46:134].any()
         assert seen[:, :44].all()
         assert seen[:, 136:].all()
@@ -251,7 +267,7 @@ class TestMasks:
     def test_a_mask_follows_the_size_of_the_picture(self, tmp_path):
         path = tmp_path / 'mask.png'
         cv2.imwrite(str(path), np.vstack([np.zeros((50, 100)), np.full((50, 100), 255)]))
-        seen = Unwrapper(CameraConfig(mask_file=str(path)), SMALL).visible(SIZE)
+        seen = Unwrapper(mirror(mask_file=str(path)), SMALL).visible(SIZE)
         assert 0.48 < seen.mean() < 0.52
 
     def test_what_is_outside_the_picture_is_filled(self):
@@ -263,7 +279,7 @@ class TestMasks:
 
     def test_rows_beyond_the_camera_repeat_the_last_seen(self):
         panorama = PanoramaConfig(width=90, height=40, elevation_min=-10.0, elevation_max=60.0)
-        unwrapper = Unwrapper(CameraConfig(), panorama)
+        unwrapper = Unwrapper(mirror(), panorama)
         result = unwrapper(picture_of(smooth))
         seen = unwrapper.visible(SIZE)
         first = int(np.argmax(seen.all(axis=1)))
@@ -274,10 +290,10 @@ class TestMasks:
     @pytest.mark.parametrize(
         ('config', 'words'),
         [
-            (CameraConfig(blind_sectors=(0.0,)), 'a start and an end'),
-            (CameraConfig(mask_file='nowhere.png'), 'nowhere.png'),
-            (CameraConfig(blind_sectors=(0.0, 359.999)), 'sees no part'),
-            (CameraConfig(blind_sectors=(-180.0, 180.0)), 'sees no part'),
+            (mirror(blind_sectors=(0.0,)), 'a start and an end'),
+            (mirror(mask_file='nowhere.png'), 'nowhere.png'),
+            (mirror(blind_sectors=(0.0, 359.999)), 'sees no part'),
+            (mirror(blind_sectors=(-180.0, 180.0)), 'sees no part'),
         ],
     )
     def test_impossible_masks_say_what_is_wrong(self, config, words):
@@ -308,7 +324,7 @@ def test_the_nearest_visible_pixel_goes_around_the_back():
 )
 def test_wrong_pictures_are_refused(picture):
     with pytest.raises(CameraError):
-        Unwrapper(CameraConfig(), SMALL)(picture)
+        Unwrapper(mirror(), SMALL)(picture)
 
 
 @pytest.mark.parametrize('shape', [(20, 40_000, 3), (40_000, 20, 3)])
@@ -324,7 +340,7 @@ def test_an_empty_range_of_elevations_is_refused():
 
 
 def test_images_of_several_sizes():
-    unwrapper = Unwrapper(CameraConfig(), SMALL)
+    unwrapper = Unwrapper(mirror(), SMALL)
     expected = direct(smooth, SMALL)
     for size in ((400, 400), (320, 320), (400, 400), (200, 200), (100, 100), (120, 120)):
         result = unwrapper(picture_of(smooth, size=size))
@@ -364,7 +380,7 @@ class TestNormalization:
             assert result.std() == 0
 
     def test_works_in_the_unwrapper(self):
-        config = CameraConfig(normalization='exposure')
+        config = mirror(normalization='exposure')
         result = Unwrapper(config, SMALL)(picture_of(smooth) // 3)
         grey = cv2.cvtColor(result, cv2.COLOR_BGR2GRAY)
         assert 105 < grey.mean() < 115

@@ -64,11 +64,12 @@ def unwrapped(*settings: Any) -> Any:
 
 
 def of_camera(settings: CameraConfig) -> Any:
-    return unwrapped(settings, PanoramaConfig())
+    model = settings.camera_model or 'mirror'  # without one there is no panorama
+    return unwrapped(dataclasses.replace(settings, camera_model=model), PanoramaConfig())
 
 
 def of_panorama(settings: PanoramaConfig) -> Any:
-    return unwrapped(CameraConfig(), settings)
+    return unwrapped(CameraConfig(camera_model='mirror'), settings)
 
 
 def of_bag(settings: BagConfig, folder: Path) -> Any:
@@ -150,7 +151,11 @@ OBSERVE: dict[type[Settings], Callable[..., Any]] = {
 }
 START = {'initial_pose': (0.0, 0.0, 0.0)}
 SPECIAL: dict[type[Settings], dict[str, Other]] = {
-    CameraConfig: {'mount_rpy': Other((0.0, 0.0, 30.0)), 'blind_sectors': Other((10.0, 60.0))},
+    CameraConfig: {
+        'camera_model': Other('equirectangular'),
+        'mount_rpy': Other((0.0, 0.0, 30.0)),
+        'blind_sectors': Other((10.0, 60.0)),
+    },
     FilterConfig: {
         'initial_pose': Other((1.0, -1.0, 0.5)),
         'initial_position_std': Other(1.0, START),

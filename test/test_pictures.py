@@ -33,9 +33,9 @@ PIXELS = {
     'bgra8': ([1, 2, 3, 4], (1, 2, 3)), '8UC4': ([1, 2, 3, 4], (1, 2, 3)),
     'rgba8': ([1, 2, 3, 4], (3, 2, 1)),
     'mono16': ([9, 200], (200, 200, 200)), '16UC1': ([9, 200], (200, 200, 200)),
-    'bgr16': ([0, 1, 0, 2, 0, 3], (1, 2, 3)), 'rgb16': ([0, 1, 0, 2, 0, 3], (3, 2, 1)),
-    'bgra16': ([0, 1, 0, 2, 0, 3, 0, 4], (1, 2, 3)),
-    'rgba16': ([0, 1, 0, 2, 0, 3, 0, 4], (3, 2, 1)),
+    'bgr16': ([0, 64, 0, 2, 0, 3], (64, 2, 3)), 'rgb16': ([0, 64, 0, 2, 0, 3], (3, 2, 64)),
+    'bgra16': ([0, 64, 0, 2, 0, 3, 0, 4], (64, 2, 3)),
+    'rgba16': ([0, 64, 0, 2, 0, 3, 0, 4], (3, 2, 64)),
 }  # fmt: skip
 """Bytes of one pixel, and the blue, green and red that they are."""
 
@@ -60,6 +60,23 @@ def test_packed_and_planar_yuv():
     for encoding, chroma in {'nv12': (90, 240), 'nv21': (240, 90)}.items():
         image = decode_image(bytes([81] * 8 + list(chroma) * 2), 2, 4, 4, encoding)
         np.testing.assert_allclose(image, np.full((2, 4, 3), (0, 0, 254)), atol=2)
+
+
+@pytest.mark.parametrize('bits', [10, 12, 14, 16])
+def test_of_16_bits_those_count_that_the_sensor_has(bits, picture):
+    """In a message and in a PNG, gray and in color; a dark image stays dark."""
+    picture[0, 0] = 255
+    words = picture.astype(np.uint16) << (bits - 8)
+    color = decode_image(words.tobytes(), 6, 8, 48, 'bgr16')
+    swapped = decode_image(words.byteswap().tobytes(), 6, 8, 48, 'bgr16', True)
+    packed = decode_compressed(encode_png(words), 'bgr16; png compressed bgr16')
+    for image in (color, swapped, packed):
+        np.testing.assert_array_equal(image, picture)
+    gray = np.repeat(picture[..., :1], 3, 2)
+    mono = np.ascontiguousarray(words[..., 0])
+    np.testing.assert_array_equal(decode_image(mono.tobytes(), 6, 8, 16, 'mono16'), gray)
+    np.testing.assert_array_equal(decode_compressed(encode_png(mono), 'mono16; png'), gray)
+    assert decode_image((mono // mono.max() * 40).tobytes(), 6, 8, 16, 'mono16').max() <= 10
 
 
 @pytest.mark.parametrize('depth', [8, 16])

@@ -31,19 +31,23 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
 _RAYS = 360  # directions from the center in which edges are looked for
-_TOLERANCE_PX = (
-    2.0  # from an edge to the circle that it supports: a blurred edge may lie this far off
-)
+_SEARCHED_PX = 640  # longer side at which circles are looked for: a soft rim is as narrow in all
+_COARSE_PX, _COARSE_STEP, _COARSE_RAYS = 160, 4, 48  # and at which circles are tried one by one
+_TOLERANCE = 0.012  # of the radius, from an edge to the circle that it supports
 _TRIALS = 400  # random circles; enough to find the rim among two thirds of wrong edges
 _ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
-_SEARCHED_PX = 4096  # rows or columns; larger images are shrunk before circles are looked for
+# Beside a circle, as shares of its radius: beyond the tenth over which light falls off at a rim.
+_BESIDE = np.array([0.03, 0.06, 0.09])
+_CONTRAST = 0.06  # of the range of a cue: more than its noise, less than a dim scene beside the rim
+_RIM_SUPPORT, _HOLE_SUPPORT = 0.3, 0.6  # a rim may be cut off, a hole is whole
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
     """A circle in an image: column and row of its center and radius in pixels.
 
-    `support` is the share of the directions around it in which an edge lies on it.
+    `support` is the share of the directions around it, of those in the image, in which an edge
+    lies on it.
     """
 
     column: float
@@ -95,22 +99,23 @@ def read_images(paths: Sequence[Path]) -> Sequence[Image]:
 def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     """Find the rim of the mirror, and its hole, in images (H, W, 3) of one size.
 
-    The rim is where, coming from outside, the image first becomes bright or, with several
-    images taken while driving, first changes: what stands out better. The hole likewise, coming
-    from the center. Raises CameraError when no circle stands out.
+    All around the rim the image is dark just outside of it or, with several images taken while
+    driving, does not change: what stands out better. The same holds just inside of the hole.
+    Raises CameraError when no circle stands out.
     """
     rng = np.random.default_rng(seed)
-    shrink = -(-max(images[0].shape) // _SEARCHED_PX)
-    cues = [(cue, _threshold(cue)) for cue in _cues(images, shrink)]
-    rims = [_find_rim(cue, threshold, rng) for cue, threshold in cues]
-    rim = _best(rims)
+    scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
+    cues = _cues(images, scale)
+    rim = _best([_find_circle(cue, rng, None) for cue in cues])
     if rim is None:
+        few = len(images) < _ENOUGH_FOR_MOTION
+        more = f'{_ENOUGH_FOR_MOTION} or more, not {len(images)}' if few else 'others'
         raise CameraError(
-            'no mirror or fisheye stands out: take several images while driving in good light, '
+            f'no mirror or fisheye stands out: take images ({more}) while driving in good light, '
             'or give --center and --radii'
         )
-    hole = _best([_find_hole(cue, rim, threshold, rng) for cue, threshold in cues])
-    return MirrorCircles(_enlarged(rim, shrink), hole and _enlarged(hole, shrink))
+    hole = _best([_find_circle(cue, rng, rim) for cue in cues])
+    return MirrorCircles(_enlarged(rim, scale), hole and _enlarged(hole, scale))
 
 
 def _best(circles: Sequence[Circle | None]) -> Circle | None:
@@ -118,18 +123,17 @@ def _best(circles: Sequence[Circle | None]) -> Circle | None:
     return max(found, key=lambda circle: circle.support, default=None)
 
 
-def _enlarged(circle: Circle, factor: int) -> Circle:
-    """The circle of an image that was shrunk by a factor, in the image."""
-    shift = (factor - 1) / 2  # between the middles of the first pixels of both
-    column, row = circle.column * factor + shift, circle.row * factor + shift
-    return Circle(column, row, circle.radius * factor, circle.support)
+def _enlarged(circle: Circle, scale: float) -> Circle:
+    """The circle of an image that was shrunk to a scale, in the image."""
+    column, row = (circle.column + 0.5) / scale - 0.5, (circle.row + 0.5) / scale - 0.5
+    return Circle(column, row, circle.radius / scale, circle.support)
 
 
-def _cues(images: Sequence[Image], shrink: int) -> list[Array]:
+def _cues(images: Sequence[Image], scale: float) -> list[Array]:
     """What distinguishes the mirror from its surroundings (h, w), 0..255: brightness, change."""
-    shape = _shrunk(images[0], shrink).shape
+    shape = _shrunk(images[0], scale).shape
     brightness, squares = np.zeros(shape), np.zeros(shape)
-    for shrunk in map(partial(_shrunk, factor=shrink), images):
+    for shrunk in map(partial(_shrunk, scale=scale), images):
         gray = cv2.GaussianBlur(shrunk, (0, 0), 1.0)
         cv2.accumulate(gray, brightness)
         cv2.accumulateSquare(gray, squares)
@@ -138,70 +142,112 @@ def _cues(images: Sequence[Image], shrink: int) -> list[Array]:
         return [brightness]
     variance = squares / len(images) - brightness**2
     change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)
-    scale = 255 / max(float(np.quantile(change, 0.95)), 1e-9)
-    scaled = np.minimum(change * scale, 255)
-    return [brightness, np.asarray(scaled)]
+    return [brightness, np.asarray(change, float)]
 
 
-def _shrunk(image: Image, factor: int) -> Image:
-    """The image in gray, each side of it divided by a factor."""
-    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    height, width = (max(side // factor, 1) for side in gray.shape)
-    whole = gray[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+def _shrunk(image: Image, scale: float) -> Array:
+    """The image in gray, each side of it times a scale."""
+    return _scaled(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), scale)
 
 
-def _threshold(cue: Array) -> float:
-    """A little above the darkness around the mirror, judged by the darker side of Otsu's split."""
-    coarse = np.clip(cue, 0, 255).astype(np.uint8)
-    split, _ = cv2.threshold(coarse, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    dark, bright = cue[cue <= split], cue[cue > split]
-    low = float(np.median(dark)) if dark.size else 0.0
-    high = float(np.median(bright)) if bright.size else 255.0
-    return low + 0.25 * (high - low)
+def _scaled(cue: Any, scale: float) -> Array:
+    size = max(round(cue.shape[1] * scale), 1), max(round(cue.shape[0] * scale), 1)
+    return np.asarray(cv2.resize(cue, size, interpolation=cv2.INTER_AREA))
 
 
-def _find_rim(cue: Array, threshold: float, rng: np.random.Generator) -> Circle | None:
-    middle = _middle(cue > threshold)
-    if middle is None:
+def _find_circle(cue: Array, rng: np.random.Generator, rim: Circle | None) -> Circle | None:
+    """The rim in a cue (h, w), or the hole about the middle of a rim that was found."""
+    low, high = np.quantile(cue, (0.02, 0.98))
+    contrast = _CONTRAST * (high - low)
+    if contrast < 1.0:
         return None
-    rim = _fit_circle(_edges(cue, middle, threshold, outermost=True), rng)
-    return rim if rim is not None and rim.support >= 0.3 else None
-
-
-def _middle(bright: NDArray[np.bool_]) -> Array | None:
-    """A point well inside the mirror: the middle of the largest bright area's bounding box."""
-    count, _, boxes, _ = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
-    if count < 2:
+    scale = min(_COARSE_PX / max(cue.shape), 1.0)
+    start = _coarse_circle(_scaled(cue, scale), contrast, rim, scale)
+    circle = None
+    for _ in range(2):
+        points = _edges(cue, start, contrast, rim is not None)
+        circle = _fit_circle(points, rng)
+        if circle is None:
+            return None
+        start = np.array([circle.column, circle.row, circle.radius])
+    if circle is None or circle.support < (_HOLE_SUPPORT if rim else _RIM_SUPPORT):
         return None
-    x, y, w, h, _ = boxes[1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))]
-    return np.array([x + (w - 1) / 2, y + (h - 1) / 2])
+    _, dark = _sides(cue, start[None, :2], circle.radius, _RAYS, rim is not None)
+    return dataclasses.replace(circle, support=circle.support / float(np.isfinite(dark).mean()))
 
 
-def _edges(
-    cue: Array, start: Array, threshold: float, outermost: bool, reach_px: float = 0.0
-) -> Array:
-    """Points (N, 2) where the cue crosses the threshold along rays from `start`; N <= rays.
-
-    The outermost crossing, or the innermost one. A ray that has none within `reach_px` (or in
-    the image), or still is bright at its border, gives no point.
-    """
+def _coarse_circle(cue: Array, contrast: float, rim: Circle | None, scale: float) -> Array:
+    """Column, row, radius at scale 1 of the circle that the cue, shrunk to a scale, shows best."""
     height, width = cue.shape
-    longest = reach_px or float(np.hypot(height, width))
-    radii = np.arange(0.0, longest, 0.25)
+    if rim is None:
+        middle = np.array([width, height]) / 2
+        steps = [np.arange(-0.3, 0.31, _COARSE_STEP / side) * side for side in (width, height)]
+        radii = np.geomspace(0.2 * min(cue.shape), 0.6 * math.hypot(*cue.shape), 40)
+    else:
+        middle, reach = np.array([rim.column, rim.row]) * scale, rim.radius * scale
+        steps = [np.linspace(-0.1, 0.1, 7) * reach] * 2
+        radii = np.geomspace(max(0.05 * reach, 2.0), 0.6 * reach, 30)
+    centers = middle + np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    best, found = -np.inf, np.array([*middle, radii[0]])
+    for radius in radii:
+        bright, dark = _sides(cue, centers, radius, _COARSE_RAYS, rim is not None)
+        seen = np.isfinite(dark).mean(1)
+        kept = seen >= _RIM_SUPPORT
+        if not kept.any():
+            continue
+        bright, dark = bright[kept], dark[kept]
+        level = np.nanmedian(dark, axis=1, keepdims=True) + contrast
+        score = np.mean((bright > level) & (dark < level), 1) - np.mean(dark >= level, 1)
+        score /= seen[kept] + _RIM_SUPPORT  # what a border cuts off says nothing
+        if score.max() > best:
+            best = float(score.max())
+            found = np.array([*centers[kept][np.argmax(score)], radius])
+    return found / scale
+
+
+def _sides(cue: Array, centers: Array, radius: float, rays: int, hole: bool) -> tuple[Array, Array]:
+    """Means (N, rays) on both sides of circles about centers (N, 2), NaN outside of the image.
+
+    First that where a mirror shows something: inside of a rim, outside of a hole.
+    """
+    angles = np.arange(rays) * 2 * np.pi / rays
+    height, width = cue.shape
+    sides = []
+    for factors in (1 - _BESIDE, 1 + _BESIDE):
+        reach = radius * factors[:, None, None]
+        columns = centers[:, 0, None] + reach * np.cos(angles)
+        rows = centers[:, 1, None] + reach * np.sin(angles)
+        inside = (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
+        values = cue[
+            np.where(inside, rows, 0).astype(int), np.where(inside, columns, 0).astype(int)
+        ]
+        count = inside.sum(0)
+        sides.append(
+            np.where(count, np.where(inside, values, 0).sum(0) / np.maximum(count, 1), np.nan)
+        )
+    return (sides[1], sides[0]) if hole else (sides[0], sides[1])
+
+
+def _edges(cue: Array, start: Array, contrast: float, hole: bool) -> Array:
+    """Points (N, 2) near a circle where the cue passes the middle between its two sides."""
+    bright, dark = (side[0] for side in _sides(cue, start[None, :2], start[2], _RAYS, hole))
+    level = np.median(dark[np.isfinite(dark)]) if np.isfinite(dark).any() else np.inf
+    factors = np.arange(0.85, 1.15, 0.25 / start[2])
     angles = np.arange(_RAYS) * 2 * np.pi / _RAYS
-    columns = start[0] + radii * np.cos(angles)[:, None]
-    rows = start[1] + radii * np.sin(angles)[:, None]
+    columns = start[0] + start[2] * factors * np.cos(angles)[:, None]
+    rows = start[1] + start[2] * factors * np.sin(angles)[:, None]
+    height, width = cue.shape
     inside = (columns >= 0) & (columns <= width - 1) & (rows >= 0) & (rows <= height - 1)
     maps = columns.astype(np.float32), rows.astype(np.float32)
-    bright = (cv2.remap(cue.astype(np.float32), *maps, cv2.INTER_LINEAR) > threshold) & inside
-    last = inside.sum(axis=1) - 1
-    if outermost:
-        index = radii.size - 1 - np.argmax(bright[:, ::-1], axis=1)
-        found = bright.any(axis=1) & (index < last - 2)
+    values = cv2.remap(cue.astype(np.float32), *maps, cv2.INTER_LINEAR)
+    above = (values > ((np.fmax(bright, level) + level) / 2)[:, None]) & inside
+    seen = (bright > level + contrast) & (dark < level + contrast)
+    if hole:
+        index = np.argmax(above, axis=1)
+        found = seen & above.any(1) & (index > 0)
     else:
-        index = np.argmax(bright, axis=1)
-        found = bright.any(axis=1) & (index > 0)
+        index = factors.size - 1 - np.argmax(above[:, ::-1], axis=1)
+        found = seen & above.any(1) & (index < inside.sum(1) - 3)
     picked = np.flatnonzero(found), index[found]
     return np.column_stack([columns[picked], rows[picked]])
 
@@ -212,15 +258,14 @@ def _fit_circle(points: Array, rng: np.random.Generator) -> Circle | None:
         return None
     best = np.zeros(len(points), bool)
     for _ in range(_TRIALS):
-        circle = _least_squares(points[rng.choice(len(points), 3, replace=False)])
-        agree = _distances(points, circle) < _TOLERANCE_PX
+        agree = _agree(points, _least_squares(points[rng.choice(len(points), 3, replace=False)]))
         if agree.sum() > best.sum():
             best = agree
     for _ in range(3):
         if best.sum() < 3:
             return None
         circle = _least_squares(points[best])
-        best = _distances(points, circle) < _TOLERANCE_PX
+        best = _agree(points, circle)
     return Circle(float(circle[0]), float(circle[1]), float(circle[2]), float(best.sum() / _RAYS))
 
 
@@ -233,21 +278,10 @@ def _least_squares(points: Array) -> Array:
     return np.array([a + origin[0], b + origin[1], np.sqrt(max(c + a**2 + b**2, 0.0))])
 
 
-def _distances(points: Array, circle: Array) -> Array:
-    return np.asarray(np.abs(np.hypot(*(points - circle[:2]).T) - circle[2]))
-
-
-def _find_hole(
-    cue: Array, rim: Circle, threshold: float, rng: np.random.Generator
-) -> Circle | None:
-    """The dark or unchanging disc about the rim's center, if there is one."""
-    center = np.array([rim.column, rim.row])
-    points = _edges(cue, center, threshold, outermost=False, reach_px=0.6 * rim.radius)
-    hole = _fit_circle(points, rng)
-    if hole is None or hole.support < 0.4:
-        return None
-    off_center = np.hypot(hole.column - rim.column, hole.row - rim.row)
-    return hole if off_center < 0.1 * rim.radius else None
+def _agree(points: Array, circle: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2) lie on a circle."""
+    off = np.hypot(*(points - circle[:2]).T) - circle[2]
+    return np.asarray(np.abs(off) < _TOLERANCE * circle[2])
 
 
 def calibrate(
@@ -395,14 +429,17 @@ def _write(drawn: Image, text: str, place: Array, color: tuple[int, int, int]) -
 
 
 def _label(strip: Image, panorama: PanoramaConfig) -> None:
-    """Draw the directions and the horizon into a panorama."""
+    """Draw the directions, the horizon, and every ten degrees above and below it."""
     height, width = strip.shape[:2]
     left_to_right = ('BACK', 'LEFT', 'FRONT', 'RIGHT')
     sides = left_to_right if panorama.clockwise else ('BACK', 'RIGHT', 'FRONT', 'LEFT')
-    span = panorama.elevation_max - panorama.elevation_min
-    horizon = panorama.elevation_max / span * height - 0.5
-    if 0 <= horizon < height:
-        cv2.line(strip, (0, round(horizon)), (width, round(horizon)), _GREEN, 1)
+    low, high = panorama.elevation_min, panorama.elevation_max
+    for elevation in range(-80, 90, 10):
+        row = round((high - elevation) / (high - low) * height - 0.5)
+        if 0 <= row < height:
+            cv2.line(strip, (0, row), (width, row), _GREEN, 1 if elevation else 2)
+            name = f'{elevation:+d} deg' if elevation else 'HORIZON'
+            _write(strip, name, np.array([width // 8, row - 3]), _GREEN)
     for quarter, name in enumerate(sides):
         column = quarter * width // 4
         cv2.line(strip, (column, 0), (column, height), _RED, 1)

@@ -3,13 +3,15 @@
 """Calibration files: the package's own, and those of other tools.
 
 The package's own is YAML with the fields of `LensCalibration`. Of other tools: camera_info as YAML
-(also as printed by ``ros2 topic echo``), what OpenCV's FileStorage writes (pinhole, fisheye,
-omnidir), Kalibr's camchain, camodocal's MEI and KANNALA_BRANDT, and OCamCalib's calib_results.txt.
+(also as printed by ``ros2 topic echo``, and camera_calibration's ost.yaml), what OpenCV's
+FileStorage writes (pinhole, fisheye, omnidir; YAML or XML), Kalibr's camchain, camodocal's MEI and
+KANNALA_BRANDT, stella_vslam, ORB-SLAM3, and OCamCalib's calib_results.txt.
 """
 
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,10 +25,11 @@ from sfa_localization.data.plain_yaml import load_yaml
 from sfa_localization.data.rejections import short_line
 
 _KNOWN = (
-    'known are camera_info, OpenCV, Kalibr and camodocal YAML, OCamCalib calib_results.txt, and '
-    'what the command calibrate writes'
+    'known are camera_info, OpenCV, Kalibr, camodocal, stella_vslam and ORB-SLAM3 YAML, OpenCV '
+    'XML, OCamCalib calib_results.txt, and what the command calibrate writes'
 )
 _PLUMB_BOB = ('', 'none', 'plumb_bob', 'radtan', 'rational_polynomial')
+_SLAM = {'Camera', 'Camera1'}
 _FISHEYE = ('equidistant', 'equi', 'fisheye', 'kannala_brandt')
 _OF_EVERY_CAMERA = (
     *('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min', 'radius_max'),
@@ -50,9 +53,18 @@ _HEAD = f"""\
 
 
 def calibration_of(camera: CameraConfig) -> LensCalibration:
-    """The lens that the camera's parameters name: its calibration_file, or its camera_model."""
+    """The lens that the camera's parameters name: its calibration_file, or its camera_model.
+
+    Raises CameraError where they name none.
+    """
     if camera.calibration_file:
         return read_calibration(Path(camera.calibration_file))
+    if not camera.camera_model:
+        raise CameraError(
+            'images are no panoramas, and no camera is described: in the parameter file set '
+            'calibration_file (see the command calibrate), or camera_model to equirectangular or '
+            'panorama, in the section /**/omnicam_node; inspect prints what to write'
+        )
     return LensCalibration(camera_model=camera.camera_model)
 
 
@@ -118,18 +130,52 @@ def _from_yaml(text: str) -> dict[str, Any]:
     text = re.sub(r'\A%YAML:1\.0\s*', '', text)
     try:
         # A topic that is echoed ends each message with a document mark.
-        content = load_yaml(text, _Loader, first=True)
+        content = _xml(text) if text[:1] == '<' else load_yaml(text, _Loader, first=True)
     except ValueError as error:
         raise CameraError(f'{error}; {_KNOWN}') from None
     if not isinstance(content, Mapping):
         raise CameraError(f'no camera calibration; {_KNOWN}')
-    if 'camera_model' in content:
+    if any(str(key).partition('.')[0] in _SLAM for key in content):
+        return _from_slam(content)
+    if 'camera_model' in content and not {'camera_matrix', 'K', 'k'} & set(content):
         return _from_own(content)
     if 'cam0' in content:
         return _from_kalibr(content['cam0'])
     if 'model_type' in content:
         return _from_camodocal(content)
     return _from_matrix(content)
+
+
+def _xml(text: str) -> dict[str, Any]:
+    """What OpenCV's FileStorage writes as XML. Raises ValueError."""
+    if '<!' in re.sub('<!--.*?-->', '', text, flags=re.DOTALL):
+        raise ValueError('XML with definitions of its own')  # which may grow without limit
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f'is not XML ({error})') from None
+    return {part.tag: (part.findtext('data') or part.text or '').split() for part in root}
+
+
+def _from_slam(content: Mapping[str, Any]) -> dict[str, Any]:
+    """stella_vslam, and ORB-SLAM3: entries Camera.fx or Camera1.fx, or fx below Camera."""
+    camera: dict[str, Any] = {}
+    for key, value in content.items():
+        head, _, name = str(key).partition('.')
+        if head in _SLAM:
+            camera |= {name: value} if name else dict(value)
+    model = str(camera.get('model', camera.get('type', ''))).lower()
+    if model == 'equirectangular':
+        return {'camera_model': model}
+    names = {'perspective': ('k1', 'k2', 'p1', 'p2', 'k3'), 'fisheye': ('k1', 'k2', 'k3', 'k4')}
+    names |= {'pinhole': names['perspective'], 'kannalabrandt8': names['fisheye']}
+    if model not in names:
+        raise CameraError(f'camera model {model!r} of a SLAM program is not supported')
+    focal = [float(camera[key]) for key in ('fx', 'fy', 'cx', 'cy')]
+    distortion = [float(camera.get(key, 0.0)) for key in names[model]]
+    kind = 'fisheye' if names[model] == names['fisheye'] else 'plumb_bob'
+    size = (camera.get(a, camera.get(b, 0)) for a, b in (('cols', 'width'), ('rows', 'height')))
+    return {**_lens(kind, focal, distortion), **_size(*size)}
 
 
 def _from_own(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,7 +230,7 @@ def _from_matrix(content: Mapping[str, Any]) -> dict[str, Any]:
     focal = [matrix[0], matrix[4], matrix[2], matrix[5]]
     names = ('distortion_coefficients', 'D', 'd', 'distCoeffs', 'dist_coeffs')
     distortion = _numbers(_first(content, *names))
-    kind = str(content.get('distortion_model', ''))
+    kind = str(content.get('distortion_model', content.get('camera_model', '')))
     if content.get('fisheye_model'):
         kind = 'fisheye'
     xi = _numbers(content.get('xi', [0.0]))[0]
@@ -195,7 +241,7 @@ def _from_matrix(content: Mapping[str, Any]) -> dict[str, Any]:
 def _size_in(content: Mapping[str, Any]) -> dict[str, Any]:
     for names in (('image_width', 'image_height'), ('width', 'height')):
         if names[0] in content:
-            return _size(content[names[0]], content[names[1]])
+            return _size(*(_numbers(content[name])[0] for name in names))
     return _size(0, 0)
 
 

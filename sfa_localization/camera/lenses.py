@@ -388,8 +388,10 @@ def _scale(calibration: LensCalibration, size: tuple[int, int]) -> Array:
     if abs(scale[0] / scale[1] - 1.0) > _ASPECT_TOLERANCE:
         raise CameraError(
             f'the image is {width} x {height} but the camera is calibrated for '
-            f'{calibrated[0]} x {calibrated[1]}: name the calibration_file of this camera (see the '
-            'command calibrate), or set camera_model to panorama where images are panoramas already'
+            f'{calibrated[0]} x {calibrated[1]}, which is no scaling of it: name the '
+            'calibration_file of this camera, or, if the images were cropped to calibrate it, add '
+            'the columns and rows cut off at the left and top to its cx and cy, and set '
+            'image_width and image_height'
         )
     return scale
 

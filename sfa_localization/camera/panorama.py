@@ -83,8 +83,15 @@ class Unwrapper:
 
     @cached_property
     def calibration(self) -> LensCalibration:
-        """The lens. Raises CameraError when its file cannot be used."""
+        """The lens. Raises CameraError where none is described, or its file cannot be used."""
         return self._calibration or calibration_of(self.camera)
+
+    @property
+    def model(self) -> str:
+        """The camera model; '' where none is described. Raises CameraError as `calibration`."""
+        camera = self.camera
+        described = self._calibration or camera.calibration_file or camera.camera_model
+        return self.calibration.camera_model if described else ''
 
     def __call__(self, image: Image) -> Image:
         """Unwrap a BGR image (H, W, 3) uint8 to (panorama.height, panorama.width, 3) uint8.
@@ -110,10 +117,9 @@ class Unwrapper:
 
     def is_panorama(self, size: tuple[int, int]) -> bool:
         """Whether images of `size` (rows, columns) are panoramas already, so only resized."""
-        model = self.calibration.camera_model
-        if model == 'panorama':
+        if self.model == 'panorama':
             return not any(self.camera.mount_rpy[:2])
-        return model != 'equirectangular' and looks_like_panorama(*size)
+        return self.model != 'equirectangular' and looks_like_panorama(*size)
 
     def _aligned(self, image: Image) -> Image:
         """A panorama, resized; if the camera makes them, also turned to the convention."""
@@ -123,7 +129,7 @@ class Unwrapper:
         result = image.copy()
         if image.shape[:2] != (height, width):
             result = np.asarray(cv2.resize(image, (width, height), interpolation=method))
-        if self.calibration.camera_model != 'panorama':
+        if self.model != 'panorama':
             return result
         shift = -round(self.camera.mount_rpy[2] / 360.0 * width)
         if self.calibration.is_mirrored:

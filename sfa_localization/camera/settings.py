@@ -90,16 +90,17 @@ class CameraConfig(Settings):
     """The omnidirectional camera on the robot, and what hides its view."""
 
     camera_model: str = setting(
-        'mirror',
+        '',
         'camera without a calibration_file: mirror (that of the simulator), equirectangular, or '
-        'panorama (the image is a panorama already)',
-        choices=('mirror', *UNCALIBRATED),
+        'panorama (the image is a panorama already); empty: none, and only images that are 3.5 '
+        'times as wide as high are used, as panoramas',
+        choices=('', 'mirror', *UNCALIBRATED),
     )
     calibration_file: str = setting(
         '',
         'calibration of the camera, which replaces camera_model: the file that the command '
-        'calibrate writes, camera_info, OpenCV, Kalibr or camodocal YAML, or OCamCalib '
-        'calib_results.txt; empty: none',
+        'calibrate writes, OCamCalib calib_results.txt, or that of camera_info, OpenCV, Kalibr, '
+        'camodocal, stella_vslam or ORB-SLAM3; empty: none',
     )
     mount_rpy: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0),

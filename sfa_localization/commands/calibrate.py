@@ -5,28 +5,43 @@
 from __future__ import annotations
 
 import argparse
+import itertools
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
+from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import (
     CalibrationConfig,
     CameraConfig,
     LensCalibration,
     PanoramaConfig,
 )
-from sfa_localization.commands.options import add_settings, given, numbers, require_kind, settings
+from sfa_localization.commands.options import (
+    add_settings,
+    add_topics,
+    given,
+    numbers,
+    require_kind,
+    settings,
+)
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import require_outputs
+from sfa_localization.data.run import Image
 
 WRITES = 'with --output a calibration file, with --check an image; else nothing'
 EXAMPLES = """\
+  calibrate my_garden --check check.png --output camera.yaml
   calibrate drive/*.png --check check.png --output camera.yaml
   calibrate image.png --model fisheye --field-of-view 190 --check check.png
   calibrate image.png --calibration calib_results.txt --mirrored yes --axis down \\
       --check check.png --output camera.yaml
   calibrate --calibration camchain.yaml --output camera.yaml
 
-The check image marks the assumed FRONT, LEFT, BACK and RIGHT of the robot, and the elevations of
-the panorama. Correct it with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90), --axis and --mirrored.
+Look at the check image: it marks the assumed FRONT, LEFT, BACK and RIGHT of the robot, and in the
+panorama below the horizon. Correct the directions with --mount-rpy (ROLLxPITCHxYAW, as 0x0x90),
+--axis and --mirrored, the horizon of a mirror with --angle-min and --angle-max: where it lies 5
+degrees above its line, take 5 off both. From circles alone nobody knows these angles.
 omnicam_node reads the file as its parameter calibration_file.
 
 how to get each model:
@@ -37,15 +52,21 @@ how to get each model:
   ocam      OCamCalib: export calib_results.txt; a mirror needs --mirrored yes --axis down
   polar     (no calibration) from images, --angle-min and --angle-max"""
 LENS = ('angle_min', 'angle_max', 'axis', 'mirrored')
+_BAGS = {'.mcap', '.db3', '.bag'}  # with folders; all else is an image
+_SAMPLES = 8  # images of a bag: enough to show what changes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add images, calibration file, circles, outputs and the mounting of the camera."""
-    parser.add_argument('images', nargs='*', type=Path, metavar='IMAGE', help='raw images')
+    parser.add_argument(
+        'images', nargs='*', type=Path, metavar='IMAGE', help='raw images, or a bag of them'
+    )
+    add_topics(parser, 'image')
     parser.add_argument(
         '--calibration',
         type=Path,
-        help='camera_info, OpenCV, Kalibr or camodocal YAML, or OCamCalib calib_results.txt',
+        help='OCamCalib calib_results.txt, or the file of camera_info, OpenCV, Kalibr, camodocal, '
+        'stella_vslam or ORB-SLAM3',
     )
     parser.add_argument(
         '--center', type=numbers, help='COLUMNxROW of the mirror (px); default: detected'
@@ -70,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         calibration.require_own(arguments.output)
     if arguments.check:
         require_kind(arguments.check, '.png')
-    images = calibration.read_images(arguments.images)
+    images = _images(arguments)
     circles = None
     if arguments.center or arguments.radii:
         circles = calibration.given_circles(arguments.center, arguments.radii, images)
@@ -78,7 +99,6 @@ def run(arguments: argparse.Namespace) -> int:
     lens = calibration.calibrate(images, arguments.calibration, circles, config, known)
     camera = settings(CameraConfig, arguments)
     text = calibration_files.calibration_text(lens, camera.mount_rpy)
-    print(text, end='')
     if images:
         # Without --check too: what is written can be used.
         check = calibration.check_image(images[0], Unwrapper(camera, PanoramaConfig(), lens))
@@ -88,4 +108,23 @@ def run(arguments: argparse.Namespace) -> int:
         raise LocalizationError('--check needs an image of the camera to draw in')
     if arguments.output:
         calibration.write_calibration(arguments.output, text)
+    print(text, end='')
+    where = arguments.check or 'the image that --check CHECK.png writes'
+    print(f'look at {where}: does the horizon lie on its line?', file=sys.stderr)
     return 0
+
+
+def _images(arguments: argparse.Namespace) -> Sequence[Image]:
+    """The images of files, or some from all over the drive of a bag."""
+    from sfa_localization.bags.reader import Bag
+    from sfa_localization.camera.calibration import read_images
+
+    bags = [path for path in arguments.images if path.is_dir() or _BAGS & set(path.suffixes)]
+    if not bags:
+        return read_images(arguments.images)
+    if len(arguments.images) > 1:
+        raise LocalizationError('give one bag, or images')
+    with Bag(bags[0]) as bag:
+        topic = bag.find('image', settings(TopicNames, arguments).image)
+        every = max(bag.topics[topic].count // _SAMPLES, 1)
+        return [image for _, image in itertools.islice(bag.images(topic), 0, None, every)]

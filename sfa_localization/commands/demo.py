@@ -23,7 +23,7 @@ from sfa_localization.data.settings import Settings, setting
 if TYPE_CHECKING:
     from sfa_localization.data.run import Trajectory
     from sfa_localization.evaluation import Evaluation
-    from sfa_localization.training import Trained
+    from sfa_localization.training import Recipe, Trained
 
 WRITES = 'in its folder two bags, model.npz, report/ with figures, results.json, logs/'
 EXAMPLES = '  demo\n  demo --world 2 --out demo_of_world_2'
@@ -50,11 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demonstration; print the errors."""
+    from sfa_localization.camera.settings import CameraConfig
     from sfa_localization.commands.live_nodes import commands, run_live
     from sfa_localization.reports.evaluation import heading_table, table
     from sfa_localization.simulation.drive import simulate
     from sfa_localization.simulation.settings import SimulationConfig
-    from sfa_localization.training import train
+    from sfa_localization.training import Recipe, train
 
     out, config, start = arguments.out, settings(DemoConfig, arguments), time.monotonic()
 
@@ -68,7 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
         if not (out / drive).exists():
             simulate(replace(garden, trajectory=drive), out / drive, progress=True)
     announce('train on the first, without ground truth')
-    trained = train([out / 'coverage'], out / 'model.npz', progress=True, resume=True)
+    recipe = Recipe(camera=CameraConfig(camera_model='mirror'))
+    trained = train([out / 'coverage'], out / 'model.npz', recipe, progress=True, resume=True)
     announce('run the three nodes live on the second')
     live = run_live(
         commands(out / 'model.npz', out / 'test', config.rate),
@@ -76,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         on_end=lambda state: announce(f'the robot is {state or "silent"}'),
     )
     announce('compare with the truth')
-    result, offline_m = _compare(trained, live, out)
+    result, offline_m = _compare(trained, live, out, recipe)
     _write_results(out, result, trained)
     announce(f'live and offline differ by {offline_m:.3f} m on average; see {out / "report"}')
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
@@ -109,12 +111,14 @@ def prepare_folder(out: Path, config: DemoConfig) -> None:
 
 
 def _compare(
-    trained: Trained, live: Mapping[str, Trajectory], out: Path
+    trained: Trained, live: Mapping[str, Trajectory], out: Path, recipe: Recipe
 ) -> tuple[Evaluation, float]:
     """Evaluate the live estimates; also return their mean distance (m) from the offline ones."""
     from sfa_localization.evaluation import evaluate, moved, score
 
-    offline = evaluate(trained.model, out / 'test', align_bags=[out / 'coverage'], progress=True)
+    offline = evaluate(
+        trained.model, out / 'test', align_bags=[out / 'coverage'], recipe=recipe, progress=True
+    )
     in_truth = {name: moved(estimate, offline.transform) for name, estimate in live.items()}
     estimates = {**offline.estimates, **in_truth}
     scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}

@@ -119,7 +119,7 @@ def _float(where: str, value: float) -> float:
 def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
     if metadata['choices'] and value not in metadata['choices']:
         raise ConfigError(
-            f'{where}: {quoted(value)} is not one of {", ".join(metadata["choices"])}'
+            f'{where}: {quoted(value)} is not one of {", ".join(filter(None, metadata["choices"]))}'
         )
     if not isinstance(value, (int, float)) or isinstance(value, bool):
         return

@@ -200,15 +200,15 @@ class OmnicamNode(LocalizationNode):
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
         """Build the tables for the size of image that is, or will be, in use, if it is known."""
-        lens = unwrapper.calibration
-        size = self._size or (lens.image_height, lens.image_width)
-        if 0 not in size:
+        lens = unwrapper.calibration if unwrapper.model else None
+        size = self._size or (lens and (lens.image_height, lens.image_width)) or (0, 0)
+        if lens and 0 not in size:
             unwrapper.visible(size)
 
     # Health.
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        details = {'camera model': self._unwrapper.calibration.camera_model}
+        details = {'camera model': self._unwrapper.model}
         if self._size is not None:
             details['image'] = f'{self._size[1]} x {self._size[0]}'
         for judge in (self._judge_source, self._judge_images):

@@ -148,7 +148,7 @@ def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
     if meta['choices']:
-        made.additional_constraints = 'one of: ' + ', '.join(meta['choices'])
+        made.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
     if meta['low'] is not None or meta['high'] is not None:
         _bound(made, item.default, meta['low'], meta['high'])
     return made

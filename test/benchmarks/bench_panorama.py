@@ -24,7 +24,7 @@ from sfa_localization.camera.panorama import Unwrapper, build_tables
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 
 CAMERA, LENS = (
-    CameraConfig(),
+    CameraConfig(camera_model='mirror'),
     LensCalibration(
         image_width=1280,
         image_height=960,

@@ -1,0 +1,76 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of real cameras, turned in software as by a robot that turns on the spot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+FOLDER = Path(__file__).parent / 'cameras'
+DESK_CENTER, DESK_RADII = (243.2, 136.1), (58.7, 149.3)
+"""Of the mirror, in pixels."""
+
+
+def desk_mirror(count, step_deg=25.0, turns='mirror'):
+    """Pictures (270, 480, 3) of a mirror in a housing; the `mirror` turns, or the whole `picture`.
+
+    All have another noise.
+    """
+    still, rng = cv2.imread(str(FOLDER / 'desk_mirror.jpg')), np.random.default_rng(0)
+    rows, columns = np.mgrid[: still.shape[0], : still.shape[1]]
+    radius = np.hypot(columns - DESK_CENTER[0], rows - DESK_CENTER[1])
+    shown = (radius > DESK_RADII[0]) & (radius < DESK_RADII[1]) | (turns == 'picture')
+    for index in range(count):
+        turn = cv2.getRotationMatrix2D(DESK_CENTER, index * step_deg, 1.0)
+        turned = cv2.warpAffine(still, turn, still.shape[1::-1])
+        picture = np.where(shown[..., None], turned, still)
+        yield np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
+
+
+def street(count, step_deg=25.0):
+    """Equirectangular pictures (240, 480, 3)."""
+    picture = cv2.imread(str(FOLDER / 'street_equirectangular.jpg'))
+    for index in range(count):
+        yield np.roll(picture, round(index * step_deg / 360 * picture.shape[1]), axis=1)
+
+
+def ordinary(count, step_deg=25.0, size=(240, 320), field_deg=80.0):
+    """Pictures (H, W, 3) of an ordinary camera in the same street."""
+    height, width = size
+    focal = width / 2 / np.tan(np.radians(field_deg / 2))
+    rows, columns = (
+        np.mgrid[:height, :width] + 0.5 - np.array([height, width])[:, None, None] / 2
+    ) / focal
+    azimuth, elevation = np.arctan(columns), np.arctan2(-rows, np.hypot(columns, 1.0))
+    for picture in street(count, step_deg):
+        across = (azimuth / (2 * np.pi) + 0.5) * picture.shape[1]
+        along = (0.5 - elevation / np.pi) * picture.shape[0]
+        yield cv2.remap(
+            picture, across.astype(np.float32), along.astype(np.float32), cv2.INTER_LINEAR
+        )
+
+
+def fisheye(size, soft, cut=0.0, count=1, step_deg=25.0):
+    """Pictures (H, W, 3) of a fisheye that looks up from the street.
+
+    Its light falls off over the share `soft` of the radius, and the border cuts it off by `cut`.
+    """
+    height, width = size
+    center, radius = (width / 2 + 4, height / 2 - 6), min(size) / 2 * 0.97 * (1 + cut)
+    rows, columns = np.mgrid[:height, :width]
+    x, y = columns - center[0], rows - center[1]
+    off = np.hypot(x, y) / radius
+    light = 1 / (1 + np.exp(np.clip((off - 1) / soft * 4, -50, 50)))
+    pictures = []
+    for picture in street(count, step_deg):
+        high, wide = picture.shape[:2]
+        maps = (
+            (np.arctan2(x, y) / (2 * np.pi) + 0.5) * (wide - 1),
+            np.minimum(off * 100 / 180, 1) * (high - 1),
+        )
+        seen = cv2.remap(picture, *(part.astype(np.float32) for part in maps), cv2.INTER_LINEAR)
+        pictures.append((seen * light[..., None] + 3).astype(np.uint8))
+    return pictures
