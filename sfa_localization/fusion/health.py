@@ -236,8 +236,8 @@ class _Window:
         is_lever, is_turned, is_scale = (kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE))
         look, arm = np.exp(1j * (self._yaws - yaws)), np.exp(1j * yaws)
         weight = counted = np.ones(rows.shape) if used is None else used.astype(float)
-        lever, angle = np.zeros((len(rows), 1), complex), np.zeros((len(rows), 1))
-        factor: Array = np.ones((len(rows), 1))
+        angle, factor = np.zeros((len(rows), 1)), np.ones((len(rows), 1))
+        lever = angle + 0j
         for step in range(_STEPS):
             w, w_yaw = weight / self._variance, weight / self._yaw_variance
             total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
@@ -246,15 +246,10 @@ class _Window:
             u = (w * np.conj(path) * z).sum(1, keepdims=True)
             u = u + seen * np.exp(-1j * angle) * (1 - is_turned * (step == 0))
             u = u / np.maximum(np.abs(u), _TINY)
-            of_arm, of_path = (
-                (w * np.abs(x) ** 2).sum(1, keepdims=True) + std**-2
-                for x, std in ((g, LEVER_STD_M), (d, SCALE_STD))
-            )
+            of_arm, of_path, of_angle = _information(w, of_yaw, g, d)
             reach = (w * np.conj(g) * (z * np.conj(u) - d)).sum(1, keepdims=True)
-            lever = is_lever * reach / of_arm
             along = (w * (np.conj(u * d) * z).real).sum(1, keepdims=True) + SCALE_STD**-2
-            factor = np.where(is_scale, along / of_path, 1.0)
-            of_angle = of_yaw + TURNED_STD_RAD**-2
+            lever, factor = is_lever * reach / of_arm, np.where(is_scale, along / of_path, 1.0)
             angle = is_turned * np.angle(seen * np.conj(u)) * of_yaw / of_angle
             path = factor * d + lever * g
             apart = np.abs(z - u * path) ** 2 / self._variance
@@ -265,10 +260,15 @@ class _Window:
         square = (w * np.abs(path) ** 2).sum(1, keepdims=True) + of_yaw + _TINY
         log = (counted * np.log(anything)).sum(1, keepdims=True) - np.log(total)
         log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5) - 0.5 * np.log(square)
-        for it, size, std, known, count in (
-            (is_lever, lever, LEVER_STD_M, of_arm, 2),
-            (is_turned, angle, TURNED_STD_RAD, of_angle, 1),
-            (is_scale, factor - 1, SCALE_STD, of_path, 1),
-        ):
-            log -= it * ((np.abs(size) / std) ** 2 + count * np.log(known * std**2)) / 2
+        log -= is_lever * (np.abs(lever / LEVER_STD_M) ** 2 / 2 + np.log(of_arm * LEVER_STD_M**2))
+        log -= (
+            is_turned * ((angle / TURNED_STD_RAD) ** 2 + np.log(of_angle * TURNED_STD_RAD**2)) / 2
+        )
+        log -= is_scale * (((factor - 1) / SCALE_STD) ** 2 + np.log(of_path * SCALE_STD**2)) / 2
         return (self._power * log)[:, 0], lever[:, 0], angle[:, 0], factor[:, 0]
+
+
+def _information(w: Array, of_yaw: Array, arm: Complex, path: Complex) -> tuple[Array, ...]:
+    """What is known about lever, factor and angle (R, 1): by the images, and before them."""
+    of_arm, of_path = ((w * np.abs(x) ** 2).sum(1, keepdims=True) for x in (arm, path))
+    return of_arm + LEVER_STD_M**-2, of_path + SCALE_STD**-2, of_yaw + TURNED_STD_RAD**-2
