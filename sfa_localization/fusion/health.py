@@ -178,7 +178,8 @@ class _Window:
         rows, yaws, delays = self._paths()
         kinds = np.append(np.zeros(len(rows)), [_LEVER, _TURNED, _SCALE])
         rows, yaws = (np.concatenate([x, np.repeat(x[:1], 3, 0)]) for x in (rows, yaws))
-        logs, lever, turned, scale = self._fitted(rows, yaws, kinds)
+        logs, sizes = self._fitted(rows, yaws, kinds)
+        lever, turned, scale = (size[:, 0] for size in sizes)
         off_m, off_rad = np.abs(rows[:-3, -1] - rows[0, -1]), np.abs(yaws[:-3, -1] - yaws[0, -1])
         of_delays = zip(logs[:-3], delays, off_m, off_rad, strict=True)
         late = [_Hypothesis('late', *each) for each in of_delays]
@@ -226,9 +227,9 @@ class _Window:
 
     def _fitted(
         self, rows: Complex, yaws: Array, kinds: Array, used: NDArray[np.bool_] | None = None
-    ) -> tuple[Array, Complex, Array, Array]:
-        """Log evidence (R,) of paths by the images `used` (R, N), and nuisances (R,): lever, angle
-        and factor, each where it is the kind of the row.
+    ) -> tuple[Array, tuple[Complex, Array, Array]]:
+        """Log evidence (R,) of paths by the images `used` (R, N), and nuisances (R, 1): lever,
+        angle and factor, each where it is the kind of the row.
 
         With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
@@ -237,7 +238,7 @@ class _Window:
         look, arm = np.exp(1j * (self._yaws - yaws)), np.exp(1j * yaws)
         weight = counted = np.ones(rows.shape) if used is None else used.astype(float)
         angle, factor = np.zeros((len(rows), 1)), np.ones((len(rows), 1))
-        lever = angle + 0j
+        lever = np.asarray(angle, complex)
         for step in range(_STEPS):
             w, w_yaw = weight / self._variance, weight / self._yaw_variance
             total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
@@ -260,12 +261,24 @@ class _Window:
         square = (w * np.abs(path) ** 2).sum(1, keepdims=True) + of_yaw + _TINY
         log = (counted * np.log(anything)).sum(1, keepdims=True) - np.log(total)
         log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5) - 0.5 * np.log(square)
-        log -= is_lever * (np.abs(lever / LEVER_STD_M) ** 2 / 2 + np.log(of_arm * LEVER_STD_M**2))
-        log -= (
-            is_turned * ((angle / TURNED_STD_RAD) ** 2 + np.log(of_angle * TURNED_STD_RAD**2)) / 2
-        )
-        log -= is_scale * (((factor - 1) / SCALE_STD) ** 2 + np.log(of_path * SCALE_STD**2)) / 2
-        return (self._power * log)[:, 0], lever[:, 0], angle[:, 0], factor[:, 0]
+        sizes = lever, angle, factor
+        log -= _prior(kinds, sizes, (of_arm, of_angle, of_path))
+        return (self._power * log)[:, 0], sizes
+
+
+def _prior(kinds: Array, sizes: tuple[Complex, Array, Array], known: tuple[Array, ...]) -> Array:
+    """Minus the log of what is expected of lever, angle and factor (R, 1), each where it is the
+    kind of the row, over how exactly it is `known` then (Laplace).
+    """
+    (lever, angle, factor), (of_arm, of_angle, of_path) = sizes, known
+    return np.select(
+        [kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE)],
+        [
+            np.abs(lever / LEVER_STD_M) ** 2 / 2 + np.log(of_arm * LEVER_STD_M**2),
+            ((angle / TURNED_STD_RAD) ** 2 + np.log(of_angle * TURNED_STD_RAD**2)) / 2,
+            (((factor - 1) / SCALE_STD) ** 2 + np.log(of_path * SCALE_STD**2)) / 2,
+        ],
+    )
 
 
 def _information(w: Array, of_yaw: Array, arm: Complex, path: Complex) -> tuple[Array, ...]:
