@@ -69,7 +69,6 @@ def test_images_stamped_with_the_odometry_after_a_stall_belong_where_they_came()
     assert max(errors) < 0.1
 
 
-@pytest.mark.xfail(strict=True, reason='the speed is that between two stamps: 200 m/s')
 def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
     """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
     drive, fused = Drive(seconds=10), known()

@@ -80,7 +80,7 @@ def _going_on(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> T
     """
     if reading.v or reading.omega:
         return reading
-    before, new = belief.twist, -math.expm1(-seconds / motion.ODOMETRY_CORRELATION_S)
+    before, new = belief.twist, -math.expm1(-seconds / ODOMETRY_TIMEOUT_S)
     v, omega = whole.v - before.v, whole.omega - before.omega
     return whole._replace(v=before.v + new * v, omega=before.omega + new * omega)
 
