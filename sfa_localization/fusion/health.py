@@ -47,7 +47,7 @@ CAUTION, FLOOR_M, FLOOR_RAD, YAW_DRIFT = 4.0, 0.05, 0.02, 0.02
 """Factor on the variances of images, their least standard deviations, and the odometry's error of
 the heading, rad per m: for what images of one place have in common."""
 DELAYS: Array = np.r_[-1.5:-0.2:0.3, 0.3, 0.6 : LONGEST_DELAY_S + 0.1 : 0.4]
-"""Delays s that are told apart, beside those that the camera's clock compensates."""
+"""Delays s that are distinguished, beside those that the camera's clock compensates."""
 LONGEST_M = 16.0
 """An estimate that was placed anew again and again is confirmed over this distance at most."""
 _ANYWHERE = 1 / (100.0 * 2 * math.pi)

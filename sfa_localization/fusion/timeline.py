@@ -38,7 +38,7 @@ class _Again(NamedTuple):
 
 
 class Timeline:
-    """Feed it the stamps of all messages; it tells which can be used."""
+    """Feed it the stamps of all messages; it says which can be used."""
 
     def __init__(self) -> None:
         self._behind, self._beyond = 0, 0

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
+from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import known, regression, score
 from sfa_localization.features.image_features import REFINING_LAYER, slow_features, spectrum
 from sfa_localization.features.network import Network
-from sfa_localization.filtering import Table, run_filter
 from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.fast_expansions import Predictor
 from sfa_localization.metric.paper_solver import PAPER_FEATURES
@@ -201,18 +202,18 @@ class Trial:
         """The filter's path in the frame of the truth, from a known start; images give positions
         only, whose errors have this correlation.
         """
-        run, (x, y), var = self.study.test, self.laid[1].T, self.covariances
-        stamps, odometry = self.study.test_truth.stamps_ns, run.odometry
-        (v, omega), (var_v, var_omega) = odometry.twists.T, odometry.variances.T
-        driven = {'v': v, 'omega': omega, 'var_v': var_v, 'var_omega': var_omega}
-        seen = {'x': x, 'y': y, 'var_x': var[:, 0, 0], 'var_y': var[:, 1, 1]}
-        filtered = run_filter(
-            Table(odometry.stamps_ns, driven),
-            Table(stamps, {**seen, 'var_xy': var[:, 0, 1]}),
-            replace(KNOWN_START, initial_pose=tuple(start_of(run).tolist())),
-            correlation=correlation,
-        )
-        return Trajectory(filtered.stamps_ns, filtered.poses)
+        run, stamps = self.study.test, self.study.test_truth.stamps_ns
+        settings = replace(KNOWN_START, initial_pose=tuple(start_of(run).tolist()))
+        fused, path = PoseFilter(settings, correlation), []
+        odometry = run.odometry
+        for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, stamps):
+            if kind == IMAGE:
+                fused.add_measurement(stamp_ns, self.laid[1][i], self.covariances[i])
+            elif not fused.add_odometry(stamp_ns, *odometry.twists[i], odometry.variances[i]):
+                path.append(fused.at(stamp_ns))
+        states = [state for state in path if state is not None]
+        poses = np.array([state.pose for state in states])
+        return Trajectory(np.array([state.stamp_ns for state in states]), poses)
 
 
 def start_of(run: Run) -> Array:
