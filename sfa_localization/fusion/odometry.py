@@ -78,7 +78,7 @@ def _going_on(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> T
     """The twist after an interval: the reading, or, where that is not filled, what the poses show:
     little of it in messages stamped almost together.
     """
-    if reading.v or reading.omega:
+    if whole is reading or reading.v or reading.omega:
         return reading
     before, new = belief.twist, -math.expm1(-seconds / ODOMETRY_TIMEOUT_S)
     v, omega = whole.v - before.v, whole.omega - before.omega
