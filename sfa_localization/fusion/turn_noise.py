@@ -30,7 +30,6 @@ _FORGETTING = 0.999
 _OUTLIER_D2 = 12.0
 """A d2 beyond this counts as this, and moves no filter: it is an outlier."""
 _STATE = (X, Y, YAW, ERROR, ERROR + 1, ERROR + 2)
-_SIZE = len(_STATE)
 
 
 class Driven(NamedTuple):
