@@ -43,7 +43,7 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize('loader', {plain_yaml.YamlLoader, yaml.SafeLoader})
+@pytest.mark.parametrize('loader', dict.fromkeys((plain_yaml.YamlLoader, yaml.SafeLoader)))
 def test_hostile_text_is_one_short_error(loader, monkeypatch):
     monkeypatch.setattr(plain_yaml, 'YamlLoader', loader)
     for text, reason in HOSTILE.values():
