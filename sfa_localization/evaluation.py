@@ -49,7 +49,7 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer, Observation, Observer
-from sfa_localization.metric.expansions import Basis
+from sfa_localization.metric.basis import Basis
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 

@@ -40,8 +40,8 @@ from sfa_localization.features.network import (
 )
 from sfa_localization.features.rotation import Map
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
-from sfa_localization.metric.fast_expansions import Predictor, map_from_arrays
 from sfa_localization.metric.refinement import Refinement
+from sfa_localization.metric.saved_map import Predictor, map_from_arrays
 
 FORMAT = 'sfa_localization place model'
 VERSION = 9

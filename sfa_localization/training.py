@@ -51,7 +51,6 @@ from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
-from sfa_localization.metric.fast_expansions import fast_map
 from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
@@ -61,14 +60,15 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
     positions,
 )
+from sfa_localization.metric.odometry_noise import against_images, expected_noise
 from sfa_localization.metric.refinement import LearnedRefinement, learn_refinement
-from sfa_localization.metric.retracing import with_closures
+from sfa_localization.metric.saved_map import fast_map
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.shared_tracks import with_closures
 from sfa_localization.metric.sufficiency import ROUTE
 from sfa_localization.metric.turn_loss import Shown, way_of
-from sfa_localization.metric.turn_noise import against_images, expected_noise
 from sfa_localization.place_model import PlaceModel
 
 logger = logging.getLogger(__name__)

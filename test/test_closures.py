@@ -20,9 +20,9 @@ from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import Stack
-from sfa_localization.metric.retracing import tracks, with_closures
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.shared_tracks import tracks, with_closures
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)

@@ -13,8 +13,7 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align
 from sfa_localization.metric import learning, selection, sufficiency
-from sfa_localization.metric.alternation import MetricProblem
-from sfa_localization.metric.expansions import Process
+from sfa_localization.metric.basis import Process
 from sfa_localization.metric.forecast import (
     REACH_M,
     Forecast,
@@ -24,6 +23,7 @@ from sfa_localization.metric.forecast import (
     nearest_used,
 )
 from sfa_localization.metric.learning import learn_metric, positions
+from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds

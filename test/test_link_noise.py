@@ -9,8 +9,8 @@ import pytest
 from metric_worlds import drive, garden_features, meander
 
 from sfa_localization.data.geometry import align
-from sfa_localization.metric.alternation import MetricProblem
-from sfa_localization.metric.expansions import Process
+from sfa_localization.metric.basis import Process
+from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -80,7 +80,7 @@ def test_the_map_is_better_for_it(monkeypatch):
 
     learned = error(solved(segments, features))
     monkeypatch.setattr(
-        'sfa_localization.metric.alternation.learned', lambda stated, form, solution: stated
+        'sfa_localization.metric.map_fit.learned', lambda stated, form, solution: stated
     )
     assert learned < 0.9 * error(solved(segments, features))
 

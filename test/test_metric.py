@@ -23,15 +23,15 @@ from metric_worlds import (
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
 from sfa_localization.features.agreement import share_within
-from sfa_localization.metric import alternation, learning, paper_solver, selection, sufficiency
-from sfa_localization.metric.alternation import MetricProblem
-from sfa_localization.metric.expansions import Monomials, Process, monomials
-from sfa_localization.metric.fast_expansions import fast_map, map_from_arrays
+from sfa_localization.metric import learning, map_fit, paper_solver, selection, sufficiency
+from sfa_localization.metric.basis import Monomials, Process, monomials
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.map_covariance import angle_covariance
+from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
 from sfa_localization.metric.phases import certify, refine
 from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate, schur
+from sfa_localization.metric.saved_map import fast_map, map_from_arrays
 from sfa_localization.metric.segments import assignment, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -177,7 +177,7 @@ def noisy_result():
 def test_the_gyros_bias_is_found(monkeypatch):
     result = noisy_result()[3]
     assert result.yaw_bias == pytest.approx([1.4e-3], abs=3e-4)
-    monkeypatch.setattr(alternation, 'YAW_BIAS_STD', 0.0)
+    monkeypatch.setattr(map_fit, 'YAW_BIAS_STD', 0.0)
     blind = learn_metric(*noisy_inputs(), GP)
     assert blind.yaw_bias == pytest.approx([0.0])
 

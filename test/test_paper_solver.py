@@ -9,8 +9,8 @@ import pytest
 from metric_worlds import criss_cross, drive, exact_features
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.metric.alternation import MetricProblem
-from sfa_localization.metric.expansions import monomials
+from sfa_localization.metric.basis import monomials
+from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.paper_solver import (
     Lines,
     Parameters,

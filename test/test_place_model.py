@@ -16,10 +16,10 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.localizer import Localizer
+from sfa_localization.metric.basis import MetricMap
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
-from sfa_localization.metric.expansions import MetricMap
-from sfa_localization.metric.fast_expansions import FastProcess, fast_map
 from sfa_localization.metric.learning import learn_metric
+from sfa_localization.metric.saved_map import FastProcess, fast_map
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sfa_localization.data.errors import DataError, ModelError
-from sfa_localization.metric import fast_expansions
-from sfa_localization.metric.expansions import (
+from sfa_localization.metric import saved_map
+from sfa_localization.metric.basis import (
     MetricMap,
     Monomials,
     Process,
@@ -15,7 +15,7 @@ from sfa_localization.metric.expansions import (
     monomials,
     spread,
 )
-from sfa_localization.metric.fast_expansions import FastProcess, fast_map, map_from_arrays
+from sfa_localization.metric.saved_map import FastProcess, fast_map, map_from_arrays
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.standard_normal((80, 6))
@@ -119,7 +119,7 @@ def test_a_large_process_is_saved_in_single_precision(monkeypatch):
     process = MetricMap(basis, rng.standard_normal((61, 2)), root, np.zeros((61, 1, 2)), 0.05, 1.0)
     exact = FastProcess.of(process, basis)
     exact_bytes = exact.to_arrays()['factor'].nbytes
-    monkeypatch.setattr(fast_expansions, '_EXACT_POINTS', 10)
+    monkeypatch.setattr(saved_map, '_EXACT_POINTS', 10)
     rounded = FastProcess.of(process, basis)
     again = map_from_arrays(rounded.to_arrays())
     assert exact_bytes == 60 * 61 / 2 * 8

@@ -26,8 +26,8 @@ from sfa_localization.metric.compass import (
 )
 from sfa_localization.metric.forecast import nearest_used
 from sfa_localization.metric.learning import MetricResult, headings, positions
-from sfa_localization.metric.retracing import tracks
 from sfa_localization.metric.segments import Segments, assignment
+from sfa_localization.metric.shared_tracks import tracks
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]

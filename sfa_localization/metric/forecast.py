@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from sfa_localization.data.geometry import Array, RigidTransform
-from sfa_localization.metric.alternation import MapFit
+from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.quadratic_form import Stack
 
 Indices = NDArray[np.int64]

@@ -15,8 +15,8 @@ from sfa_localization.features.closures import Views
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.metric.learning import MetricResult, headings, positions
-from sfa_localization.metric.retracing import tracks
 from sfa_localization.metric.segments import Segments, assignment
+from sfa_localization.metric.shared_tracks import tracks
 
 # Between the drives: farther than any stretch.
 _ANOTHER_DRIVE_M = 1e6

@@ -18,10 +18,10 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, wrap_angle
 from sfa_localization.features.agreement import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
-from sfa_localization.metric.alternation import MapFit, MetricProblem
-from sfa_localization.metric.expansions import MetricMap
+from sfa_localization.metric.basis import MetricMap
 from sfa_localization.metric.forecast import Forecast, forecast, nearest_used
 from sfa_localization.metric.map_covariance import angle_covariance, metric_map, plane, sway
+from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.quadratic_form import Stack

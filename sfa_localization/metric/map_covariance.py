@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.metric import phases
-from sfa_localization.metric.alternation import MapFit
-from sfa_localization.metric.expansions import MetricMap
+from sfa_localization.metric.basis import MetricMap
+from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.quadratic_form import schur
 
 Complex = NDArray[np.complex128]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, compose, invert
-from sfa_localization.metric.alternation import MapFit
+from sfa_localization.metric.map_fit import MapFit
 
 
 def map_frame(fit: MapFit) -> RigidTransform:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.alternation import MapFit, MetricProblem, residual_variance
-from sfa_localization.metric.expansions import Monomials, monomials
+from sfa_localization.metric.basis import Monomials, monomials
+from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
 from sfa_localization.metric.phases import certify, phase_cost
 from sfa_localization.metric.quadratic_form import QuadraticForm, Solution, eliminate, schur
 

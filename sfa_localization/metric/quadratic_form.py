@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.phases import Certificate, refine, synchronize
-from sfa_localization.metric.retracing import tracks
 from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.shared_tracks import tracks
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
@@ -68,7 +68,7 @@ class Stack:
     starts: Array
     """(N, 3) odometry poses of the segments' frames."""
     track: Indices
-    """(N,) the first segment along the same track: see retracing.py."""
+    """(N,) the first segment along the same track: see shared_tracks.py."""
 
     @classmethod
     def of(cls, segments: Segments) -> Stack:

@@ -28,14 +28,14 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.agreement import Agreement, quantile
 from sfa_localization.features.image_features import Spectrum
-from sfa_localization.metric.expansions import Process
-from sfa_localization.metric.fast_expansions import FastProcess
+from sfa_localization.metric.basis import Process
 from sfa_localization.metric.learning import (
     MetricResult,
     headings,
     learn_metric,
     left_out_agreement,
 )
+from sfa_localization.metric.saved_map import FastProcess
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.settings import MetricConfig
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, align_complex
-from sfa_localization.metric.alternation import MapFit, MetricProblem
-from sfa_localization.metric.expansions import Basis, Monomials, Process, spread
+from sfa_localization.metric.basis import Basis, Monomials, Process, spread
+from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
 from sfa_localization.metric.quadratic_form import Stack, eliminate, schur
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.alternation import MapFit
 from sfa_localization.metric.map_covariance import angle_covariance
+from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.phases import metric_upgrade
 from sfa_localization.metric.quadratic_form import Stack
 

@@ -24,8 +24,8 @@ from metric_worlds import Drive, criss_cross, drive, garden_features, grid, mean
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align
-from sfa_localization.metric.alternation import MapFit, MetricProblem
-from sfa_localization.metric.expansions import Monomials, monomials
+from sfa_localization.metric.basis import Monomials, monomials
+from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, descend, odometry_start
 from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate

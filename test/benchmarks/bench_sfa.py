@@ -50,6 +50,7 @@ from sfa_localization.features.network_training import (
     train_network,
 )
 from sfa_localization.features.sfa import Statistics, solve
+from sfa_localization.metric.basis import MetricMap, Process
 from sfa_localization.metric.compass import Compass, kernel_between, triangular
 from sfa_localization.metric.compass_training import (
     INDUCING_IMAGES,
@@ -57,9 +58,8 @@ from sfa_localization.metric.compass_training import (
     _solve,
     compass_layers,
 )
-from sfa_localization.metric.expansions import MetricMap, Process
-from sfa_localization.metric.fast_expansions import FastProcess
 from sfa_localization.metric.refinement import DIMENSIONS, Projection, Refinement, turned_back
+from sfa_localization.metric.saved_map import FastProcess
 from sfa_localization.metric.selection import INDUCING_POINTS
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import COARSE_POINTS

@@ -27,8 +27,8 @@ from sfa_localization.features.network import Network
 from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.fast_expansions import Predictor
 from sfa_localization.metric.paper_solver import PAPER_FEATURES
+from sfa_localization.metric.saved_map import Predictor
 from sfa_localization.metric.segments import Segments, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit a map for one basis: alternate between the global solution and the noise of its residuals.
 
-    expand      slow features to phi(s)                          expansions.py
+    expand      slow features to phi(s)                          basis.py
     eliminate   the map's weights from equation 1                quadratic_form.py
     solve       directions, origins and biases, certified        quadratic_form.py, phases.py
     noise       variance and correlation of the residuals        here
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.expansions import Basis
+from sfa_localization.metric.basis import Basis
 from sfa_localization.metric.link_noise import learned
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import (

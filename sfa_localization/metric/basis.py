@@ -212,7 +212,7 @@ class MetricMap:
     def to_arrays(self) -> Arrays:
         """Plain arrays, from which `from_arrays` restores a map of monomials.
 
-        That of a process is saved in its fast form, see fast_expansions.py.
+        That of a process is saved in its fast form, see saved_map.py.
         """
         assert isinstance(self.basis, Monomials)
         own = {

@@ -24,7 +24,7 @@ from scipy import linalg
 from sfa_localization.data.array_files import Arrays, packed, unpacked
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.expansions import (
+from sfa_localization.metric.basis import (
     Basis,
     MetricMap,
     Process,
