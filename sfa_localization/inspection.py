@@ -29,8 +29,8 @@ from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
+from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.segments import PIECE_LENGTH_M
-from sfa_localization.metric.sufficiency import ROUTE, is_one_route
 
 PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
 MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'

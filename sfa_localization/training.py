@@ -51,6 +51,7 @@ from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
+from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.keyframe_map import KeyframeMap, learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
@@ -67,7 +68,6 @@ from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import with_closures
-from sfa_localization.metric.sufficiency import ROUTE
 from sfa_localization.metric.turn_loss import Shown, way_of
 from sfa_localization.place_model import PlaceModel
 

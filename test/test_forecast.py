@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align
-from sfa_localization.metric import learning, selection, sufficiency
+from sfa_localization.metric import drive_check, learning, selection
 from sfa_localization.metric.basis import Process
 from sfa_localization.metric.forecast import (
     REACH_M,
@@ -54,7 +54,7 @@ def trained(name, noise=0.05):
 def quick_and_tolerant(patch):
     """Few inducing points, and directions as uncertain as they may be."""
     patch.setattr(selection, 'INDUCING_POINTS', 300)
-    patch.setattr(sufficiency, 'ANGLE_STD_MAX_DEG', 180.0)
+    patch.setattr(drive_check, 'ANGLE_STD_MAX_DEG', 180.0)
 
 
 @cache

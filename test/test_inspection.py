@@ -35,7 +35,7 @@ from sfa_localization.inspection import (
     path_length,
     spacing,
 )
-from sfa_localization.metric.sufficiency import ROUTE
+from sfa_localization.metric.drive_check import ROUTE
 
 START = 1_700_000_000_000_000_000
 STEP = 200_000_000

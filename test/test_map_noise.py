@@ -17,9 +17,9 @@ from sfa_localization.data.run import Odometry, integrate
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.fusion.camera_clock import CameraClock
+from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.odometry_noise import against_images, expected_noise, turn_noise
 from sfa_localization.metric.settings import SegmentConfig
-from sfa_localization.metric.sufficiency import ROUTE
 from sfa_localization.training import learn_place
 
 

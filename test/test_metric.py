@@ -23,7 +23,7 @@ from metric_worlds import (
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
 from sfa_localization.features.agreement import share_within
-from sfa_localization.metric import learning, map_fit, paper_solver, selection, sufficiency
+from sfa_localization.metric import drive_check, learning, map_fit, paper_solver, selection
 from sfa_localization.metric.basis import Monomials, Process, monomials
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.map_covariance import angle_covariance
@@ -419,7 +419,7 @@ def test_a_short_piece_of_unknown_direction_does_not_refuse_a_drive():
         Monomials.fit(exact_features(run.poses), 5, 0.0)
     )
     lengths = np.array([segment.length_m for segment in segments])
-    sure = sufficiency.diagnose(fit).angle_std_rad
+    sure = drive_check.diagnose(fit).angle_std_rad
     deviations = np.sqrt(np.diag(angle_covariance(fit)))
     assert lengths[deviations <= sure].sum() >= 0.9 * lengths.sum()
     assert lengths[deviations < sure].sum() < 0.9 * lengths.sum()

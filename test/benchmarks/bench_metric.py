@@ -25,13 +25,13 @@ from metric_worlds import Drive, criss_cross, drive, garden_features, grid, mean
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align
 from sfa_localization.metric.basis import Monomials, monomials
+from sfa_localization.metric.drive_check import check, diagnose
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, descend, odometry_start
 from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.metric.sufficiency import check, diagnose
 
 NOISE = {'bias': 1e-3, 'yaw_noise': 0.01, 'speed_noise': 0.03}
 # The paper's eight features and no ridge; the yaw-rate bias has no place in its costs.
