@@ -76,8 +76,6 @@ setup(
         'simulation': ['trimesh>=4.4', 'embreex>=2.17.7'],
         # The reference engine of `train`, made of MDP's nodes.
         'mdp': ['MDP==3.6'],
-        # Several processes or machines for `train`.
-        'distributed': ['distributed>=2024.1'],
         # colcon finds the test runner by this name.
         'test': ['pytest>=7.4', 'hypothesis>=6.82', 'psutil>=5.9'],
         'dev': ['ruff==0.17.5', 'mypy==2.4.1', 'types-PyYAML', 'pytest-xdist>=3.3'],

@@ -40,7 +40,6 @@ OPTIONAL = {
     'trimesh': 'trimesh embreex',
     'embreex': 'trimesh embreex',
     'mdp': 'MDP==3.6',
-    'distributed': 'distributed',
     'lz4': 'lz4',
     'mcap': 'mcap',
     'zstandard': 'zstandard',

@@ -22,7 +22,6 @@ from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Image
-from sfa_localization.features.agreement import Agreement, disagreement
 from sfa_localization.features.image_features import (
     REFINING_LAYER,
     layer_harmonics,
@@ -30,7 +29,7 @@ from sfa_localization.features.image_features import (
     spectrum,
 )
 from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
-from sfa_localization.features.nearby import Spectra
+from sfa_localization.features.local_regression import Spectra
 from sfa_localization.features.network import (
     Architecture,
     Layer,
@@ -39,6 +38,7 @@ from sfa_localization.features.network import (
     check_weights,
 )
 from sfa_localization.features.rotation import Map
+from sfa_localization.features.rotation_spread import Agreement, disagreement
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.refinement import Refinement
 from sfa_localization.metric.saved_map import Predictor, map_from_arrays

@@ -37,15 +37,10 @@ from sfa_localization.features import mdp_engine
 from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.closures import Closures, Views, find_closures, views_of
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
-from sfa_localization.features.joined_drives import edges_between
 from sfa_localization.features.network import Architecture, Network, standard_architecture
-from sfa_localization.features.network_training import (
-    Executor,
-    ImageSequence,
-    in_this_process,
-    train_network,
-)
+from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
@@ -120,7 +115,6 @@ def train(
     progress: bool = False,
     resume: bool = False,
     strict: bool = False,
-    executor: Executor = in_this_process,
 ) -> Trained:
     """Learn a place model from bags and write it to `output`.
 
@@ -137,7 +131,7 @@ def train(
             checkpoint.remove()
         with one_core():
             known = match_images(runs, recipe, progress)
-        network = _train_hierarchy(runs, known.closures, recipe, checkpoint, executor, progress)
+        network = _train_hierarchy(runs, known.closures, recipe, checkpoint, progress)
         with one_core():
             trained = learn_place(network, runs, recipe, progress, strict, known)
         trained.model.save(output)
@@ -166,7 +160,6 @@ def _train_hierarchy(
     closures: Closures,
     recipe: Recipe,
     checkpoint: Checkpoint,
-    executor: Executor,
     progress: bool,
 ) -> Network:
     """Step 3, from the checkpoint where there is one."""
@@ -191,7 +184,6 @@ def _train_hierarchy(
             sequences,
             seed,
             start=start,
-            executor=executor,
             on_stage=checkpoint.write,
             on_shard=bar.update,
         )

@@ -14,8 +14,8 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.features.closures import STRETCH_M, Closures, Views, find_closures
-from sfa_localization.features.joined_drives import edges_between
 from sfa_localization.features.keyframes import quantized, texture
+from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.loops import Loops

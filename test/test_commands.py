@@ -25,7 +25,6 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.commands.options import given
 from sfa_localization.config import write_config
 from sfa_localization.data.settings import Settings
-from sfa_localization.features import cluster
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
 
@@ -269,7 +268,6 @@ CASES: dict[str, list[Case]] = {
             prepare=lambda out: (out / '.model.npz.checkpoint.npz').write_bytes(b'of another'),
         ),
         Case('--strict', refuses('read without --strict'), base=DAMAGED['train']),
-        Case('--dask {dask}', noted('on the cluster')),
         Case('--image-topic /nothing', refuses('/nothing')),
         Case('--odom-topic /ground_truth', QUALITY),
         Case('--imu-topic /nothing', refuses('/nothing')),
@@ -383,8 +381,6 @@ def watched(name: str, notes: list[Any]) -> Iterator[None]:
             watch_play(patch, notes)
         if name == 'demo':
             watch_demo(patch, notes)
-        if name == 'train':
-            watch_cluster(patch, notes)
         yield
 
 
@@ -431,16 +427,6 @@ def watch_demo(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
     patch.setattr(live_nodes, 'run_live', run_live)
     patch.setattr(demo, '_compare', lambda *_args: (SimpleNamespace(scores={}), 0.0))
     patch.setattr(demo, '_write_results', lambda *_args: None)
-
-
-def watch_cluster(patch: pytest.MonkeyPatch, notes: list[Any]) -> None:
-    compute = cluster._compute
-
-    def noting(*args):
-        notes.append('on the cluster')
-        return compute(*args)
-
-    patch.setattr(cluster, '_compute', noting)
 
 
 def run(name: str, words: str, folder: Path, **places: Any) -> Outcome:
@@ -525,7 +511,7 @@ def without(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..
 
 
 @pytest.mark.parametrize('name', cli.COMMANDS)
-def test_each_option_alone_has_its_effect(name, data, without, tmp_path, request):
+def test_each_option_alone_has_its_effect(name, data, without, tmp_path):
     if name in ('play', 'demo'):
         pytest.importorskip('rclpy')
     failed = []
@@ -533,24 +519,12 @@ def test_each_option_alone_has_its_effect(name, data, without, tmp_path, request
         words = f'{BASE[name] if case.base is None else case.base} {case.beside}'
         places, folder = {'data': data}, tmp_path / option
         folder.mkdir()
-        if '{dask}' in case.words:
-            places['dask'] = request.getfixturevalue('scheduler')
         plain = without(name, words, case)
         case.prepare(folder)
         changed = run(name, f'{words} {case.words}', folder, **places)
         if changed.code not in (0, 1) or not case.differs(plain, changed):
             failed.append(f'{plain.text}\n-- with {case.words}:\n{changed.text}')
     assert not failed, '\n'.join(failed)
-
-
-@pytest.fixture(scope='module')
-def scheduler() -> Iterator[str]:
-    """Return the address of a cluster of one worker in this process."""
-    distributed = pytest.importorskip('distributed')
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as local:
-        yield local.scheduler_address
 
 
 @pytest.mark.parametrize(('size', 'entry'), [

@@ -22,7 +22,7 @@ from metric_worlds import (
 
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
-from sfa_localization.features.agreement import share_within
+from sfa_localization.features.rotation_spread import share_within
 from sfa_localization.metric import drive_check, learning, map_fit, paper_solver, selection
 from sfa_localization.metric.basis import Monomials, Process, monomials
 from sfa_localization.metric.learning import headings, learn_metric, positions

@@ -15,7 +15,7 @@ from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.nearby import Nearby
+from sfa_localization.features.local_regression import Nearby
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import View

@@ -8,7 +8,7 @@ from cylinder_worlds import Spheres
 from test_keyframes import CONFIG, COUNTER, holds, learnt, unseen
 
 from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.nearby import Nearby
+from sfa_localization.features.local_regression import Nearby
 from sfa_localization.features.other_light import OtherLight
 
 NOISE = MatchNoise(by_variation=5.0)

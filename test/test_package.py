@@ -54,7 +54,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__main__': ({'cli'}, set()),
     'data': (set(), {'numpy', 'threadpoolctl', 'tqdm', 'yaml'}),
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
-    'features': ({'data'}, NUMERIC | {'cv2', 'mdp', 'dask', 'distributed'}),
+    'features': ({'data'}, NUMERIC | {'cv2', 'mdp'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
     'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard'}),
     'metric': ({'data', 'features'}, NUMERIC),
@@ -84,7 +84,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
 # From these rooms only the settings may be imported, which need no ROS.
 SETTINGS_ONLY = {('config', 'nodes')}
 # Never at run time on the robot, nor in anything its nodes import.
-NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'dask', 'tqdm'}
+NOT_ON_THE_ROBOT = {'mdp', 'pickle', 'matplotlib', 'trimesh', 'embreex', 'rosbags', 'tqdm'}
 OWN_NOT_ON_THE_ROBOT = {
     f'{NAME}.{word}' for word in ('training', 'evaluation', 'updating', 'simulation')
 }

@@ -51,9 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures of the training')
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
-    parser.add_argument(
-        '--dask', metavar='ADDRESS', help='train on a cluster whose workers share the output folder'
-    )
     add_topics(parser, 'image', 'odometry', 'imu')
     add_settings(parser, SegmentConfig, ('segments',))
     add_settings(parser, MetricConfig, ('solver', 'metric_map'))
@@ -67,20 +64,17 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.update:
         return _update(arguments)
     from sfa_localization import training
-    from sfa_localization.features.cluster import executor_at
     from sfa_localization.reports.summary import summary
 
     used = recipe(arguments)
-    with executor_at(arguments.dask) as executor:
-        trained = training.train(
-            arguments.bags,
-            arguments.output,
-            used,
-            progress=True,
-            resume=arguments.resume,
-            strict=arguments.strict,
-            executor=executor,
-        )
+    trained = training.train(
+        arguments.bags,
+        arguments.output,
+        used,
+        progress=True,
+        resume=arguments.resume,
+        strict=arguments.strict,
+    )
     print(summary(trained))
     if arguments.report:
         _write_report(arguments.report, arguments.bags, trained, used)
@@ -90,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _update(arguments: argparse.Namespace) -> int:
     """Extend a model; say what was added."""
-    unused = [name for name in ('report', 'resume', 'dask') if getattr(arguments, name)]
+    unused = [name for name in ('report', 'resume') if getattr(arguments, name)]
     for group in (SegmentConfig, MetricConfig, NetworkConfig):
         unused += given(group, arguments)
     if unused:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
-from sfa_localization.features.agreement import disagreement
 from sfa_localization.features.network import Network
 from sfa_localization.features.rotation import Map
+from sfa_localization.features.rotation_spread import disagreement
 
 Complex = NDArray[np.complex128]
 Spectrum = NDArray[np.complex64]

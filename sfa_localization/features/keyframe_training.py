@@ -14,12 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.agreement import (
-    LENGTH_TO_STD,
-    MEDIAN_TO_STD,
-    needed_factor,
-    quantile,
-)
 from sfa_localization.features.keyframes import (
     LOWEST,
     LOWEST_SHARE,
@@ -28,7 +22,13 @@ from sfa_localization.features.keyframes import (
     MatchNoise,
     correlate,
 )
-from sfa_localization.features.nearby import Nearby
+from sfa_localization.features.local_regression import Nearby
+from sfa_localization.features.rotation_spread import (
+    LENGTH_TO_STD,
+    MEDIAN_TO_STD,
+    needed_factor,
+    quantile,
+)
 
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
 

@@ -27,7 +27,13 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.nearby import Nearby, Spectra, averaged, place_among, turned
+from sfa_localization.features.local_regression import (
+    Nearby,
+    Spectra,
+    averaged,
+    place_among,
+    turned,
+)
 
 Texture = NDArray[np.float32]
 

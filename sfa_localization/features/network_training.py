@@ -3,8 +3,8 @@
 """Train the network layer by layer from streamed panoramas: section 2.2 of the paper.
 
 Each layer needs two passes: one for its linear SFA, one for the SFA of the expanded signals. A
-pass is a sum over shards of the drives, so it may run in this process or on a cluster; the sums
-are merged in the order of the shards, so the result does not depend on where they ran.
+pass is a sum over shards of the drives, computed on all cores; the sums are merged in the order of
+the shards, so the result does not depend on how many cores there are.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,44 +104,23 @@ def _gain(std: float, seed: Sequence[int]) -> NDArray[np.float32]:
     return np.asarray(np.exp(std * (normal[0] + normal[1:] / 3)), np.float32)
 
 
-class Executor(Protocol):
-    """Computes the sums over the shards and merges them, always in the same order.
-
-    It calls `on_shard` with the number of images of each finished shard.
-    """
-
-    def __call__(
-        self,
-        work: Callable[[Shard], Sums],
-        shards: Sequence[Shard],
-        on_shard: Callable[[int], object],
-    ) -> Sums: ...
-
-
-def in_this_process(
-    work: Callable[[Shard], Sums], shards: Sequence[Shard], on_shard: Callable[[int], object]
-) -> Sums:
-    """Compute the shards on all cores, and merge them in their order."""
-    parts = _in_threads(work, shards)
-    total: Sums | None = None
-    for part, shard in zip(parts, shards, strict=True):
-        if total is None:
-            total = part
-        else:
-            total.merge(part)
+def _summed(partial: Partial, shards: Sequence[Shard], on_shard: Callable[[int], object]) -> Sums:
+    """Sums of the stage that comes next over all shards, merged in their order."""
+    total = _sums(partial)
+    for part, shard in zip(_in_threads(partial, shards), shards, strict=True):
+        total.merge(part)
         on_shard(shard.stop - shard.start)
-    assert total is not None
     return total
 
 
-def _in_threads(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Iterator[Sums]:
+def _in_threads(partial: Partial, shards: Sequence[Shard]) -> Iterator[Sums]:
     """The sums of the shards in order; one more shard than there are cores is in progress."""
-    workers = _cores()
+    workers = cores()
     with one_core(), ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Sums]] = deque()
         try:
             for shard in shards:
-                waiting.append(pool.submit(work, shard))
+                waiting.append(pool.submit(stage_sums, partial, shard))
                 if len(waiting) > workers:
                     yield waiting.popleft().result()
             while waiting:
@@ -152,7 +130,7 @@ def _in_threads(work: Callable[[Shard], Sums], shards: Sequence[Shard]) -> Itera
                 future.cancel()
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that this process may use."""
     affinity = getattr(os, 'sched_getaffinity', None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -283,7 +261,6 @@ def train_network(
     relative_cut: float = RELATIVE_CUT,
     rotate: bool = True,
     start: Partial | None = None,
-    executor: Executor = in_this_process,
     on_stage: Callable[[Partial], object] = lambda partial: None,
     on_shard: Callable[[int], object] = lambda images: None,
 ) -> Network:
@@ -298,18 +275,8 @@ def train_network(
     partial = start or Partial(architecture, rotate=rotate)
     shards = shards_of(sequences, seed, light_std)
     while not partial.finished:
-        total = executor(_Stage(partial), shards, on_shard)
+        total = _summed(partial, shards, on_shard)
         with one_core():
             partial = partial.advanced(total.result(), relative_cut)
         on_stage(partial)
     return partial.network()
-
-
-@dataclass(frozen=True, slots=True)
-class _Stage:
-    """The work on one shard: a plain object, so that it can be sent to another machine."""
-
-    partial: Partial
-
-    def __call__(self, shard: Shard) -> Sums:
-        return stage_sums(self.partial, shard)

@@ -22,7 +22,7 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.nearby import Spectra
+from sfa_localization.features.local_regression import Spectra
 
 # Standard deviations of the logarithm: at the start, of its change from image to image, and of what
 # one image shows of it, which those around it repeat.

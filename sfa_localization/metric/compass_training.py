@@ -13,8 +13,8 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.agreement import MEDIAN_TO_STD, Agreement, share_within
 from sfa_localization.features.image_features import ImageFeatures
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, Agreement, share_within
 from sfa_localization.metric.compass import (
     Compass,
     calibrated,

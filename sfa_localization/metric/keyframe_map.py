@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.agreement import Agreement, needed_factor, share_within
 from sfa_localization.features.closures import Views
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
+from sfa_localization.features.rotation_spread import Agreement, needed_factor, share_within
 from sfa_localization.metric.learning import MetricResult, headings, positions
 from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.shared_tracks import tracks

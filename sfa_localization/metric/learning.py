@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, wrap_angle
-from sfa_localization.features.agreement import Agreement, needed_factor
+from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.basis import MetricMap
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.agreement import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
+from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.metric.quadratic_form import Solution, Stack
 
 Complex = NDArray[np.complex128]

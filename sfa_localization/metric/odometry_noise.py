@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.features.agreement import MEDIAN_TO_STD
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.segments import ImagePoses, Segments
 from sfa_localization.metric.settings import SegmentConfig

@@ -26,8 +26,8 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.agreement import Agreement, quantile
 from sfa_localization.features.image_features import Spectrum
+from sfa_localization.features.rotation_spread import Agreement, quantile
 from sfa_localization.metric.basis import Process
 from sfa_localization.metric.learning import (
     MetricResult,

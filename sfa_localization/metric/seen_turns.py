@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Stamps
-from sfa_localization.features.agreement import MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import (
     OdometryTrack,
     TurnCorrection,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.agreement import MEDIAN_TO_STD
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import LENGTH, OdometryTrack, Way, seconds_since_start
 
 Complex = NDArray[np.complex128]

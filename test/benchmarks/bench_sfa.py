@@ -30,8 +30,6 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
-from sfa_localization.features import network_training as hierarchy
-from sfa_localization.features.agreement import Agreement
 from sfa_localization.features.image_features import (
     REFINING_LAYER,
     harmonics,
@@ -45,10 +43,11 @@ from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
     RELATIVE_CUT,
     ImageSequence,
-    in_this_process,
+    cores,
     shards_of,
     train_network,
 )
+from sfa_localization.features.rotation_spread import Agreement
 from sfa_localization.features.sfa import Statistics, solve
 from sfa_localization.metric.basis import MetricMap, Process
 from sfa_localization.metric.compass import Compass, kernel_between, triangular
@@ -108,7 +107,7 @@ def bench_training(folder: Path, quick: bool = False) -> dict[str, float]:
     train_network(ARCHITECTURE, [drive])
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     name = 'train_200_pictures' if quick else 'train_paper_size'
-    return {f'{name}_s': wall, f'{name}_cpu_s': cpu, 'cores': float(hierarchy._cores())}
+    return {f'{name}_s': wall, f'{name}_cpu_s': cpu, 'cores': float(cores())}
 
 
 def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
@@ -128,7 +127,7 @@ def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
             seconds['mdp'].append(time.process_time() - start)
             part = _first(drive, our_size)
             start = time.process_time()
-            network = train_network(ARCHITECTURE, [part], executor=_on_one_core)
+            network = train_network(ARCHITECTURE, [part])
             seconds['ours'].append(time.process_time() - start)
     theirs = _extrapolated(sizes, seconds['mdp'])
     ours = _extrapolated(our_sizes, seconds['ours'])
@@ -141,15 +140,6 @@ def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
         'train_mdp_paper_size_hours': float(theirs @ [1, PAPER_PICTURES]) / 3600,
         **_execution(flow, network, drive.panoramas.read(0, 1)),
     }
-
-
-def _on_one_core(work, shards, on_shard):
-    cores = hierarchy._cores
-    hierarchy._cores = lambda: 1
-    try:
-        return in_this_process(work, shards, on_shard)
-    finally:
-        hierarchy._cores = cores
 
 
 def _first(drive: ImageSequence, count: int) -> ImageSequence:

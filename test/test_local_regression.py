@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.features.keyframes import normalized, spectrum
-from sfa_localization.features.nearby import Nearby, averaged, place_among, turned
+from sfa_localization.features.local_regression import Nearby, averaged, place_among, turned
 
 ROWS = 8
 SIZES = pytest.mark.parametrize('columns', [60, 61])

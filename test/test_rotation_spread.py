@@ -5,7 +5,12 @@
 import numpy as np
 import pytest
 
-from sfa_localization.features.agreement import Agreement, disagreement, quantile, share_within
+from sfa_localization.features.rotation_spread import (
+    Agreement,
+    disagreement,
+    quantile,
+    share_within,
+)
 
 
 def drawn(exponent, axes, count=20_000, seed=0):
