@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
-from sfa_localization.data.array_schema import ArrayRule, Schema, check_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
@@ -50,86 +49,8 @@ FARTHEST_M = 1e6
 """
 SCALE_STD = 0.01
 """Of the scale of a map: its meters are those of wheels, seldom known better."""
-_STEEPEST = 1e9
-"""Weights of a map, m: a million times those of any training."""
-_MOST_DRIVES = 1e6
-"""Drives that added keyframes: more than a robot ever makes."""
 _LONGEST_DELAY_S = 10.0
 """Of a camera: training finds delays of up to half a second."""
-_AGREEMENT = [{'numbers': ArrayRule('3', positive=(1,))}]
-_PROCESS = {
-    'kind': ArrayRule('', 'U'),
-    'scale': ArrayRule('K'),
-    'points': ArrayRule('MK'),
-    'linear': ArrayRule('MC', largest=_STEEPEST),
-    'constant': ArrayRule('C', largest=FARTHEST_M),
-    'factor': ArrayRule('T'),
-    'in_double': ArrayRule('', 'b'),
-    'scalars': ArrayRule('3', all_positive=True),
-}
-_MONOMIALS = {
-    'kind': ArrayRule('', 'U'),
-    'weights': ArrayRule('M2'),
-    'spread': ArrayRule('MR'),
-    'sway': ArrayRule('MS2'),
-    'noise_m': ArrayRule('', all_positive=True),
-    'inflation': ArrayRule('', all_positive=True),
-}
-_BASIS = {
-    'center': ArrayRule('M'),
-    'turn': ArrayRule('MR'),
-    'ridge': ArrayRule('P'),
-    'features': ArrayRule('', 'i', all_positive=True),
-}
-_KEYFRAMES = {
-    'textures': ArrayRule('NRC', 'i'),
-    'poses': ArrayRule('N3', largest=FARTHEST_M),
-    'noise': ArrayRule('10', all_positive=True),
-    'clockwise': ArrayRule('', 'b'),
-}
-_DRIVES = {
-    'drives': ArrayRule('N', 'i', largest=_MOST_DRIVES),
-    'trained': ArrayRule('', 'i', all_positive=True, largest=_MOST_DRIVES),
-}
-SCHEMA: Schema = {
-    'network/#/': [
-        {
-            'linear': ArrayRule('DL'),
-            'linear_offset': ArrayRule('L'),
-            'slow': ArrayRule('EK'),
-            'slow_offset': ArrayRule('K'),
-            'delta': ArrayRule('T'),
-        }
-    ],
-    'metric/': [_PROCESS, _MONOMIALS],
-    'metric/basis_': [_BASIS],
-    'keyframes/': [_KEYFRAMES, {**_KEYFRAMES, **_DRIVES}],
-    'agreement/': _AGREEMENT,
-    'yaw_agreement/': _AGREEMENT,
-    'compass/': [
-        {
-            'features': ArrayRule('MK'),
-            'harmonic': ArrayRule('MJ', 'c'),
-            'feature_scale': ArrayRule('K', all_positive=True),
-            'harmonic_scale': ArrayRule('J', all_positive=True),
-            'weights': ArrayRule('M', 'c'),
-            'factor': ArrayRule('T', 'c'),
-            'scalars': ArrayRule('3', positive=(0, 1)),
-            'calibration': ArrayRule('2', positive=(0,)),
-        }
-    ],
-    'refinement/': [
-        {
-            'mean': ArrayRule('D'),
-            'axes': ArrayRule('DK'),
-            'scalars': ArrayRule('2', positive=(1,)),
-            **{f'metric_{name}': rule for name, rule in _PROCESS.items()},
-            **{f'agreement_{name}': rule for name, rule in _AGREEMENT[0].items()},
-        }
-    ],
-    'header': [{'': ArrayRule('', 'U')}],
-}
-"""The arrays of a model file. A part that is added to the model has its group here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +225,6 @@ class PlaceModel:
         path = Path(path)
         arrays = read_arrays(path, FORMAT, VERSION, 'train it with the train command')
         try:
-            check_arrays(arrays, SCHEMA)
             model = cls._from_arrays(arrays, json.loads(str(arrays['header'])))
             model._prove()
         except LocalizationError as error:
