@@ -41,8 +41,8 @@ robustness: $(READY)  ## run the tests of test/README.md; print what each fault 
 animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp
 	PYTHONPATH=.:test $(PY) -m robustness.animation resource/kidnapped.webp
 
-fuzz: $(READY)  ## 10,000 hostile messages, models, bags, YAML and image files each (ARGS='--kinds bags')
-	$(PY) test/benchmarks/fuzz.py $(ARGS)
+fuzz: $(READY)  ## thousands of damaged messages, models, bags, YAML and image files (ARGS='-k bags')
+	FUZZ_INPUTS=10000 $(PY) -m pytest -q test/test_fuzz.py $(ARGS)
 
 soak: $(READY)  ## run the three nodes for an hour at 20x; nothing may grow (ARGS='--seconds 800')
 	PYTHONPATH=. $(PY) test/benchmarks/soak.py $(ARGS)

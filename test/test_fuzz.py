@@ -1,100 +1,186 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A share of the hostile inputs of `make fuzz`, and whether it finds what it looks for."""
+"""Damaged bags, models, images and texts: each is read, or rejected by one line of our errors.
 
-from __future__ import annotations
+`make fuzz` tries thousands of each kind (FUZZ_INPUTS); the tests try some.
+"""
 
-import importlib.util
+import logging
 import os
-import signal
-import sys
-import time
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
-import fuzz_inputs
+import cv2
 import numpy as np
 import pytest
+from bag_formats import FORMATS, drive, write_version
+from cylinder_worlds import place
+from test_calibration_files import CAMERA_INFO, OCAM
 
-SHARE = {'messages': 500, 'models': 150, 'bags': 150, 'yaml': 300, 'images': 600}
-"""Inputs of each kind: some seconds; `make fuzz` makes 10,000."""
+from sfa_localization.bags import decoding
+from sfa_localization.bags.files import Topic
+from sfa_localization.bags.reader import KINDS, Bag
+from sfa_localization.bags.recording import METADATA, parse_metadata
+from sfa_localization.camera.calibration_files import read_calibration
+from sfa_localization.camera.encodings import decode_compressed
+from sfa_localization.camera.panorama import read_mask
+from sfa_localization.camera.settings import CameraConfig
+from sfa_localization.config import load_changes, load_settings, render
+from sfa_localization.data.errors import LocalizationError
+from sfa_localization.inspection import inspect
+from sfa_localization.place_model import PlaceModel
 
-
-def load_fuzz():
-    path = Path(__file__).parent / 'benchmarks' / 'fuzz.py'
-    spec = importlib.util.spec_from_file_location('fuzz', path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules['fuzz'] = module  # dataclasses look it up
-    spec.loader.exec_module(module)
-    return module
-
-
-fuzz = load_fuzz()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('name', SHARE)
-def test_a_share_of_the_inputs(name):
-    total = fuzz.Fuzzer(name).run(0, SHARE[name])
-    assert total.failures == []
-    assert total.inputs == SHARE[name]
-    assert 0.05 < total.read / total.inputs < 0.95, 'the inputs are neither intact nor rubbish'
-    assert 0 < total.peak_mb < 1000
+INPUTS = int(os.environ.get('FUZZ_INPUTS', '100'))
+Random = np.random.Generator
 
 
-class Faulty:
-    """A kind whose fifth input does what is asked of it in `FAULT`."""
+def damaged(data: bytes, random: Random) -> bytes:
+    """Bytes after one to six changes, half of them near the ends, where headers and indexes are."""
+    for _ in range(random.integers(1, 7)):
+        near, size = int(random.integers(0, 200)), int(random.integers(1, 60))
+        at = int(random.choice([near, len(data) - near, random.integers(0, len(data) + 1)]))
+        before, part, after = data[: max(at, 0)], data[at : at + size], data[at + size :]
+        changes = (
+            b'',
+            after,
+            bytes(size) + after,
+            b'\xff' * size + after,
+            random.bytes(size) + after,
+            random.bytes(size) + part + after,
+            part * 3 + after,
+            bytes(byte ^ 1 for byte in part) + after,
+        )
+        data = before + changes[random.integers(len(changes))]
+    return data
 
-    def prepare(self, folder: Path) -> None:
-        (folder / 'intact').touch()
 
-    def open(self, folder: Path) -> None:
-        assert (folder / 'intact').exists()
-        self._fault, self._used = os.environ['FAULT'], 0
+def spoilt(text: str, random: Random) -> str:
+    """Text after one to six changes."""
+    tokens = ['[', ']', '{', '- ', ': ', '&a ', '*a', '"', '|', '#', '!!int ', '---\n', '.nan',
+              '1e999', '9' * 5001, '2001-99-99', '\t', '\n', '\0', '\ud7ff', '[' * 999]  # fmt: skip
+    for _ in range(random.integers(1, 7)):
+        at, size = int(random.integers(0, len(text) + 1)), int(random.integers(0, 30))
+        put = [*tokens, text[at : at + size] * 3, ''][random.integers(len(tokens) + 2)]
+        text = text[:at] + put + text[at + size * int(random.integers(2)) :]
+    return text
 
-    def use(self, random: np.random.Generator, folder: Path) -> bool:
-        self._used += 1
-        if random.integers(10**9) != FIFTH:
-            return True
-        if self._fault == 'death':
-            os.kill(os.getpid(), signal.SIGSEGV)
-        elif self._fault == 'hang':
-            time.sleep(60)
-        elif self._fault == 'memory':
-            bytearray(fuzz.MEMORY)
-        elif self._fault == 'exit':
-            sys.exit('enough')
-        else:
-            raise KeyError('unexpected')
+
+def is_read(read: Callable[[], object], errors: type[Exception] = LocalizationError) -> bool:
+    """Whether it is read; it may raise one of our errors, in one line, and no other."""
+    try:
+        read()
+    except errors as error:
+        assert '\n' not in str(error) and len(str(error)) < 1500
         return False
+    return True
 
 
-FIFTH = int(np.random.default_rng([4, *b'faulty']).integers(10**9))
-fuzz_inputs.KINDS['faulty'] = Faulty
+def check(use: Callable[[Random], bool], inputs: int = INPUTS) -> None:
+    """Use inputs, each made of its own number; neither all nor none of them can be read."""
+    found = []
+    for number in range(inputs):
+        try:
+            found.append(use(np.random.default_rng(number)))
+        except Exception as error:
+            raise AssertionError(f'input {number}') from error
+    assert 0.02 < np.mean(found) < 0.98
 
 
-@pytest.mark.parametrize(
-    ('fault', 'found', 'text'),
-    [
-        ('death', 'deaths', 'exit code -11'),
-        ('hang', 'hangs', 'no end after 2 s'),
-        ('memory', 'tracebacks', 'MemoryError'),
-        ('exit', 'tracebacks', 'SystemExit: enough'),
-        ('error', 'tracebacks', "KeyError: 'unexpected'"),
-    ],
-)
-def test_what_goes_wrong_is_found_and_the_rest_goes_on(fault, found, text, monkeypatch):
-    monkeypatch.setenv('FAULT', fault)
-    total = fuzz.Fuzzer('faulty', 2.0, [__file__]).run(0, 10)
-    (failure,) = total.failures
-    assert getattr(total, found) == [failure]
-    assert failure.startswith('faulty 4: ') and text in failure
-    assert (total.inputs, total.read) == (10, 9)
-    line = fuzz.table({'faulty': total}).splitlines()[1].split()
-    assert line[:3] == ['faulty', '10', '9']
-    assert [int(number) for number in line[3:6]] == [
-        int(found == column) for column in ('deaths', 'tracebacks', 'hangs')
-    ]
+@pytest.fixture(autouse=True)
+def quiet(caplog):
+    caplog.set_level(logging.CRITICAL, 'sfa_localization')
 
 
-if __name__ == '__main__':
-    fuzz.run_inputs(sys.argv[1:])
+WHOLE = ['version 5', 'version 9', 'lone mcap, zstd', 'lone mcap, lz4', 'lone mcap, neither',
+         'ROS 1 lz4', 'sqlite3 zstd file', 'mcap zstd file', 'mcap zstd message']  # fmt: skip
+
+
+def read_streams(path: Path) -> None:
+    with Bag(path) as bag:
+        for kind in KINDS:
+            is_read(lambda kind=kind: bag.find(kind))
+        assert all(image.ndim == 3 for _, image in bag.images('/image_raw'))
+        assert np.isfinite(bag.odometry('/odom').poses).all()
+        assert np.isfinite(bag.yaw_rate('/imu').omega).all()
+        bag.trajectory('/ground_truth')
+
+
+def test_damaged_bags(tmp_path):
+    """Of every format; their files and their metadata."""
+    messages = drive(tmp_path)[:90]
+    for name in WHOLE:
+        FORMATS[name](tmp_path / name, messages)
+
+    def use(random: Random) -> bool:
+        whole = tmp_path / WHOLE[random.integers(len(WHOLE))]
+        bag = Path(shutil.copytree(whole, tmp_path / f'bag {random.integers(10**9)}'))
+        file = bag / random.choice(sorted(os.listdir(bag)))
+        content = file.read_bytes()
+        if file.name == METADATA and random.random() < 0.5:
+            file.write_bytes(spoilt(content.decode(), random).encode())
+        else:
+            file.write_bytes(damaged(content, random))
+        found = is_read(lambda: read_streams(bag))
+        found = is_read(lambda: inspect(bag)) or found
+        shutil.rmtree(bag)
+        return found
+
+    check(use)
+
+
+def test_damaged_messages(tmp_path):
+    decode = decoding.Decoder()
+    reads = {decoding.IMAGE: decoding.image_of, decoding.ODOMETRY: decoding.odometry_of}
+    messages = [m for m in drive(tmp_path) if m.kind in reads]
+
+    def use(random: Random) -> bool:
+        _, kind, _, data = messages[random.integers(len(messages))]
+        topic = Topic('/a', kind, 'cdr', (), 1)
+        return is_read(lambda: reads[kind](decode(damaged(data, random), topic)))
+
+    check(use)
+
+
+def test_damaged_models(tmp_path):
+    """Hardly any can be read: each part has its checksum."""
+    place().model.save(tmp_path / 'whole.npz')
+    whole, path = (tmp_path / 'whole.npz').read_bytes(), tmp_path / 'model.npz'
+    for number in range(INPUTS):
+        path.write_bytes(damaged(whole, np.random.default_rng(number)))
+        is_read(lambda: PlaceModel.load(path))
+
+
+def test_damaged_texts(tmp_path):
+    """Of parameter files, calibrations and metadata."""
+    info = CAMERA_INFO.format(model='plumb_bob', n=5, coefficients='[0.1, 0, 0, 0, 0]')
+    changes = 'sfa_node:\n  ros__parameters:\n    model: a.npz\n    map_frame: map\n'
+    metadata = (write_version(tmp_path / 'bag', drive(tmp_path)[:20], 5) / METADATA).read_text()
+    texts, path = [render(), changes, info, OCAM, metadata], tmp_path / 'file.yaml'
+
+    def use(random: Random) -> bool:
+        text = spoilt(texts[random.integers(len(texts))], random)
+        path.write_bytes(text.encode('utf-8', 'surrogatepass'))
+        found = [
+            is_read(lambda: load_changes(path)),
+            is_read(lambda: load_settings(path, 'omnicam_node', CameraConfig)),
+            is_read(lambda: read_calibration(path)),
+            is_read(lambda: parse_metadata(text), ValueError),
+        ]
+        return any(found)
+
+    check(use)
+
+
+def test_damaged_images(tmp_path):
+    image = np.random.default_rng(0).integers(0, 256, (37, 53, 3), np.uint8)
+    whole = [cv2.imencode(end, image)[1].tobytes() for end in ('.png', '.jpg', '.bmp', '.tiff')]
+    path = tmp_path / 'mask.png'
+
+    def use(random: Random) -> bool:
+        data = damaged(whole[random.integers(len(whole))], random)
+        path.write_bytes(data)
+        found = is_read(lambda: decode_compressed(data, 'bgr8; jpeg compressed bgr8'))
+        return is_read(lambda: read_mask(str(path), (53, 37))) or found
+
+    check(use)

@@ -10,6 +10,7 @@ from typing import Any
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from sfa_localization.bags.files import Topic
 from sfa_localization.camera.encodings import read_compressed, read_raw
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.messages import read_planar, read_stamp, read_twist
@@ -39,18 +40,18 @@ class Decoder:
         self._ros2 = typestore(Stores.ROS2_JAZZY)
         self._ros1 = typestore(Stores.ROS1_NOETIC)
 
-    def can_decode(self, kind: str, serialization: str) -> bool:
-        """Whether messages of this type can be decoded."""
-        if serialization == 'ros1':
-            return kind in self._ros1.fielddefs
-        return serialization == 'cdr' and kind in self._ros2.fielddefs
+    def can_decode(self, topic: Topic) -> bool:
+        """Whether the messages of a topic can be decoded."""
+        if topic.serialization == 'ros1':
+            return topic.kind in self._ros1.fielddefs
+        return topic.serialization == 'cdr' and topic.kind in self._ros2.fielddefs
 
-    def __call__(self, data: bytes, kind: str, serialization: str) -> Any:
-        """Decode `data` of message type `kind`. Raises MessageError for damaged data."""
-        ros1 = serialization == 'ros1'
+    def __call__(self, data: bytes, topic: Topic) -> Any:
+        """Decode a message of a topic. Raises MessageError for damaged data."""
+        ros1 = topic.serialization == 'ros1'
         decode = self._ros1.deserialize_ros1 if ros1 else self._ros2.deserialize_cdr
         try:
-            return decode(data, kind)
+            return decode(data, topic.kind)
         except Exception as error:  # a parser of foreign bytes fails in many ways
             raise MessageError(f'damaged message ({type(error).__name__})') from None
 

@@ -11,27 +11,18 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rosbags.interfaces import Qos
-
 from sfa_localization.bags import decoding
 from sfa_localization.bags import motion_arrays as motion
+from sfa_localization.bags.files import ZSTD_MAGIC, Record, Topic, add_problem, inflate_message
 from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.storage import (
-    ZSTD_MAGIC,
-    Channel,
-    DamageError,
-    Record,
-    add_problem,
-    inflate_message,
-)
 from sfa_localization.bags.topic_stream import Item, Stream, Tally
-from sfa_localization.data.errors import BagError, LocalizationError
+from sfa_localization.data.errors import BagError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
 from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
@@ -68,17 +59,6 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """A topic of a bag; `count` is the larger of the counts in its metadata and in its files."""
-
-    name: str
-    kind: str
-    count: int
-    serialization: str
-    qos: tuple[Qos, ...]
-
-
 class Bag:
     """Context manager over one bag: a folder, or a single .db3, .mcap or .bag file.
 
@@ -113,11 +93,7 @@ class Bag:
     @property
     def topics(self) -> dict[str, Topic]:
         """All topics by name."""
-        counts = self.recording.counts
-        return {
-            name: Topic(name, channel.kind, counts[name], channel.serialization, channel.qos)
-            for name, channel in self.recording.channels.items()
-        }
+        return self.recording.topics
 
     @property
     def counts(self) -> dict[str, Count]:
@@ -236,9 +212,8 @@ class Bag:
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic of any type, which may be empty; unknown types have the value None."""
-        channel = self.recording.channels[topic]
         stream = self._stream(topic, _itself, convert)
-        stream.opaque = not self._decode.can_decode(channel.kind, channel.serialization)
+        stream.opaque = not self._decode.can_decode(self.topics[topic])
         stream.required = False
         return stream
 
@@ -257,7 +232,7 @@ class Bag:
         for stream in streams:
             by_topic.setdefault(stream.topic, []).append(stream)
         for record in self.messages(by_topic):
-            for stream in by_topic[record[0].topic]:
+            for stream in by_topic[record[0].name]:
                 stream.received += 1
                 item = self._item(stream, *record)
                 for ready in stream.stamps.push(item) if item is not None else ():
@@ -269,12 +244,12 @@ class Bag:
                 yield stream, ready.stamp_ns, ready.value
             self._check_complete(stream)
 
-    def _item(self, stream: Stream, channel: Channel, receive_ns: int, data: bytes) -> Item | None:
+    def _item(self, stream: Stream, topic: Topic, receive_ns: int, data: bytes) -> Item | None:
         """The stamp and value of a message; None of one that is counted as rejected."""
         if stream.opaque:
             return Item(receive_ns, receive_ns, None)
         try:
-            part = stream.select(self._decode(data, channel.kind, channel.serialization))
+            part = stream.select(self._decode(data, topic))
             if part is None:
                 stream.tally.leave_out('transforms of other frames')
                 return None
@@ -287,20 +262,19 @@ class Bag:
             return None
 
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
-        """Channel, reception in ns and serialized bytes, as recorded, in order of reception."""
+        """Topic, reception in ns and serialized bytes, as recorded, in order of reception."""
         for record in self.recording.messages(set(topics), start_ns):
             if record[2][:4] != ZSTD_MAGIC:
                 yield record
                 continue
             try:
                 yield record[0], record[1], inflate_message(record[2])
-            except DamageError as damage:
-                text = f'{record[0].topic}: a compressed message is damaged ({damage})'
-                add_problem(self.recording.problems, text)
+            except MessageError as error:
+                add_problem(self.recording.problems, f'{record[0].name}: {error}')
 
     def _check_complete(self, stream: Stream) -> None:
         """Compare the messages read with the bag's own count; no usable message is an error."""
-        expected = self.recording.counts[stream.topic]
+        expected = self.topics[stream.topic].count
         if stream.received < expected:
             lost = f'{stream.received} of {expected} messages read; {REMEDY}'
             add_problem(self.recording.problems, f'{stream.topic}: {lost}')

@@ -39,7 +39,8 @@ from rosbags.typesys import Stores
 from rosgraph_msgs.msg import Clock
 
 from sfa_localization.bags.decoding import COMPRESSED, IMAGE, ODOMETRY, typestore
-from sfa_localization.bags.reader import Bag, Topic
+from sfa_localization.bags.files import Topic
+from sfa_localization.bags.reader import Bag
 from sfa_localization.commands.pace import (
     FASTER,
     PAUSE,
@@ -234,13 +235,13 @@ class Player:
 
     def _play_once(self) -> bool:
         """Publish the bag from its start; False when ROS was shut down."""
-        for channel, receive_ns, data in self._bag.messages(self._publishers, self._start_ns):
+        for topic, receive_ns, data in self._bag.messages(self._publishers, self._start_ns):
             if not self._wait_until(receive_ns):
                 return False
-            if channel.serialization == 'ros1':
-                data = self._convert(data, channel.kind)
-            self._publishers[channel.topic].publish(bytes(data))
-            self.played.messages[channel.topic] += 1
+            if topic.serialization == 'ros1':
+                data = self._convert(data, topic.kind)
+            self._publishers[topic.name].publish(bytes(data))
+            self.played.messages[topic.name] += 1
         return True
 
     def _wait_until(self, stamp_ns: int) -> bool:
