@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -48,42 +49,27 @@ def assert_found(circles, center=CENTER, radii=RADII, atol=1.0, hole_atol=2.0):
     )
 
 
-def test_one_image_on_a_dark_background():
-    assert_found(find_circles([scene(1)]))
-
-
-def test_a_drive_before_a_bright_still_background():
-    """The surroundings are brighter than the mirror; only change distinguishes them."""
+def test_a_mirror_on_a_dark_and_on_a_bright_still_background():
+    """The latter is brighter than the mirror; only change distinguishes it."""
+    found = find_circles([scene(1)])
+    assert_found(found)
+    assert find_circles([scene(1)]) == found
     still = np.full((480, 640, 1), 200.0)
     still[::8] = 60
     assert_found(find_circles([scene(n, still) for n in range(8)]), atol=3.0)
 
 
-def test_a_rim_that_the_image_cuts_off():
-    circles = find_circles([scene(1, center=(330.0, 200.0), radii=(42.0, 260.0))])
-    np.testing.assert_allclose(
-        (circles.rim.column, circles.rim.row, circles.rim.radius), (330, 200, 260), atol=2.0
-    )
-
-
-def test_a_mirror_without_a_hole():
+def test_a_rim_that_the_image_cuts_off_and_a_mirror_without_a_hole():
+    rim = find_circles([scene(1, center=(330.0, 200.0), radii=(42.0, 260.0))]).rim
+    np.testing.assert_allclose((rim.column, rim.row, rim.radius), (330, 200, 260), atol=2.0)
     assert find_circles([scene(1, radii=(0.0, 200.0))]).hole is None
 
 
-def test_the_same_images_give_the_same_circles():
-    assert find_circles([scene(1)]) == find_circles([scene(1)])
-
-
-@pytest.mark.parametrize('level', [0, 255])
-def test_images_without_a_mirror_are_rejected(level):
-    with pytest.raises(CameraError, match='stands out'):
-        find_circles([np.full((480, 640, 3), level, np.uint8)])
-
-
-def test_noise_without_a_mirror_is_rejected():
+def test_images_without_a_mirror_are_rejected():
     noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
-    with pytest.raises(CameraError, match='stands out'):
-        find_circles([noise])
+    for picture in (0 * noise, 0 * noise + 255, noise, np.full((3, 9000, 3), 10, np.uint8)):
+        with pytest.raises(CameraError, match='stands out'):
+            find_circles([picture])
 
 
 @pytest.mark.parametrize('side', [480, 1440, 2880])
@@ -117,25 +103,12 @@ def test_an_ordinary_camera_has_no_circle(count, size):
         find_circles(list(ordinary(count, size=size)))
 
 
-@pytest.mark.parametrize('size', [(6000, 6001), (3, 9000)])
-def test_images_larger_than_the_search_takes(size):
-    middle, radii = (size[1] / 2, size[0] / 2), (700.3, 2600.7)
-    picture = np.full((*size, 3), 10, np.uint8)
-    for radius, level in zip(radii[::-1], (150, 10), strict=True):
-        cv2.circle(picture, (round(middle[0]), round(middle[1])), round(radius), (level,) * 3, -1)
-    if min(size) < 100:
-        with pytest.raises(CameraError, match='stands out'):
-            find_circles([picture])
-    else:
-        assert_found(find_circles([picture]), middle, radii, atol=2.0)
-
-
 def test_memory_does_not_grow_with_the_images(tmp_path):
-    """Of a few kB each, with 12 MB of pixels."""
+    """Of a few kB each, with 4 MB of pixels."""
     paths = [tmp_path / f'{n}.png' for n in range(9)]
     for n, path in enumerate(paths):
-        picture = np.full((2000, 2000, 3), 10, np.uint8)
-        cv2.circle(picture, (1000, 1000), 750, (100 + 10 * n,) * 3, -1)
+        picture = np.full((1200, 1200, 3), 10, np.uint8)
+        cv2.circle(picture, (600, 600), 450, (100 + 10 * n,) * 3, -1)
         cv2.imwrite(str(path), picture)
     peaks = []
     for count in (3, 9):
@@ -143,32 +116,37 @@ def test_memory_does_not_grow_with_the_images(tmp_path):
         find_circles(read_images(paths[:count]))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 12e6
+    assert peaks[1] < peaks[0] + 4e6
 
 
 @pytest.fixture
-def picture(tmp_path):
-    path = tmp_path / 'raw.png'
-    cv2.imwrite(str(path), scene(1))
-    return path
+def picture(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite('raw.png', scene(1))
+    return 'raw.png'
 
 
-def test_from_images_to_a_calibration_file(tmp_path, picture, capsys):
-    output, check = tmp_path / 'made' / 'camera.yaml', tmp_path / 'check.png'
-    arguments = ['calibrate', str(picture), '--output', str(output), '--check', str(check)]
+def test_from_images_to_a_calibration_file(picture, capsys):
+    arguments = ['calibrate', picture, '--output', 'made/camera.yaml', '--check', 'check.png']
     assert cli.main([*arguments, '--angle-min', '70', '--angle-max', '120']) == 0
-    lens = read_calibration(output)
+    lens = read_calibration(Path('made/camera.yaml'))
     assert lens.camera_model == 'polar'
     assert (lens.image_width, lens.image_height) == (640, 480)
     assert lens.cx == pytest.approx(CENTER[0], abs=1.0)
     assert lens.radius_max == pytest.approx(RADII[1], abs=1.0)
     assert (lens.angle_min, lens.angle_max) == (70.0, 120.0)
-    camera = CameraConfig(calibration_file=str(output))
-    result = Unwrapper(camera, PanoramaConfig())(scene(1))
-    assert result.min() > 30  # no background inside the panorama
+    result = Unwrapper(CameraConfig(calibration_file='made/camera.yaml'), PanoramaConfig())
+    assert result(scene(1)).min() > 30  # no background inside the panorama
     assert 'camera_model: polar' in capsys.readouterr().out
-    assert cv2.imread(str(check)).shape[1] == 1200
-    assert sorted(entry.name for entry in output.parent.iterdir()) == ['camera.yaml']
+    assert [entry.name for entry in Path('made').iterdir()] == ['camera.yaml']
+    arguments = ['calibrate', picture, '--output', 'camera.yaml']
+    assert cli.main([*arguments, '--model', 'fisheye', '--field-of-view', '200']) == 0
+    lens = read_calibration(Path('camera.yaml'))
+    assert lens.camera_model == 'fisheye'
+    assert lens.fx == pytest.approx(RADII[1] / np.radians(100), rel=0.01)
+    assert cli.main([*arguments, '--center', '300x200', '--radii', '20x150']) == 0
+    lens = read_calibration(Path('camera.yaml'))
+    assert (lens.cx, lens.cy, lens.radius_min, lens.radius_max) == (300.0, 200.0, 20.0, 150.0)
 
 
 def test_from_a_bag_to_a_calibration_file_and_a_look(tmp_path, capsys):
@@ -191,37 +169,23 @@ def test_from_a_bag_to_a_calibration_file_and_a_look(tmp_path, capsys):
     assert 'give one bag, or images' in capsys.readouterr().err
 
 
-def test_a_fisheye_from_its_rim(tmp_path, picture):
-    output = tmp_path / 'camera.yaml'
-    arguments = ['--model', 'fisheye', '--field-of-view', '200', '--output', str(output)]
-    assert cli.main(['calibrate', str(picture), *arguments]) == 0
-    lens = read_calibration(output)
-    assert lens.camera_model == 'fisheye'
-    assert lens.fx == pytest.approx(RADII[1] / np.radians(100), rel=0.01)
-
-
-def test_circles_given_by_hand(tmp_path, picture):
-    output = tmp_path / 'camera.yaml'
-    arguments = ['--center', '300x200', '--radii', '20x150', '--output', str(output)]
-    assert cli.main(['calibrate', str(picture), *arguments]) == 0
-    lens = read_calibration(output)
-    assert (lens.cx, lens.cy, lens.radius_min, lens.radius_max) == (300.0, 200.0, 20.0, 150.0)
+KALIBR = """cam0:
+  camera_model: omni
+  intrinsics: [0.8, 233, 230, 373, 253]
+  distortion_model: radtan
+  distortion_coeffs: [0.1, 0.01, 0.001, -8.0e-05]
+  resolution: [752, 480]
+"""
 
 
 def test_from_a_calibration_file(tmp_path):
     known, output = tmp_path / 'camchain.yaml', tmp_path / 'camera.yaml'
-    known.write_text(
-        'cam0:\n  camera_model: omni\n  intrinsics: [0.8, 233, 230, 373, 253]\n'
-        '  distortion_model: radtan\n  distortion_coeffs: [0.1, 0.01, 0.001, -8.0e-05]\n'
-        '  resolution: [752, 480]\n'
-    )
+    known.write_text(KALIBR)
     arguments = ['--calibration', str(known), '--mount-rpy', '0x0x90', '--output', str(output)]
     assert cli.main(['calibrate', *arguments]) == 0
     lens = read_calibration(output)
     assert lens == read_calibration(known)
-    assert (lens.camera_model, lens.xi) == ('mirror', 0.8)
-    assert lens.distortion == (0.1, 0.01, 0.001, -8e-05)
-    assert (lens.radius_min, lens.radius_max) == (0.0, 0.0)
+    assert (lens.camera_model, lens.xi, lens.radius_min) == ('mirror', 0.8, 0.0)
     assert 'mount_rpy: [0.0, 0.0, 90.0]' in output.read_text()
 
 
@@ -239,37 +203,30 @@ def test_from_a_calibration_file(tmp_path):
         (['raw.png', '--calibration', 'other.yaml'], 'add the columns and rows cut off'),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_written(tmp_path, monkeypatch, capsys, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    cv2.imwrite('raw.png', scene(1))
+def test_bad_input_is_one_line_and_nothing_written(picture, capsys, arguments, words):
     cv2.imwrite('small.png', scene(1)[:100])
     cv2.imwrite('filled.png', scene(1, radii=(0.0, 200.0)))
-    (tmp_path / 'notes.txt').write_text('no picture')
-    (tmp_path / 'other.yaml').write_text(
-        'cam0:\n  camera_model: omni\n  intrinsics: [0.8, 233, 230, 373, 253]\n'
-        '  resolution: [480, 480]\n'
-    )
-    output = tmp_path / 'camera.yaml'
-    assert cli.main(['calibrate', *arguments, '--output', str(output)]) == 1
+    Path('notes.txt').write_text('no picture')
+    Path('other.yaml').write_text(KALIBR.replace('752', '480'))
+    assert cli.main(['calibrate', *arguments, '--output', 'camera.yaml']) == 1
     printed, error = capsys.readouterr()
     assert words in error and printed == ''
     assert '\n' not in error.strip()
-    assert not output.exists()
+    assert not Path('camera.yaml').exists()
 
 
 @pytest.mark.parametrize('option', ['--output', '--check'])
-def test_what_is_read_is_not_replaced(tmp_path, monkeypatch, capsys, picture, option):
-    monkeypatch.chdir(tmp_path)
-    before = picture.read_bytes()
-    assert cli.main(['calibrate', str(picture), option, str(picture)]) == 1
-    assert 'would be replaced' in capsys.readouterr().err and picture.read_bytes() == before
-    assert cli.main(['calibrate', str(picture), '--output', 'a', '--check', './a']) == 1
+def test_what_is_read_is_not_replaced(picture, capsys, option):
+    before = Path(picture).read_bytes()
+    assert cli.main(['calibrate', picture, option, picture]) == 1
+    assert 'would be replaced' in capsys.readouterr().err and Path(picture).read_bytes() == before
+    assert cli.main(['calibrate', picture, '--output', 'a', '--check', './a']) == 1
     assert 'a: named for two outputs: give each its own' in capsys.readouterr().err
-    assert cli.main(['calibrate', str(picture), '--output', 'camera.yaml']) == 0
-    before = (tmp_path / 'camera.yaml').read_bytes()
+    assert cli.main(['calibrate', picture, '--output', 'camera.yaml']) == 0
+    before = Path('camera.yaml').read_bytes()
     known = ['--calibration', 'camera.yaml', '--mount-rpy', '0x0x90']
     assert cli.main(['calibrate', *known, '--output', './camera.yaml']) == 1
-    assert (tmp_path / 'camera.yaml').read_bytes() == before
+    assert Path('camera.yaml').read_bytes() == before
 
 
 def test_the_check_image_marks_the_directions():
@@ -283,21 +240,15 @@ def test_the_check_image_marks_the_directions():
     assert red[319:321, 460:590].any(axis=0).all()
 
 
-def test_given_circles_are_checked():
-    with pytest.raises(CameraError, match='--radii'):
-        given_circles((1.0, 2.0), (5.0, 4.0))
-    assert given_circles((1.0, 2.0), (0.0, 4.0)).hole is None
-
-
-@pytest.mark.parametrize('center', [(320.0, 240.0), (0.0, 480.0), (640.0, 240.0)])
-def test_a_rim_may_lie_partly_outside_the_image_but_not_wholly(center):
+def test_a_rim_may_lie_partly_outside_the_image_but_not_wholly():
     picture = np.zeros((480, 640, 3), np.uint8)
-    farthest = float(np.hypot(max(center[0], 640 - center[0]), max(center[1], 480 - center[1])))
-    given_circles(center, (40.0, farthest - 1), [picture])
-    beyond, beside = (center, (40.0, farthest + 1)), ((-1.0, 240.0), (4.0, 9.0))
-    for wrong_center, radii in (beyond, beside, ((9.0, float('nan')), (0.0, 9.0))):
-        with pytest.raises(CameraError, match='not in an image of 640x480 pixels'):
-            given_circles(wrong_center, radii, [picture])
+    for center in ((320.0, 240.0), (0.0, 480.0), (640.0, 240.0)):
+        farthest = float(np.hypot(max(center[0], 640 - center[0]), max(center[1], 480 - center[1])))
+        given_circles(center, (40.0, farthest - 1), [picture])
+        beyond, beside = (center, (40.0, farthest + 1)), ((-1.0, 240.0), (4.0, 9.0))
+        for wrong_center, radii in (beyond, beside, ((9.0, float('nan')), (0.0, 9.0))):
+            with pytest.raises(CameraError, match='not in an image of 640x480 pixels'):
+                given_circles(wrong_center, radii, [picture])
 
 
 def test_of_center_and_radii_what_is_not_given_is_found():
@@ -311,3 +262,6 @@ def test_of_center_and_radii_what_is_not_given_is_found():
     assert (radii.hole.radius, radii.rim.radius) == (50.0, 180.0)
     with pytest.raises(CameraError, match='both --center and --radii'):
         given_circles((300.0, 200.0), None)
+    with pytest.raises(CameraError, match='--radii'):
+        given_circles((1.0, 2.0), (5.0, 4.0))
+    assert given_circles((1.0, 2.0), (0.0, 4.0)).hole is None

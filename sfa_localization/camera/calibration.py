@@ -17,16 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.calibration_files import CALIBRATION_TITLE, read_calibration
-from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed, encode_png
+from sfa_localization.camera.encodings import encode_png, read_image
 from sfa_localization.camera.lenses import make_camera
-from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import (
-    CalibrationConfig,
-    LensCalibration,
-    PanoramaConfig,
-)
+from sfa_localization.camera.panorama import Unwrapper, panorama_rays
+from sfa_localization.camera.settings import CalibrationConfig, LensCalibration
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import atomic_write, first_bytes, read_regular
+from sfa_localization.data.files import atomic_write, first_bytes
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -74,13 +70,7 @@ class _Files(Sequence[Image]):
         return len(self._paths)
 
     def __getitem__(self, index: Any) -> Any:
-        path = self._paths[index]
-        try:
-            return decode_compressed(read_regular(path, LARGEST_FILE))
-        except OSError as error:
-            raise CameraError(f'{path}: {error.strerror or error}') from None
-        except CameraError as error:
-            raise CameraError(f'{path}: {error}') from None
+        return read_image(self._paths[index])
 
 
 def read_images(paths: Sequence[Path]) -> Sequence[Image]:
@@ -368,82 +358,85 @@ def _require_inside(circles: MirrorCircles, image: Image) -> None:
         )
 
 
-_GREEN, _RED, _WHITE = (80, 220, 80), (60, 60, 255), (255, 255, 255)
-_CHECK_WIDTH = 1200  # px, at least; small images are framed, so that labels of the strip fit
+_GREEN, _RED = (80, 220, 80), (60, 60, 255)
+_CHECK_WIDTH = 1200  # px: smaller images are framed, so that the labels of the panorama fit
+_SIDES = {'FRONT': 0, 'LEFT': 90, 'BACK': 180, 'RIGHT': 270}
+_LABELS_DEG = 45  # azimuth at which elevations are named
+_STEP, _NEAR = 4, 0.999  # pixels among which the place of a label is looked for; its least cosine
 
 
 def check_image(image: Image, unwrapper: Unwrapper) -> Image:
-    """The raw image with its directions and elevations drawn in, above its panorama."""
-    (height, raw_width), unwrapped = image.shape[:2], unwrapper(image)
-    width = max(raw_width, _CHECK_WIDTH)
-    size = (width, max(round(unwrapped.shape[0] * width / unwrapped.shape[1]), 1))
-    strip = np.asarray(cv2.resize(unwrapped, size, interpolation=cv2.INTER_LINEAR), np.uint8)
-    _label(strip, unwrapper.panorama)
-    left = (width - raw_width) // 2
-    framed = np.zeros((height + len(strip), width, 3), np.uint8)
-    raw = framed[:height, left : left + raw_width]
-    raw[:], framed[height:] = image, strip
-    _annotate(raw, unwrapper)
+    """The raw image above its panorama, 1200 px wide: in both, directions red, and every ten
+    degrees above and below the horizon green.
+    """
+    strip = _wide(unwrapper(image), _CHECK_WIDTH)
+    rays = _wide(panorama_rays(unwrapper.panorama), _CHECK_WIDTH)
+    _draw(strip, rays)
+    raw = _wide(image, min(image.shape[1], _CHECK_WIDTH))
+    height, width = raw.shape[:2]
+    model = make_camera(
+        unwrapper.calibration, (height, width), unwrapper.panorama, unwrapper.camera.mount_rpy
+    )
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(float)
+    _draw(raw, model.unproject(pixels.reshape(-1, 2)).reshape(height, width, 3))
+    left = (_CHECK_WIDTH - width) // 2
+    framed = np.zeros((height + len(strip), _CHECK_WIDTH, 3), np.uint8)
+    framed[:height, left : left + width], framed[height:] = raw, strip
     return framed
 
 
-def _annotate(drawn: Image, unwrapper: Unwrapper) -> None:
-    """Draw directions and elevations into a raw image."""
-    panorama, size = unwrapper.panorama, (drawn.shape[0], drawn.shape[1])
-    model = make_camera(unwrapper.calibration, size, panorama, unwrapper.camera.mount_rpy)
-    circle = np.radians(45.0 + np.arange(0, 361, 1.0))
-    for elevation in (panorama.elevation_min, 0.0, panorama.elevation_max):
-        ring = model.project(_rays(circle, np.radians(elevation)))
-        _draw(drawn, ring, _GREEN, f'{elevation:+g} deg')
-    heights = np.radians(np.linspace(panorama.elevation_min, panorama.elevation_max, 50))
-    for name, azimuth in (('FRONT', 0.0), ('LEFT', 90.0), ('BACK', 180.0), ('RIGHT', 270.0)):
-        spoke = model.project(_rays(np.radians(azimuth), heights))
-        _draw(drawn, spoke, _RED, name)
+def _wide(image: Any, width: int) -> Any:
+    """A copy of an image (H, W, 3) scaled to a width."""
+    height = max(round(image.shape[0] * width / image.shape[1]), 1)
+    shrinks = width < image.shape[1]
+    return cv2.resize(
+        image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
 
 
-def _rays(azimuth: Any, elevation: Any) -> Array:
-    azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
-    flat = np.cos(elevation)
-    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+def _draw(drawn: Image, rays: Array) -> None:
+    """Draw directions and elevations into an image whose pixels see rays (H, W, 3)."""
+    x, y, z = np.moveaxis(rays, -1, 0)
+    for elevation in range(-80, 90, 10):
+        line = _border(z > np.sin(np.radians(elevation)), x)
+        if elevation == 0:
+            line |= np.roll(line, 1, axis=0)
+        drawn[line] = _GREEN
+    for seen in (x > 0, y > 0):
+        drawn[_border(seen, x)] = _RED
+    for elevation in range(-80, 90, 10):
+        name = f'{elevation:+d} deg' if elevation else 'HORIZON'
+        _write(drawn, name, rays, (_LABELS_DEG, elevation), _GREEN)
+    for name, azimuth in _SIDES.items():
+        _write(drawn, name, rays, (azimuth, 0), _RED)
 
 
-def _draw(drawn: Image, line: Array, color: tuple[int, int, int], name: str) -> None:
-    """Draw the visible parts of a line (N, 2) and its name at its end."""
-    visible = np.asarray(np.isfinite(line).all(axis=1))
-    for part in np.split(np.arange(len(line)), np.flatnonzero(np.diff(visible)) + 1):
-        if visible[part[0]]:
-            points = np.rint(line[part]).astype(np.int32).reshape(-1, 1, 2)
-            cv2.polylines(drawn, [points], False, color, 1, cv2.LINE_AA)
-    if visible.any():
-        _write(drawn, name, line[np.flatnonzero(visible)[-1]], color)
+def _border(inside: NDArray[np.bool_], seen: Array) -> NDArray[np.bool_]:
+    """Mask (H, W) of where a region ends, beside pixels that see something."""
+    border = np.zeros(inside.shape, bool)
+    visible = np.isfinite(seen)
+    border[1:] |= (inside[1:] != inside[:-1]) & visible[1:] & visible[:-1]
+    border[:, 1:] |= (inside[:, 1:] != inside[:, :-1]) & visible[:, 1:] & visible[:, :-1]
+    return border
 
 
-def _write(drawn: Image, text: str, place: Array, color: tuple[int, int, int]) -> None:
+def _write(
+    drawn: Image, text: str, rays: Array, toward: tuple[float, float], color: tuple[int, int, int]
+) -> None:
+    """Write a text where the image shows an azimuth and elevation (degrees), if it does."""
+    azimuth, elevation = np.radians(toward)
+    level = np.cos(elevation)
+    ray = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+    likeness = np.nan_to_num(rays[::_STEP, ::_STEP] @ ray, nan=-1.0)
+    place = np.unravel_index(np.argmax(likeness), likeness.shape)
+    if likeness[place] < _NEAR:
+        return
     font = cv2.FONT_HERSHEY_SIMPLEX
     (width, height), _ = cv2.getTextSize(text, font, 0.5, 1)
-    limit = np.array([drawn.shape[1] - width - 2, drawn.shape[0] - 4])
-    column, row = np.clip(np.rint(place).astype(int), [2, height + 2], np.maximum(limit, 2))
+    column = int(np.clip(_STEP * place[1] + 3, 2, max(drawn.shape[1] - width - 2, 2)))
+    row = int(np.clip(_STEP * place[0] - 3, height + 2, max(drawn.shape[0] - 4, height + 2)))
     for ink, thickness in (((0, 0, 0), 3), (color, 1)):  # a black outline keeps it readable
-        start = (int(column), int(row))
-        cv2.putText(drawn, text, start, font, 0.5, ink, thickness, cv2.LINE_AA)
-
-
-def _label(strip: Image, panorama: PanoramaConfig) -> None:
-    """Draw the directions, the horizon, and every ten degrees above and below it."""
-    height, width = strip.shape[:2]
-    left_to_right = ('BACK', 'LEFT', 'FRONT', 'RIGHT')
-    sides = left_to_right if panorama.clockwise else ('BACK', 'RIGHT', 'FRONT', 'LEFT')
-    low, high = panorama.elevation_min, panorama.elevation_max
-    for elevation in range(-80, 90, 10):
-        row = round((high - elevation) / (high - low) * height - 0.5)
-        if 0 <= row < height:
-            cv2.line(strip, (0, row), (width, row), _GREEN, 1 if elevation else 2)
-            name = f'{elevation:+d} deg' if elevation else 'HORIZON'
-            _write(strip, name, np.array([width // 8, row - 3]), _GREEN)
-    for quarter, name in enumerate(sides):
-        column = quarter * width // 4
-        cv2.line(strip, (column, 0), (column, height), _RED, 1)
-        _write(strip, name, np.array([column + 4, height - 6]), _WHITE)
+        cv2.putText(drawn, text, (column, row), font, 0.5, ink, thickness, cv2.LINE_AA)
 
 
 def require_own(path: Path) -> None:
@@ -455,14 +448,11 @@ def require_own(path: Path) -> None:
 
 def write_calibration(path: Path, text: str) -> None:
     """Write a calibration file, whole or not at all. Raises CameraError naming it."""
-    _write_file(path, text.encode())
+    with atomic_write(path, CameraError) as file:
+        file.write(text.encode())
 
 
 def write_check(path: Path, image: Image) -> None:
     """Write an image (H, W, 3) as PNG. Raises CameraError naming the file."""
-    _write_file(path, encode_png(image))
-
-
-def _write_file(path: Path, data: bytes) -> None:
     with atomic_write(path, CameraError) as file:
-        file.write(data)
+        file.write(encode_png(image))

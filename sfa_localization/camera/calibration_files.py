@@ -28,9 +28,6 @@ _KNOWN = (
     'known are camera_info, OpenCV, Kalibr, camodocal, stella_vslam and ORB-SLAM3 YAML, OpenCV '
     'XML, OCamCalib calib_results.txt, and what the command calibrate writes'
 )
-_PLUMB_BOB = ('', 'none', 'plumb_bob', 'radtan', 'rational_polynomial')
-_SLAM = {'Camera', 'Camera1'}
-_FISHEYE = ('equidistant', 'equi', 'fisheye', 'kannala_brandt')
 _OF_EVERY_CAMERA = (
     *('camera_model', 'image_width', 'image_height', 'cx', 'cy', 'radius_min', 'radius_max'),
     *('axis', 'mirrored'),
@@ -50,6 +47,20 @@ _HEAD = f"""\
 #   calibration_file: name of this file
 #   mount_rpy: {{mount_rpy}}
 """
+
+# What programs call the same things; the first that is there counts.
+_PARTS = {'Camera', 'Camera1', 'cam0', 'mirror_parameters', 'distortion_parameters',
+          'projection_parameters'}  # fmt: skip
+_MATRIX = ('camera_matrix', 'K', 'k', 'cameraMatrix', 'intrinsics')
+_FOCAL = (('fx', 'gamma1', 'mu'), ('fy', 'gamma2', 'mv'), ('cx', 'u0'), ('cy', 'v0'))
+_COEFFICIENTS = (
+    'distortion_coefficients', 'D', 'd', 'distCoeffs', 'dist_coeffs', 'distortion_coeffs',
+)  # fmt: skip
+_SIZES = (('image_width', 'width', 'cols'), ('image_height', 'height', 'rows'))
+_KINDS = ('camera_model', 'model_type', 'model', 'type', 'distortion_model')
+_MIRRORS = {'mei', 'omni'}
+_FISHEYES = {'equidistant', 'equi', 'fisheye', 'kannala_brandt', 'kannalabrandt8'}
+_PINHOLES = {'', 'none', 'pinhole', 'perspective', 'plumb_bob', 'radtan', 'rational_polynomial'}
 
 
 def calibration_of(camera: CameraConfig) -> LensCalibration:
@@ -88,11 +99,12 @@ def read_calibration(path: Path) -> LensCalibration:
     except OSError as error:
         raise CameraError(f'{path}: {error.strerror or error}') from None
     try:
-        fields = _from_yaml(text) if path.suffix.lower() != '.txt' else _from_ocam(text)
+        fields = _from_ocam(text) if path.suffix.lower() == '.txt' else _from_names(text)
         return LensCalibration(**{'radius_min': 0.0, 'radius_max': 0.0, **fields})
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-        reason = short_line(str(error) + (' is missing' if isinstance(error, KeyError) else ''))
-        raise CameraError(f'{path}: no camera calibration ({reason}); {_KNOWN}') from None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CameraError(
+            f'{path}: no camera calibration ({short_line(str(error))}); {_KNOWN}'
+        ) from None
     except (CameraError, ConfigError) as error:
         raise CameraError(f'{path}: {error}') from None
 
@@ -126,7 +138,8 @@ def _matrix_node(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
 _Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _matrix_node)
 
 
-def _from_yaml(text: str) -> dict[str, Any]:
+def _from_names(text: str) -> dict[str, Any]:
+    """A file of names and values, YAML or XML."""
     text = re.sub(r'\A%YAML:1\.0\s*', '', text)
     try:
         # A topic that is echoed ends each message with a document mark.
@@ -135,21 +148,13 @@ def _from_yaml(text: str) -> dict[str, Any]:
         raise CameraError(f'{error}; {_KNOWN}') from None
     if not isinstance(content, Mapping):
         raise CameraError(f'no camera calibration; {_KNOWN}')
-    if any(str(key).partition('.')[0] in _SLAM for key in content):
-        return _from_slam(content)
-    if 'camera_model' in content and not {'camera_matrix', 'K', 'k'} & set(content):
+    if 'camera_model' in content and not set(_MATRIX) & set(content):
         return _from_own(content)
-    if 'cam0' in content:
-        return _from_kalibr(content['cam0'])
-    if 'model_type' in content:
-        return _from_camodocal(content)
-    return _from_matrix(content)
+    return _from_others(_flat(content))
 
 
 def _xml(text: str) -> dict[str, Any]:
     """What OpenCV's FileStorage writes as XML. Raises ValueError."""
-    if '<!' in re.sub('<!--.*?-->', '', text, flags=re.DOTALL):
-        raise ValueError('XML with definitions of its own')  # which may grow without limit
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -157,25 +162,16 @@ def _xml(text: str) -> dict[str, Any]:
     return {part.tag: (part.findtext('data') or part.text or '').split() for part in root}
 
 
-def _from_slam(content: Mapping[str, Any]) -> dict[str, Any]:
-    """stella_vslam, and ORB-SLAM3: entries Camera.fx or Camera1.fx, or fx below Camera."""
-    camera: dict[str, Any] = {}
+def _flat(content: Mapping[Any, Any]) -> dict[str, Any]:
+    """Names and values of a file, with those of the parts that hold a camera's."""
+    found: dict[str, Any] = {}
     for key, value in content.items():
-        head, _, name = str(key).partition('.')
-        if head in _SLAM:
-            camera |= {name: value} if name else dict(value)
-    model = str(camera.get('model', camera.get('type', ''))).lower()
-    if model == 'equirectangular':
-        return {'camera_model': model}
-    names = {'perspective': ('k1', 'k2', 'p1', 'p2', 'k3'), 'fisheye': ('k1', 'k2', 'k3', 'k4')}
-    names |= {'pinhole': names['perspective'], 'kannalabrandt8': names['fisheye']}
-    if model not in names:
-        raise CameraError(f'camera model {model!r} of a SLAM program is not supported')
-    focal = [float(camera[key]) for key in ('fx', 'fy', 'cx', 'cy')]
-    distortion = [float(camera.get(key, 0.0)) for key in names[model]]
-    kind = 'fisheye' if names[model] == names['fisheye'] else 'plumb_bob'
-    size = (camera.get(a, camera.get(b, 0)) for a, b in (('cols', 'width'), ('rows', 'height')))
-    return {**_lens(kind, focal, distortion), **_size(*size)}
+        part, _, name = str(key).partition('.')
+        if part in _PARTS and isinstance(value, Mapping):
+            found = {**_flat(value), **found}
+        else:
+            found.setdefault(name if part in _PARTS and name else str(key), value)
+    return found
 
 
 def _from_own(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,101 +184,79 @@ def _from_own(content: Mapping[str, Any]) -> dict[str, Any]:
     return dict(content)
 
 
-def _from_kalibr(camera: Mapping[str, Any]) -> dict[str, Any]:
-    model = camera['camera_model']
-    numbers = _numbers(camera['intrinsics'])
-    if model not in ('omni', 'pinhole'):
+def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Other programs' files: a camera's kind, focal lengths, center, distortion and size."""
+    kinds = {str(named[name]).lower() for name in _KINDS if name in named}
+    if 'equirectangular' in kinds:
+        return {'camera_model': 'equirectangular'}
+    if any(_given(named, 'fisheye_model')):
+        kinds = {'fisheye'}
+    numbers, xi = _given(named, *_MATRIX), _given(named, 'xi')
+    has_mirror = bool(xi or kinds & _MIRRORS)
+    unknown = kinds - _PINHOLES - (_MIRRORS if has_mirror else _FISHEYES)
+    if unknown:
         raise CameraError(
-            f'Kalibr camera model {model!r} is not supported; calibrate with omni-radtan or '
-            'pinhole-equi'
+            f'camera model {" ".join(sorted(unknown))!r} is not supported; calibrate with another: '
+            'omni or MEI, equidistant or KANNALA_BRANDT, or a pinhole with radtan'
         )
-    xi = numbers.pop(0) if model == 'omni' else 0.0
-    distortion = _numbers(camera.get('distortion_coeffs', []))
-    kind = str(camera.get('distortion_model', 'none'))
-    return {
-        **_lens(kind, numbers, distortion, xi, has_mirror=model == 'omni'),
-        **_size(*camera['resolution']),
-    }
-
-
-def _from_camodocal(content: Mapping[str, Any]) -> dict[str, Any]:
-    kind, projection = str(content['model_type']).upper(), content['projection_parameters']
-    size = _size(content['image_width'], content['image_height'])
-    if kind == 'MEI':
-        focal = [projection[name] for name in ('gamma1', 'gamma2', 'u0', 'v0')]
-        distortion = [content['distortion_parameters'][name] for name in ('k1', 'k2', 'p1', 'p2')]
-        xi = float(content['mirror_parameters']['xi'])
-        return {**_lens('radtan', _numbers(focal), _numbers(distortion), xi, True), **size}
-    if kind == 'KANNALA_BRANDT':
-        focal = [projection[name] for name in ('mu', 'mv', 'u0', 'v0')]
-        distortion = [projection[name] for name in ('k2', 'k3', 'k4', 'k5')]
-        return {**_lens('equidistant', _numbers(focal), _numbers(distortion)), **size}
-    raise CameraError(f'camodocal model {kind} is not supported; use MEI or KANNALA_BRANDT')
-
-
-def _from_matrix(content: Mapping[str, Any]) -> dict[str, Any]:
-    """camera_info and OpenCV: a camera matrix, coefficients, and a name for their model."""
-    matrix = _numbers(_first(content, 'camera_matrix', 'K', 'k', 'cameraMatrix', 'intrinsics'))
-    if len(matrix) != 9:
-        raise CameraError(f'the camera matrix has {len(matrix)} numbers, not 9')
-    if matrix[0] == 0.0:
+    if has_mirror and len(numbers) == 5:
+        xi, numbers = numbers[:1], numbers[1:]
+    if len(numbers) == 9:
+        numbers = [numbers[0], numbers[4], numbers[2], numbers[5]]
+    numbers = numbers or [_required(named, *names) for names in _FOCAL]
+    if len(numbers) != 4:
+        raise CameraError(f'{len(numbers)} numbers of focal lengths and center, not 4')
+    if numbers[0] == 0.0:
         raise CameraError('the camera is not calibrated: its focal length is 0')
-    focal = [matrix[0], matrix[4], matrix[2], matrix[5]]
-    names = ('distortion_coefficients', 'D', 'd', 'distCoeffs', 'dist_coeffs')
-    distortion = _numbers(_first(content, *names))
-    kind = str(content.get('distortion_model', content.get('camera_model', '')))
-    if content.get('fisheye_model'):
-        kind = 'fisheye'
-    xi = _numbers(content.get('xi', [0.0]))[0]
-    lens = _lens(kind, focal, distortion, xi, has_mirror='xi' in content)
-    return {**lens, **_size_in(content)}
-
-
-def _size_in(content: Mapping[str, Any]) -> dict[str, Any]:
-    for names in (('image_width', 'image_height'), ('width', 'height')):
-        if names[0] in content:
-            return _size(*(_numbers(content[name])[0] for name in names))
-    return _size(0, 0)
-
-
-def _lens(
-    kind: str,
-    focal: list[float],
-    distortion: list[float],
-    xi: float = 0.0,
-    has_mirror: bool = False,
-) -> dict[str, Any]:
-    """Fields of a lens with focal = [fx, fy, cx, cy]; `kind` is the name of the distortion."""
-    if len(focal) != 4:
-        raise CameraError(f'{len(focal)} numbers of focal lengths and center, not 4')
-    lens = dict(zip(('fx', 'fy', 'cx', 'cy'), focal, strict=True))
-    coefficients = tuple((distortion + [0.0] * 4)[:4]) if any(distortion) else ()
-    if any(distortion[4:]):
-        raise CameraError(f'{len(distortion)} coefficients of distortion; only 4 are supported')
-    if kind.lower() in _FISHEYE and not has_mirror:
-        return {'camera_model': 'fisheye', **lens, 'distortion': coefficients}
-    if kind.lower() not in _PLUMB_BOB:
-        raise CameraError(f'distortion model {kind!r} is not supported here')
+    fisheye = not has_mirror and bool(kinds & _FISHEYES)
+    lens = {
+        **dict(zip(('fx', 'fy', 'cx', 'cy'), numbers, strict=True)),
+        **dict(zip(('image_width', 'image_height'), _size(named), strict=True)),
+        'distortion': _distortion(named, fisheye),
+    }
+    if fisheye:
+        return {'camera_model': 'fisheye', **lens}
+    if has_mirror:
+        return {'camera_model': 'mirror', 'xi': (xi or [_required(named, 'xi')])[0], **lens}
     # A lens without a mirror shows the world as it is, and looks where it is pointed.
-    plain = {} if has_mirror else {'mirrored': 'no', 'axis': 'forward'}
-    return {'camera_model': 'mirror', 'xi': xi, **plain, **lens, 'distortion': coefficients}
+    return {'camera_model': 'mirror', 'xi': 0.0, 'mirrored': 'no', 'axis': 'forward', **lens}
 
 
-def _size(width: Any, height: Any) -> dict[str, Any]:
-    return {'image_width': int(width), 'image_height': int(height)}
+def _distortion(named: Mapping[str, Any], fisheye: bool) -> tuple[float, ...]:
+    """The four coefficients, none where all are 0."""
+    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3')
+    names = ('k2', 'k3', 'k4', 'k5') if fisheye and 'k5' in named else names  # camodocal's
+    if set(_COEFFICIENTS) & set(named):
+        numbers = _given(named, *_COEFFICIENTS)
+    else:
+        numbers = [(_given(named, name) or [0.0])[0] for name in names]
+    if any(numbers[4:]):
+        raise CameraError(f'{len(numbers)} coefficients of distortion; only 4 are supported')
+    return tuple((numbers + [0.0] * 4)[:4]) if any(numbers) else ()
 
 
-def _first(content: Mapping[str, Any], *names: str) -> Any:
-    for name in names:
-        if name in content:
-            return content[name]
-    raise CameraError(f'none of {", ".join(names)} is given; {_KNOWN}')
+def _size(named: Mapping[str, Any]) -> list[int]:
+    """Columns and rows, 0 where they are not given."""
+    both = _given(named, 'resolution') or [(_given(named, *n) or [0.0])[0] for n in _SIZES]
+    return [int(number) for number in both]
+
+
+def _given(named: Mapping[str, Any], *names: str) -> list[float]:
+    """The numbers under the first of the names that is there; none where there is none."""
+    return next((_numbers(named[name]) for name in names if name in named), [])
+
+
+def _required(named: Mapping[str, Any], *names: str) -> float:
+    numbers = _given(named, *names)
+    if not numbers:
+        raise CameraError(f'none of {", ".join(names)} is given; {_KNOWN}')
+    return numbers[0]
 
 
 def _numbers(value: Any) -> list[float]:
     """Flatten a number, nested lists, or a matrix with `data` to floats."""
     if isinstance(value, Mapping):
-        return _numbers(value['data'])
+        return _given(value, 'data')
     if isinstance(value, (list, tuple)):
         return [number for entry in value for number in _numbers(entry)]
     return [float(value)]

@@ -20,11 +20,11 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed
+from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.settings import CaptureConfig
 from sfa_localization.camera.watch import FROZEN_S, FrozenWatch
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import is_regular, read_regular
+from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Image
 
 logger = logging.getLogger(__name__)
@@ -161,10 +161,7 @@ class Folder:
         if path is None:
             return None
         self._pacer.wait()
-        try:
-            return decode_compressed(read_regular(path, LARGEST_FILE))
-        except (CameraError, OSError) as error:
-            raise CameraError(f'image {path.name}: {error}') from None
+        return read_image(path)
 
     def close(self) -> None:
         """Nothing is open between two images."""
@@ -208,11 +205,8 @@ class Feed:
         self.config = config
         self._open, self._deliver = open_capture, deliver
         self._reject, self._wanted = reject, wanted
-        self._lock = threading.Lock()
         self._stopped = threading.Event()
-        self._generation = 0
         self._status = FeedStatus()
-        self._defect = ''
         self._pause_s = _REOPEN_FIRST_S
         self._deadline_s = np.inf  # when a read or an opening in progress counts as hanging
         self._frozen = FrozenWatch()
@@ -230,45 +224,39 @@ class Feed:
 
     def status(self) -> FeedStatus:
         """The status that the feed's thread set last."""
-        with self._lock:
-            return self._status
+        return self._status
 
     def check(self) -> FeedStatus:
         """Abandon an opening or a read that hangs; return the status."""
         if time.monotonic() > self._deadline_s and not self._stopped.is_set():
             self._lose(f'silent for {self.config.silence_timeout:g} s')
             self._begin(pause=True)
-        return self.status()
+        return self._status
 
     def _begin(self, pause: bool) -> None:
-        with self._lock:
-            self._generation += 1
-            generation = self._generation
         self._deadline_s = np.inf
-        self._thread = threading.Thread(target=self._run, args=(generation, pause), daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(pause,), daemon=True)
         self._thread.start()
 
     def _lose(self, problem: str) -> None:
-        with self._lock:
-            self._status = FeedStatus('lost', problem, self._status.lost + 1)
+        self._status = FeedStatus('lost', problem, self._status.lost + 1)
 
     def _set_state(self, state: str) -> None:
-        with self._lock:
-            self._status = FeedStatus(state, '', self._status.lost)
+        self._status = FeedStatus(state, '', self._status.lost)
 
-    def _is_current(self, generation: int) -> bool:
-        with self._lock:
-            return generation == self._generation and not self._stopped.is_set()
+    def _goes_on(self) -> bool:
+        """Whether the calling thread is the feed's, and not one that was abandoned or stopped."""
+        return threading.current_thread() is self._thread and not self._stopped.is_set()
 
-    def _run(self, generation: int, pause: bool) -> None:
+    def _run(self, pause: bool) -> None:
         if pause:
             self._back_off()
-        while self._is_current(generation):
+        while self._goes_on():
             try:
-                self._read_all(generation)
+                self._read_all()
                 return
             except Exception as error:  # whatever it is, the camera is to be opened again
-                if not self._is_current(generation):
+                if not self._goes_on():
                     return
                 self._lose(self._problem(error))
             self._back_off()
@@ -279,9 +267,7 @@ class Feed:
             return str(error)
         text = f'internal error: {type(error).__name__}'
         self._reject(text)
-        if text != self._defect:
-            self._defect = text
-            logger.error('%s', text, exc_info=error)
+        logger.error('%s', text, exc_info=error)
         return text
 
     def _back_off(self) -> None:
@@ -289,24 +275,22 @@ class Feed:
         pause, self._pause_s = self._pause_s, min(2 * self._pause_s, _REOPEN_LONGEST_S)
         self._stopped.wait(pause)
 
-    def _expect_within(self, seconds: float) -> None:
-        self._deadline_s = time.monotonic() + seconds
-
-    def _read_all(self, generation: int) -> None:
+    def _read_all(self) -> None:
         """Open, and read to the end; raises CameraError when the source has to be opened again."""
-        self._expect_within(_OPENING_S + self.config.silence_timeout)
-        if self.status().state == 'new':
+        self._deadline_s = time.monotonic() + _OPENING_S + self.config.silence_timeout
+        if self._status.state == 'new':
             self._set_state('opening')
         capture = self._open()
         try:
-            while self._is_current(generation) and self._read_one(capture, generation):
+            while self._goes_on() and self._read_one(capture):
                 pass
         finally:
             capture.close()
 
-    def _read_one(self, capture: Capture, generation: int) -> bool:
+    def _read_one(self, capture: Capture) -> bool:
         """Deliver one image; False at the end."""
-        self._expect_within(self.config.silence_timeout if capture.live else np.inf)
+        silence = self.config.silence_timeout if capture.live else np.inf
+        self._deadline_s = time.monotonic() + silence
         if not capture.live and not self._wanted():
             return not self._stopped.wait(_IDLE_PAUSE_S)
         try:
@@ -316,25 +300,18 @@ class Feed:
         except CameraError as error:
             self._reject(str(error))
             return True
-        return self._is_current(generation) and self._accept(image, capture.live)
-
-    def _accept(self, image: Image | None, live: bool) -> bool:
+        if not self._goes_on():
+            return False
         if image is None:
             self._deadline_s = np.inf
             self._set_state('ended')
             return False
-        if live:
-            self._require_new(image)
-        elif self.status().state != 'running':
-            self._set_state('running')
-        self._deliver(image)
-        return True
-
-    def _require_new(self, image: Image) -> None:
-        """Raise Lost when the device repeats its last image, also when it was opened again."""
-        if self._frozen.add(image):
-            if self.status().state == 'running':
+        if not capture.live or self._frozen.add(image):
+            if self._status.state == 'running':
                 self._pause_s = _REOPEN_FIRST_S
             self._set_state('running')
-        if self._frozen.frozen_for_s():
+        # The device repeats its last image, perhaps also when it was opened again.
+        if capture.live and self._frozen.frozen_for_s():
             raise Lost(f'the last image has been repeated for {FROZEN_S:g} s')
+        self._deliver(image)
+        return True

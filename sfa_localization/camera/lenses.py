@@ -10,9 +10,8 @@ integers. What a lens cannot see is NaN. `CameraModel` mounts a lens on the robo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -22,10 +21,11 @@ from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, Pano
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
 
-LEAST_AFFINE = 1e-3
-"""Determinant of the affine part of a lens: 1 for square pixels; at 0 all pixels lie on a line."""
+_LEAST_AFFINE = 1e-3  # determinant of an affine part: 1 for square pixels; at 0 they lie on a line
+_WIDEST_PLANE = 20.0  # radius in the plane of a mirror up to which its distortion is inverted
 _SAMPLES = 2048  # of a curve that is inverted, before Newton's method
 _NEWTON_STEPS = 3
+_LINEAR = (0.0,) * 4  # coefficients of no distortion
 
 
 class Lens(Protocol):
@@ -42,33 +42,36 @@ class Lens(Protocol):
         """Unit rays (N, 3) of pixels (N, 2); NaN where a pixel sees nothing."""
 
 
-class IncreasingCurve:
-    """A smooth y = f(x), f(0) = 0, on the part of [0, limit] where it increases; and its inverse.
+class Curve(NamedTuple):
+    """A function of arrays and its inverse, NaN where there is none."""
 
-    `f` and its derivative `df` take and return arrays.
+    value: Callable[[Array], Array]
+    inverse: Callable[[Array], Array]
+
+
+def increasing(f: Callable[[Array], Array], df: Callable[[Array], Array], limit: float) -> Curve:
+    """A smooth y = f(x), f(0) = 0, with derivative df, where it increases from 0 up to a limit.
+
+    Raises CameraError where it does not increase at all.
     """
+    x = np.linspace(0.0, limit, _SAMPLES)
+    falling = np.flatnonzero(df(x) <= 0.0)
+    x = x[: falling[0]] if falling.size else x
+    if len(x) < 2:
+        raise CameraError('the distortion or polynomial does not increase from the center')
+    y, end = f(x), x[-1]
 
-    def __init__(
-        self, f: Callable[[Array], Array], df: Callable[[Array], Array], limit: float
-    ) -> None:
-        x = np.linspace(0.0, limit, _SAMPLES)
-        falling = np.flatnonzero(df(x) <= 0.0)
-        end = falling[0] if falling.size else _SAMPLES
-        if end < 2:
-            raise CameraError('the distortion or polynomial does not increase from the center')
-        self._f, self._df, self._x, self._y = f, df, x[:end], f(x[:end])
+    def value(at: Array) -> Array:
+        return np.where(at <= end, f(np.minimum(at, end)), np.nan)
 
-    def value(self, x: Array) -> Array:
-        """Return f(x), NaN beyond the increasing part."""
-        return np.where(x <= self._x[-1], self._f(np.minimum(x, self._x[-1])), np.nan)
-
-    def inverse(self, y: Array) -> Array:
-        """Return x with f(x) = y, NaN beyond the increasing part."""
-        reachable = np.minimum(y, self._y[-1])
-        x = np.interp(reachable, self._y, self._x)
+    def inverse(of: Array) -> Array:
+        reachable = np.minimum(of, y[-1])
+        at = np.interp(reachable, y, x)
         for _ in range(_NEWTON_STEPS):
-            x = np.clip(x - (self._f(x) - reachable) / self._df(x), 0.0, self._x[-1])
-        return np.where(y <= self._y[-1] * (1 + 1e-12), x, np.nan)
+            at = np.clip(at - (f(at) - reachable) / df(at), 0.0, end)
+        return np.where(of <= y[-1] * (1 + 1e-12), at, np.nan)
+
+    return Curve(value, inverse)
 
 
 def _normalized(vectors: Array) -> Array:
@@ -76,175 +79,83 @@ def _normalized(vectors: Array) -> Array:
     return np.asarray(vectors / np.where(length > 0, length, np.nan))
 
 
-def _angle_and_direction(rays: Array) -> tuple[Array, Array]:
-    """Angle (N,) from the axis, and the unit direction (N, 2) across it (0 on the axis)."""
-    across = np.hypot(rays[:, 0], rays[:, 1])
-    direction = rays[:, :2] / np.where(across > 0, across, 1.0)[:, None]
-    return np.arctan2(across, rays[:, 2]), direction
-
-
-def _radius_and_direction(plane: Array) -> tuple[Array, Array]:
-    """Length (N,) and unit direction (N, 2) of plane vectors (N, 2)."""
+def _polar(plane: Array) -> tuple[Array, Array]:
+    """Length (N,) and unit direction (N, 2) of plane vectors (N, 2), 0 at the center."""
     radius = np.hypot(plane[:, 0], plane[:, 1])
     return radius, plane / np.where(radius > 0, radius, 1.0)[:, None]
 
 
-def _ray(angle: Array, direction: Array) -> Array:
-    """Unit rays (N, 3) at an angle (N,) from the axis toward directions (N, 2)."""
-    return np.column_stack([np.sin(angle)[:, None] * direction, np.cos(angle)])
-
-
 @dataclass(frozen=True)
-class MirrorLens:
-    """The unified model: C. Mei and P. Rives, ICRA 2007, as in OpenCV's omnidir and Kalibr's omni.
+class RadialLens:
+    """Every lens about one center: rays meet a plane, which is bent, sheared and scaled to pixels.
 
-    A ray meets the unit sphere, is seen from a point `xi` behind the sphere's center, distorted
-    (radial k1 k2, tangential p1 p2) and scaled. Central mirrors have 0 < xi <= 1; xi = 0 is a
-    pinhole camera.
+    With `xi` it is the unified model of C. Mei and P. Rives, ICRA 2007 (OpenCV's omnidir, Kalibr's
+    omni): a ray (x, y, z) meets the plane at (x, y) / (z + xi). Central mirrors have 0 < xi <= 1;
+    xi = 0 is a pinhole camera. Without, it meets the plane at its angle (rad) from the axis.
+    `bend` maps the radius there, None where it stays, and `tangential` holds p1 and p2; then pixels
+    are focal * (affine @ plane) + center.
     """
 
-    focal: Array
     center: Array
-    xi: float
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-
-    @cached_property
-    def _radial(self) -> IncreasingCurve:
-        k1, k2 = self.distortion[:2]
-        curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2])
-        return IncreasingCurve(curve, curve.deriv(), 20.0)
+    focal: Array
+    xi: float | None = None
+    bend: Curve | None = None
+    tangential: tuple[float, float] = (0.0, 0.0)
+    affine: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 0.0), (0.0, 1.0))
 
     def project(self, rays: Array) -> Array:
+        bent = self._bent(self._to_plane(rays)) @ np.array(self.affine).T
+        return np.asarray(self.focal * bent + self.center)
+
+    def unproject(self, pixels: Array) -> Array:
+        bent = ((pixels - self.center) / self.focal) @ np.linalg.inv(self.affine).T
+        return self._from_plane(self._straight(bent))
+
+    def _to_plane(self, rays: Array) -> Array:
+        if self.xi is None:
+            across, direction = _polar(rays[:, :2])
+            return np.arctan2(across, rays[:, 2])[:, None] * direction
         depth = rays[:, 2] + self.xi
         # Beyond this cone the sphere's far side would be seen a second time.
         visible = rays[:, 2] > -(self.xi if self.xi <= 1.0 else 1.0 / self.xi)
-        plane = rays[:, :2] / np.where(visible & (depth > 1e-9), depth, np.nan)[:, None]
-        return np.asarray(self.focal * self._distorted(plane) + self.center)
+        return rays[:, :2] / np.where(visible & (depth > 1e-9), depth, np.nan)[:, None]
 
-    def unproject(self, pixels: Array) -> Array:
-        plane = self._undistorted((pixels - self.center) / self.focal)
+    def _from_plane(self, plane: Array) -> Array:
+        if self.xi is None:
+            angle, direction = _polar(plane)
+            angle = np.where(angle <= np.pi, angle, np.nan)
+            return np.column_stack([np.sin(angle)[:, None] * direction, np.cos(angle)])
         square = np.sum(plane**2, axis=1)
         root = 1.0 + (1.0 - self.xi**2) * square
         scale = (self.xi + np.sqrt(np.where(root >= 0, root, np.nan))) / (1.0 + square)
         return np.column_stack([plane * scale[:, None], scale - self.xi])
 
-    def _tangential(self, plane: Array) -> Array:
-        p1, p2 = self.distortion[2:]
+    def _shift(self, plane: Array) -> Array:
+        """The tangential part of a distortion (N, 2)."""
+        p1, p2 = self.tangential
         x, y = plane[:, 0], plane[:, 1]
         square = x**2 + y**2
         shift_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
         shift_y = p1 * (square + 2 * y**2) + 2 * p2 * x * y
         return np.column_stack([shift_x, shift_y])
 
-    def _distorted(self, plane: Array) -> Array:
-        if not any(self.distortion):
+    def _bent(self, plane: Array) -> Array:
+        if self.bend is None:
             return plane
-        radius, direction = _radius_and_direction(plane)
-        return self._radial.value(radius)[:, None] * direction + self._tangential(plane)
+        radius, direction = _polar(plane)
+        return self.bend.value(radius)[:, None] * direction + self._shift(plane)
 
-    def _undistorted(self, plane: Array) -> Array:
-        """Invert `_distorted`: the tangential part is small, so its fixed point contracts."""
-        if not any(self.distortion):
+    def _straight(self, plane: Array) -> Array:
+        """Invert `_bent`: the tangential part is small, so its fixed point contracts."""
+        if self.bend is None:
             return plane
-        result = plane
-        for _ in range(50):
-            radius, direction = _radius_and_direction(plane - self._tangential(result))
-            previous, result = result, self._radial.inverse(radius)[:, None] * direction
+        result = np.zeros_like(plane)
+        for _ in range(50 if any(self.tangential) else 1):
+            radius, direction = _polar(plane - self._shift(result))
+            previous, result = result, self.bend.inverse(radius)[:, None] * direction
             if not np.any(np.abs(result - previous) > 1e-13):
                 break
         return result
-
-
-@dataclass(frozen=True)
-class FisheyeLens:
-    """Kannala-Brandt model as in OpenCV's fisheye; equidistant where all coefficients are 0.
-
-    The radius is focal * (a + k1 a^3 + k2 a^5 + k3 a^7 + k4 a^9) of the angle a from the axis.
-    """
-
-    focal: Array
-    center: Array
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-
-    @cached_property
-    def _radial(self) -> IncreasingCurve:
-        k1, k2, k3, k4 = self.distortion
-        curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
-        return IncreasingCurve(curve, curve.deriv(), np.pi)
-
-    def project(self, rays: Array) -> Array:
-        angle, direction = _angle_and_direction(rays)
-        plane = self._radial.value(angle)[:, None] * direction
-        return np.asarray(self.focal * plane + self.center)
-
-    def unproject(self, pixels: Array) -> Array:
-        radius, direction = _radius_and_direction((pixels - self.center) / self.focal)
-        return _ray(self._radial.inverse(radius), direction)
-
-
-@dataclass(frozen=True)
-class OcamLens:
-    """Polynomial model: D. Scaramuzza, A. Martinelli and R. Siegwart, ICVS 2006 (OCamCalib).
-
-    A pixel at radius r from the center sees the ray (x, y, -(a0 + a1 r + a2 r^2 + ...)); the
-    affine matrix [[c, d], [e, 1]] acts on (row, column). `limit` is the largest radius in use.
-    """
-
-    polynomial: Polynomial
-    center: Array
-    affine: tuple[float, float, float]
-    limit: float
-
-    @cached_property
-    def _matrix(self) -> Array:
-        c, d, e = self.affine  # of (row, column), so swapped for (column, row)
-        return np.array([[1.0, e], [d, c]])
-
-    @cached_property
-    def _angle(self) -> IncreasingCurve:
-        """Angle from the axis as a function of the radius."""
-        slope = self.polynomial.deriv()
-
-        def angle(radius: Array) -> Array:
-            return np.asarray(np.arctan2(radius, -self.polynomial(radius)))
-
-        def derivative(radius: Array) -> Array:
-            depth = self.polynomial(radius)
-            return np.asarray((radius * slope(radius) - depth) / (radius**2 + depth**2))
-
-        return IncreasingCurve(angle, derivative, self.limit)
-
-    def project(self, rays: Array) -> Array:
-        angle, direction = _angle_and_direction(rays)
-        plane = self._angle.inverse(angle)[:, None] * direction
-        return np.asarray(plane @ self._matrix.T + self.center)
-
-    def unproject(self, pixels: Array) -> Array:
-        plane = (pixels - self.center) @ np.linalg.inv(self._matrix).T
-        radius, direction = _radius_and_direction(plane)
-        return _ray(self._angle.value(radius), direction)
-
-
-@dataclass(frozen=True)
-class PolarLens:
-    """No calibration but two circles: the angle from the axis grows linearly with the radius."""
-
-    center: Array
-    radii: tuple[float, float]
-    angles: tuple[float, float]
-
-    def project(self, rays: Array) -> Array:
-        angle, direction = _angle_and_direction(rays)
-        (near, far), (low, high) = self.radii, self.angles
-        radius = near + (angle - low) * (far - near) / (high - low)
-        plane = np.where(radius >= 0.0, radius, np.nan)[:, None] * direction
-        return np.asarray(plane + self.center)
-
-    def unproject(self, pixels: Array) -> Array:
-        radius, direction = _radius_and_direction(pixels - self.center)
-        (near, far), (low, high) = self.radii, self.angles
-        angle = low + (radius - near) * (high - low) / (far - near)
-        return _ray(np.where((angle >= 0.0) & (angle <= np.pi), angle, np.nan), direction)
 
 
 @dataclass(frozen=True)
@@ -279,8 +190,8 @@ class CylinderLens:
 class DualFisheyeLens:
     """Two fisheyes back to back in one image; `turn` (3, 3) takes rays to the second's frame."""
 
-    first: FisheyeLens
-    second: FisheyeLens
+    first: RadialLens
+    second: RadialLens
     turn: Array
     center: None = None
 
@@ -407,7 +318,7 @@ def _make_lens(
         return CylinderLens((columns, rows), (-np.pi / 2, np.pi / 2))
     center = np.array([calibration.cx, calibration.cy])
     if model == 'polar':
-        return _polar_lens(calibration, center)
+        return RadialLens(center, np.ones(2), bend=_polar_bend(calibration))
     if model == 'ocam':
         return _ocam_lens(calibration, center, size)
     focal = np.array([calibration.fx, calibration.fy])
@@ -415,37 +326,62 @@ def _make_lens(
         raise CameraError(
             f'distortion has {len(calibration.distortion)} coefficients; give 4, or none'
         )
-    k1, k2, k3, k4 = calibration.distortion or (0.0,) * 4
+    k1, k2, k3, k4 = calibration.distortion or _LINEAR
     if model == 'mirror':
-        return MirrorLens(focal, center, calibration.xi, (k1, k2, k3, k4))
-    fisheye = FisheyeLens(focal, center, (k1, k2, k3, k4))
+        curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2])
+        bend = increasing(curve, curve.deriv(), _WIDEST_PLANE) if any((k1, k2, k3, k4)) else None
+        return RadialLens(center, focal, calibration.xi, bend, (k3, k4))
+    curve = Polynomial([0.0, 1.0, 0.0, k1, 0.0, k2, 0.0, k3, 0.0, k4])
+    fisheye = RadialLens(center, focal, bend=increasing(curve, curve.deriv(), np.pi))
     return fisheye if model == 'fisheye' else _dual_fisheye_lens(calibration, fisheye)
 
 
-def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int]) -> OcamLens:
+def _polar_bend(calibration: LensCalibration) -> Curve:
+    """No calibration but two circles: the angle from the axis grows linearly with the radius."""
+    near, far = calibration.radius_min, calibration.radius_max
+    if near >= far or calibration.angle_min >= calibration.angle_max:
+        raise CameraError('the polar model needs radius_min < radius_max and angle_min < angle_max')
+    low, high = np.radians([calibration.angle_min, calibration.angle_max])
+    slope = (far - near) / (high - low)
+    line, back = (
+        Polynomial([near - low * slope, slope]),
+        Polynomial([low - near / slope, 1 / slope]),
+    )
+    return Curve(*(lambda x, f=f: np.where(f(x) >= 0.0, f(x), np.nan) for f in (line, back)))
+
+
+def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int]) -> RadialLens:
+    """Polynomial model: D. Scaramuzza, A. Martinelli and R. Siegwart, ICVS 2006 (OCamCalib).
+
+    A pixel at radius r from the center sees the ray (x, y, -(a0 + a1 r + a2 r^2 + ...)); the
+    affine matrix [[c, d], [e, 1]] acts on (row, column).
+    """
     if len(calibration.polynomial) < 2 or len(calibration.affine) != 3:
         raise CameraError('the ocam model needs polynomial (a0 a1 ...) and affine (c d e)')
     if calibration.polynomial[0] >= 0.0:
         raise CameraError('polynomial[0] of the ocam model must be negative')
+    c, d, e = calibration.affine
+    if abs(c - d * e) < _LEAST_AFFINE:
+        raise CameraError('affine (c d e) of the ocam model is singular: c - d e must not be 0')
+    height = -Polynomial(calibration.polynomial)
+    slope = height.deriv()
+
+    def angle(radius: Array) -> Array:
+        return np.asarray(np.arctan2(radius, height(radius)))
+
+    def derivative(radius: Array) -> Array:
+        depth = height(radius)
+        return np.asarray((depth - radius * slope(radius)) / (radius**2 + depth**2))
+
     calibrated = (calibration.image_height, calibration.image_width)
     limit = calibration.radius_max or float(np.hypot(*np.maximum(size, calibrated)))
-    c, d, e = calibration.affine
-    if abs(c - d * e) < LEAST_AFFINE:
-        raise CameraError('affine (c d e) of the ocam model is singular: c - d e must not be 0')
-    return OcamLens(Polynomial(calibration.polynomial), center, (c, d, e), limit)
+    seen = increasing(angle, derivative, limit)
+    bend = Curve(seen.inverse, seen.value)
+    return RadialLens(center, np.ones(2), bend=bend, affine=((1.0, e), (d, c)))
 
 
-def _polar_lens(calibration: LensCalibration, center: Array) -> PolarLens:
-    radii = (calibration.radius_min, calibration.radius_max)
-    angles = (calibration.angle_min, calibration.angle_max)
-    if radii[0] >= radii[1] or angles[0] >= angles[1]:
-        raise CameraError('the polar model needs radius_min < radius_max and angle_min < angle_max')
-    low, high = np.radians(angles)
-    return PolarLens(center, radii, (float(low), float(high)))
-
-
-def _dual_fisheye_lens(calibration: LensCalibration, first: FisheyeLens) -> DualFisheyeLens:
+def _dual_fisheye_lens(calibration: LensCalibration, first: RadialLens) -> DualFisheyeLens:
     center = np.array([calibration.second_cx, calibration.second_cy])
     roll = Rotation.from_euler('z', calibration.second_roll, degrees=True).as_matrix()
     to_second = roll @ np.diag([-1.0, 1.0, -1.0])
-    return DualFisheyeLens(first, FisheyeLens(first.focal, center, first.distortion), to_second)
+    return DualFisheyeLens(first, replace(first, center=center), to_second)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.camera.calibration_files import calibration_of
-from sfa_localization.camera.encodings import LARGEST_FILE, decode_compressed
+from sfa_localization.camera.encodings import read_image
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import (
     UNCALIBRATED,
@@ -22,7 +22,6 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.files import read_regular
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
@@ -102,14 +101,10 @@ class Unwrapper:
         _check(image)
         size = (image.shape[0], image.shape[1])
         if self.is_panorama(size):
-            result = self._aligned(image)
-        else:
-            tables = self._tables_of(size)
-            maps = tables.pixels, tables.fractions
-            result = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=tables.border))
-        if self.camera.normalization == 'off':
-            return result
-        return normalized(result, self.camera.normalization)
+            return self._aligned(image)
+        tables = self._tables_of(size)
+        maps = tables.pixels, tables.fractions
+        return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=tables.border))
 
     def visible(self, size: tuple[int, int]) -> Mask:
         """Mask (H, W) of the panorama pixels visible in images of `size` (rows, columns)."""
@@ -199,9 +194,9 @@ def _in_sectors(rays: Array, sectors: tuple[float, ...]) -> Mask:
 def read_mask(path: str, size: tuple[int, int]) -> Mask:
     """Read a mask image for images of `size` (rows, columns): True where it is not black."""
     try:
-        image = decode_compressed(read_regular(path, LARGEST_FILE))
-    except (CameraError, OSError) as error:
-        raise CameraError(f'mask_file {path} is missing or is no image ({error})') from None
+        image = read_image(path)
+    except CameraError as error:
+        raise CameraError(f'mask_file is missing or is no image ({error})') from None
     mask = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     resized = cv2.resize(mask, (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     return np.asarray(resized) >= 128
@@ -240,26 +235,3 @@ def _nearest_column(visible: NDArray[np.bool_]) -> NDArray[np.intp]:
     left = np.maximum(right - 1, 0)
     nearer = np.arange(width) - around[left] < around[right] - np.arange(width)
     return np.asarray(np.where(nearer, around[left], around[right]) % width)
-
-
-_TARGET = 110.0  # gray levels, mean brightness after normalization: the middle of most scenes
-_GAIN_MAX = 8.0  # beyond it, noise is all that grows
-
-
-def normalized(panorama: Image, method: str) -> Image:
-    """Normalize brightness: 'exposure' by one gain, 'local' by that of the surroundings."""
-    gray = cv2.cvtColor(panorama, cv2.COLOR_BGR2GRAY)
-    if method == 'exposure':
-        gain = min(_TARGET / max(float(gray.mean()), 1.0), _GAIN_MAX)
-        return np.asarray(cv2.convertScaleAbs(panorama, alpha=gain))
-    gain_map = np.minimum(_TARGET / np.maximum(_surroundings(np.asarray(gray)), 1.0), _GAIN_MAX)
-    return np.asarray(np.clip(panorama * gain_map[..., None] + 0.5, 0, 255), np.uint8)
-
-
-def _surroundings(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Mean brightness (H, W) over an eighth of the circle, which closes on itself."""
-    reach = max(gray.shape[1] // 16, 1)
-    wide = cv2.copyMakeBorder(gray, 0, 0, reach, reach, cv2.BORDER_WRAP)
-    window = (2 * reach + 1, 2 * (gray.shape[0] // 4) + 1)
-    mean = cv2.blur(wide.astype(np.float32), window, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(mean[:, reach:-reach])

@@ -122,12 +122,6 @@ class CameraConfig(Settings):
         high=720.0,
         live=True,
     )
-    normalization: str = setting(
-        'off',
-        'brightness: off, exposure (one gain per panorama), local (by the surrounding brightness)',
-        choices=('off', 'exposure', 'local'),
-        live=True,
-    )
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)
