@@ -9,16 +9,15 @@ import pytest
 from cylinder_worlds import Spheres, recipe, run_in, wander
 from metric_worlds import Drive, drive, meander
 
-from sfa_localization import training
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
 from sfa_localization.features.closures import Closures
-from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
 from sfa_localization.metric.seen_turns import CLOSURES_MIN, Headings, corrections
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.training_input import TrainingInput
 
 CONFIG = SegmentConfig()
 
@@ -147,17 +146,15 @@ def test_a_training_turns_by_its_images_where_wheels_slip(clockwise):
     slipping = dataclasses.replace(
         true, twists=twists, poses=integrate(true.stamps_ns, twists, true.poses[0])
     )
-    closures = training.match_images([run], config).closures
-    seen = [list(training.visual_headings(run.panoramas))]
-    clocks = [CameraClock()]
-    given = (clocks, seen, closures, config.segments)
-    assert training._seen_turns([run], *given) is None
-    runs = [dataclasses.replace(run, odometry=slipping)]
-    found = training._seen_turns(runs, *given)
-    assert found is not None
+    given = TrainingInput.of([run], config).drives
+    assert given.turns() == [None]
+    bad = dataclasses.replace(run, odometry=slipping)
+    (drive,) = given.items
+    slipped = dataclasses.replace(given, items=(dataclasses.replace(drive, run=bad),))
+    assert slipped.turns() != [None]
     errors = []
-    for turns in (None, found):
-        segments = training.cut_odometry(runs, clocks, config.segments, turns=turns)
+    for seen in (dataclasses.replace(slipped, closures=Closures.none()), slipped):
+        segments = seen.cut()
         turned = np.array([s.start[2] - true.poses[s.images[0], 2] for s in segments])
         errors.append(np.abs(wrap_angle(turned - turned[0])).mean())
     assert errors[1] < 0.5 * errors[0]

@@ -2,27 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training from bags: what it leaves behind, how it goes on, and what it refuses."""
 
+import logging
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres, panorama_config, recipe, run_in, wander
+from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, panorama_config, recipe, run_in, wander
 
 from sfa_localization import training
 from sfa_localization.bags.drives import read_drive, read_drives
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
-from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run
+from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
 from sfa_localization.features import checkpoint as checkpoints
 from sfa_localization.features import image_features
-from sfa_localization.features.network_training import ImageSequence
-from sfa_localization.metric import compass_training
+from sfa_localization.features.network_training import ImageSequence, train_network
+from sfa_localization.metric import compass_training, refinement
+from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
-from sfa_localization.training import Recipe, train
+from sfa_localization.training import Recipe, learn_place, train
 
 PICTURES = 160
 ARCHITECTURE = replace(
@@ -133,18 +136,11 @@ def test_turned_maps_refine_the_map(bag, tmp_path):
 
 
 def test_maps_that_cannot_refine_leave_the_first_map(bag, tmp_path, monkeypatch, caplog):
-    """With all its points, and where the heading was learned."""
-    monkeypatch.setattr(training, 'COARSE_POINTS', 30)
-    refined = train([bag], tmp_path / 'model.npz', RECIPE)
-    monkeypatch.setattr(training, 'learn_refinement', _fail)
+    monkeypatch.setattr(refinement, 'learn_metric', _fail)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
     assert 'positions are not refined: the drive cannot fix a map' in caplog.text
     assert trained.model.compass is not None and trained.model.refinement is None
     assert 'refined' not in summary(trained)
-    assert len(refined.model.metric.points) == 30
-    assert len(trained.model.metric.points) > 100
-    places = [model.metric.predict(trained.features)[0] for model in (refined.model, trained.model)]
-    assert np.hypot(*np.subtract(*places).T).mean() < 0.1
 
 
 def test_two_layers_have_none_to_refine_with(bag, tmp_path):
@@ -258,7 +254,7 @@ def test_a_damaged_checkpoint_is_refused(bag, tmp_path):
 @pytest.mark.parametrize('late', [False, True])
 def test_after_an_error_no_model_is_left(bag, tmp_path, late, monkeypatch):
     if late:
-        monkeypatch.setattr(training, 'learn_place', _fail)
+        monkeypatch.setattr(training, 'learn_map', _fail)
     wrong = replace(ARCHITECTURE, size=(12, 36))
     recipe = RECIPE if late else replace(RECIPE, architecture=wrong)
     with pytest.raises(LocalizationError):
@@ -273,7 +269,7 @@ def _fail(*args, **kwargs):
 
 def test_an_old_model_survives_an_error(bag, tmp_path, monkeypatch):
     (tmp_path / 'model.npz').write_bytes(b'old')
-    monkeypatch.setattr(training, 'learn_place', _fail)
+    monkeypatch.setattr(training, 'learn_map', _fail)
     with pytest.raises(DataError):
         train([bag], tmp_path / 'model.npz', RECIPE)
     assert (tmp_path / 'model.npz').read_bytes() == b'old'
@@ -339,3 +335,37 @@ def test_a_drive_is_streamed_from_the_cache(bag, tmp_path):
     run = read_drive(bag, tmp_path, Recipe(panorama=RECIPE.panorama))
     assert isinstance(run.panoramas.images, np.memmap)
     assert tmp_path in Path(run.panoramas.images.filename).parents
+
+
+def straight_route(speed):
+    """A drive straight ahead of 12 m at 4 Hz and less, whose odometry states no variance."""
+    count = 400
+    stamps = 10**9 + np.arange(count) * round(12e9 / speed / count)
+    twists = np.tile([speed, 0.0], (count, 1))
+    poses = integrate(stamps, twists, np.array([-6.0, 0.0, 0.0]))
+    odometry = Odometry(stamps, poses, twists, np.zeros((count, 2)))
+    return run_in(Spheres.about(1), odometry, recipe().panorama)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('speed', [0.03, 0.12])
+def test_one_straight_route_gives_a_model_and_one_sentence(speed, caplog):
+    run = straight_route(speed)
+    network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
+    with warnings.catch_warnings(), caplog.at_level(logging.WARNING):
+        warnings.simplefilter('error')
+        trained = learn_place(network, [run], recipe())
+    assert [record.message for record in caplog.records].count(ROUTE) == 1
+    assert trained.segments.images.skipped == {}
+    aside = np.array([[x, 1.5, 0.0] for x in (-2.0, 0.0, 2.0)])
+    on = trained.model.locate_all(run.panoramas.read(150, 250))
+    off = trained.model.locate_all(Spheres.about(1).panoramas(aside, recipe().panorama))
+    places = np.array([one.position for one in on])
+    assert np.hypot(*(places - run.odometry.poses[150:250, :2]).T).mean() < 0.1
+    surest, least = (
+        pick(np.trace(one.covariance[:2, :2]) for one in part)
+        for pick, part in ((max, on), (min, off))
+    )
+    assert least > 10 * surest
+    with pytest.raises(DataError, match='no track crosses another'):
+        learn_place(network, [run], recipe(), strict=True)

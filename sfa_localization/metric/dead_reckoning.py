@@ -89,16 +89,9 @@ class OdometryTrack:
 
     @classmethod
     def of(
-        cls,
-        odometry: Odometry,
-        config: SegmentConfig,
-        yaw_rate: YawRate | None,
-        turn_noise: float | None = None,
+        cls, odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None = None
     ) -> OdometryTrack:
-        """From wheel odometry, with the turns of the gyroscope where there is one.
-
-        A known `turn_noise` (rad per square root of s) replaces what is stated or assumed.
-        """
+        """From wheel odometry, with the turns of the gyroscope where there is one."""
         kept, skipped = _usable(odometry)
         stamps, poses = odometry.stamps_ns[kept], np.array(odometry.poses[kept], float)
         twists = odometry.twists[kept]
@@ -115,9 +108,7 @@ class OdometryTrack:
             twists = np.column_stack([twists[:, 0], np.gradient(yaw, seconds_since_start(stamps))])
         elif config.yaw_source == 'gyro':
             raise DataError('yaw_source is gyro, but there is no yaw rate: name the imu topic')
-        assumed = config.yaw_noise if turn_noise is None else turn_noise
-        stated = variances if turn_noise is None else np.zeros(len(variances))
-        sums = _running_sums(stamps, poses, yaw, stated, assumed)
+        sums = _running_sums(stamps, poses, yaw, variances, config.yaw_noise)
         rate = _smoothed(seconds_since_start(stamps), twists[:, 1])
         part = np.concatenate([[0], np.cumsum(breaks)])
         count = Count(int(kept.sum()), skipped)

@@ -34,6 +34,11 @@ class KeyframeMap:
     improvement: float = 1.0
     within_95: float = 0.95
 
+    @property
+    def quality(self) -> dict[str, float]:
+        """Figures that are stored in the model."""
+        return {'keyframes': len(self.keyframes.poses), 'left_out_within_95': self.within_95}
+
 
 def learn_keyframes(
     views: Views,

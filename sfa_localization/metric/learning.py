@@ -9,6 +9,7 @@ descent is in paper_solver.py. Complex numbers are x + i y in meters.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import choose, leave_out, part_of
+from sfa_localization.metric.selection import Span, choose, leave_out, part_of
 from sfa_localization.metric.settings import MetricConfig
 
 Indices = NDArray[np.int64]
@@ -80,23 +81,32 @@ class MetricResult:
         """
         return float(np.hypot(*self.left_out.T).mean())
 
+    @property
+    def quality(self) -> dict[str, Any]:
+        """Figures of merit; plain numbers and lists."""
+        x, y, error = self.forecast.worst
+        return {
+            'certified': bool(self.certificate.certified),
+            'certificate': float(self.certificate.eigenvalue),
+            'residual_m': float(np.hypot(*self.residuals.T).mean()),
+            'expected_error_m': self.forecast.expected_m,
+            'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
+            'left_out_error_m': self.left_out_error_m,
+            'coverage': self.diagnostics.as_dict(),
+        }
+
 
 def learn_metric(
     features: Array,
     segments: Segments,
     config: MetricConfig,
     seed: int = 0,
-    *,
-    points: int | None = None,
-    scale: Array | None = None,
+    span: Span | None = None,
     onto: MetricResult | None = None,
 ) -> MetricResult:
     """Learn meters from slow features (N, K), one row per image of the runs, and segments.
 
-    At most `points` images span a Gaussian process. It weights the features by their slowness and
-    chooses how many it reads; with `scale` (K,), it weights them by that and reads all; a unit
-    length is then the typical distance of two images. The result lies in its own map frame, or in
-    that of `onto`, another result of the same segments.
+    The result lies in its own map frame, or in that of `onto`, another result of the same segments.
 
     Raises DataError when the features are unusable, when the drive cannot determine a map (the
     message names what to drive instead), or when optimality is not proven.
@@ -107,7 +117,7 @@ def learn_metric(
     if config.solver == 'paper':
         fit, history = paper_solver.learn(problem)
     else:
-        fit = choose(problem, points, scale)
+        fit = choose(problem, span)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)

@@ -16,6 +16,7 @@ back is exact also by fractions of a column.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,9 +27,10 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.image_features import Spectrum
+from sfa_localization.features.image_features import ImageFeatures, Spectrum
 from sfa_localization.features.rotation_spread import Agreement, quantile
 from sfa_localization.metric.basis import Process
+from sfa_localization.metric.compass_training import LearnedHeading
 from sfa_localization.metric.learning import (
     MetricResult,
     headings,
@@ -37,8 +39,10 @@ from sfa_localization.metric.learning import (
 )
 from sfa_localization.metric.saved_map import FastProcess
 from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.selection import Span
 from sfa_localization.metric.settings import MetricConfig
 
+logger = logging.getLogger(__name__)
 Vectors = NDArray[np.float32]
 
 DIMENSIONS = 32
@@ -223,12 +227,36 @@ def learn_refinement(
     # They count by their own size, as principal components do.
     scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
     process = replace(config, solver='certified', metric_map='gp', slow_features=0)
-    metric = learn_metric(features, segments, process, seed, points=POINTS, scale=scale, onto=first)
+    metric = learn_metric(features, segments, process, seed, Span(POINTS, scale), first)
     agreement = left_out_agreement(disagreement, metric)
     assert isinstance(metric.map.basis, Process)
     fast = FastProcess.of(metric.map, metric.map.basis)
     refinement = Refinement(projection, fast, agreement, sign, _usual(first, metric))
     return LearnedRefinement(refinement, metric)
+
+
+def refined(
+    images: ImageFeatures,
+    segments: Segments,
+    first: MetricResult,
+    heading: LearnedHeading | None,
+    config: MetricConfig,
+    seed: int = 0,
+) -> LearnedRefinement | None:
+    """As `learn_refinement`; None without a heading or a layer to refine with, and where no finer
+    map can be learned.
+
+    The paper's descent and its monomials stay as they are: they are there for comparison.
+    """
+    article = config.solver == 'paper' or config.metric_map == 'monomials'
+    if images.spectra is None or heading is None or article:
+        return None
+    views, sign = images.disagreement, heading.compass.sign
+    try:
+        return learn_refinement(images.spectra, views, segments, first, sign, config, seed)
+    except DataError as error:
+        logger.warning('positions are not refined: %s', error)
+        return None
 
 
 def _components(

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +132,12 @@ class Segments:
     def __len__(self) -> int:
         return len(self.items)
 
+    @property
+    def quality(self) -> dict[str, Any]:
+        """Figures that are stored in the model."""
+        losses = [way.loss if way else 0.0 for way in self.ways]
+        return {'segments': len(self), 'turn_loss': losses}
+
     def __iter__(self) -> Iterator[Segment]:
         return iter(self.items)
 
@@ -143,7 +150,6 @@ def cut(
     image_stamps_ns: Stamps,
     config: SegmentConfig,
     yaw_rate: YawRate | None = None,
-    turn_noise: float | None = None,
     turns: TurnCorrection | None = None,
     way: Way | None = None,
 ) -> Segments:
@@ -152,13 +158,12 @@ def cut(
     `config.segments` names the cutter: 'straight' keeps lines between turns on the spot, by
     translational and angular velocity, as the paper does; 'any' cuts the whole drive into pieces
     bounded by length and by accumulated odometry error. Images without odometry, of a standing
-    robot, or in too short a piece are left out and counted in `Segments.images`. A known
-    `turn_noise` (rad per square root of s) replaces what the messages state; `turns` correct those
-    of the odometry, and state their noise; `way` corrects what its wheels counted.
+    robot, or in too short a piece are left out and counted in `Segments.images`. `turns` correct
+    those of the odometry, and state their noise; `way` corrects what its wheels counted.
 
     Raises DataError when no segment is left.
     """
-    track = tracked(odometry, config, yaw_rate, turn_noise, turns)
+    track = tracked(odometry, config, yaw_rate, turns)
     track = track if way is None else track.driven(way)
     skipped: dict[str, int] = {}
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
@@ -179,11 +184,10 @@ def tracked(
     odometry: Odometry,
     config: SegmentConfig,
     yaw_rate: YawRate | None = None,
-    turn_noise: float | None = None,
     turns: TurnCorrection | None = None,
 ) -> OdometryTrack:
     """The dead reckoning that `cut` cuts, with its arguments."""
-    track = OdometryTrack.of(odometry, config, yaw_rate, turn_noise)
+    track = OdometryTrack.of(odometry, config, yaw_rate)
     return track if turns is None else track.corrected(turns)
 
 

@@ -44,6 +44,17 @@ _FLOOR_M = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
+class Span:
+    """What spans a Gaussian process: at most `points` images. It weights the features by their
+    slowness and chooses how many it reads; with `scale` (K,), it weights them by that and reads
+    all; a unit length is then the typical distance of two images.
+    """
+
+    points: int = INDUCING_POINTS
+    scale: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class LeftOut:
     """Predictions of images whose segments the map was learned without, row by row."""
 
@@ -161,18 +172,15 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
     return np.asarray(weights / np.where(std > 0, std, 1.0))
 
 
-def choose(problem: MetricProblem, points: int | None = None, scale: Array | None = None) -> MapFit:
-    """The fit of the best basis of the kind that the settings name.
-
-    A process of at most `points` inducing points reads all features with weights `scale` (K,), or
-    the best count of them by their slowness.
-    """
-    size = INDUCING_POINTS if points is None else min(points, INDUCING_POINTS)
+def choose(problem: MetricProblem, span: Span | None = None) -> MapFit:
+    """The fit of the best basis of the kind that the settings name."""
+    span = span or Span()
+    size = min(span.points, INDUCING_POINTS)
     if problem.config.metric_map == 'monomials':
         return _choose_monomials(problem)
-    if scale is None:
+    if span.scale is None:
         return _choose_process(problem, size)
-    return _choose_scaled(problem, size, scale)
+    return _choose_scaled(problem, size, span.scale)
 
 
 def _counts(problem: MetricProblem) -> list[int]:

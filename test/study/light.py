@@ -22,11 +22,14 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory
 from sfa_localization.evaluation import evaluate, fit_transform, moved, score
+from sfa_localization.features.closures import Closures
+from sfa_localization.metric.drives import Drives
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.figures import save_text
 from sfa_localization.simulation.settings import SimulationConfig
-from sfa_localization.training import Recipe, clock_of, cut_odometry, train
+from sfa_localization.training import Recipe, train
+from sfa_localization.training_input import drive_of
 from study.light_report import matrix_figure, table
 from study.paper import RECIPES, flat
 from study.results import (
@@ -249,7 +252,7 @@ def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:
     slow = slow_of(model.network)
     features = features_of(slow, training)
     try:
-        segments = cut_odometry([training], [clock_of(training)], STRAIGHT)
+        segments = Drives((drive_of(training),), Closures.none(), STRAIGHT).cut()
         metric = learn_metric(features, segments, RECIPES['paper']).map
     except DataError as error:
         nothing: Cell = {'mean_m': None, 'problem': str(error)}

@@ -22,17 +22,19 @@ from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import known, regression, score
+from sfa_localization.features.closures import Closures
 from sfa_localization.features.image_features import REFINING_LAYER, slow_features, spectrum
 from sfa_localization.features.network import Network
-from sfa_localization.fusion.camera_clock import CameraClock
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.paper_solver import PAPER_FEATURES
 from sfa_localization.metric.saved_map import Predictor
 from sfa_localization.metric.segments import Segments, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe, clock_of, cut_odometry
+from sfa_localization.training import Recipe
+from sfa_localization.training_input import drive_of
 from study.results import BATCH, Cell
 
 Rows = NDArray[np.int64]
@@ -50,24 +52,27 @@ class Study:
     their images; the map is laid on the truth by the last training drive.
     """
 
-    training: tuple[Run, ...]
+    drives: tuple[Drive, ...]
     test: Run
-    clocks: tuple[CameraClock, ...]
     places: Array
     test_truth: Trajectory
 
     @classmethod
     def read(cls, bags: Sequence[Path], test: Path, cache: Path, recipe: Recipe) -> Study:
         """From bags; their images go to the folder `cache`. Raises BagError or DataError."""
-        runs = []
+        drives = []
         for bag in [*bags, test]:
             folder = cache / bag.name
             folder.mkdir(exist_ok=True)
-            runs.append(read_drive(bag, folder, recipe, want_truth=True))
-        clocks = tuple(clock_of(run) for run in runs)
-        truths = [_truth(run, clock) for run, clock in zip(runs, clocks, strict=True)]
+            drives.append(drive_of(read_drive(bag, folder, recipe, want_truth=True)))
+        truths = [_truth(drive) for drive in drives]
         places = np.concatenate([truth.poses[:, :2] for truth in truths[:-1]])
-        return cls(tuple(runs[:-1]), runs[-1], clocks[:-1], places, truths[-1])
+        return cls(tuple(drives[:-1]), drives[-1].run, places, truths[-1])
+
+    @property
+    def training(self) -> tuple[Run, ...]:
+        """The runs of the training drives."""
+        return tuple(drive.run for drive in self.drives)
 
     @property
     def truth(self) -> Trajectory:
@@ -84,8 +89,7 @@ class Study:
     def segments(self, config: SegmentConfig, only_last: bool = False) -> Segments:
         """Segments of all training drives, or of the last one; by rows among the images of all."""
         first = len(self.training) - 1 if only_last else 0
-        parts = zip(self.training[first:], self.clocks[first:], strict=True)
-        cut = [cut_odometry([run], [clock], config) for run, clock in parts]
+        cut = [Drives((one,), Closures.none(), config).cut() for one in self.drives[first:]]
         return join(cut, self.starts[first:])
 
     def laid_on(self, config: SegmentConfig) -> Rows:
@@ -112,13 +116,13 @@ def features_of(of: Features, run: Run) -> Array:
     return np.concatenate([of(batch) for batch in run.panoramas.batches(BATCH)])
 
 
-def _truth(run: Run, clock: CameraClock) -> Trajectory:
+def _truth(drive: Drive) -> Trajectory:
     """True poses where the images were taken, NaN where unknown."""
-    if run.ground_truth is None:
-        raise DataError(f'{run.name}: no ground truth to judge by')
-    stamps = run.panoramas.stamps_ns - clock.delay_ns
-    poses = run.ground_truth.at(stamps)
-    poses[~known(run.ground_truth, stamps)] = np.nan
+    truth, stamps = drive.run.ground_truth, drive.stamps_ns
+    if truth is None:
+        raise DataError(f'{drive.run.name}: no ground truth to judge by')
+    poses = truth.at(stamps)
+    poses[~known(truth, stamps)] = np.nan
     return Trajectory(stamps, poses)
 
 

@@ -1,0 +1,134 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The drives that a map is learned from: odometry, what images show of its errors, and segments.
+
+Wheels err in turns: images show how far the robot turned (seen_turns.py) and, once there is a map,
+how much of the way was lost in turns (turn_loss.py).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Run, Stamps
+from sfa_localization.features.closures import Closures
+from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
+from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
+from sfa_localization.metric.seen_turns import Headings, corrections
+from sfa_localization.metric.segments import Segments, cut, join, tracked
+from sfa_localization.metric.selection import Span
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.shared_tracks import with_closures
+from sfa_localization.metric.turn_loss import Shown, way_of
+
+logger = logging.getLogger(__name__)
+
+_LOSS_ROUNDS = 2
+"""The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A run, the headings (N,) rad `seen` in its N images, whose sign may be either, and by how
+    much their stamps are late, None where the drive does not show it."""
+
+    run: Run
+    seen: Sequence[float]
+    delay_ns: int | None = None
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """(N,) of the images, by the clock of the odometry."""
+        return self.run.panoramas.stamps_ns - (self.delay_ns or 0)
+
+    @property
+    def delay_s(self) -> float | None:
+        """By how much the stamps are late."""
+        return None if self.delay_ns is None else self.delay_ns * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Drives:
+    """All drives, whose images are numbered drive after drive, and their loop closures."""
+
+    items: tuple[Drive, ...]
+    closures: Closures
+    config: SegmentConfig
+
+    @property
+    def starts(self) -> list[int]:
+        """Number of each drive's first image."""
+        counts = [len(drive.run.panoramas) for drive in self.items]
+        return [sum(counts[:k]) for k in range(len(counts))]
+
+    def turns(self) -> Sequence[TurnCorrection | None]:
+        """What the images correct of each drive's turns; None where odometry is as good."""
+        seen = [
+            Headings.of(
+                OdometryTrack.of(drive.run.odometry, self.config, drive.run.yaw_rate),
+                drive.stamps_ns,
+                drive.seen,
+            )
+            for drive in self.items
+        ]
+        return corrections(seen, self.closures) or [None] * len(self.items)
+
+    def cut(self, ways: Sequence[Way | None] = ()) -> Segments:
+        """The segments of section 3.1, of all drives; `ways` correct what wheels counted.
+
+        Raises DataError.
+        """
+        parts = [
+            cut(drive.run.odometry, drive.stamps_ns, self.config, drive.run.yaw_rate, turns, way)
+            for drive, turns, way in zip(
+                self.items, self.turns(), ways or [None] * len(self.items), strict=True
+            )
+        ]
+        return with_closures(join(parts, self.starts), self.closures)
+
+    def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
+        """The way of each drive by the map, where its wheels lose some in turns.
+
+        All have the same scale: it is that of the map, and no drive is better known by itself.
+        """
+        images, places = positions(result, segments)
+        places, yaw = places - result.residuals, headings(result, segments)[1]
+        shown = places[:, 0] + 1j * places[:, 1]
+        found = []
+        for k, (drive, turns) in enumerate(zip(self.items, self.turns(), strict=True)):
+            track = tracked(drive.run.odometry, self.config, drive.run.yaw_rate, turns)
+            rows = images - self.starts[k]
+            own = (rows >= 0) & (rows < len(drive.stamps_ns))
+            time_s = (drive.stamps_ns[rows[own]] - track.stamps_ns[0]) * 1e-9
+            found.append(way_of(track, Shown(time_s, shown[own], yaw[own]), segments.ways[k]))
+        scales = [way.scale for way in found if way]
+        return [way and way._replace(scale=float(np.mean(scales))) for way in found]
+
+
+def learn_map(
+    drives: Drives, features: Array, config: MetricConfig, seed: int = 0, span: Span | None = None
+) -> tuple[Segments, MetricResult]:
+    """Segments, and the certified map from features (N, K) of all images to them: section 3.
+
+    Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
+    DataError.
+    """
+    segments = drives.cut()
+    result = learn_metric(features, segments, config, seed, span)
+    for _ in range(_LOSS_ROUNDS if config.solver == 'certified' else 0):
+        ways = drives.ways(segments, result)
+        if not any(ways):
+            break
+        try:
+            shorter = drives.cut(ways)
+            segments, result = shorter, learn_metric(features, shorter, config, seed, span)
+        except DataError as error:
+            logger.warning('the way that wheels lose in turns stays in the map: %s', error)
+            break
+    return segments, result

@@ -1,0 +1,118 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What all steps of a training share: settings, and drives with clocks and loop closures."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sfa_localization.bags.drives import ReadingRecipe
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.camera.turns import headings
+from sfa_localization.data.progress import announce, progress_bar
+from sfa_localization.data.run import Run
+from sfa_localization.features.closures import Views, find_closures, views_of
+from sfa_localization.features.network import Architecture, standard_architecture
+from sfa_localization.features.network_training import ImageSequence
+from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.features.zero_time_edges import edges_between
+from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
+from sfa_localization.metric.drives import Drive, Drives
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+
+logger = logging.getLogger(__name__)
+
+STEPS = 9
+"""Of a training, see training.py."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe(ReadingRecipe):
+    """Everything that decides what is learned from a bag.
+
+    `architecture` replaces the standard network for the size of the panoramas.
+    """
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    metric: MetricConfig = field(default_factory=MetricConfig)
+    architecture: Architecture | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingInput:
+    """Drives with clocks and loop closures, the `views` that these are found by, and settings."""
+
+    drives: Drives
+    views: Views
+    recipe: Recipe
+    progress: bool = False
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
+        """Step 2: what images show before anything is learned, also in different lights."""
+        total = sum(len(run.panoramas) for run in runs)
+        title = titled(2, 'find loop closures')
+        with progress_bar(title, total, shown=progress) as bar:
+            views = views_of(runs, bar.update)
+        closures = find_closures(views, recipe.panorama.clockwise)
+        drives = Drives(tuple(map(drive_of, runs)), closures, recipe.segments)
+        return cls(drives, views, recipe, progress)
+
+    @property
+    def runs(self) -> tuple[Run, ...]:
+        """One for each drive."""
+        return tuple(drive.run for drive in self.drives.items)
+
+    @property
+    def panorama(self) -> PanoramaConfig:
+        """The recipe's, in the size of the recorded ones."""
+        height, width, _ = self.runs[0].panoramas.shape
+        return replace(self.recipe.panorama, height=height, width=width)
+
+    @property
+    def architecture(self) -> Architecture:
+        """The recipe's, or the standard one for the panoramas."""
+        size = self.panorama.height, self.panorama.width
+        normalization = self.recipe.network.normalization
+        return self.recipe.architecture or standard_architecture(size, normalization)
+
+    @property
+    def sequences(self) -> list[ImageSequence]:
+        """What the network is trained on: the drives, and the loop closures between them."""
+        rotations, clockwise = self.architecture.rotations, self.recipe.panorama.clockwise
+        own = [ImageSequence.of(run) for run in self.runs]
+        drives = [run.panoramas for run in self.runs]
+        return own + edges_between(drives, self.drives.closures, rotations, clockwise)
+
+    def say(self, step: int, text: str) -> None:
+        """Announce a step."""
+        announce(titled(step, text), shown=self.progress)
+
+    def bar(self, step: int, text: str, passes: int = 1, done: int = 0) -> Any:
+        """The progress of a step in so many passes through all images; some may be done."""
+        images = sum(len(one.panoramas) for one in self.runs)
+        return progress_bar(
+            titled(step, text), images * passes, initial=images * done, shown=self.progress
+        )
+
+
+def titled(step: int, text: str) -> str:
+    """What a step does, with its number."""
+    return f'{text} (step {step} of {STEPS})'
+
+
+def drive_of(run: Run) -> Drive:
+    """A run with the clock of its camera; warns of a delay that the filter cannot compensate."""
+    seen = list(headings(run.panoramas))
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, seen)
+    if abs(clock.delay_ns) > DELAY_LIMIT_NS:
+        logger.warning(
+            '%s: the stamps of images and odometry are %.2f s apart: the filter compensates half '
+            'a second only; synchronize both clocks', run.name, abs(clock.delay_s),
+        )  # fmt: skip
+    return Drive(run, seen, clock.delay_ns if clock.known else None)
