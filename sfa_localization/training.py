@@ -17,13 +17,12 @@ Steps 2, 7, 8 and keyframes go beyond the paper.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from sfa_localization.bags.drives import image_cache, read_drives
-from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -34,7 +33,6 @@ from sfa_localization.features.network import Network
 from sfa_localization.features.network_training import train_network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
-from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.drives import learn_map
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import (
@@ -50,8 +48,6 @@ from sfa_localization.place_model import PlaceModel
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe
 from sfa_localization.training_input import TrainingInput
-
-logger = logging.getLogger(__name__)
 
 COARSE_POINTS = 700
 """Inducing points of a map that is refined: with more, the refined map and the heading are no
@@ -139,11 +135,8 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     with given.bar(4, 'compute the slow features of all images') as bar:
         images = features_of_runs(network, given.runs, layers, bar.update)
     given.say(6, 'cut the odometry, and learn the map')  # steps 5 and 6
-    segments, first = learn_map(given.drives, images.slow, config, seed, Span(COARSE_POINTS))
-    if first.diagnostics.one_route and strict:
-        raise DataError(f'{ROUTE}, or train without --strict')
-    if first.diagnostics.one_route:
-        logger.warning(ROUTE)
+    span = Span(COARSE_POINTS)
+    segments, first = learn_map(given.drives, images.slow, config, seed, span, strict)
     given.say(7, 'learn the heading')
     heading = learn_heading(images, segments, first)
     given.say(8, 'refine the map')
@@ -155,6 +148,11 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         given.views, images.disagreement, segments, result, finest, given.recipe.panorama.clockwise
     )
     result = replace(result, forecast=result.forecast.improved(known.improvement))
+    delays = [drive.delay_s for drive in given.drives.items]
+    quality: dict[str, Any] = {'features_used': first.map.features, 'refined': finer is not None}
+    quality |= {'camera_delay_s': delays, 'pictures': len(images.slow), **images.variance_shares}
+    quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
+    quality |= {**segments.quality, **result.quality, **known.quality}
     model = PlaceModel(
         network,
         fast_map(first.map),
@@ -164,22 +162,8 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         heading.compass if heading else None,
         heading.agreement if heading else None,
         layers if heading else (),
-        {},
+        {**quality, **(heading.quality if heading else {})},
         correlation_along_drive(result, segments, TURN_RADIUS_M),
         finer.refinement if finer else None,
     )
-    quality = {
-        'delta': network.deltas[-1].tolist(),
-        'rank': [list(ranks) for ranks in network.ranks],
-        'pictures': len(images.slow),
-        'features_used': first.map.features,
-        'refined': finer is not None,
-        'camera_delay_s': [drive.delay_s for drive in given.drives.items],
-        **images.variance_shares,
-        **segments.quality,
-        **result.quality,
-        **known.quality,
-        **(heading.quality if heading else {}),
-    }
-    model = replace(model, quality=quality)
     return Trained(model, given.runs, images.slow, segments, result, heading)

@@ -93,7 +93,7 @@ def trained(tmp_path_factory):
 def test_a_training_says_what_it_does(trained):
     text = trained[-1]
     for words in ('read garden: ', 'learn slow features in ', 'compute the slow features of all',
-                  'learn the map from ', 'learn the heading ', 'refine the map ',
+                  'learn the map ', 'learn the heading ', 'refine the map ',
                   'choose keyframes, and check the map '):  # fmt: skip
         assert words in text, text
     for step in (2, 3, 4, 6, 7, 8, 9):

@@ -19,6 +19,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run, Stamps
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
+from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
@@ -112,12 +113,17 @@ class Drives:
 
 
 def learn_map(
-    drives: Drives, features: Array, config: MetricConfig, seed: int = 0, span: Span | None = None
+    drives: Drives,
+    features: Array,
+    config: MetricConfig,
+    seed: int = 0,
+    span: Span | None = None,
+    strict: bool = False,
 ) -> tuple[Segments, MetricResult]:
     """Segments, and the certified map from features (N, K) of all images to them: section 3.
 
     Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
-    DataError.
+    DataError; `strict` also for a single route, of which else a warning says so.
     """
     segments = drives.cut()
     result = learn_metric(features, segments, config, seed, span)
@@ -131,4 +137,8 @@ def learn_map(
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break
+    if result.diagnostics.one_route and strict:
+        raise DataError(f'{ROUTE}, or train without --strict')
+    if result.diagnostics.one_route:
+        logger.warning(ROUTE)
     return segments, result
