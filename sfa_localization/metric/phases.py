@@ -26,8 +26,6 @@ CERTIFICATE_TOLERANCE = 1e-9
 _NEWTON_STEPS = 100
 # Newton's steps shrink quadratically: the one after this would be rounding.
 _CONVERGED = 1e-9
-# Of the relaxation, a last resort that is seldom entered.
-_SWEEPS = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +61,13 @@ def certify(h: Complex, z: Complex) -> Certificate:
 def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Certificate]:
     """Global minimizer z (N,) and its certificate.
 
-    Starts from `starts`, then from the smallest eigenvector, from the metric upgrade, and at last
-    from the semidefinite relaxation, which the certificate is dual to; the first certified minimum
-    ends the search. The result may be uncertified: check the certificate.
+    Starts from `starts`, then from the smallest eigenvector, and from the metric upgrade; the first
+    certified minimum ends the search. The result may be uncertified: check the certificate.
     """
     first = [unit(s) for s in starts] or [spectral_start(h)]
     z = min([refine(h, s) for s in first], key=lambda c: phase_cost(h, c))
     certificate = certify(h, z)
-    for more in (_spectral_starts, _upgraded_starts, _relaxed_starts):
+    for more in (_spectral_starts, _upgraded_starts):
         if certificate.certified:
             break
         z = min([z, *(refine(h, c) for c in more(h, z))], key=lambda c: phase_cost(h, c))
@@ -114,22 +111,6 @@ def metric_upgrade(g: Complex) -> tuple[Complex, float]:
 def _upgraded_starts(h: Complex, z: Complex) -> list[Complex]:
     start = metric_upgrade(h)[0] if len(h) > 2 else z
     return [start, np.conj(start), np.conj(z)]
-
-
-def _relaxed_starts(h: Complex, z: Complex) -> list[Complex]:
-    """Phases of the leading vector of the relaxation's solution, by descent block by block."""
-    rank = min(len(h), 4)
-    rows = np.zeros((len(h), rank), complex)
-    rows[:, 0] = z
-    rows += 0.1 * np.exp(2j * np.pi * np.outer(np.arange(len(h)), np.arange(rank)) * 0.618)
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    off = h - np.diag(np.diag(h))
-    for _ in range(_SWEEPS):
-        for n in range(len(h)):
-            pull = -off[n] @ rows
-            size = np.linalg.norm(pull)
-            rows[n] = pull / size if size > 0 else rows[n]
-    return [unit(np.linalg.svd(rows, full_matrices=False)[0][:, 0])]
 
 
 def refine(h: Complex, z: Complex) -> Complex:
