@@ -17,7 +17,7 @@ from typing import Any
 from sfa_localization import __version__
 from sfa_localization.commands.processes import terminable
 from sfa_localization.data.errors import LocalizationError, NodeError
-from sfa_localization.nodes.help import NODES, asks_for_help, node_help
+from sfa_localization.nodes.entry import NODES, asks_for_help, node_help
 
 COMMANDS = {
     'simulate': 'Record a bag with a simulated robot in a simulated garden.',
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(name: str, words: Sequence[str]) -> int:
     """Run a node, which reads its ROS arguments itself, or a command; the exit code."""
     if name in NODES and asks_for_help(words[1:]):
-        print(node_help(name, NODES[name]), end='')
+        print(node_help(name), end='')
         return 0
     if name in NODES:
         node = importlib.import_module(f'sfa_localization.nodes.{name}')

@@ -52,6 +52,16 @@ def pytest_collection_modifyitems(config, items):
         config.hook.pytest_deselected(items=others)
 
 
+@pytest.fixture
+def bench():
+    """Nodes under test, and one that feeds and hears them, in a domain of this process."""
+    from ros_bench import Bench
+
+    made = Bench()
+    yield made
+    made.close()
+
+
 @pytest.fixture(scope='module')
 def gardens():
     """Build a garden once for all drives in it: seed, area, light and season make it."""

@@ -28,7 +28,7 @@ REASONS = {
     'localizer.py': ('_observation',),
     'nodes/discovery.py': ('_tell',),
     'nodes/lifecycle.py': ('_time_problem',),
-    'nodes/ekf_node.py': ('_status', '_receive_pose'),
+    'nodes/ekf_node.py': ('status', '_receive_pose'),
     'nodes/sfa_node.py': ('health',),
     'nodes/omnicam_node.py': ('health', '_judge_source', '_judge_images'),
 }

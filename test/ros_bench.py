@@ -1,16 +1,27 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A bench for nodes under test: its own context and domain, an executor in a thread, deadlines."""
+"""A bench for nodes under test: its own context and domain, an executor in a thread, deadlines.
+
+And the nodes as processes in the same domain.
+"""
 
 import contextlib
+import os
+import subprocess
+import sys
 import threading
 import time
+from unittest import mock
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from ros_domains import free_domain
 
+from sfa_localization.nodes import lifecycle
+
+DOMAIN = free_domain()
 DEADLINE_S = 60.0  # passed only where something is wrong: busy machines take their time
 
 
@@ -22,6 +33,35 @@ def until(condition, deadline_s=DEADLINE_S):
             return True
         time.sleep(0.005)
     return bool(condition())
+
+
+def start_process(*words, **options):
+    """A process of this interpreter, in the domain of the bench."""
+    environment = {
+        **os.environ,
+        'ROS_DOMAIN_ID': str(DOMAIN),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'OMP_NUM_THREADS': '1',
+        'PYTHONPATH': os.pathsep.join(sys.path),
+    }
+    return subprocess.Popen([sys.executable, *map(str, words)], env=environment, **options)
+
+
+def start_node(name, *parameters, namespace='/'):
+    """The process of a node."""
+    words = [word for value in parameters for word in ('-p', value)]
+    command = '-m', 'sfa_localization', name, '--ros-args', '-r', f'__ns:={namespace}'
+    return start_process(*command, *words)
+
+
+def end_process(process):
+    """Ask it to end, and make it where it does not."""
+    process.terminate()
+    try:
+        process.wait(DEADLINE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 class Spinner(SingleThreadedExecutor):
@@ -47,7 +87,7 @@ class Spinner(SingleThreadedExecutor):
 class Bench:
     """Runs nodes, publishes to them and records what they publish."""
 
-    def __init__(self, domain_id):
+    def __init__(self, domain_id=DOMAIN):
         self.context = rclpy.Context()
         rclpy.init(
             context=self.context,
@@ -64,7 +104,8 @@ class Bench:
         node = kind(context=self.context, parameter_overrides=values, **(options or {}))
         self.nodes.append(node)
         if start:
-            assert node.start(), node.failure
+            with mock.patch.object(lifecycle, 'DIAGNOSTICS_PERIOD_S', 0.1):  # quicker tests
+                assert node.start(), node.failure
         self.executor.add_node(node)
         return node
 
@@ -88,6 +129,15 @@ class Bench:
             # The subscription knows the publisher a moment later; best effort, it would miss one.
             time.sleep(0.1)
         self._publishers[topic].publish(message)
+
+    def forget(self, topic):
+        """Publish on it no more; a node that is configured again is waited for again."""
+        self.node.destroy_publisher(self._publishers.pop(topic))
+
+    def publish_until(self, topic, message, condition):
+        """Again and again: what is best effort may be lost."""
+        self.publish(topic, message)
+        return until(lambda: until(condition, 0.1) or self.publish(topic, message))
 
     def call(self, kind, name, request):
         client = self.node.create_client(kind, name)

@@ -5,74 +5,59 @@
 import numpy as np
 import pytest
 from picture_readers import PictureReader
-from ros_domains import free_domain
 
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
+
+from nav_msgs.msg import Odometry
+from ros_bench import until
+from sensor_msgs.msg import CompressedImage, Image
+
+from sfa_localization.nodes import discovery
+from sfa_localization.nodes.conversions import to_image, to_odometry
+from sfa_localization.nodes.ekf_node import EkfNode
+from sfa_localization.nodes.omnicam_node import OmnicamNode
+from sfa_localization.nodes.sfa_node import SfaNode
+
 pytestmark = pytest.mark.ros
-
-from nav_msgs.msg import Odometry  # noqa: E402
-from ros_bench import Bench, until  # noqa: E402
-from sensor_msgs.msg import CompressedImage, Image  # noqa: E402
-
-from sfa_localization.nodes import discovery  # noqa: E402
-from sfa_localization.nodes.conversions import to_image, to_odometry  # noqa: E402
-from sfa_localization.nodes.ekf_node import EkfNode  # noqa: E402
-from sfa_localization.nodes.omnicam_node import OmnicamNode  # noqa: E402
-from sfa_localization.nodes.sfa_node import SfaNode  # noqa: E402
-
-DOMAIN = free_domain()
+STAMP_NS = 10**9
 
 
-@pytest.fixture
-def bench(monkeypatch):
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
     monkeypatch.setattr(discovery, 'PATIENCE_S', 0.0)
-    made = Bench(DOMAIN)
-    yield made
-    made.close()
 
 
-def driving(stamp_ns):
-    return to_odometry(
-        np.zeros(3), np.eye(3), (0.0, 0.0), np.eye(2), stamp_ns, ('odom', 'base_link')
-    )
-
-
-def heard(bench, node, topic, message, stamps=range(1, 400)):
-    """Publish until the node has used something as its input `topic`."""
-    publisher = bench.node.create_publisher(type(message(1)), topic, 10)
-    moving = iter(stamps)
-
-    def used():
-        publisher.publish(message(next(moving) * 50_000_000))
-        return bool(until(lambda: used_of(node), 0.1))
-
-    return until(used)
-
-
-def used_of(node):
-    return sum(monitor.used for name, monitor in node.monitors.items() if 'timer' not in name)
+def announce(bench, node, kind, *names):
+    """Publishers of these topics, which the node knows of."""
+    made = [bench.node.create_publisher(kind, name, 10) for name in names]
+    assert until(lambda: all(node.count_publishers(name) for name in names))
+    return made
 
 
 def takes_another(node, topic):
-    node._discovery.look()
+    node.discovery.look()
     return node.shown(topic) != node.resolve_topic_name(topic)
 
 
 def test_odometry_of_another_name_is_found(bench):
     node = bench.run(EkfNode)
-    assert heard(bench, node, '/wheel_odometry', driving)
+    zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
+    message = to_odometry(zero, one, zero[:2], one[:2, :2], STAMP_NS, frames)
+    used = node.monitor('odom')
+    assert bench.publish_until('/wheel_odometry', message, lambda: used.received)
     assert node.shown('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
-    bench.node.create_publisher(Odometry, '/odom', 10)
+    announce(bench, node, Odometry, '/odom')
     assert until(lambda: node.shown('odom') == '/odom'), 'its own name comes first'
 
 
 def test_images_of_another_name_are_found(bench):
     node = bench.run(OmnicamNode)
-    bench.listen(Image, 'panorama')
-    picture = np.full((60, 600, 3), 90, np.uint8)
-    assert heard(bench, node, '/camera/image', lambda stamp: to_image(picture, stamp, 'camera'))
+    heard = bench.listen(Image, 'panorama')
+    message = to_image(np.full((60, 600, 3), 90, np.uint8), STAMP_NS, 'camera')
+    assert bench.publish_until('/camera/image', message, lambda: heard)
+    assert node.shown('image_raw') == '/camera/image'
 
 
 @pytest.mark.parametrize(
@@ -85,39 +70,40 @@ def test_images_of_another_name_are_found(bench):
     ],
 )
 def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
-    publishers = [bench.node.create_publisher(Odometry, name, 10) for name in others]
     node = bench.run(EkfNode, options={'cli_args': arguments})
-    assert until(lambda: all(node.count_publishers(name) for name in others))
+    announce(bench, node, Odometry, *others)
     assert not takes_another(node, 'odom')
-    assert len(publishers) == len(others)
 
 
 @pytest.mark.parametrize(
-    ('kind', 'robot', 'there', 'remedy'),
+    ('kind', 'robot', 'there', 'arguments'),
     [
-        (OmnicamNode, '/robot1', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
         # The driver is in the namespace, or its topic alone, because a bridge has none.
         (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
+        (OmnicamNode, '/robot1', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
         # Played from a bag, of another namespace, and of the node's own.
         (OmnicamNode, '', ['/panorama'], 'image:=NAME or panorama:=NAME'),
         (OmnicamNode, '', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
     ],
 )
-def test_the_output_of_another_localizer_is_no_sensor(bench, kind, robot, there, remedy):
+def test_the_output_of_another_localizer_is_no_sensor(bench, kind, robot, there, arguments):
     if robot:
         bench.run(kind, options={'namespace': robot})
-    message = Odometry if kind is EkfNode else Image
-    publishers = [bench.node.create_publisher(message, name, 10) for name in there]
     node = bench.run(kind)
-    topic = 'odom' if kind is EkfNode else 'image_raw'
-    assert until(lambda: takes_another(node, topic) or all(map(hint_of(node).count, there)))
+    message, topic = (Odometry, 'odom') if kind is EkfNode else (Image, 'image_raw')
+    announce(bench, node, message, *there)
+    node.discovery.look()
     assert not takes_another(node, topic)
-    assert remedy in hint_of(node) and '-r ' not in hint_of(node)
-    assert len(publishers) == len(there)
+    hint = node.discovery.hint
+    assert all(name in hint for name in there) and hint.endswith(f': {arguments}')
 
 
-def hint_of(node):
-    return node._discovery.hint
+def test_an_output_of_this_package_under_another_name_is_no_sensor(bench):
+    bench.run(EkfNode, options={'cli_args': ['--ros-args', '-r', 'ekf/odometry:=/fused',
+                                             '-r', '__ns:=/robot1']})  # fmt: skip
+    node = bench.run(EkfNode)
+    assert until(lambda: node.count_publishers('/fused'))
+    assert not takes_another(node, 'odom') and '/fused' in node.discovery.hint
 
 
 @pytest.mark.parametrize(('kind', 'settings'), [
@@ -129,18 +115,17 @@ def test_without_images_the_diagnostics_name_those_that_there_are(
 ):
     """Of both types: another `image_transport` may be all that is wrong."""
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: PictureReader()))
-    there = {'/a': Image, '/b': Image, '/a/packed': CompressedImage, '/b/packed': CompressedImage}
-    publishers = [bench.node.create_publisher(made, name, 1) for name, made in there.items()]
     node = bench.run(kind, **settings)
+    announce(bench, node, Image, '/a', '/b')
+    announce(bench, node, CompressedImage, '/a/packed', '/b/packed')
     bench.node.create_subscription(Image, 'panorama', lambda _: None, 1)
-    words = [f'{name} (sensor_msgs/msg/{made.__name__})' for name, made in there.items()]
+    words = [f'/{name} (sensor_msgs/msg/Image)' for name in 'ab']
+    words += [f'/{name}/packed (sensor_msgs/msg/CompressedImage)' for name in 'ab']
     assert until(lambda: all(word in node.health()[1] for word in words))
-    assert len(publishers) == 4
 
 
 def test_what_has_been_heard_stays(bench):
-    bench.node.create_publisher(Odometry, '/wheels', 10)
     node = bench.run(EkfNode)
-    assert until(lambda: node.count_publishers('/wheels'))
+    announce(bench, node, Odometry, '/wheels')
     node.monitor('odom').receive()
     assert not takes_another(node, 'odom')

@@ -28,8 +28,8 @@ from test_style import DOCUMENTS
 from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.settings import Settings
+from sfa_localization.nodes.entry import CANNOT_START, DIED
 from sfa_localization.nodes.settings import EkfNodeConfig
-from sfa_localization.nodes.signals import CANNOT_START, DIED
 
 ROOT = Path(__file__).parents[1]
 README_LINES = 130

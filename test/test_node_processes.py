@@ -1,53 +1,42 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""ekf_node and sfa_node as processes: signals, bad parameters, wrong requests."""
+"""ekf_node and sfa_node as processes: signals, bad parameters and arguments, exit codes."""
 
 import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
-from ros_domains import free_domain
 
 pytest.importorskip('rclpy')
+
+from ros_bench import DEADLINE_S, DOMAIN, until
+from std_msgs.msg import String
+
+from sfa_localization.nodes.entry import CANNOT_START, DIED
+from sfa_localization.nodes.lifecycle import latched_qos
+
 pytestmark = pytest.mark.ros
-
-from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
-from std_msgs.msg import String  # noqa: E402
-
-from sfa_localization.nodes.lifecycle import latched_qos  # noqa: E402
-from sfa_localization.nodes.signals import DIED  # noqa: E402
-
-DOMAIN = free_domain()
-
-
-@pytest.fixture
-def bench():
-    made = Bench(DOMAIN)
-    yield made
-    made.close()
+START = Path(__file__).parents[1] / 'resource/start'
+RUN = 'import sys; from sfa_localization.nodes import entry; sys.exit(entry.{}())'
 
 
 @pytest.fixture
 def start(tmp_path):
     """Start a node's process; all are ended with the test."""
     processes = []
+    environment = {**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_LOG_DIR': str(tmp_path)}
+    environment['PYTHONPATH'] = str(START.parents[1])
 
-    def begin(node, *parameters, arguments=(), before=''):
-        arguments = [*arguments, *(part for text in parameters for part in ('-p', text))]
-        code = f'{before}\nimport sys; from sfa_localization.nodes import entry\n'
-        code += f'sys.exit(entry.{node}())'
-        environment = {
-            **os.environ,
-            'ROS_DOMAIN_ID': str(DOMAIN),
-            'ROS_LOG_DIR': str(tmp_path),
-            'OMP_NUM_THREADS': '1',
-        }
-        command = [sys.executable, '-c', code]
-        if arguments:
-            command += ['--ros-args', *arguments]
+    def begin(node, *arguments, before=None):
+        """Its start script; or the same in Python, after other code."""
+        command = [sys.executable, str(START / node)]
+        if before is not None:
+            command[1:] = ['-c', f'{before}\n{RUN.format(node)}']
+        command += ['--ros-args', *arguments] if arguments else []
         processes.append(
             subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
         )
@@ -60,25 +49,19 @@ def start(tmp_path):
         process.communicate()
 
 
-def running(bench):
-    heard = []
-    bench.node.create_subscription(String, 'ekf/state', heard.append, latched_qos())
-    return until(lambda: heard)
-
-
 def ended(process):
-    """Wait until a process ends: its exit code, and what it printed."""
-    _, text = process.communicate(timeout=DEADLINE_S)
+    """Wait until a process ends, perhaps beside others: its exit code, and what it printed."""
+    _, text = process.communicate(timeout=3 * DEADLINE_S)
     return process.returncode, text
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_node_with_exit_code_0(bench, start, number):
     """Active and unconfigured."""
-    active, unconfigured = start('ekf_node'), start('ekf_node', 'autostart:=false',
-                                                    arguments=['-r', '__node:=other'])  # fmt: skip
-    assert running(bench)
-    assert until(lambda: 'other' in bench.node.get_node_names())
+    heard, active = [], start('ekf_node')
+    unconfigured = start('ekf_node', '-p', 'autostart:=false', '-r', '__node:=other')
+    bench.node.create_subscription(String, 'ekf/state', heard.append, latched_qos())
+    assert until(lambda: heard and 'other' in bench.node.get_node_names())
     for process in (active, unconfigured):
         process.send_signal(number)
         code, text = ended(process)
@@ -86,7 +69,18 @@ def test_a_signal_ends_the_node_with_exit_code_0(bench, start, number):
 
 
 # Code that runs before the node's: at some moment the process sends itself a signal.
-SEND = 'import os, signal, sys\ndef send(): os.kill(os.getpid(), signal.{})\n'
+SEND = """
+import os, signal, sys
+def send(wait_for=None):
+    os.kill(os.getpid(), signal.{})
+    while wait_for is not None and wait_for.context.ok():
+        pass
+"""
+IN_NODE = """
+from sfa_localization.nodes.ekf_node import EkfNode
+works = EkfNode.{0}
+EkfNode.{0} = lambda self: (send(self), works(self))[1]
+"""
 MOMENTS = {
     'importing': """
 class Finder:
@@ -99,40 +93,11 @@ sys.meta_path.insert(0, Finder)
     'initialising': """
 import rclpy
 init = rclpy.init
-def late(**options):
-    send()
-    init(**options)
-rclpy.init = late
+rclpy.init = lambda **options: (send(), init(**options))
 """,
-    'starting': """
-from sfa_localization.nodes.ekf_node import EkfNode
-setup = EkfNode.setup
-def signalled(self):
-    send()
-    while self.context.ok():
-        pass
-    setup(self)
-EkfNode.setup = signalled
-""",
-    'made': """
-from sfa_localization.nodes.ekf_node import EkfNode
-def signalled(self):
-    send()
-    while self.context.ok():
-        pass
-    return False
-EkfNode.start = signalled
-""",
-    'publishing': """
-from sfa_localization.nodes.ekf_node import EkfNode
-health = EkfNode.health
-def signalled(self):
-    send()
-    while self.context.ok():
-        pass
-    return health(self)
-EkfNode.health = signalled
-""",
+    'starting': IN_NODE.format('setup'),
+    'made': IN_NODE.format('start'),
+    'publishing': IN_NODE.format('health'),
     'ending': """
 from sfa_localization.nodes.ekf_node import EkfNode
 started, destroy = EkfNode.started, EkfNode.destroy_node
@@ -150,12 +115,27 @@ sys.exit = lambda code: (send(), leave(code))
 
 def test_a_signal_at_any_moment_ends_with_exit_code_0(start):
     started = {m: start('ekf_node', before=SEND.format('SIGINT') + MOMENTS[m]) for m in MOMENTS}
-    for m in ('initialising', 'starting'):
-        started[f'{m}, SIGTERM'] = start('ekf_node', before=SEND.format('SIGTERM') + MOMENTS[m])
+    before = SEND.format('SIGTERM') + MOMENTS['initialising']
+    started['initialising, SIGTERM'] = start('ekf_node', before=before)
     for moment, process in started.items():
         code, text = ended(process)
         assert code == 0, (moment, text)
         assert not [w for w in ('Traceback', 'internal error', 'refused') if w in text], moment
+
+
+def test_a_start_script_ends_at_ctrl_c_before_its_slow_imports(start):
+    """As soon as it handles signals; before, it is Python that starts."""
+    process = start('sfa_node')
+    status = Path(f'/proc/{process.pid}/status')
+    handled = 1 << (signal.SIGTERM - 1)
+
+    def caught():
+        (line,) = (line for line in status.read_text().splitlines() if line.startswith('SigCgt'))
+        return int(line.split()[1], 16) & handled
+
+    assert until(caught)
+    process.send_signal(signal.SIGINT)
+    assert ended(process) == (0, '')
 
 
 WRONG = [
@@ -167,10 +147,10 @@ WRONG = [
 
 
 def test_a_wrong_parameter_ends_the_node_with_its_name(start):
-    started = [(start(node, *parameters), why) for node, parameters, why in WRONG]
+    started = [(start(node, '-p', *words), why) for node, words, why in WRONG]
     for process, why in started:
         code, text = ended(process)
-        assert code == 1 and why in text and 'Traceback' not in text, (why, text)
+        assert code == CANNOT_START and why in text and 'Traceback' not in text, (why, text)
 
 
 FILES = {
@@ -182,8 +162,8 @@ UNREADABLE = [
     (['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
     (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
     (['-r', 'odom'], "remap rule: '-r odom'"),
+    (['--lost_std', '2'], 'unknown arguments after --ros-args: '),
     (['--', '--lost_std', '2'], 'unknown arguments --lost_std 2: give parameters as --ros-args -p'),
-    (['-p', 'model:=\udcff'], r'not UTF-8: model:=\udcff'),
 ]
 
 
@@ -193,10 +173,10 @@ def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path):
     started = []
     for words, why in UNREADABLE:
         words = [f'{tmp_path}/{word}' if word.endswith('.yaml') else word for word in words]
-        started.append((start('ekf_node', arguments=words), why))
+        started.append((start('ekf_node', *words), why))
     for process, why in started:
         code, text = ended(process)
-        assert code == 1 and why in text and 'Traceback' not in text, (why, text)
+        assert code == CANNOT_START and why in text and 'Traceback' not in text, (why, text)
 
 
 def test_a_node_that_dies_later_has_another_exit_code_than_one_that_cannot_start(start):
@@ -222,7 +202,7 @@ def test_a_section_for_another_namespace_or_a_misspelt_one_is_warned_of(start, t
         )
         words = ['--params-file', str(path), '-r', '__ns:=/robot1']
         before = SEND.format('SIGINT') + MOMENTS['made']
-        started.append((path, key, ignored, start('ekf_node', arguments=words, before=before)))
+        started.append((path, key, ignored, start('ekf_node', *words, before=before)))
     for path, key, ignored, process in started:
         code, text = ended(process)
         assert code == 0, text

@@ -33,8 +33,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.time import Time
-from ros_bench import Bench, until
-from ros_domains import free_domain
+from ros_bench import DOMAIN, until
 from std_msgs.msg import String
 from test_docs import replay
 
@@ -44,48 +43,36 @@ from sfa_localization.nodes.conversions import to_pose_with_covariance
 from sfa_localization.nodes.lifecycle import latched_qos
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-DOMAIN = free_domain()
 ROOT = Path(__file__).parents[1]
 DRIVE, MODEL_DRIVE = ROOT / 'bags' / 'sample_test', ROOT / 'bags' / 'sample'
 COMMAND_S = 60
 """A command of ros2 imports for seconds, and more on a busy machine."""
-DIRECT = ['--no-daemon', '--spin-time', '3']
-"""Without the daemon of ros2, which would outlive the tests."""
+DIRECT = ['--no-daemon', '--spin-time', '5']
+"""Without the daemon of ros2, which would outlive the tests; nodes are found in that time."""
+ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN), 'PYTHONUNBUFFERED': '1'}
 
 
-@pytest.fixture
-def bench():
-    made = Bench(DOMAIN)
-    yield made
-    made.close()
-
-
-@pytest.fixture(scope='module')
-def environment(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('ros_log')
-    return {
-        **os.environ,
-        'ROS_DOMAIN_ID': str(DOMAIN),
-        'ROS_LOG_DIR': str(folder),
-        'PYTHONUNBUFFERED': '1',
-    }
+def ros2(*words, refused=False, timeout_s=COMMAND_S):
+    """Run `ros2 ...` to its end: its output; only what is `refused` may fail."""
+    done = subprocess.run(
+        ['ros2', *map(str, words)], env=ENVIRONMENT, stdin=subprocess.DEVNULL,
+        capture_output=True, text=True, timeout=timeout_s,
+    )  # fmt: skip
+    assert refused or done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 @pytest.fixture(scope='module')
-def model(environment, tmp_path_factory):
+def model(tmp_path_factory):
     """A model of the first sample drive."""
     path = tmp_path_factory.mktemp('model') / 'model.npz'
-    words = ['ros2', 'run', 'sfa_localization', 'train', MODEL_DRIVE, '--output', path]
-    done = subprocess.run(
-        [*map(str, words)], env=environment, stdin=subprocess.DEVNULL, capture_output=True,
-        text=True, timeout=600,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
+    words = 'run', 'sfa_localization', 'train', MODEL_DRIVE, '--output', path
+    ros2(*words, timeout_s=1200)
     return path
 
 
 @pytest.fixture
-def start(environment, tmp_path):
+def start(tmp_path):
     """Start `ros2 ...` as in a terminal of its own: Ctrl-C reaches the whole of it."""
     running = []
 
@@ -93,7 +80,7 @@ def start(environment, tmp_path):
         log = tmp_path / f'{len(running)}.log'
         with open(log, 'w') as output:
             process = subprocess.Popen(
-                ['ros2', *map(str, words)], env=environment, stdin=subprocess.DEVNULL,
+                ['ros2', *map(str, words)], env=ENVIRONMENT, stdin=subprocess.DEVNULL,
                 stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
         process.log = log
@@ -107,21 +94,6 @@ def start(environment, tmp_path):
                 os.killpg(process.pid, number)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(15)
-
-
-@pytest.fixture
-def ros2(environment):
-    """Return a function that runs `ros2 ...` to its end: its output; only `refused` may fail."""
-
-    def call(*words, refused=False):
-        done = subprocess.run(
-            ['ros2', *map(str, words)], env=environment, stdin=subprocess.DEVNULL,
-            capture_output=True, text=True, timeout=COMMAND_S,
-        )  # fmt: skip
-        assert refused or done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
-
-    return call
 
 
 def interrupted(process):
@@ -142,6 +114,12 @@ def planar(pose):
     return np.array(read_planar(pose.position, pose.orientation))
 
 
+def played(start, path, *words):
+    """A bag is played to its end."""
+    player = start('bag', 'play', path, '--disable-keyboard-controls', *words)
+    assert player.wait(3 * COMMAND_S) == 0, player.log.read_text()
+
+
 def launch(start, *arguments):
     return start('launch', 'sfa_localization', 'localization.launch.py', *arguments)
 
@@ -154,7 +132,7 @@ def test_a_node_of_ros2_run_ends_at_ctrl_c(bench, start):
     assert until(lambda: 'ekf_node' not in bench.node.get_node_names())
 
 
-def test_a_parameter_dump_can_be_read_back(bench, start, ros2, tmp_path):
+def test_a_parameter_dump_can_be_read_back(bench, start, tmp_path):
     first = start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-p', 'lost_std:=1.25')
     states(bench)
     dumped = ros2('param', 'dump', '/ekf_node', *DIRECT)
@@ -170,7 +148,7 @@ def test_a_parameter_dump_can_be_read_back(bench, start, ros2, tmp_path):
     assert 'double array' in ros2('param', 'describe', '/ekf_node', 'initial_pose', *DIRECT)
 
 
-def test_a_live_parameter_is_set_and_a_wrong_value_is_refused(bench, start, ros2):
+def test_a_live_parameter_is_set_and_a_wrong_value_is_refused(bench, start):
     start('run', 'sfa_localization', 'ekf_node')
     states(bench)
     assert 'successful' in ros2('param', 'set', '/ekf_node', 'lost_std', '1.5', *DIRECT)
@@ -179,7 +157,7 @@ def test_a_live_parameter_is_set_and_a_wrong_value_is_refused(bench, start, ros2
     assert '1.5' in ros2('param', 'get', '/ekf_node', 'lost_std', *DIRECT).split()
 
 
-def test_the_life_cycle_is_driven_from_the_command_line(bench, start, ros2):
+def test_the_life_cycle_is_driven_from_the_command_line(bench, start):
     start('run', 'sfa_localization', 'ekf_node')
     states(bench)
     assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('active')
@@ -220,9 +198,7 @@ def test_a_lookup_of_tf2_during_bag_play_is_ekf_odometry(bench, start):
     start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-p', 'initial_pose:=[0.0,0.0,0.0]')
     states(bench)
     corrector = Corrector(bench)
-    player = start('bag', 'play', DRIVE, '--topics', '/odom', '--rate', '4',
-                   '--disable-keyboard-controls')  # fmt: skip
-    assert player.wait(COMMAND_S) == 0, player.log.read_text()
+    played(start, DRIVE, '--topics', '/odom', '--rate', '2')
     assert until(lambda: len(corrector.fused) > 700), 'ekf_node did not follow the bag'
     found, missed = [], []
     for stamp_ns, fused in sorted(corrector.fused.items())[:-1]:
@@ -236,7 +212,7 @@ def test_a_lookup_of_tf2_during_bag_play_is_ekf_odometry(bench, start):
     assert np.ptp(found, axis=0)[0] > 0.05, 'nothing was corrected'
 
 
-def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, ros2, model):
+def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, model):
     chain = launch(start, f'model:={model}', 'namespace:=robot1', 'image_transport:=compressed')
     heard = states(bench, '/robot1')
     nodes = ros2('node', 'list', *DIRECT).split()
@@ -244,11 +220,8 @@ def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, ros2, mod
     assert until(lambda: bench.node.count_publishers('/robot1/tf') == 1)
     assert bench.node.count_publishers('/tf') == 0
     assert until(lambda: bench.node.count_subscribers('/robot1/image_raw/compressed'), COMMAND_S)
-    player = start(
-        'bag', 'play', DRIVE, '--disable-keyboard-controls', '--remap', '/odom:=/robot1/odom',
-        '/panorama/compressed:=/robot1/image_raw/compressed',
-    )  # fmt: skip
-    assert player.wait(COMMAND_S + 60) == 0, player.log.read_text()
+    images = '/panorama/compressed:=/robot1/image_raw/compressed'
+    played(start, DRIVE, '--remap', '/odom:=/robot1/odom', images)
     assert any(state.data.startswith('LOCALISED') for state in heard)
     _, told = interrupted(chain)
     assert 'process has died' not in told and 'Traceback' not in told
@@ -259,8 +232,7 @@ def test_the_replay_of_the_readme_becomes_localised(bench, start, model):
     chain = launch(start, *(f'{k}:={v}' for k, v in {**arguments, 'model': model}.items()))
     heard = states(bench)
     assert until(lambda: bench.node.count_subscribers('/panorama/compressed'), COMMAND_S)
-    player = start('bag', 'play', path, '--disable-keyboard-controls')
-    assert player.wait(COMMAND_S + 60) == 0, player.log.read_text()
+    played(start, path)
     assert any(state.data.startswith('LOCALISED') for state in heard)
     assert 'omnicam_node' not in bench.node.get_node_names()
     interrupted(chain)
@@ -283,19 +255,22 @@ def test_a_launch_with_a_model_that_cannot_be_loaded_ends_with_1(start, tmp_path
 def test_a_node_that_dies_is_started_again_unless_asked(bench, start, model, respawn):
     chain = launch(start, f'model:={model}', f'respawn:={respawn}')
     heard = states(bench)
-    assert until(lambda: bench.node.count_publishers('/sfa/pose'), COMMAND_S)
-    (number,) = re.findall(
-        r'sfa_node-\d+\]: process started with pid \[(\d+)', chain.log.read_text()
-    )
+
+    def printed(text):
+        return chain.log.read_text().count(text)
+
+    assert until(lambda: printed('[sfa_node]: active') == 1, COMMAND_S)
+    (number,) = re.findall(r'\[sfa_node-\d+\]: process started with pid \[(\d+)',
+                           chain.log.read_text())  # fmt: skip
     os.kill(int(number), signal.SIGKILL)
-    assert until(lambda: 'exit code -9' in chain.log.read_text(), COMMAND_S)
+    assert until(lambda: printed('exit code -9') == 1, COMMAND_S)
     if respawn == 'true':
-        assert until(lambda: chain.log.read_text().count('[sfa_node]: active') == 2, COMMAND_S)
+        assert until(lambda: printed('[sfa_node]: active') == 2, COMMAND_S)
         return
     # The middleware misses a process that was killed only some time later.
     gone = 'nobody publishes on /sfa/pose_with_covariance'
     assert until(lambda: gone in heard[-1].data, COMMAND_S)
-    assert chain.log.read_text().count('[sfa_node]: active') == 1
+    assert printed('[sfa_node]: active') == 1
 
 
 def test_a_node_ends_at_ctrl_c_as_soon_as_it_handles_signals(start):

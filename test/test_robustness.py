@@ -171,7 +171,7 @@ def replay(bench, drive, events, together):
     assert until(lambda: len(heard) == sent[0])
     bench.node.destroy_subscription(listener)
     bench.end(node)
-    state = node._filter.state
+    state = node.filter.state
     bench._publishers.clear()
     return state, heard
 
@@ -238,9 +238,9 @@ def test_of_odometry_that_comes_too_fast_the_newest_is_used(bench):
         for number in range(1, 400):
             bench.publish('odom', standing(START_NS + number * 20_000_000))
     last = START_NS + 399 * 20_000_000
-    assert until(lambda: node._filter.state.stamp_ns == last)
+    assert until(lambda: node.filter.state.stamp_ns == last)
     assert node.monitor('odom').received <= 102, 'older ones were dropped'
-    assert math.isfinite(node._filter.state.position_std)
+    assert math.isfinite(node.filter.state.position_std)
 
 
 @contextlib.contextmanager

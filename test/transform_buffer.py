@@ -2,13 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """What tf2 does with the transforms of one pair of frames: sorted by time, interpolated between."""
 
+import json
 import math
 
 import numpy as np
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
 
 from sfa_localization.data.messages import read_stamp, read_yaw
 
 KEPT_NS = 10_000_000_000
+
+
+class AsText(String):
+    """Stands in for tf2_msgs, which the wheels of ROS lack: stamps and transforms as text."""
+
+    def __new__(cls, transforms):
+        sent = []
+        for message in transforms:
+            t = message.transform
+            pose = t.translation.x, t.translation.y, read_yaw(t.rotation)
+            sent.append((read_stamp(message.header.stamp), pose))
+        return serialize_message(String(data=json.dumps(sent)))
 
 
 class TransformBuffer:
@@ -17,12 +32,10 @@ class TransformBuffer:
     def __init__(self):
         self._entries = []
 
-    def add(self, transforms):
-        """Insert messages (TransformStamped)."""
-        for message in transforms:
-            t = message.transform
-            pose = np.array([t.translation.x, t.translation.y, read_yaw(t.rotation)])
-            self.insert(read_stamp(message.header.stamp), pose)
+    def add(self, message):
+        """Insert what an AsText holds."""
+        for stamp_ns, pose in json.loads(message.data):
+            self.insert(stamp_ns, np.array(pose))
 
     def insert(self, stamp_ns, pose):
         """Insert a transform (3,); too old a one is dropped, as those that it makes too old."""

@@ -7,12 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from sfa_localization.nodes.entry import NODES
 from sfa_localization.nodes.monitor import steady_s
 
 PATIENCE_S = 3.0
 """Time before another topic is taken: drivers of cameras and wheels may start after this node."""
 _OUTPUTS = '/ekf/odometry', '/panorama', '/panorama/compressed'
-"""Odometry and images of this package's own nodes, live or from a bag: never an input."""
+"""Odometry and images of this package's nodes, as a bag may hold them: never an input."""
 
 
 class Discovery:
@@ -32,7 +33,6 @@ class Discovery:
         take: Callable[[str], None] | None = None,
     ) -> None:
         self._node, self._topic, self._arguments = node, topic, arguments
-        self._own = node.get_name(), node.get_namespace()
         self._types = [f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}' for kind in kinds]
         self._start_s = steady_s()
         self._given = node.resolve_topic_name(topic)
@@ -45,52 +45,52 @@ class Discovery:
 
     def look(self) -> None:
         """Take a topic, or log, and keep in `hint`, which ones there are."""
-        if self._taken and self._take is not None:
-            if self._node.count_publishers(self._given):
-                self._taken = False
-                self._take(self._given)
-            return
-        there = self._there()
-        names = [*filter(self._qualifies, there.get(self._types[0], []))]
-        if self._take is None or len(names) != 1:
-            self._tell(there)
-            return
-        self._taken, self.hint = True, ''
-        self._node.get_logger().warning(
-            f'nobody publishes on {self._given}: taking {names[0]}, the only {self._types[0]}; '
-            f'{self._arguments[0]}:={names[0].removesuffix("/compressed")} makes this permanent'
-        )
-        self._take(names[0])
-
-    def _there(self) -> dict[str, list[str]]:
-        """Topics of other nodes, by type; none where there is an input, or soon may be."""
         early = steady_s() < self._start_s + PATIENCE_S
-        received = self._node.monitor(self._topic).received
-        if early or received or self._node.count_publishers(self._given):
-            return {}
-        named = sorted(self._node.get_topic_names_and_types())
-        return {
-            wanted: [
-                n for n, kinds in named if wanted in kinds and self._publishers(n) - {self._own}
-            ]
-            for wanted in self._types
-        }
+        expected = self._node.count_publishers(self._given)
+        if self._taken and expected and self._take is not None:
+            self._taken = False
+            self._take(self._given)
+        elif early or expected or self._node.monitor(self._topic).received:
+            self.hint = ''
+        elif not self._taken:
+            self._choose()
 
-    def _tell(self, there: dict[str, list[str]]) -> None:
-        listed = [f'{name} ({kind})' for kind, names in there.items() for name in names]
+    def _choose(self) -> None:
+        named = sorted(self._node.get_topic_names_and_types())
+        own = {(self._node.get_name(), self._node.get_namespace())}
+        there = [
+            (name, kind)
+            for kind in self._types
+            for name, kinds in named
+            if kind in kinds and self._publishers(name) - own
+        ]
+        usable = [n for n, kind in there if kind == self._types[0] and self._qualifies(n)]
+        if self._take is not None and len(usable) == 1:
+            self._taken, self.hint = True, ''
+            self._node.get_logger().warning(
+                f'nobody publishes on {self._given}: taking {usable[0]}, the only '
+                f'{self._types[0]}; {self._arguments[0]}:={usable[0].removesuffix("/compressed")} '
+                'makes this permanent'
+            )
+            self._take(usable[0])
+        else:
+            self._tell(', '.join(f'{name} ({kind})' for name, kind in there))
+
+    def _tell(self, listed: str) -> None:
         choices = ' or '.join(f'{argument}:=NAME' for argument in self._arguments)
-        hint = f'nobody publishes on {self._given}; there are {", ".join(listed)}: {choices}'
+        hint = f'nobody publishes on {self._given}; there are {listed}: {choices}'
         before, self.hint = self.hint, hint if listed else ''
         if self.hint not in ('', before):
             self._node.get_logger().warning(self.hint)
 
     def _qualifies(self, name: str) -> bool:
-        """No output of this node or package, and in no namespace where only other nodes are."""
+        """No output of this package, and in no namespace where only other nodes are."""
         below = self._node.get_namespace().rstrip('/') + '/'
         spaces = {f'{space}/' for _, space in self._node.get_node_names_and_namespaces()}
         others = tuple(space for space in spaces if len(space) > len(below))
         usual = name.startswith(below) and not name.startswith(others)
-        return usual and not name.endswith(_OUTPUTS) and self._own not in self._publishers(name)
+        ours = {node for node, _ in self._publishers(name)} & {*NODES, self._node.get_name()}
+        return usual and not name.endswith(_OUTPUTS) and not ours
 
     def _publishers(self, name: str) -> set[tuple[str, str]]:
         infos = self._node.get_publishers_info_by_topic(name)

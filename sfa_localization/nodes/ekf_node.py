@@ -10,14 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import (
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    QuaternionStamped,
-    TransformStamped,
-)
+from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
@@ -32,19 +26,8 @@ from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
+from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.broadcast import Broadcast
-from sfa_localization.nodes.conversions import (
-    Motion,
-    read_error_correlation,
-    read_odometry,
-    read_pose,
-    read_turned,
-    to_odometry,
-    to_pose,
-    to_pose_with_covariance,
-    to_stamp,
-    to_transform,
-)
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import (
     LocalizationNode,
@@ -73,7 +56,7 @@ PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
 IMAGES_SILENCE = 3.0
 """Images may be silent for so many times silence_timeout: they come less often than odometry."""
 _WATCH_PERIOD_S = 0.2
-_REPEAT_STATE_S = 1.0
+_REPEAT_STATE_S = 0.9  # between states of the same level, with other reasons
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time: less is jitter
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
 
@@ -88,16 +71,14 @@ class EkfNode(LocalizationNode):
 
     def _begin(self) -> None:
         self._config = self.settings(EkfNodeConfig)
-        self._filter = PoseFilter(self.settings(FilterConfig))
-        self._paused = False
+        self.filter = PoseFilter(self.settings(FilterConfig))
         self._broadcast = Broadcast()
-        self._path: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
+        self._path: deque[geometry.PoseStamped] = deque(maxlen=PATH_LENGTH)
         self._path_ns = 0
+        self._paused = False
         self._frames = self._config.odom_frame, self._config.base_frame
-        self._state_text = ''
-        self._state_level: Level | None = None
-        self._ticks_since_state = 0
-        self._last_moved = (0, 0.0)
+        self._told: tuple[Level | None, str, float] = None, '', 0.0
+        self._last_moved = 0, 0.0
         self._sure: State | None = None
 
     def setup(self) -> None:
@@ -105,37 +86,36 @@ class EkfNode(LocalizationNode):
         self._restore_pose()
         self._make_publishers()
         self._subscribe_odometry()
-        self._discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
-        self.subscribe(PoseWithCovarianceStamped, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
-        self.subscribe(QuaternionStamped, 'sfa/turned', self._receive_turned, sensor_qos(20))
+        self.discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
+        pose = geometry.PoseWithCovarianceStamped
+        self.subscribe(pose, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
+        turned = geometry.QuaternionStamped
+        self.subscribe(turned, 'sfa/turned', self._receive_turned, sensor_qos(20))
         for kind, topic, receive in (
             (Float64, 'sfa/camera_delay', self._receive_delay),
             (Float64MultiArray, 'sfa/error_correlation', self._receive_correlation),
         ):
             self.subscribe(kind, topic, receive, latched_qos(), while_inactive=True)
         for topic in ('initialpose', '~/set_pose'):
-            self.subscribe(PoseWithCovarianceStamped, topic, self._set_pose, reliable_qos(1))
+            self.subscribe(pose, topic, self._set_pose, reliable_qos(1))
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
         self.every(SAVE_PERIOD_S, self._save_pose)
         # Looped playback steps simulated time back; stamps alone would show it only later.
+        back = Duration(nanoseconds=_BACKWARD_JUMP_NS)
+        threshold = JumpThreshold(min_forward=None, min_backward=back, on_clock_change=False)
         self._jumps = self.get_clock().create_jump_callback(
-            JumpThreshold(
-                min_forward=None,
-                min_backward=Duration(nanoseconds=_BACKWARD_JUMP_NS),
-                on_clock_change=False,
-            ),
-            post_callback=self._clock_jumped,
+            threshold, post_callback=self._clock_jumped
         )
 
     def _make_publishers(self) -> None:
         self._odometry = self.publisher(Odometry, 'ekf/odometry')
-        self._pose = self.publisher(PoseWithCovarianceStamped, 'ekf/pose')
+        self._pose = self.publisher(geometry.PoseWithCovarianceStamped, 'ekf/pose')
         self._trail = self.publisher(Path, 'ekf/path')
         self._state = self.publisher(String, 'ekf/state', latched_qos())
         self._verdict = self.publisher(DiagnosticArray, 'ekf/measurement_status')
-        self._transform = self.publisher(TransformStamped, 'ekf/map_to_odom')
+        self._transform = self.publisher(geometry.TransformStamped, 'ekf/map_to_odom')
         self._tf = None
         if self._config.publish_tf and TFMessage is not None:
             self._tf = self.publisher(TFMessage, '/tf', QoSProfile(depth=100))
@@ -149,11 +129,11 @@ class EkfNode(LocalizationNode):
 
     def destroy_node(self) -> None:
         """End the node; the last sure pose is kept."""
-        self._attempt('pose_file', self._save_pose)
+        self.attempt('pose_file', self._save_pose)
         super().destroy_node()
 
     def teardown(self) -> None:
-        self._attempt('pose_file', self._save_pose)
+        self.attempt('pose_file', self._save_pose)
         if self._jumps is not None:
             self._jumps.unregister()
             self._jumps = None
@@ -162,7 +142,7 @@ class EkfNode(LocalizationNode):
         if isinstance(settings, EkfNodeConfig):
             self._config = settings
         if isinstance(settings, FilterConfig):
-            self._filter.reconfigure(settings)
+            self.filter.reconfigure(settings)
 
     # Inputs.
 
@@ -172,22 +152,21 @@ class EkfNode(LocalizationNode):
         self.subscribe(Odometry, _ODOM, receive, sensor_qos(100), instead=instead)
 
     def _receive_odometry(self, message: Odometry) -> None:
-        motion = read_odometry(message)
-        self._frames = (
-            motion.frame or self._config.odom_frame,
-            motion.child_frame or self._config.base_frame,
-        )
-        reason = self._filter.add_odometry(
+        motion, config = convert.read_odometry(message), self._config
+        self._frames = motion.frame or config.odom_frame, motion.child_frame or config.base_frame
+        reason = self.filter.add_odometry(
             motion.stamp_ns, *motion.twist, motion.variances, motion.pose.tolist()
         )
         if reason:
             raise MessageError(reason)
-        state = self._filter.at(motion.stamp_ns)
+        state = self.filter.at(motion.stamp_ns)
         if state is not None:
-            self._publish_odometry(state, motion)
+            self._publish_odometry(state, motion.stamp_ns)
+            map_to_odom = compose(state.pose, invert(motion.pose))
+            self._publish_transform(motion.stamp_ns, map_to_odom)
             self._extend_path(state)
 
-    def _receive_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _receive_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         stamp_ns, pose, covariance = self._read_in_map(message)
         if self._paused:
             # The estimate goes on by odometry: ekf/pose as well as ekf/odometry and /tf.
@@ -195,58 +174,56 @@ class EkfNode(LocalizationNode):
             raise MessageError('paused')
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
-        update = self._filter.add_measurement(stamp_ns, pose, covariance)
+        update = self.filter.add_measurement(stamp_ns, pose, covariance)
         self._publish_verdict(update)
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
 
-    def _receive_turned(self, message: QuaternionStamped) -> None:
-        self._filter.add_turned(*read_turned(message))
+    def _receive_turned(self, message: geometry.QuaternionStamped) -> None:
+        self.filter.add_turned(*convert.read_turned(message))
 
     def _receive_delay(self, message: Float64) -> None:
         require_sane('camera delay', message.data)
-        self._filter.expect_delay(float(message.data))
+        self.filter.expect_delay(float(message.data))
 
     def _receive_correlation(self, message: Float64MultiArray) -> None:
-        self._filter.reconfigure(correlation=read_error_correlation(message))
+        self.filter.reconfigure(correlation=convert.read_error_correlation(message))
 
-    def _set_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _set_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:
-            message.header.stamp = to_stamp(max(self._newest_ns(), 1))
+            state, now_ns = self.filter.state, int(self.get_clock().now().nanoseconds)
+            stamp_ns = state.stamp_ns if state is not None else max(now_ns, 1)
+            message.header.stamp = convert.to_stamp(stamp_ns)
         stamp_ns, pose, covariance = self._read_in_map(message)
-        self._filter.set_pose(stamp_ns, pose, covariance if covariance.any() else None)
+        self.filter.set_pose(stamp_ns, pose, covariance if covariance.any() else None)
         self.get_logger().info(f'pose set to {pose[0]:.2f}, {pose[1]:.2f}, {pose[2]:.2f} rad')
         self._publish_state()
 
-    def _read_in_map(self, message: PoseWithCovarianceStamped) -> tuple[int, Any, Any]:
+    def _read_in_map(self, message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
         frame = message.header.frame_id.lstrip('/')
         if frame not in ('', self._config.map_frame):
             raise MessageError(f'frame is {frame!r}, not {self._config.map_frame!r}')
-        return read_pose(message)
-
-    def _newest_ns(self) -> int:
-        state = self._filter.state
-        return state.stamp_ns if state is not None else int(self.get_clock().now().nanoseconds)
+        return convert.read_pose(message)
 
     def _reset(self, _: Any, response: Any) -> Any:
         self._forget()
         self._publish_state()
-        response.success, response.message = True, self._status().level.name
+        response.success, response.message = True, self.status().level.name
         return response
 
     def _pause(self, request: Any, response: Any) -> Any:
         self._paused = bool(request.data)
         self._publish_state()
-        response.success = True
-        response.message = 'images are not fused' if self._paused else 'images are fused'
+        told = 'images are not fused' if self._paused else 'images are fused'
+        response.success, response.message = True, told
         return response
 
     def _clock_jumped(self, jump: TimeJump) -> None:
         self.get_logger().warning(
             f'the clock went back by {-jump.delta.nanoseconds * 1e-9:.1f} s: starting anew'
         )
-        self._attempt('clock', self._forget)
+        self._forget()
 
     def _restore_pose(self) -> None:
         """Begin at the pose of before the restart: a hypothesis, which images confirm or not."""
@@ -259,7 +236,7 @@ class EkfNode(LocalizationNode):
             self.get_logger().warning(f'{error}: waiting for images that show where')
             return
         if saved is not None:
-            self._filter.set_pose(saved.stamp_ns, saved.pose, saved.moved())
+            self.filter.set_pose(saved.stamp_ns, saved.pose, saved.moved())
             x, y, yaw = saved.pose
             self.get_logger().info(f'{path}: looking first at {x:.2f}, {y:.2f}, {yaw:.2f} rad')
 
@@ -271,78 +248,60 @@ class EkfNode(LocalizationNode):
             saved = SavedPose(state.stamp_ns, frame, state.pose, state.pose_covariance)
             save_pose(FilePath(self._config.pose_file), saved)
 
-    def _defect(self, name: str, error: Exception) -> str:
+    def defect(self, name: str, error: Exception) -> str:
         """What failed inside may fail at every message from now on: the filter starts anew."""
-        reason = super()._defect(name, error)
         self._forget()
-        return reason
+        return super().defect(name, error)
 
     def _forget(self) -> None:
-        self._filter.reset()
+        self.filter.reset()
         self._broadcast.reset()
         self._path.clear()
 
     # Outputs.
 
-    def _publish_odometry(self, state: State, motion: Motion) -> None:
-        frame = self._config.map_frame
-        self._odometry.publish(
-            to_odometry(
-                state.pose,
-                state.pose_covariance,
-                state.twist,
-                state.twist_covariance,
-                motion.stamp_ns,
-                (frame, self._frames[1]),
-            )
-        )
-        self._publish_transform(motion.stamp_ns, compose(state.pose, invert(motion.pose)))
+    def _publish_odometry(self, state: State, stamp_ns: int) -> None:
+        pose, twist = (state.pose, state.pose_covariance), (state.twist, state.twist_covariance)
+        frames = self._config.map_frame, self._frames[1]
+        self._odometry.publish(convert.to_odometry(*pose, *twist, stamp_ns, frames))
 
     def _publish_transform(self, stamp_ns: int, map_to_odom: Array) -> None:
         """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
         frames = self._config.map_frame, self._frames[0]
-        self._transform.publish(to_transform(map_to_odom, stamp_ns, frames))
+        self._transform.publish(convert.to_transform(map_to_odom, stamp_ns, frames))
         if self._tf is not None:
             ahead_ns = round(self._config.transform_tolerance * 1e9)
             dated = self._broadcast.add(stamp_ns, map_to_odom, ahead_ns)
-            transforms = [to_transform(pose, at_ns, frames) for at_ns, pose in dated]
+            transforms = [convert.to_transform(pose, at_ns, frames) for at_ns, pose in dated]
             self._tf.publish(TFMessage(transforms=transforms))
 
     def _publish_verdict(self, update: Update) -> None:
         """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
         level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
-        values = {
-            'accepted': str(update.accepted).lower(),
-            'd2': _number(update.d2),
-            'threshold': _number(update.threshold),
-        }
-        stamp = to_stamp(max(update.stamp_ns, 0))
+        values = {'accepted': str(update.accepted).lower()}
+        for name, value in (('d2', update.d2), ('threshold', update.threshold)):
+            values[name] = f'{value:.6g}' if math.isfinite(value) else ''
+        stamp = convert.to_stamp(max(update.stamp_ns, 0))
         self._verdict.publish(self.diagnostic('measurement', level, update.reason, values, stamp))
 
     def _publish_pose(self, stamp_ns: int) -> None:
         """Publish the estimate at the stamp of an image."""
-        state = self._filter.at(stamp_ns)
+        state, frame = self.filter.at(stamp_ns), self._config.map_frame
         if state is not None:
-            self._pose.publish(
-                to_pose_with_covariance(
-                    state.pose, state.pose_covariance, stamp_ns, self._config.map_frame
-                )
-            )
+            pose = state.pose, state.pose_covariance
+            self._pose.publish(convert.to_pose_with_covariance(*pose, stamp_ns, frame))
 
     def _extend_path(self, state: State) -> None:
         if abs(state.stamp_ns - self._path_ns) < PATH_PERIOD_S * 1e9:
             return
-        self._path_ns = state.stamp_ns
-        self._path.append(to_pose(state.pose, state.stamp_ns, self._config.map_frame))
+        self._path_ns, frame = state.stamp_ns, self._config.map_frame
+        self._path.append(convert.to_pose(state.pose, state.stamp_ns, frame))
         if self._trail.get_subscription_count():
-            path = Path(poses=list(self._path))
-            path.header.stamp = to_stamp(state.stamp_ns)
-            path.header.frame_id = self._config.map_frame
-            self._trail.publish(path)
+            self._trail.publish(Path(header=self._path[-1].header, poses=list(self._path)))
 
-    def _status(self) -> Status:
+    def status(self) -> Status:
         """The filter's status, and what the wall clock adds: inputs that do not arrive."""
-        status, added = self._filter.status, []
+        status, added = self.filter.status, []
         by_now, running_s = self._by_now(), steady_s() - self._configured_s
         timeout_s = self._config.silence_timeout
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
@@ -356,12 +315,12 @@ class EkfNode(LocalizationNode):
         lost = []
         if by_now is not None and (added or status.level is Level.DEGRADED):
             # The filter's time is that of its messages: by the wall clock it may be lost.
-            lost = [f'{reason} by now' for reason in uncertainty(by_now, self._filter.config)]
+            lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]
         return status.with_reasons(lost, added)
 
     def _by_now(self) -> State | None:
         """The estimate; after a long silence, predicted to the present by the wall clock."""
-        state = self._filter.state
+        state = self.filter.state
         if state is None:
             return None
         if state.stamp_ns != self._last_moved[0]:
@@ -370,45 +329,38 @@ class EkfNode(LocalizationNode):
         heard = self.monitor(_ODOM).received or self.monitor(_IMAGE_POSE).received
         if not heard or silent_s <= self._config.silence_timeout:
             return state
-        return self._filter.at(state.stamp_ns + round(silent_s * 1e9))
+        return self.filter.at(state.stamp_ns + round(silent_s * 1e9))
 
     def _publish_state(self) -> None:
         """Publish the state when its level changes at once, when its reasons do at most at 1 Hz."""
         if not self.active:
             return
-        status = self._status()
+        status = self.status()
         if status.level is Level.LOCALISED:
-            self._sure = self._filter.state
+            self._sure = self.filter.state
         text = ': '.join([status.level.name, '; '.join(status.reasons)]).rstrip(': ')
-        self._ticks_since_state += 1
-        changed = status.level is not self._state_level
-        waited_s = self._ticks_since_state * _WATCH_PERIOD_S
-        if not changed and (text == self._state_text or waited_s < _REPEAT_STATE_S):
-            return
-        self._ticks_since_state = 0
+        level, before, told_s = self._told
+        changed, now_s = status.level is not level, steady_s()
+        if changed or (text != before and now_s > told_s + _REPEAT_STATE_S):
+            self._told = status.level, text, now_s
+            self._state.publish(String(data=text))
         if changed:
             self.get_logger().info(text)
-        self._state_text, self._state_level = text, status.level
-        self._state.publish(String(data=text))
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        status, state = self._status(), self._by_now()
+        status, state = self.status(), self._by_now()
         values = {'state': status.level.name}
-        values.update({name: str(n) for name, n in sorted(self._filter.counts.items())})
+        values.update({name: str(n) for name, n in sorted(self.filter.counts.items())})
         if state is not None:
             values['position std [m]'] = f'{state.position_std:.3f}'
             values['heading std [deg]'] = f'{math.degrees(state.yaw_std):.2f}'
             values['yaw-rate bias [rad/s]'] = f'{state.yaw_rate_bias:.5f}'
             values['wheel scale'] = f'{state.wheel_scale:.4f}'
             values['way lost in turns [m/rad]'] = f'{state.turn_loss:.3f}'
-        clock = self._filter.camera_clock
+        clock = self.filter.camera_clock
         if clock.known:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or status.level.name, values
-
-
-def _number(value: float) -> str:
-    return f'{value:.6g}' if np.isfinite(value) else ''
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -1,24 +1,83 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes' executables: signals are handled before the slow imports begin."""
+"""How the process of a node begins and ends: its executable, --help, exit codes, and signals.
+
+A launch and its terminal both send SIGINT, at any time: also before ROS is there to listen, and
+when it has ended. Imports nothing that takes time, and no ROS.
+"""
 
 from __future__ import annotations
 
 import importlib
+import os
+import re
+import signal
 import sys
+import textwrap
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
-from sfa_localization.nodes import signals
-from sfa_localization.nodes.help import NODES, asks_for_help, node_help
+NODES = {
+    'omnicam_node': 'ROS 2 node: camera images to panoramas (--ros-args -p NAME:=VALUE).',
+    'sfa_node': 'ROS 2 node: panoramas to slow features and poses.',
+    'ekf_node': 'ROS 2 node: poses and odometry to the pose in the map.',
+}
+CANNOT_START, DIED = 1, 2
+"""Exit codes: a launch ends with a node that cannot start, and starts one again that has died."""
+_NUMBERS = (signal.SIGINT, signal.SIGTERM)
+_left_to_ros = False
 
 
 def run(name: str) -> int:
     """Run a node; the exit code."""
     if asks_for_help(sys.argv[1:]):
-        sys.stdout.write(node_help(name, NODES[name]))
+        sys.stdout.write(node_help(name))
         return 0
-    signals.end_at_once()
+    end_at_once()
     return int(importlib.import_module(f'sfa_localization.nodes.{name}').main())
 
 
 omnicam_node, sfa_node, ekf_node = (partial(run, name) for name in NODES)
+
+
+def asks_for_help(words: Sequence[str]) -> bool:
+    """Whether arguments of a node ask for help: before those of ROS, or in their place."""
+    return bool({'-h', '--help'} & set(words))
+
+
+def node_help(name: str) -> str:
+    """Usage, and each parameter with its default."""
+    from sfa_localization.config import render
+
+    head = rf'^/\*\*/{name}:\n  ros__parameters:\n'
+    (section,) = re.findall(rf'{head}((?: .*\n)*)', render(), re.MULTILINE)
+    shown = textwrap.indent(textwrap.dedent(section), '  ')
+    return (
+        f'{NODES[name]}\n\nusage: {name} [--ros-args [-p NAME:=VALUE] [-r TOPIC:=OTHER] '
+        f'[--params-file FILE]]\n\nIt runs until SIGINT or SIGTERM, and writes no file unless a '
+        f'parameter names one.\n\nparameters:\n{shown}'
+    )
+
+
+def end_at_once() -> None:
+    """End the process with exit code 0 at a signal: nothing has begun that needs an end."""
+    for number in _NUMBERS:
+        signal.signal(number, _obey)
+
+
+def leave_to_ros() -> None:
+    """Do nothing at a signal from now on: rclpy has its own handlers, which end its context."""
+    global _left_to_ros
+    _left_to_ros = True
+
+
+def ignore() -> None:
+    """Ignore signals for the rest of the process; Python leaves this so while it ends."""
+    for number in _NUMBERS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _obey(number: int, frame: Any) -> None:
+    if not _left_to_ros:
+        os._exit(0)

@@ -15,9 +15,6 @@ from typing import Any, TypeVar, cast
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -28,14 +25,13 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from sfa_localization.data.errors import ConfigError, LocalizationError
-from sfa_localization.data.rejections import encodable, short_line
+from sfa_localization.data.rejections import short_line
 from sfa_localization.data.settings import Settings
 from sfa_localization.data.threads import one_core
-from sfa_localization.nodes import parameters, signals
+from sfa_localization.nodes import entry, parameters
 from sfa_localization.nodes.discovery import PATIENCE_S
 from sfa_localization.nodes.monitor import Monitor, steady_s
 from sfa_localization.nodes.settings import NodeConfig
-from sfa_localization.nodes.signals import CANNOT_START, DIED
 
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
@@ -69,20 +65,19 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, kinds: Sequence[type[Settings]], **options: Any) -> None:
-        self.monitors: dict[str, Monitor] = {}
-        self._ended = False
         super().__init__(name, **options)
         # rclpy makes this one without `create_service`.
         change = self._service_change_state
-        change.callback = self._answering('change_state', change.callback)
+        change.callback = self._guarded('change_state', change.callback)
         self.active = False
         self.failure = ''
+        self.monitors: dict[str, Monitor] = {}
         self._resolved: dict[str, str] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         everything: list[type[Settings]] = [NodeConfig, *kinds]
         self._settings = {kind: parameters.declare(self, kind) for kind in everything}
-        parameters.on_change(self, self._settings, self.settings_changed)
+        parameters.on_change(self, self._settings, self.check, self.settings_changed)
         parameters.warn_of_unknown(self)
 
     # What a node fills in.
@@ -95,6 +90,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def teardown(self) -> None:
         """Release what `setup` made beyond publishers, subscriptions, services and timers."""
+
+    def check(self, settings: parameters.Current) -> None:
+        """Before live parameters change; a LocalizationError gives the reason why they cannot."""
 
     def settings_changed(self, settings: Settings) -> None:
         """Live parameters have changed to `settings`, which are checked already."""
@@ -109,9 +107,9 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """The values in force."""
         return cast(S, self._settings[kind])
 
-    def shown(self, topic: str) -> str:
-        """An input by its full name, after remapping; what is no topic, as it is."""
-        return self._resolved.get(topic, topic)
+    def monitor(self, name: str) -> Monitor:
+        """The counts of one input, made at its first use."""
+        return self.monitors.setdefault(name, Monitor())
 
     def diagnostic(
         self, part: str, level: Any, text: str, values: dict[str, str], stamp: Any
@@ -125,10 +123,6 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         message = DiagnosticArray(status=[status])
         message.header.stamp = stamp
         return message
-
-    def monitor(self, name: str) -> Monitor:
-        """The counts of one input, made at its first use."""
-        return self.monitors.setdefault(name, Monitor())
 
     def publisher(self, kind: Any, topic: str, qos: QoSProfile | None = None) -> Any:
         """A publisher that is silent until activation; its QoS can be overridden by parameters."""
@@ -160,7 +154,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         made = self.create_subscription(
             kind,
             instead or topic,
-            self._guarded(topic, callback, while_inactive),
+            self.receiver(topic, callback, while_inactive),
             qos or sensor_qos(),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
@@ -169,10 +163,28 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def unsubscribe(self, topic: str) -> None:
         """Drop the subscriptions of an input, if there are any."""
         resolved = self.shown(topic)
-        for entry in [*self._entities]:
-            if isinstance(entry[1], Subscription) and entry[1].topic_name == resolved:
-                self._entities.remove(entry)
-                self.destroy_subscription(entry[1])
+        for destroy, made in [*self._entities]:
+            if isinstance(made, Subscription) and made.topic_name == resolved:
+                self._entities.remove((destroy, made))
+                self.destroy_subscription(made)
+
+    def receiver(
+        self, topic: str, callback: Callable[[Any], None], while_inactive: bool = False
+    ) -> Callable[[Any], None]:
+        """A callback that counts its messages, and their latency, under `topic`."""
+        monitor = self.monitor(topic)
+
+        def receive(message: Any) -> None:
+            if self.active or while_inactive:
+                received_s = monitor.receive()
+                if self.attempt(topic, callback, message):
+                    monitor.use(received_s)
+
+        return receive
+
+    def shown(self, topic: str) -> str:
+        """An input by its full name, after remapping; what is no topic, as it is."""
+        return self._resolved.get(topic, topic)
 
     def require_input(self, topic: str, instead: str = '') -> None:
         """Take a topic as an input. Raises ConfigError where this node itself publishes on it."""
@@ -204,24 +216,30 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             except LocalizationError as error:
                 response.success, response.message = False, str(error)
             except Exception as error:
-                if self._running():
-                    response.success, response.message = False, self._defect(name, error)
+                response.success, response.message = False, self.defect(name, error)
             return response
 
         self._entities.append((self.destroy_service, self.create_service(kind, name, answer)))
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call at a steady period: simulated time may stop, and wall time may step back.
-
-        What the callback raises is counted under its name; the timer goes on.
-        """
+        """Call at a steady period: simulated time may stop, and wall time may step back."""
         name = f'timer {callback.__name__.strip("_")}'
-
-        def call() -> None:
-            self._attempt(name, callback)
-
-        made = self.create_timer(period_s, call, clock=self._steady)
+        made = self.create_timer(
+            period_s, lambda: self.attempt(name, callback) and None, clock=self._steady
+        )
         self._entities.append((self.destroy_timer, made))
+
+    def attempt(self, name: str, callback: Callable[..., None], *given: Any) -> bool:
+        """Call; what it raises is counted and logged under `name`. True where it raised nothing."""
+        try:
+            callback(*given)
+        except LocalizationError as error:
+            self.refuse(name, str(error))
+        except Exception as error:
+            self.defect(name, error)  # a node must outlive any message
+        else:
+            return True
+        return False
 
     def refuse(self, topic: str, reason: str) -> int:
         """Count a rejected message; log the first of a reason, then each thousandth.
@@ -233,84 +251,44 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self.get_logger().warning(f'{self.shown(topic)}: {short_line(reason)} ({count} so far)')
         return count
 
-    def _defect(self, name: str, error: Exception) -> str:
-        """Count an error in the program itself, and log where it came from."""
+    def defect(self, name: str, error: Exception) -> str:
+        """Count an error in the program itself, and log where it came from; the reason.
+
+        After a signal nothing can be published any more, and that is no defect.
+        """
         reason = f'internal error: {type(error).__name__}'
-        if self.refuse(name, reason) == 1:
+        if self.context.ok() and self.refuse(name, reason) == 1:
             self.get_logger().error(traceback.format_exc())
         return reason
-
-    def _guarded(
-        self, topic: str, callback: Callable[[Any], None], while_inactive: bool = False
-    ) -> Callable[[Any], None]:
-        monitor = self.monitor(topic)
-
-        def receive(message: Any) -> None:
-            if not (self.active or while_inactive):
-                return
-            received_s = monitor.receive()
-            if self._attempt(topic, lambda: callback(message)):
-                monitor.use(received_s)
-
-        return receive
-
-    def _attempt(self, name: str, callback: Callable[[], None]) -> bool:
-        """Call; what it raises is counted and logged under `name`. True where it raised nothing."""
-        try:
-            callback()
-        except LocalizationError as error:
-            self.refuse(name, str(error))
-        except Exception as error:
-            if self._running():
-                self._defect(name, error)  # a node must outlive any message
-        else:
-            return True
-        return False
-
-    def _running(self) -> bool:
-        """False after a signal, and once the node is destroyed, perhaps by another thread while a
-        callback runs: nothing can be published or answered any more, and that is no defect."""
-        return bool(self.context.ok()) and not self._ended
 
     # What rclpy itself makes: the services of parameters and of the life cycle, and /clock.
 
     def create_service(
-        self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], **options: Any
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any
     ) -> Any:
-        """A service, by rclpy too, whose requests end nothing: what raises is refused."""
-        answer = self._answering(srv_name.rpartition('/')[2], callback)
-        return super().create_service(srv_type, srv_name, answer, **options)
+        """A service, by rclpy too, whose requests end nothing."""
+        guarded = self._guarded(srv_name.rpartition('/')[2], callback)
+        return super().create_service(srv_type, srv_name, guarded, **options)
 
     def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[[Any], None], *more: Any, **options: Any
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *more: Any, **options: Any
     ) -> Any:
         """A subscription, by rclpy too, whose messages end nothing: /clock may be negative."""
+        guarded = self._guarded(topic, callback)
+        return super().create_subscription(msg_type, topic, guarded, *more, **options)
 
-        def receive(message: Any) -> None:
+    def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """A callback that counts what it raises; the answer of a service is empty then."""
+
+        def call(*given: Any) -> Any:
             try:
-                callback(message)
+                return callback(*given)
             except Exception as error:
-                if self._running():
-                    self.refuse(topic, f'{type(error).__name__}: {error}')
+                if self.context.ok():
+                    self.refuse(name, f'{type(error).__name__}: {error}')
+                return given[-1]
 
-        return super().create_subscription(msg_type, topic, receive, *more, **options)
-
-    def _answering(
-        self, name: str, callback: Callable[[Any, Any], Any]
-    ) -> Callable[[Any, Any], Any]:
-        """A service's callback that refuses what it cannot do."""
-
-        def answer(request: Any, response: Any) -> Any:
-            try:
-                return callback(request, response)
-            except Exception as error:
-                if not self._running():
-                    raise
-                reason = f'request refused: {type(error).__name__}: {short_line(str(error))}'
-                self.refuse(name, reason)
-                return refusal(request, response, reason)
-
-        return answer
+        return call
 
     # Life cycle.
 
@@ -349,22 +327,14 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         self._drop()
         return super().on_cleanup(state)
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._drop()
-        return super().on_shutdown(state)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._drop()
-        return super().on_error(state)
+    on_shutdown = on_error = on_cleanup
 
     def destroy_node(self) -> None:
         """End the node, and leave ROS at once.
 
         rclpy's state machine would keep the node until the garbage collection; where that comes
-        while others start, the middleware may wait for itself. A callback that runs meanwhile in
-        another thread ends without a word, and other nodes of its executor go on.
+        while others start, the middleware may wait for itself.
         """
-        self._ended = True
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 
@@ -380,10 +350,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def _publish_health(self) -> None:
         if not self.active:
             return
-        found: list[tuple[int, str, dict[str, str]]] = []
-        if not self._attempt('health', lambda: found.append(self.health())):
-            found.append((DiagnosticStatus.ERROR, 'the state of the node cannot be determined', {}))
-        level, text, values = found[0]
+        try:
+            level, text, values = self.health()
+        except Exception as error:
+            self.defect('health', error)
+            level, values = DiagnosticStatus.ERROR, {}
+            text = 'the state of the node cannot be determined'
         problem = self._time_problem()
         if problem:
             self.refuse('/clock', problem)
@@ -395,27 +367,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def _time_problem(self) -> str:
         """What is wrong where simulated time is asked for, and does not come."""
+        simulated = self.get_parameter('use_sim_time').value
         waiting = steady_s() < self._configured_s + PATIENCE_S
-        if (
-            waiting
-            or not self.get_parameter('use_sim_time').value
-            or self.get_clock().now().nanoseconds
-        ):
+        if waiting or not simulated or self.get_clock().now().nanoseconds:
             return ''
         return 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
-
-
-def refusal(request: Any, response: Any, reason: str) -> Any:
-    """The answer to a request that raised: nothing of it has been done from there on."""
-    refused = SetParametersResult(successful=False, reason=reason)
-    if isinstance(response, SetParameters.Response):
-        missing = len(request.parameters) - len(response.results)
-        response.results = [*response.results, *([refused] * missing)]
-    elif isinstance(response, SetParametersAtomically.Response):
-        response.result = refused
-    elif isinstance(response, ChangeState.Response):
-        response.success = False
-    return response
 
 
 def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
@@ -423,20 +379,25 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
 
     For the main thread of a process that then ends: signals are ignored afterwards.
     """
-    node = None
-    signals.end_at_once()
+    words, node = list(sys.argv if args is None else args), None
+    entry.end_at_once()
     try:
-        if not _initialised(sys.argv if args is None else args):
-            return CANNOT_START
-        signals.leave_to_ros()
+        problem = _initialise(words)
+        if problem:
+            rclpy.logging.get_logger('sfa_localization').fatal(problem)
+            return entry.CANNOT_START
+        entry.leave_to_ros()
         # Made first: after a signal it could not be made any more.
         executor = SingleThreadedExecutor()
         node = make()
-        parameters.warn_of_ignored_files(node, sys.argv if args is None else args)
+        parameters.warn_of_ignored_files(node, words)
         if not node.start():
-            return CANNOT_START if rclpy.ok() else 0  # a signal is no failure
+            return entry.CANNOT_START if rclpy.ok() else 0  # a signal is no failure
+        # A signal just before the executor waits does not always wake it.
+        node.create_timer(_AWAKE_S, lambda: None, clock=node._steady)
+        executor.add_node(node)
         with one_core():
-            _spin(executor, node)
+            executor.spin()
     except ExternalShutdownException:
         return 0
     except Exception as error:
@@ -445,45 +406,28 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
         known = isinstance(error, LocalizationError)
         text = str(error) if known else traceback.format_exc()
         rclpy.logging.get_logger('sfa_localization').fatal(text)
-        return DIED if node is not None and node.active else CANNOT_START
+        return entry.DIED if node is not None and node.active else entry.CANNOT_START
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-        signals.ignore()
+        entry.ignore()
     return 0
 
 
-def _initialised(args: Sequence[str]) -> bool:
-    """Initialize ROS; False, and why is logged, where its arguments or files cannot be used."""
-    reason = ''
+def _initialise(words: list[str]) -> str:
+    """Initialize ROS; the reason where its arguments or files cannot be used, else ''."""
     try:
-        rclpy.init(args=list(args))
-        others = rclpy.utilities.remove_ros_args(list(args))[1:]
-        if others:
-            reason = f'unknown arguments {encodable(" ".join(others))}: give parameters as '
-            reason += '--ros-args -p NAME:=VALUE, and topics as --ros-args -r NAME:=TOPIC'
-    except (RuntimeError, UnicodeEncodeError) as error:  # the first is the base of all of rclpy's
-        reason = str(error)
-        # Of unknown arguments its text is their list, and no more.
-        if isinstance(error, rclpy_implementation.UnknownROSArgsError):
-            reason = f'unknown arguments after --ros-args: {reason}'
-        elif isinstance(error, UnicodeEncodeError):
-            reason = f'an argument is not UTF-8: {encodable(error.object)}'
-    if reason:
-        rclpy.logging.get_logger('sfa_localization').fatal(reason)
-    return not reason
-
-
-def _spin(executor: SingleThreadedExecutor, node: LocalizationNode) -> None:
-    # A signal just before the executor waits does not always wake it; an inactive node has nothing
-    # else that would.
-    node.create_timer(_AWAKE_S, lambda: None, clock=node._steady)
-    executor.add_node(node)
-    while rclpy.ok():
-        try:
-            executor.spin()
-        except rclpy_implementation.RCLError as error:
-            # A signal ends here at some moments.
-            if rclpy.ok():
-                node.get_logger().error(f'request refused: {error}')
+        rclpy.init(args=words)
+    # Of unknown arguments its text is their list, and no more.
+    except rclpy_implementation.UnknownROSArgsError as error:
+        return f'unknown arguments after --ros-args: {error}'
+    except RuntimeError as error:  # the base of all of rclpy's
+        return str(error)
+    others = ' '.join(rclpy.utilities.remove_ros_args(words)[1:])
+    if not others:
+        return ''
+    return (
+        f'unknown arguments {others}: give parameters as --ros-args -p NAME:=VALUE, and topics as '
+        '--ros-args -r NAME:=TOPIC'
+    )

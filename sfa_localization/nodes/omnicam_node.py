@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
@@ -23,20 +21,14 @@ from sfa_localization.camera.capture import Feed, FeedStatus, opener
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
 from sfa_localization.camera.watch import FrozenWatch
-from sfa_localization.data.errors import LocalizationError, MessageError
+from sfa_localization.data.errors import MessageError
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
-from sfa_localization.nodes import parameters
-from sfa_localization.nodes.conversions import read_image, to_compressed, to_image, to_info
+from sfa_localization.nodes import conversions as convert
+from sfa_localization.nodes import lifecycle
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import (
-    LocalizationNode,
-    latched_qos,
-    reliable_qos,
-    run_node,
-    sensor_qos,
-)
 from sfa_localization.nodes.monitor import steady_s
+from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import OmnicamNodeConfig
 
 _DEMAND_PERIOD_S = 0.1  # between looks for subscribers: a new one waits no longer for images
@@ -45,7 +37,7 @@ _JPEG_QUALITY = 90  # percent; no visible artifacts, about a tenth of the raw si
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
-class OmnicamNode(LocalizationNode):
+class OmnicamNode(lifecycle.LocalizationNode):
     """Unwraps each image and publishes it as `panorama` and `panorama/compressed`.
 
     `panorama/info`, latched, gives the elevations of the rows and the direction of the columns.
@@ -55,49 +47,45 @@ class OmnicamNode(LocalizationNode):
         groups = [OmnicamNodeConfig, CaptureConfig, CameraConfig, PanoramaConfig]
         super().__init__('omnicam_node', groups, **options)
         self._config = self.settings(OmnicamNodeConfig)
-        self._source = self.settings(CaptureConfig)
-        self._unwrapper = self._new_unwrapper()
+        self._unwrapper = self._new_unwrapper(self._settings)
         self._size: tuple[int, int] | None = None
-        self._frozen = FrozenWatch()
-        self._listening = False
-        self._discovery: Discovery | None = None
-        self._instead = ''
-        self._listening_since_s = 0.0
+        self._listening_since_s: float | None = None
         self._feed: Feed | None = None
         self._arrival: Any = None
         self._newest: tuple[int, Image] | None = None
         self._newest_lock = threading.Lock()
-        self.add_on_set_parameters_callback(self._check_camera)
 
     # Life cycle.
 
     def setup(self) -> None:
-        self._unwrapper = self._new_unwrapper()
         self._build_tables(self._unwrapper)
         self._frozen = FrozenWatch()
-        self._panoramas = self.publisher(ImageMessage, 'panorama', reliable_qos(2))
+        self._panoramas = self.publisher(ImageMessage, 'panorama', lifecycle.reliable_qos(2))
         compressed = self.following('panorama/compressed')
-        self._compressed = self.publisher(CompressedImage, compressed, reliable_qos(2))
-        self._info = self.publisher(String, self.following('panorama/info'), latched_qos())
+        self._compressed = self.publisher(CompressedImage, compressed, lifecycle.reliable_qos(2))
+        info = self.following('panorama/info')
+        self._info = self.publisher(String, info, lifecycle.latched_qos())
         raw = self._config.image_transport == 'raw'
         self._input = 'image_raw' if raw else self.following('image_raw/compressed')
-        self._discovery, self._instead = None, ''
-        if self._source.source == 'topic':
+        self.discovery: Discovery | None = None
+        self._instead = ''
+        if self.settings(CaptureConfig).source == 'topic':
             self.require_input(self._input)
             self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
             arguments = 'image', 'panorama'
-            self._discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
+            self.discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
         else:
-            self._input = self._source.source_path
-            guarded = self._guarded(self._input, self._use_newest)
-            self._arrival = self.create_guard_condition(lambda: guarded(None))
-            self._feed = Feed(
-                opener(self._source), self._deliver, self._source, self._reject, self._wanted
-            )
+            self._set_up_feed(self.settings(CaptureConfig))
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
 
+    def _set_up_feed(self, source: CaptureConfig) -> None:
+        self._input = source.source_path
+        receive = self.receiver(self._input, self._use_newest)
+        self._arrival = self.create_guard_condition(lambda: receive(None))
+        self._feed = Feed(opener(source), self._deliver, source, self._reject, self._wanted)
+
     def started(self) -> None:
-        self._info.publish(to_info(self.settings(PanoramaConfig)))
+        self._info.publish(convert.to_info(self.settings(PanoramaConfig)))
         self._follow_demand()
         if self._feed is not None and self._feed.status().state == 'new':
             self._feed.start()
@@ -106,8 +94,7 @@ class OmnicamNode(LocalizationNode):
         if self._feed is not None:
             self._feed.stop()
             self.destroy_guard_condition(self._arrival)
-        self._feed = self._arrival = self._newest = None
-        self._listening = False
+        self._feed = self._arrival = self._newest = self._listening_since_s = None
 
     # Demand: without subscribers there is no subscription, and files wait.
 
@@ -118,12 +105,12 @@ class OmnicamNode(LocalizationNode):
     def _follow_demand(self) -> None:
         if self._feed is not None:
             self._feed.check()
-        elif self._wanted() and not self._listening:
-            self._listening, self._listening_since_s = True, steady_s()
-            kind, receive = self._kinds[0], self._use_message
-            self.subscribe(kind, self._input, receive, sensor_qos(1), instead=self._instead)
         elif not self._wanted():
             self._stop_listening()
+        elif self._listening_since_s is None:
+            self._listening_since_s = steady_s()
+            kind, qos = self._kinds[0], lifecycle.sensor_qos(1)
+            self.subscribe(kind, self._input, self._use_message, qos, instead=self._instead)
 
     def _take(self, topic: str) -> None:
         """Take images from another topic than the expected one, or again from that."""
@@ -132,14 +119,14 @@ class OmnicamNode(LocalizationNode):
         self._instead = topic
 
     def _stop_listening(self) -> None:
-        if self._listening:
+        if self._listening_since_s is not None:
             self.unsubscribe(self._input)
-        self._listening = False
+        self._listening_since_s = None
 
     # Images.
 
     def _use_message(self, message: ImageMessage | CompressedImage) -> None:
-        stamp_ns, image = read_image(message)
+        stamp_ns, image = convert.read_image(message)
         self._publish(image, stamp_ns, self._config.frame_id or message.header.frame_id)
 
     def _deliver(self, image: Image) -> None:
@@ -163,40 +150,36 @@ class OmnicamNode(LocalizationNode):
             self._publish(image, stamp_ns, self._config.frame_id)
 
     def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
-        panorama = self._unwrapper(image)
+        panorama, frame = self._unwrapper(image), frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
-        frame = frame or 'omnicam'
         if self._panoramas.get_subscription_count():
-            self._panoramas.publish(to_image(panorama, stamp_ns, frame))
+            self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
         if self._compressed.get_subscription_count():
-            self._compressed.publish(to_compressed(panorama, stamp_ns, frame, _JPEG_QUALITY))
+            packed = convert.to_compressed(panorama, stamp_ns, frame, _JPEG_QUALITY)
+            self._compressed.publish(packed)
         self._frozen.add(image)
 
     # Parameters that change while running.
 
+    def check(self, settings: Current) -> None:
+        """Raises LocalizationError for a mask, sector, mount or elevation without a panorama."""
+        if any(settings[kind] != self._settings[kind] for kind in (CameraConfig, PanoramaConfig)):
+            self._build_tables(self._new_unwrapper(settings))
+
     def settings_changed(self, settings: Settings) -> None:
-        if isinstance(settings, CaptureConfig):
-            self._source = settings
-            if self._feed is not None:
-                self._feed.config = settings
+        if isinstance(settings, CaptureConfig) and self._feed is not None:
+            self._feed.config = settings
         elif isinstance(settings, (CameraConfig, PanoramaConfig)):
-            self._unwrapper = self._new_unwrapper()
+            self._unwrapper = self._new_unwrapper(self._settings)
             if self.active:
-                self._info.publish(to_info(self.settings(PanoramaConfig)))
+                self._info.publish(convert.to_info(self.settings(PanoramaConfig)))
 
-    def _new_unwrapper(self) -> Unwrapper:
-        return Unwrapper(self.settings(CameraConfig), self.settings(PanoramaConfig))
-
-    def _check_camera(self, changes: Sequence[Parameter]) -> SetParametersResult:
-        """Reject a mask, sector, mount or elevation from which no panorama can be made."""
-        try:
-            camera = parameters.changed(self.settings(CameraConfig), changes)
-            panorama = parameters.changed(self.settings(PanoramaConfig), changes)
-            if (camera, panorama) != (self._unwrapper.camera, self._unwrapper.panorama):
-                self._build_tables(Unwrapper(camera, panorama))
-        except LocalizationError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+    @staticmethod
+    def _new_unwrapper(settings: Current) -> Unwrapper:
+        return Unwrapper(
+            cast(CameraConfig, settings[CameraConfig]),
+            cast(PanoramaConfig, settings[PanoramaConfig]),
+        )
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
         """Build the tables for the size of image that is, or will be, in use, if it is known."""
@@ -211,29 +194,27 @@ class OmnicamNode(LocalizationNode):
         details = {'camera model': self._unwrapper.model}
         if self._size is not None:
             details['image'] = f'{self._size[1]} x {self._size[0]}'
-        for judge in (self._judge_source, self._judge_images):
-            level, text = judge(details)
-            if level != _OK or text:
-                return level, text, details
-        return _OK, 'running', details
+        level, text = self._judge_source(details)
+        if not text:
+            level, text = self._judge_images(details)
+        return level, text or 'running', details
 
     def _judge_source(self, details: dict[str, str]) -> tuple[int, str]:
         if self._feed is not None:
             return _judge_feed(self._feed.status(), details)
-        if not self._listening:
+        if self._listening_since_s is None:
             return _OK, 'idle: nobody listens to the panorama'
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
-        if silent_s > self._source.silence_timeout:
+        if silent_s > self.settings(CaptureConfig).silence_timeout:
             silent = f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
-            return _ERROR, (self._discovery and self._discovery.hint) or silent
+            return _ERROR, (self.discovery and self.discovery.hint) or silent
         return _OK, ''
 
     def _judge_images(self, details: dict[str, str]) -> tuple[int, str]:
-        frozen_s = self._frozen.frozen_for_s()
+        frozen_s, monitor = self._frozen.frozen_for_s(), self.monitor(self._input)
         if frozen_s:
             return _WARN, f'the camera has repeated its last image for {frozen_s:.0f} s'
-        monitor = self.monitor(self._input)
         if monitor.received and not monitor.used:
             return _ERROR, 'no image could be used so far'
         visible = 1.0
@@ -257,4 +238,4 @@ def _judge_feed(status: FeedStatus, details: dict[str, str]) -> tuple[int, str]:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM."""
-    return run_node(OmnicamNode, args)
+    return lifecycle.run_node(OmnicamNode, args)

@@ -21,10 +21,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from sfa_localization.config import all_names, ignored_sections
-from sfa_localization.data.errors import ConfigError
+from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.settings import Settings, nearest
 
 S = TypeVar('S', bound=Settings)
+Current = dict[type[Settings], Settings]
+"""The settings in force, by their class."""
 _LARGEST_INTEGER = 2**63 - 1
 
 
@@ -38,43 +40,47 @@ def declare(node: Node, kind: type[S]) -> S:
 
 
 def on_change(
-    node: Node, current: dict[type[Settings], Settings], apply: Callable[[Settings], None]
+    node: Node,
+    current: Current,
+    check: Callable[[Current], None],
+    apply: Callable[[Settings], None],
 ) -> None:
     """Check changes of live parameters together, keep them in `current`, and hand them to `apply`.
 
-    A change that is out of range, or wrong beside the other parameters, is rejected, with the
-    reason in the answer to the request, and nothing is applied.
+    A change that is out of range, or wrong beside the other parameters, or for which `check`
+    raises a LocalizationError, is rejected, with the reason in the answer to the request, and
+    nothing is applied.
     """
     fields = {item.name: item for kind in current for item in dataclasses.fields(kind)}
 
     def convert(changes: list[Parameter]) -> list[Parameter]:
         return [typed(fields[c.name], c) if c.name in fields else c for c in changes]
 
-    def check(changes: list[Parameter]) -> SetParametersResult:
+    def judge(changes: list[Parameter]) -> SetParametersResult:
         try:
-            for settings in current.values():
-                changed(settings, changes)
-        except ConfigError as error:
+            check({kind: _changed(settings, changes) for kind, settings in current.items()})
+        except LocalizationError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def accept(changes: list[Parameter]) -> None:
         for kind, settings in [*current.items()]:
-            current[kind] = changed(settings, changes)
+            current[kind] = _changed(settings, changes)
             if current[kind] != settings:
                 apply(current[kind])
 
     # One for all settings: rclpy would join the lists of several.
     node.add_pre_set_parameters_callback(convert)
-    node.add_on_set_parameters_callback(check)
+    node.add_on_set_parameters_callback(judge)
     node.add_post_set_parameters_callback(accept)
 
 
-def changed(settings: S, changes: Sequence[Parameter]) -> S:
+def _changed(settings: S, changes: Sequence[Parameter]) -> S:
     """The settings with those of `changes` that belong to them. Raises ConfigError."""
-    values = {item.name: getattr(settings, item.name) for item in dataclasses.fields(settings)}
-    values.update({change.name: change.value for change in changes if change.name in values})
-    return type(settings).from_mapping(values, 'parameters')
+    names = {item.name for item in dataclasses.fields(settings)}
+    return dataclasses.replace(
+        settings, **{change.name: change.value for change in changes if change.name in names}
+    )
 
 
 def typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
@@ -129,38 +135,34 @@ def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
     given = node._parameter_overrides.get(item.name, default)
     if isinstance(item.default, tuple) and given.value is None:  # `[]` in a parameter file
         given = Parameter(item.name, value=[])
-    writable = descriptor(item)
-    writable.read_only = False
+    writable, final = _descriptor(item), _descriptor(item)
+    writable.read_only, final.type = False, default.type_.value
     # By its type alone: an empty list as the value would make it one of bytes.
     node.declare_parameter(item.name, default.type_, writable, ignore_override=True)
     result = node.set_parameters([typed(item, given)])[0]
     if not result.successful:
         raise ConfigError(f'parameter {item.name!r}: {result.reason}')
-    final = descriptor(item)
-    final.type = default.type_.value
     node.set_descriptor(item.name, final)
     return node.get_parameter(item.name).value
 
 
-def descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
-    """Descriptor of one setting: description with unit, range, and whether it may change."""
+def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
+    """Descriptor of one setting: description with unit, range, and whether it may change.
+
+    Lists have no range in ROS; their Settings check them.
+    """
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
     if meta['choices']:
         made.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
-    if meta['low'] is not None or meta['high'] is not None:
-        _bound(made, item.default, meta['low'], meta['high'])
+    low, high = meta['low'], meta['high']
+    if isinstance(item.default, float) and (low, high) != (None, None):
+        least = -sys.float_info.max if low is None else float(low)
+        most = sys.float_info.max if high is None else float(high)
+        made.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
+    elif type(item.default) is int and (low, high) != (None, None):
+        first = -_LARGEST_INTEGER if low is None else int(low)
+        last = _LARGEST_INTEGER if high is None else int(high)
+        made.integer_range = [IntegerRange(from_value=first, to_value=last)]
     return made
-
-
-def _bound(made: ParameterDescriptor, default: Any, low: float | None, high: float | None) -> None:
-    """Give a scalar its range; arrays have none in ROS and are checked by their Settings."""
-    if isinstance(default, float):
-        lowest = -sys.float_info.max if low is None else float(low)
-        highest = sys.float_info.max if high is None else float(high)
-        made.floating_point_range = [FloatingPointRange(from_value=lowest, to_value=highest)]
-    elif isinstance(default, int) and not isinstance(default, bool):
-        least = -_LARGEST_INTEGER if low is None else int(low)
-        most = _LARGEST_INTEGER if high is None else int(high)
-        made.integer_range = [IntegerRange(from_value=least, to_value=most)]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,7 @@ def save_pose(path: Path, saved: SavedPose) -> None:
     """Write the file, completely or not at all. Raises LocalizationError, also where a file holds
     something else than a pose: it stays.
     """
-    if not _holds_pose(path):
-        raise DataError(f'{path}: holds no saved pose, and stays: remove it or choose another file')
+    _content(path)
     content = {
         'version': _VERSION,
         'stamp_ns': saved.stamp_ns,
@@ -55,30 +54,29 @@ def save_pose(path: Path, saved: SavedPose) -> None:
         file.write((json.dumps(content) + '\n').encode())
 
 
-def _holds_pose(path: Path) -> bool:
-    """Whether a file may be written over: of any version and frame, empty, or not there yet."""
-    try:
-        text = read_regular(path, _LARGEST_FILE)
-        return not text or {'version', 'frame', 'pose'} <= set(json.loads(text))
-    except FileNotFoundError:
-        return True
-    except (OSError, ValueError, TypeError, RecursionError):
-        return False
-
-
 def load_pose(path: Path, frame: str) -> SavedPose | None:
     """What was saved, checked; None where there is no file yet. Raises DataError."""
+    content = _content(path)
+    if content is None:
+        return None
     try:
-        content = json.loads(read_regular(path, _LARGEST_FILE))
         if content['version'] != _VERSION or content['frame'] != frame:
             raise DataError(f'it is no pose of version {_VERSION} in the frame {frame!r}')
         pose, covariance = read_pose(content['pose'], content['covariance'])
         return SavedPose(int(content['stamp_ns']), frame, pose, covariance)
+    except (DataError, ValueError, TypeError, LookupError, OverflowError) as error:
+        raise DataError(f'{path}: cannot be used: {error}; remove it') from None
+
+
+def _content(path: Path) -> Any:
+    """What a file holds, of any version; None where it is empty or missing. Raises DataError."""
+    try:
+        text = read_regular(path, _LARGEST_FILE)
+        content = json.loads(text) if text else None
+        if content is None or {'version', 'frame', 'pose'} <= set(content):
+            return content
     except FileNotFoundError:
         return None
-    except OSError as error:
-        raise DataError(f'{path}: holds no saved pose: {error}') from None
-    except (ValueError, TypeError, LookupError, OverflowError, RecursionError):
-        raise DataError(f'{path}: holds no saved pose: remove it or choose another file') from None
-    except DataError as error:
-        raise DataError(f'{path}: cannot be used: {error}') from None
+    except (OSError, ValueError, TypeError, RecursionError):
+        pass
+    raise DataError(f'{path}: holds no saved pose, and stays: remove it or choose another file')

@@ -7,34 +7,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import CompressedImage
-from sensor_msgs.msg import Image as ImageMessage
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import NOVELTY_WARNING
-from sfa_localization.data.errors import ConfigError, LocalizationError, MessageError
+from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.settings import Settings
 from sfa_localization.localizer import Observation, Observer
-from sfa_localization.nodes.conversions import (
-    read_image,
-    read_info,
-    to_array,
-    to_error_correlation,
-    to_pose,
-    to_pose_with_covariance,
-    to_turned,
-)
+from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
 from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, run_node, sensor_qos
+from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.place_model import PlaceModel
 
@@ -49,36 +39,30 @@ class SfaNode(LocalizationNode):
         super().__init__('sfa_node', [SfaNodeConfig, WatchConfig], **options)
         self._config = self.settings(SfaNodeConfig)
         self._observer: Observer | None = None
-        self._loaded: tuple[str, PlaceModel] | None = None
-        self._last: Observation | None = None
-        self._declared: PanoramaConfig | None = None
-        self._undeclared_logged = False
-        self.add_on_set_parameters_callback(self._check_model)
+        self._loaded: PlaceModel | None = None
 
     def setup(self) -> None:
-        self._config = self.settings(SfaNodeConfig)
         self._observer = Observer(self._load(self._config.model), self.settings(WatchConfig))
-        self._last = None
+        self._last: Observation | None = None
         self._features = self.publisher(Float64MultiArray, 'sfa/slow_features')
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-        self._correlation = self.publisher(
-            Float64MultiArray, 'sfa/error_correlation', latched_qos()
-        )
+        correlation = 'sfa/error_correlation'
+        self._correlation = self.publisher(Float64MultiArray, correlation, latched_qos())
         self._delay = self.publisher(Float64, 'sfa/camera_delay', latched_qos())
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
-        compressed = self._config.image_transport == 'compressed'
-        kind = CompressedImage if compressed else ImageMessage
-        self._topic = self.following('panorama/compressed') if compressed else 'panorama'
-        self._declared, self._undeclared_logged = None, False
+        self._declared: PanoramaConfig | None = None
+        self._undeclared_logged = False
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
+        compressed = self._config.image_transport == 'compressed'
+        self._topic = self.following('panorama/compressed') if compressed else 'panorama'
+        kinds = [CompressedImage, Image] if compressed else [Image, CompressedImage]
         # Depth 1: when images come faster than they are located, the oldest is dropped.
-        self.subscribe(kind, self._topic, self._receive, sensor_qos(1))
-        kinds = [ImageMessage, CompressedImage]
-        self._discovery = Discovery(self, self._topic, kinds, ['panorama'])
+        self.subscribe(kinds[0], self._topic, self._receive, sensor_qos(1))
+        self.discovery = Discovery(self, self._topic, kinds, ['panorama'])
 
     def started(self) -> None:
         self._publish_correlation()
@@ -100,25 +84,20 @@ class SfaNode(LocalizationNode):
         self.get_logger().info(f'{path}: panoramas of {size.width}x{size.height}')
         return model
 
-    def _check_model(self, changes: list[Parameter]) -> SetParametersResult:
-        """Reject a model that cannot be loaded before anything changes, in any state."""
-        for change in changes:
-            if change.name == 'model':
-                try:
-                    self._loaded = str(change.value), self._load(str(change.value))
-                except LocalizationError as error:
-                    return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+    def check(self, settings: Current) -> None:
+        """Raises LocalizationError for a model that cannot be loaded, in any state."""
+        path = cast(SfaNodeConfig, settings[SfaNodeConfig]).model
+        if path != self._config.model:
+            self._loaded = self._load(path)
 
     def settings_changed(self, settings: Settings) -> None:
         if isinstance(settings, WatchConfig) and self._observer is not None:
             self._observer.watch.config = settings
-        if not isinstance(settings, SfaNodeConfig):
-            return
-        self._config = settings
-        if self._loaded is not None and self._loaded[0] == settings.model:
-            self._use(self._loaded[1])
-        self._loaded = None
+        if isinstance(settings, SfaNodeConfig):
+            before, self._config = self._config, settings
+            if settings.model != before.model and self._loaded is not None:
+                self._use(self._loaded)
+            self._loaded = None
 
     def _use(self, model: PlaceModel) -> None:
         """Go on with another model; an unconfigured node reads its own when it is configured."""
@@ -134,21 +113,21 @@ class SfaNode(LocalizationNode):
     def _publish_correlation(self) -> None:
         """Publish how the model's errors correlate and how late images were: ekf_node needs it."""
         assert self._observer is not None
-        correlation = self._observer.model.error_correlation
-        self._correlation.publish(to_error_correlation(correlation))
-        self._delay.publish(Float64(data=float(self._observer.model.camera_delay_s)))
+        model = self._observer.model
+        self._correlation.publish(convert.to_error_correlation(model.error_correlation))
+        self._delay.publish(Float64(data=float(model.camera_delay_s)))
 
     # Images.
 
     def _receive_info(self, message: String) -> None:
-        self._declared = read_info(message)
+        self._declared = convert.read_info(message)
 
-    def _declared_problem(self, model: PlaceModel) -> str:
+    def _declared_problem(self, expected: PanoramaConfig) -> str:
         """How the panoramas are declared to differ from those of training; '' when they do not."""
         if self._declared is None:
-            self._log_undeclared(model.panorama)
+            self._log_undeclared(expected)
             return ''
-        differences = model.panorama.differences(self._declared)
+        differences = expected.differences(self._declared)
         if not differences:
             return ''
         return (
@@ -167,50 +146,47 @@ class SfaNode(LocalizationNode):
             f'{"clockwise" if expected.clockwise else "counterclockwise"}, as in training'
         )
 
-    def _receive(self, message: ImageMessage | CompressedImage) -> None:
+    def _receive(self, message: Image | CompressedImage) -> None:
         assert self._observer is not None
-        problem = self._declared_problem(self._observer.model)
+        problem = self._declared_problem(self._observer.model.panorama)
         if problem:
             raise MessageError(problem)
-        self._last = observation = self._observer.observe(*read_image(message))
+        self._last = observation = self._observer.observe(*convert.read_image(message))
         self._publish(observation)
         if observation.problem:
             raise MessageError(observation.problem)
 
-    def _publish(self, observation: Observation) -> None:
+    def _publish(self, seen: Observation) -> None:
         """An unusable image gets no pose without covariance: it would look like a usable one."""
-        frame, slow = self._config.map_frame, observation.estimate.slow_features
-        stamp_ns, pose = observation.stamp_ns, observation.pose
+        frame, slow, stamp_ns = self._config.map_frame, seen.estimate.slow_features, seen.stamp_ns
         if np.all(np.isfinite(slow)):
-            self._features.publish(to_array(slow, 'slow features'))
+            self._features.publish(convert.to_array(slow, 'slow features'))
             self._feature_pose.publish(_feature_pose(slow, stamp_ns))
-        if math.isfinite(observation.turned):
-            self._turned.publish(to_turned(observation.turned, stamp_ns, _TURNED_FRAME))
-        if not observation.problem:
-            self._pose.publish(to_pose(pose, stamp_ns, frame))
-        covariance = observation.covariance
-        self._uncertain.publish(to_pose_with_covariance(pose, covariance, stamp_ns, frame))
+        if math.isfinite(seen.turned):
+            self._turned.publish(convert.to_turned(seen.turned, stamp_ns, _TURNED_FRAME))
+        if not seen.problem:
+            self._pose.publish(convert.to_pose(seen.pose, stamp_ns, frame))
+        uncertain = convert.to_pose_with_covariance(seen.pose, seen.covariance, stamp_ns, frame)
+        self._uncertain.publish(uncertain)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
-        problem = self._last.problem if self._last is not None else ''
+        assert self._observer is not None
         novelty = self._last.estimate.novelty if self._last is not None else 0.0
-        light = self._observer.other_light if self._observer is not None else 0.0
         values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
-        values['unlike by light'] = f'{100 * light:.0f} %'
-        silent = self.monitor(self._topic).silent_for_s()
+        values['unlike by light'] = f'{100 * self._observer.other_light:.0f} %'
+        monitor, topic = self.monitor(self._topic), self.shown(self._topic)
+        silent = monitor.silent_for_s()
         if math.isinf(silent):
-            waiting = f'waiting for images on {self.shown(self._topic)}'
-            return _WARN, self._discovery.hint or waiting, values
+            return _WARN, self.discovery.hint or f'waiting for images on {topic}', values
         if silent > self._config.silence_timeout:
-            return _ERROR, f'no image on {self.shown(self._topic)} for {silent:.0f} s', values
-        declared = self._declared_problem(self._observer.model) if self._observer else ''
+            return _ERROR, f'no image on {topic} for {silent:.0f} s', values
+        declared = self._declared_problem(self._observer.model.panorama)
         if declared:
             return _ERROR, declared, values
-        if self.monitor(self._topic).used == 0:
+        if monitor.used == 0:
             return _ERROR, 'no image has been usable', values
-        if problem:
-            late = self._observer is not None and self._observer.watch.repeats
-            return _WARN if late else _ERROR, problem, values
+        if self._last is not None and self._last.problem:
+            return _WARN if self._observer.watch.repeats else _ERROR, self._last.problem, values
         if novelty > NOVELTY_WARNING:
             return _WARN, 'images are unlike those of training', values
         return _OK, 'locating', values
@@ -219,7 +195,7 @@ class SfaNode(LocalizationNode):
 def _feature_pose(slow: Any, stamp_ns: int) -> PoseStamped:
     """The first three slow features as a position, as the paper draws them."""
     x, y, z = [*map(float, slow[:3]), 0.0, 0.0, 0.0][:3]
-    message = to_pose([x, y, 0.0], stamp_ns, _FEATURE_FRAME)
+    message = convert.to_pose([x, y, 0.0], stamp_ns, _FEATURE_FRAME)
     message.pose.position.z = z
     return message
 

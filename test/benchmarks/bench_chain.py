@@ -1,22 +1,16 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The chain of three nodes against a bare relay of the same messages: `bench_chain.py MODEL`.
+"""The three nodes as processes against three relays that only pass messages on: `bench_chain.py`
+MODEL.npz. Latency from a picture to its pose, and CPU; then those of one, two and four robots.
 
-Both run as three processes each, with pictures at 30 Hz and odometry at 50 Hz, in turns, in one
-run. A latency is the time from sending a picture to receiving what the third process makes of it.
-
-Then the CPU of each node at camera rates of 10 and 30 Hz, for one, two and four robots that share
-the machine and the domain, each in its namespace.
+The two chains take turns at 30 pictures and 50 odometry messages a second; the pictures are
+panoramas already, so that both carry the same. All nodes run on this machine, in one domain.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import statistics
-import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -26,48 +20,46 @@ import psutil
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from ros_bench import Spinner
-from ros_domains import free_domain
+from ros_bench import DOMAIN, Spinner, end_process, start_node, start_process
 
 from sfa_localization.data.messages import read_stamp
-from sfa_localization.nodes.conversions import (
-    to_image,
-    to_odometry,
-    to_pose_with_covariance,
-    to_stamp,
-)
+from sfa_localization.nodes.conversions import to_image, to_odometry, to_pose_with_covariance
 from sfa_localization.place_model import PlaceModel
 
-DOMAIN = free_domain()
-PICTURES_HZ, ODOMETRY_HZ = 30.0, 50.0
+ODOMETRY_HZ, PICTURES_HZ = 50.0, 30.0
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
-BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-DEADLINE_S = 20.0
+STAGES = [
+    (Image, 'image_raw'),
+    (Image, 'panorama'),
+    (PoseWithCovarianceStamped, 'sfa/pose_with_covariance'),
+    (PoseWithCovarianceStamped, 'ekf/pose'),
+]
+"""What each of three nodes takes, and what it gives."""
+DEADLINE_S, LAST_S = 60.0, 1.0
 ROBOTS, RATES_HZ = (1, 2, 4), (10.0, 30.0)
 
 
 class Relay(Node):
-    """Passes a message on, and does the least that its neighbour in the chain must: nothing."""
+    """Passes a message on, and does the least that its neighbor in the chain must: nothing."""
 
     def __init__(self, stage: int) -> None:
         super().__init__(f'relay_{stage}')
-        kinds = [Image, Image, PoseWithCovarianceStamped, PoseWithCovarianceStamped]
-        self.out = self.create_publisher(kinds[stage + 1], f'relay/stage_{stage + 1}', 10)
-        source = f'relay/stage_{stage}'
-        self.create_subscription(kinds[stage], source, self.pass_on, BEST_EFFORT)
-        self.create_subscription(Odometry, 'relay/odom', lambda _: None, BEST_EFFORT)
+        (self.kind, topic), (self.made, output) = STAGES[stage : stage + 2]
+        self.out = self.create_publisher(self.made, output, 10)
+        self.create_subscription(self.kind, topic, self.pass_on, qos_profile_sensor_data)
+        self.create_subscription(Odometry, 'odom', lambda _: None, qos_profile_sensor_data)
         self.answer = to_pose_with_covariance([0, 0, 0], np.eye(3), 1, 'map')
 
     def pass_on(self, message: Any) -> None:
         """The picture as it is, then a pose of the same stamp."""
-        if isinstance(message, Image) and self.out.msg_type is not Image:
+        if self.made is not self.kind:
             self.answer.header.stamp = message.header.stamp
             message = self.answer
         self.out.publish(message)
@@ -85,72 +77,75 @@ def relay(stage: int) -> None:
 
 
 class Driver:
-    """Sends pictures and odometry, and notes when the answers come."""
+    """Sends pictures and odometry to robots in namespaces, and notes when the poses come."""
 
-    def __init__(self, panorama: np.ndarray) -> None:
+    def __init__(self, model: PlaceModel, names: list[str]) -> None:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node('bench', context=self.context)
         self.executor = Spinner(self.context)
         self.executor.add_node(self.node)
+        size = (model.panorama.height, model.panorama.width, 3)
+        self.panorama = np.random.default_rng(1).integers(40, 215, size, np.uint8)
         self.sent: dict[int, float] = {}
-        self.latencies: list[float] = []
-        self.panorama = panorama
-        make, listen = self.node.create_publisher, self.node.create_subscription
-        self.images = {name: make(Image, f'{name}', 10) for name in ('image_raw', 'relay/stage_0')}
-        self.odometry = {name: make(Odometry, name, 10) for name in ('odom', 'relay/odom')}
-        for topic in ('ekf/pose', 'relay/stage_3'):
-            listen(PoseWithCovarianceStamped, topic, self.hear, 10)
+        self.latencies: dict[str, list[float]] = {name: [] for name in names}
+        make = self.node.create_publisher
+        self.images = {name: make(Image, f'/{name}/image_raw', 10) for name in names}
+        self.odometry = {name: make(Odometry, f'/{name}/odom', 10) for name in names}
+        for name in names:
+            kind, topic = STAGES[-1]
+            self.node.create_subscription(kind, f'/{name}/{topic}', self.listener(name), 10)
 
-    def hear(self, message: PoseWithCovarianceStamped) -> None:
-        """Note the time from sending to receiving."""
-        sent = self.sent.pop(read_stamp(message.header.stamp), None)
-        if sent is not None:
-            self.latencies.append(time.perf_counter() - sent)
+    def listener(self, name: str) -> Any:
+        """What to do with a pose of this robot."""
 
-    def run(self, image_topic: str, odometry_topic: str, seconds: float) -> tuple[list[float], int]:
-        """Send for some seconds; latencies of the answers, and how many pictures were sent."""
+        def hear(message: PoseWithCovarianceStamped) -> None:
+            sent = self.sent.get(read_stamp(message.header.stamp))
+            if sent is not None:
+                self.latencies[name].append(time.perf_counter() - sent)
+
+        return hear
+
+    def run(self, names: list[str], rate_hz: float, seconds: float) -> int:
+        """Send for some seconds; how many pictures each of the robots got."""
         self.sent.clear()
-        self.latencies.clear()
         start, pictures, moves = time.perf_counter(), 0, 0
         while (now := time.perf_counter() - start) < seconds:
             if now >= moves / ODOMETRY_HZ:
-                self.move(odometry_topic)
+                self.move(names)
                 moves += 1
-            elif now >= pictures / PICTURES_HZ:
-                self.picture(image_topic)
+            elif now >= pictures / rate_hz:
+                self.picture(names)
                 pictures += 1
             else:
                 time.sleep(0.0005)
-        time.sleep(1.0)
-        return list(self.latencies), pictures
+        time.sleep(LAST_S)
+        return pictures
 
-    def move(self, topic: str) -> None:
-        """One odometry message of a robot that stands."""
-        spread = np.eye(2) * 1e-4
-        frames = ('odom', 'base_link')
-        zero = np.zeros(3)
-        self.odometry[topic].publish(
-            to_odometry(zero, np.eye(3), zero[:2], spread, time.time_ns(), frames)
-        )
+    def move(self, names: list[str]) -> None:
+        """One odometry message of robots that stand."""
+        zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
+        message = to_odometry(zero, one, zero[:2], one[:2, :2] * 1e-4, time.time_ns(), frames)
+        for name in names:
+            self.odometry[name].publish(message)
 
-    def picture(self, topic: str) -> None:
+    def picture(self, names: list[str]) -> None:
         """One picture, never the same twice."""
         stamp_ns = time.time_ns()
         self.panorama[0, 0] = stamp_ns % 251
         self.panorama[3::6, ::3, 0] ^= 1
         message = to_image(self.panorama, stamp_ns, 'omnicam')
-        message.header.stamp = to_stamp(stamp_ns)
         self.sent[stamp_ns] = time.perf_counter()
-        self.images[topic].publish(message)
+        for name in names:
+            self.images[name].publish(message)
 
-    def wait(self, topic: str, odometry_topic: str) -> None:
-        """Until a picture comes back."""
+    def wait(self) -> None:
+        """Until each robot has answered."""
         end = time.monotonic() + DEADLINE_S
-        while time.monotonic() < end:
-            if self.run(topic, odometry_topic, 0.5)[0]:
-                return
-        raise RuntimeError(f'nothing comes back from {topic}')
+        while silent := [name for name, heard in self.latencies.items() if not heard]:
+            if time.monotonic() > end:
+                raise RuntimeError(f'nothing comes back from {", ".join(silent)}')
+            self.run(silent, 10.0, 0.5)
 
     def close(self) -> None:
         """End the node and its thread."""
@@ -159,238 +154,98 @@ class Driver:
         rclpy.try_shutdown(context=self.context)
 
 
-def start(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    """A process of one node, alone on its domain."""
-    environment = {
-        **os.environ,
-        'ROS_DOMAIN_ID': str(DOMAIN),
-        'ROS_LOG_DIR': str(folder),
-        'OMP_NUM_THREADS': '1',
-        'PYTHONPATH': os.pathsep.join(sys.path),
-    }
-    return subprocess.Popen([sys.executable, *command], env=environment)
+class Processes:
+    """Three processes for each robot; `kinds` are chain or relay, by namespace."""
 
+    def __init__(self, model_path: Path, model: PlaceModel, kinds: dict[str, str]) -> None:
+        size = model.panorama
+        parameters = {
+            'omnicam_node': ['camera_model:=panorama', f'width:={size.width}',
+                             f'height:={size.height}', f'elevation_min:={size.elevation_min}',
+                             f'elevation_max:={size.elevation_max}'],
+            'sfa_node': [f'model:={model_path.resolve()}'],
+            'ekf_node': ['initial_pose:=[0.0, 0.0, 0.0]'],
+        }  # fmt: skip
+        self.driver = Driver(model, [*kinds])
+        self.running = {
+            name: [
+                start_node(node, *parameters[node], namespace=f'/{name}')
+                if kind == 'chain'
+                else start_process(__file__, stage, '--ros-args', '-r', f'__ns:=/{name}')
+                for stage, node in enumerate(NODES)
+            ]
+            for name, kind in kinds.items()
+        }
 
-def chain(
-    model_path: Path, model: PlaceModel, folder: Path, namespace: str = '/'
-) -> list[subprocess.Popen[bytes]]:
-    """The three nodes; the pictures are panoramas already, so that both sides carry the same."""
-    size = model.panorama
-    parameters = {
-        'omnicam_node': ['camera_model:=panorama', f'width:={size.width}',
-                         f'height:={size.height}', f'elevation_min:={size.elevation_min}',
-                         f'elevation_max:={size.elevation_max}'],
-        'sfa_node': [f'model:={model_path}'],
-        'ekf_node': ['initial_pose:=[0.0, 0.0, 0.0]'],
-    }  # fmt: skip
-    code = 'import sys; from sfa_localization.nodes.{} import main; sys.exit(main())'
-    return [
-        start(
-            [
-                '-c',
-                code.format(node),
-                '--ros-args',
-                '-r',
-                f'__ns:={namespace}',
-                *(p for v in parameters[node] for p in ('-p', v)),
-            ],
-            folder,
-        )
-        for node in NODES
-    ]
+    def __enter__(self) -> Processes:
+        return self
 
+    def __exit__(self, *_: object) -> None:
+        self.driver.close()
+        for each in self.running.values():
+            for process in each:
+                end_process(process)
 
-class Fleet:
-    """Robots that stand: sends pictures and odometry to each, and counts the poses of each."""
+    def measure(self, names: list[str], rate_hz: float, seconds: float) -> tuple[int, np.ndarray]:
+        """Pictures that each robot got, and CPU seconds (robots, 3) that its nodes used."""
+        before = self._cpu_s(names)
+        return self.driver.run(names, rate_hz, seconds), self._cpu_s(names) - before
 
-    def __init__(self, panorama: np.ndarray, names: list[str]) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
-        self.node = rclpy.create_node('fleet', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.panorama = panorama
-        self.answers = dict.fromkeys(names, 0)
-        make = self.node.create_publisher
-        self.images = [make(Image, f'/{name}/image_raw', 10) for name in names]
-        self.odometry = [make(Odometry, f'/{name}/odom', 10) for name in names]
-        for name in names:
-            self.node.create_subscription(
-                PoseWithCovarianceStamped, f'/{name}/ekf/pose', self.counter(name), 10
-            )
-
-    def counter(self, name: str) -> Any:
-        """What to do with a pose of this robot."""
-
-        def count(_: PoseWithCovarianceStamped) -> None:
-            self.answers[name] += 1
-
-        return count
-
-    def send(self) -> None:
-        """Send one picture to each robot, never the same twice."""
-        self.panorama[3::6, ::3, 0] ^= 1
-        stamp_ns = time.time_ns()
-        self.panorama[0, 0] = stamp_ns % 251
-        message = to_image(self.panorama, stamp_ns, 'omnicam')
-        for publisher in self.images:
-            publisher.publish(message)
-
-    def move(self) -> None:
-        """Send one odometry message to each robot."""
-        zero, frames = np.zeros(3), ('odom', 'base_link')
-        message = to_odometry(zero, np.eye(3), zero[:2], np.eye(2) * 1e-4, time.time_ns(), frames)
-        for publisher in self.odometry:
-            publisher.publish(message)
-
-    def run(self, seconds: float, rate_hz: float) -> int:
-        """Send for some seconds; how many pictures each robot got."""
-        start, pictures, moves = time.perf_counter(), 0, 0
-        while (now := time.perf_counter() - start) < seconds:
-            if now >= moves / ODOMETRY_HZ:
-                self.move()
-                moves += 1
-            elif now >= pictures / rate_hz:
-                self.send()
-                pictures += 1
-            else:
-                self.executor.spin_once(timeout_sec=0.0005)
-        return pictures
-
-    def wait(self) -> None:
-        """Until each robot has answered."""
-        end = time.monotonic() + 3 * DEADLINE_S
-        while not all(self.answers.values()):
-            self.run(0.5, 10.0)
-            if time.monotonic() > end:
-                raise RuntimeError(f'robots do not answer: {self.answers}')
-
-    def close(self) -> None:
-        """End the node."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-
-def bench_robots(model_path: Path | str, seconds: float = 8.0) -> dict[str, float]:
-    """CPU shares of each node (1: one core), the mean of the robots, by robots and camera rate."""
-    model = PlaceModel.load(model_path)
-    figures: dict[str, float] = {}
-    for count in ROBOTS:
-        figures |= _bench_fleet(Path(model_path).resolve(), model, count, seconds)
-    return figures
-
-
-def _bench_fleet(
-    model_path: Path, model: PlaceModel, count: int, seconds: float
-) -> dict[str, float]:
-    names = [f'robot{k + 1}' for k in range(count)]
-    processes: list[subprocess.Popen[bytes]] = []
-    fleet = Fleet(some_panorama(model), names)
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            for name in names:
-                processes += chain(model_path, model, Path(folder), f'/{name}')
-            fleet.wait()
-            figures: dict[str, float] = {}
-            for rate_hz in RATES_HZ:
-                figures |= _fleet_figures(fleet, processes, rate_hz, seconds)
-            return figures
-        finally:
-            fleet.close()
-            _end(processes)
-
-
-def _fleet_figures(
-    fleet: Fleet, processes: list[subprocess.Popen[bytes]], rate_hz: float, seconds: float
-) -> dict[str, float]:
-    before, answered = cpu_seconds(processes), sum(fleet.answers.values())
-    pictures = fleet.run(seconds, rate_hz)
-    shares = ((cpu_seconds(processes) - before) / seconds).reshape(-1, len(NODES)).mean(axis=0)
-    robots = len(fleet.answers)
-    prefix = f'robots_{robots}_at_{rate_hz:.0f}_hz'
-    named = {f'{prefix}_cpu_{n}': float(s) for n, s in zip(NODES, shares, strict=True)}
-    share = (sum(fleet.answers.values()) - answered) / (pictures * robots)
-    return {**named, f'{prefix}_answered': share}
-
-
-def some_panorama(model: PlaceModel) -> np.ndarray:
-    """A picture of the model's size, of random dots."""
-    size = (model.panorama.height, model.panorama.width, 3)
-    return np.random.default_rng(1).integers(40, 215, size, np.uint8)
-
-
-def cpu_seconds(processes: list[subprocess.Popen[bytes]]) -> np.ndarray:
-    """CPU time that each process has used, s."""
-    times = [psutil.Process(process.pid).cpu_times() for process in processes]
-    return np.array([spent.user + spent.system for spent in times])
+    def _cpu_s(self, names: list[str]) -> np.ndarray:
+        used = [[psutil.Process(p.pid).cpu_times() for p in self.running[name]] for name in names]
+        return np.array([[times.user + times.system for times in each] for each in used])
 
 
 def bench_chain(model_path: Path | str, rounds: int = 3, seconds: float = 8.0) -> dict[str, float]:
     """Median latency over the relay's, the chain's p99 in ms, and its CPU share (1: one core)."""
-    model = PlaceModel.load(model_path)
-    sides: dict[str, list[subprocess.Popen[bytes]]] = {'chain': [], 'relay': []}
-    driver = Driver(some_panorama(model))
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            sides['chain'] = chain(Path(model_path).resolve(), model, Path(folder))
-            sides['relay'] = [start([__file__, '--relay', str(k)], Path(folder)) for k in range(3)]
-            return _measure(driver, sides, rounds, seconds)
-        finally:
-            driver.close()
-            _end([*sides['chain'], *sides['relay']])
+    model, sides = PlaceModel.load(model_path), ('chain', 'relay')
+    with Processes(Path(model_path), model, {side: side for side in sides}) as processes:
+        processes.driver.wait()
+        taken = processes.driver.latencies
+        cpu, sent = {side: np.zeros(3) for side in sides}, dict.fromkeys(sides, 0)
+        for heard in taken.values():
+            heard.clear()
+        for _ in range(rounds):
+            for side in sides:
+                pictures, used = processes.measure([side], PICTURES_HZ, seconds)
+                sent[side] += pictures
+                cpu[side] += used[0]
+    found: dict[str, float] = {}
+    for side in sides:
+        found[f'{side}_latency_p50_ms'], found[f'{side}_latency_p99_ms'] = (
+            float(np.percentile(taken[side], percent) * 1e3) for percent in (50, 99)
+        )
+        shares = cpu[side] / (rounds * (seconds + LAST_S))
+        found[f'{side}_cpu_share'] = float(shares.sum())
+        found[f'{side}_answered'] = len(taken[side]) / sent[side]
+        if side == 'chain':
+            found |= {f'chain_cpu_share_{n}': float(s) for n, s in zip(NODES, shares, strict=True)}
+    ratio = found['chain_latency_p50_ms'] / found['relay_latency_p50_ms']
+    return {'chain_latency_over_relay': ratio, **found}
 
 
-def _end(processes: list[subprocess.Popen[bytes]]) -> None:
-    """Ask all to end, then make those that do not."""
-    for process in processes:
-        process.terminate()
-    for process in processes:
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def _measure(
-    driver: Driver, sides: dict[str, list[subprocess.Popen[bytes]]], rounds: int, seconds: float
-) -> dict[str, float]:
-    topics = {'chain': ('image_raw', 'odom'), 'relay': ('relay/stage_0', 'relay/odom')}
-    for name in sides:
-        driver.wait(*topics[name])
-    taken: dict[str, list[float]] = {name: [] for name in sides}
-    cpu = {name: np.zeros(3) for name in sides}
-    sent = dict.fromkeys(sides, 0)
-    for _ in range(rounds):
-        for name, processes in sides.items():
-            before = cpu_seconds(processes)
-            latencies, pictures = driver.run(*topics[name], seconds)
-            cpu[name] += cpu_seconds(processes) - before
-            taken[name] += latencies
-            sent[name] += pictures
-    wall = rounds * (seconds + 1.0)
-    median = {name: statistics.median(values) for name, values in taken.items()}
-    shares = {
-        f'chain_cpu_share_{n}': float(c / wall) for n, c in zip(NODES, cpu['chain'], strict=True)
-    }
-    return {
-        'chain_latency_over_relay': median['chain'] / median['relay'],
-        'chain_latency_p50_ms': median['chain'] * 1e3,
-        'chain_latency_p99_ms': float(np.percentile(taken['chain'], 99) * 1e3),
-        'chain_cpu_share': float(cpu['chain'].sum() / wall),
-        **shares,
-        'chain_answered': len(taken['chain']) / sent['chain'],
-        'relay_latency_p50_ms': median['relay'] * 1e3,
-        'relay_latency_p99_ms': float(np.percentile(taken['relay'], 99) * 1e3),
-        'relay_cpu_share': float(cpu['relay'].sum() / wall),
-        'relay_answered': len(taken['relay']) / sent['relay'],
-    }
+def bench_robots(model_path: Path | str, seconds: float = 8.0) -> dict[str, float]:
+    """CPU shares of each node (1: one core), the mean of the robots, by robots and camera rate."""
+    model, found = PlaceModel.load(model_path), {}
+    for count in ROBOTS:
+        names = [f'robot{k + 1}' for k in range(count)]
+        with Processes(Path(model_path), model, dict.fromkeys(names, 'chain')) as processes:
+            processes.driver.wait()
+            for rate_hz in RATES_HZ:
+                answers = processes.driver.latencies
+                before = sum(map(len, answers.values()))
+                pictures, used = processes.measure(names, rate_hz, seconds)
+                prefix = f'robots_{count}_at_{rate_hz:.0f}_hz'
+                for node, cpu_s in zip(NODES, used.mean(axis=0), strict=True):
+                    found[f'{prefix}_cpu_{node}'] = float(cpu_s / (seconds + LAST_S))
+                answered = sum(map(len, answers.values())) - before
+                found[f'{prefix}_answered'] = answered / (pictures * count)
+    return found
 
 
 if __name__ == '__main__':
-    if sys.argv[1] == '--relay':
-        relay(int(sys.argv[2]))
+    if sys.argv[1].isdigit():
+        relay(int(sys.argv[1]))
     else:
         measured = {**bench_chain(sys.argv[1]), **bench_robots(sys.argv[1])}
         sys.stdout.write(json.dumps(measured, indent=2) + '\n')

@@ -65,7 +65,7 @@ def filmed(messages, start_ns):
             if not (due and START_S <= second < STOP_S and self.last and self.panorama is not None):
                 return
             pose, spread = in_truth(self.last)
-            level = ekf._status().level.name
+            level = ekf.status().level.name
             self.shots.append(Shot(second, message.true, pose, spread, level, self.panorama))
 
     to_truth()

@@ -120,7 +120,7 @@ class Chain:
         ))  # fmt: skip
         if not self.wait(lambda: done(ekf, ODOM)[1] > handled):
             return
-        if done(ekf, ODOM)[0] > used and ekf._filter.state is not None:
+        if done(ekf, ODOM)[0] > used and ekf.filter.state is not None:
             self.wait(lambda: self.last and read_stamp(self.last.header.stamp) == message.stamp_ns)
         self.note(message, ekf)
 
@@ -132,7 +132,7 @@ class Chain:
         place = [pose.position.x, pose.position.y, read_yaw(pose.orientation)]
         second = (message.at_ns - self.start_ns) * 1e-9
         spread = covariance[np.ix_(_PLANAR, _PLANAR)]
-        status = ekf._status()
+        status = ekf.status()
         self.outputs.append(output(second, status, place, spread, message.true))
 
     def wait(self, condition):
