@@ -146,7 +146,7 @@ def test_without_tf2_msgs_the_node_runs_and_says_so(bench, monkeypatch, capfd):
     assert 'tf2_msgs is not installed' in capfd.readouterr().err
 
 
-def test_every_measurement_gets_its_verdict_and_a_refused_one_is_not_used_too(bench):
+def test_every_measurement_gets_its_verdict(bench):
     drive = Drive(seconds=2, **NOISY)
     drive.seen[10, :2] += 9.0
     node = bench.run(EkfNode, initial_pose=AT_ORIGIN)
@@ -164,7 +164,7 @@ def test_every_measurement_gets_its_verdict_and_a_refused_one_is_not_used_too(be
     assert monitor.refused == {'outside the gate': 1}
 
 
-def test_the_state_is_latched_and_on_diagnostics_with_rates_and_counts(bench):
+def test_the_state_is_on_diagnostics_for_programs(bench):
     """With the level, and the keys that config/problems.md names."""
     drive = Drive(twists=from_rest(winding(4)), **NOISY)
     node = bench.run(EkfNode, silence_timeout=60.0)

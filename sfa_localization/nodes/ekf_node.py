@@ -215,8 +215,8 @@ class EkfNode(LocalizationNode):
     def _pause(self, request: Any, response: Any) -> Any:
         self._paused = bool(request.data)
         self._publish_state()
-        told = 'images are not fused' if self._paused else 'images are fused'
-        response.success, response.message = True, told
+        response.success = True
+        response.message = 'images are not fused' if self._paused else 'images are fused'
         return response
 
     def _clock_jumped(self, jump: TimeJump) -> None:
