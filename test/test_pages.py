@@ -176,7 +176,7 @@ def test_the_page_of_an_evaluation(judged, tmp_path):
     write_evaluation_page(tmp_path, 'a <model>', truth, estimates, scores, counts, pictures)
     found = read(tmp_path)
     assert found.headings == ['How far off?', 'Where is it weak?', 'May I trust it?',
-                              'What was rejected?', 'Slow features', 'Worst images']  # fmt: skip
+                              'What was rejected?', 'Worst images']  # fmt: skip
     assert '3 images: too <dark> & small' in found.text, 'escaped, and read back'
     assert 'a <model>' in found.text
     assert 'LOST: 10% of the drive' in found.text

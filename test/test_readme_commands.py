@@ -90,7 +90,7 @@ def test_results_beat_odometry_and_the_mean_position(folder):
 
 def test_report_contains_its_figures(folder):
     names = {path.name for path in (folder / 'report').iterdir()}
-    assert {'trajectories.png', 'errors.png', 'firing_maps.png', 'report.md'} <= names
+    assert {'index.html', 'overview.png', 'errors.png'} <= names
 
 
 @pytest.mark.ros

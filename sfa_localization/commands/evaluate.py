@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from sfa_localization.evaluation import Evaluation
 
 WRITES = """\
-tables on standard output; with --report index.html (one page for a browser), its figures,
-  report.md; with --json the errors"""
+tables on standard output; with --report index.html (one page for a browser) and its figures;
+  with --json the errors"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
   evaluate garden.npz bags/test --align bags/coverage --report report --json results.json"""

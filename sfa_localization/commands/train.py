@@ -28,7 +28,7 @@ from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 if TYPE_CHECKING:
     from sfa_localization.training import Recipe, Trained
 
-WRITES = 'MODEL.npz; with --report index.html (one page for a browser), its figures, training.md'
+WRITES = 'MODEL.npz; with --report index.html (one page for a browser) and its figures'
 EXAMPLES = """\
   train bags/coverage --output garden.npz
   train bags/a bags/b --output garden.npz --config localization.yaml --report report

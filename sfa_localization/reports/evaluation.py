@@ -24,7 +24,6 @@ from sfa_localization.reports.figures import (
     WorstImage,
     in_meters,
     save,
-    save_text,
     worst_images,
     write_worst_images,
 )
@@ -105,13 +104,13 @@ Rows = tuple[list[str], list[list[str]]]
 
 
 def _position_rows(scores: Scores) -> Rows:
-    rows = [[_label(n), *(number(one[c], c) for c in COLUMNS)] for n, one in scores.items()]
+    rows = [[LABELS.get(n, n), *(number(one[c], c) for c in COLUMNS)] for n, one in scores.items()]
     return ['position error (m)', *COLUMNS], rows
 
 
 def _heading_rows(scores: Scores) -> Rows:
     errors = {name: one['yaw_deg'] for name, one in scores.items() if one.get('yaw_deg')}
-    rows = [[_label(n), *(f'{yaw[c]:.2f}' for c in YAW_COLUMNS)] for n, yaw in errors.items()]
+    rows = [[LABELS.get(n, n), *(f'{yaw[c]:.2f}' for c in YAW_COLUMNS)] for n, yaw in errors.items()]
     return ['heading error (degrees)', *YAW_COLUMNS], rows
 
 
@@ -120,10 +119,6 @@ def number(value: float | None, column: str) -> str:
     if value is None:
         return '-'
     return f'{int(value)}' if column == 'n' else f'{value:.3f}'
-
-
-def _label(name: str) -> str:
-    return LABELS.get(name, name)
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -157,7 +152,7 @@ def trust_lines(scores: Scores) -> list[str]:
         if best.get('mean') is not None:
             parts.append(f'scaled by {best["scale"]:.4f} it errs by {best["mean"]:.3f} m')
         if parts:
-            lines.append(f'{_label(name)}: {"; ".join(parts)}')
+            lines.append(f'{LABELS.get(name, name)}: {"; ".join(parts)}')
     return lines
 
 
@@ -169,30 +164,13 @@ def write_report(
     positions: Array,
     features: Array,
 ) -> None:
-    """Write all figures and ``report.md`` into `folder`, created when missing.
+    """Write the figures overview.png and errors.png into `folder`, created when missing.
 
     Estimates are in the truth's frame; `positions` (N, 2) m and `features` (N, K) belong together.
     Raises LocalizationError when a file cannot be written.
     """
-    trajectories_figure(folder / 'trajectories.png', truth, estimates, scores)
-    errors_figure(folder / 'errors.png', truth, estimates)
-    firing_maps_figure(folder / 'firing_maps.png', positions, features)
     overview_figure(folder / 'overview.png', truth, estimates, scores, positions, features)
-    images = [f'![{name}]({name}.png)' for name in ('trajectories', 'errors', 'firing_maps')]
-    parts = ['# Evaluation', table(scores), heading_table(scores), *images]
-    save_text(folder / 'report.md', '\n\n'.join(parts) + '\n')
-
-
-def trajectories_figure(
-    path: Path, truth: Trajectory, estimates: Estimates, scores: Scores | None = None
-) -> None:
-    """Draw the true and the estimated paths from above, axes equal, in meters.
-
-    `scores`, by the estimates' names, adds each mean error to the legend.
-    """
-    figure = Figure(figsize=(8.0, 7.6), layout='constrained')
-    _draw_paths(figure.add_subplot(), truth, estimates, scores or {})
-    save(figure, path)
+    errors_figure(folder / 'errors.png', truth, estimates)
 
 
 def errors_figure(path: Path, truth: Trajectory, estimates: Estimates) -> None:
@@ -245,17 +223,17 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
     x, y = truth.poses[0, :2]
     axes.annotate('start', (x, y), xytext=(7, 7), textcoords='offset points')
     for name, estimate in estimates.items():
-        mean = f': {number(scores[name]["mean"], "mean")} m' if name in scores else ''
+        mean = f': {number(scores[name]["mean"], "mean")} m'
         points = estimate.poses[truth.covers(estimate.stamps_ns)]
-        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **STYLES.get(name, OTHER))
+        axes.plot(points[:, 0], points[:, 1], label=LABELS.get(name, name) + mean, **STYLES.get(name, OTHER))
     _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False)
-    axes.set_title('Estimated and true paths (mean error)' if scores else 'Paths')
+    axes.set_title('Estimated and true paths (mean error)')
 
 
 def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*position_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
+        axes.plot(*position_errors(truth, estimate), label=LABELS.get(name, name), **STYLES.get(name, OTHER))
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
     if estimates:
@@ -331,14 +309,13 @@ def write_evaluation_page(
         page.verdict(*judgment(scores, counts)),
         page.section('How far off?', page.table(*_position_rows(scores)),
                      page.table(*_heading_rows(scores)),
-                     page.figure(folder / 'trajectories.png', 'Estimated and true paths')),
+                     page.figure(folder / 'overview.png', 'Estimated and true paths, slow features '
+                                 'where the images seem to be taken, and errors')),
         page.section('Where is it weak?', page.items([*_weak_lines(truth, estimates['ekf'])]),
                      page.figure(folder / 'error_map.png', 'Error of the filter along the path')),
         page.section('May I trust it?', page.items([*_trust(scores, counts)]),
                      page.figure(folder / 'errors.png', 'Errors over time')),
         page.section('What was rejected?', page.items([*_rejected(counts)])),
-        page.section('Slow features',
-                     page.figure(folder / 'firing_maps.png', 'Slow features at the estimates')),
         page.section('Worst images', page.figure(folder / 'worst_images.png', 'Single images with '
                      'the largest errors, and where they were taken')) if samples else '',
     )  # fmt: skip

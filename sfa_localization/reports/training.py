@@ -54,7 +54,7 @@ def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
 def write_training_report(
     folder: Path, trained: Trained, samples: Mapping[WorstImage, Image] | None = None
 ) -> None:
-    """Write figures of the training, training.md, and the page index.html that contains them all.
+    """Write figures of the training, and the page index.html that contains them all.
 
     The `samples` of the worst images too, where there are any. Makes the folder. Raises
     LocalizationError when a file cannot be written.
@@ -66,9 +66,6 @@ def write_training_report(
     if samples:
         figures.write_worst_images(folder / 'worst_images.png', samples)
     names = [name for name in _CAPTIONS if samples or name != 'worst_images']
-    shown = [f'![{name}]({name}.png)' for name in names]
-    text = '\n\n'.join(['# Training', f'```\n{summary(trained)}\n```', *shown]) + '\n'
-    figures.save_text(folder / 'training.md', text)
     parts = {name: page.figure(folder / f'{name}.png', _CAPTIONS[name]) for name in names}
     page.write_page(
         folder,
