@@ -104,13 +104,13 @@ Rows = tuple[list[str], list[list[str]]]
 
 
 def _position_rows(scores: Scores) -> Rows:
-    rows = [[LABELS.get(n, n), *(number(one[c], c) for c in COLUMNS)] for n, one in scores.items()]
+    rows = [[_label(n), *(number(one[c], c) for c in COLUMNS)] for n, one in scores.items()]
     return ['position error (m)', *COLUMNS], rows
 
 
 def _heading_rows(scores: Scores) -> Rows:
     errors = {name: one['yaw_deg'] for name, one in scores.items() if one.get('yaw_deg')}
-    rows = [[LABELS.get(n, n), *(f'{yaw[c]:.2f}' for c in YAW_COLUMNS)] for n, yaw in errors.items()]
+    rows = [[_label(n), *(f'{yaw[c]:.2f}' for c in YAW_COLUMNS)] for n, yaw in errors.items()]
     return ['heading error (degrees)', *YAW_COLUMNS], rows
 
 
@@ -119,6 +119,10 @@ def number(value: float | None, column: str) -> str:
     if value is None:
         return '-'
     return f'{int(value)}' if column == 'n' else f'{value:.3f}'
+
+
+def _label(name: str) -> str:
+    return LABELS.get(name, name)
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -152,7 +156,7 @@ def trust_lines(scores: Scores) -> list[str]:
         if best.get('mean') is not None:
             parts.append(f'scaled by {best["scale"]:.4f} it errs by {best["mean"]:.3f} m')
         if parts:
-            lines.append(f'{LABELS.get(name, name)}: {"; ".join(parts)}')
+            lines.append(f'{_label(name)}: {"; ".join(parts)}')
     return lines
 
 
@@ -225,7 +229,7 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
     for name, estimate in estimates.items():
         mean = f': {number(scores[name]["mean"], "mean")} m'
         points = estimate.poses[truth.covers(estimate.stamps_ns)]
-        axes.plot(points[:, 0], points[:, 1], label=LABELS.get(name, name) + mean, **STYLES.get(name, OTHER))
+        axes.plot(points[:, 0], points[:, 1], label=_label(name) + mean, **STYLES.get(name, OTHER))
     _frame_view(axes, np.concatenate([truth.poses, *map(_bulk, estimates.values())])[:, :2])
     axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False)
     axes.set_title('Estimated and true paths (mean error)')
@@ -233,7 +237,7 @@ def _draw_paths(axes: Axes, truth: Trajectory, estimates: Estimates, scores: Sco
 
 def _draw_position_errors(axes: Axes, truth: Trajectory, estimates: Estimates) -> None:
     for name, estimate in estimates.items():
-        axes.plot(*position_errors(truth, estimate), label=LABELS.get(name, name), **STYLES.get(name, OTHER))
+        axes.plot(*position_errors(truth, estimate), label=_label(name), **STYLES.get(name, OTHER))
     axes.set(xlabel='time (s)', ylabel='position error (m)', xlim=(0, None), ylim=(0, None))
     axes.grid(alpha=0.3)
     if estimates:
