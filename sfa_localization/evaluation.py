@@ -266,7 +266,7 @@ def _title(run: Run) -> str:
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
-    run = read_drive(bag, cache, recipe, progress, want_truth=truth, odometry_tolerance_s=0.0)
+    run = read_drive(bag, cache, recipe, progress, want_truth=truth)
     if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
         raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
     return run

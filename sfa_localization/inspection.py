@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
+from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.reader import KINDS, Bag
-from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.calibration import MirrorCircles, find_circles

@@ -102,7 +102,7 @@ def update(
     recipe, added = as_live(recipe or ReadingRecipe(), model.panorama), []
     with image_cache(Path(output)) as cache:
         for bag in bags:
-            run = read_drive(bag, cache, recipe, progress, strict=strict, odometry_tolerance_s=0.0)
+            run = read_drive(bag, cache, recipe, progress, strict=strict)
             new = new_views(model, run, config, watch, progress=progress)
             model = extended(model, new, Path(bag).name)
             added.append((Path(bag).name, len(new)))

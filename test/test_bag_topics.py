@@ -14,8 +14,8 @@ from bag_formats import PERIOD, pose, stamp
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from sfa_localization.bags.drives import ReadingRecipe, read_drive
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.data.errors import BagError
@@ -238,10 +238,10 @@ def test_a_faulty_image_is_skipped_and_counted(
 ) -> None:
     entry = ('/camera', stamp(2) + 7, picture(stamp(2) + 7, **changes))
     path = full(tmp_path / 'bag', entry)
-    run = load_run(path, cache=tmp_path)
+    run = read_drive(path, tmp_path)
     assert run.counts['images'].as_dict() == {'used': COUNT, 'skipped': {reason: 1}}
     with pytest.raises(BagError, match=f'/camera: {reason}; read without --strict'):
-        load_run(path, cache=tmp_path, strict=True)
+        read_drive(path, tmp_path, strict=True)
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf])
@@ -334,11 +334,13 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
             connection = writer.add_connection(topic, kind, typestore=STORE)
             for k in range(4):
                 writer.write(connection, stamp(k), STORE.serialize_cdr(made(stamp(k)), kind))
-    run = load_run(tmp_path / 'bag', cache=tmp_path / 'cache')
+    run = read_drive(tmp_path / 'bag', tmp_path / 'cache')
     assert run.yaw_rate is None and len(run.panoramas) == 4
     assert 'no message on /imu: continuing without gyroscope' in caplog.text
     with pytest.raises(BagError, match='/imu'):
-        load_run(tmp_path / 'bag', cache=tmp_path / 'cache', topics=TopicNames(imu='/imu'))
+        read_drive(
+            tmp_path / 'bag', tmp_path / 'cache', ReadingRecipe(topics=TopicNames(imu='/imu'))
+        )
 
 
 def drive_bag(path: Path, pose: Callable[[int], Any], twist: Any, count: int = 100) -> Path:

@@ -10,8 +10,8 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from sfa_localization.bags.decoding import IMAGE
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.run_loader import load_run
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import MessageError
@@ -141,7 +141,7 @@ def test_of_a_camera_of_few_bits_inspect_training_and_nodes_see_the_same(tmp_pat
             bag.message('/images', k * 10**9, message)
             bag.odometry('/odom', k * 10**9, [0.2 * k, 0.0, 0.0], [0.2, 0.0], [0.01, 0.01])
     assert not [lack for lack in inspect(tmp_path / 'bag').lacks if 'dark' in lack]
-    run = load_run(tmp_path / 'bag', cache=tmp_path)
+    run = read_drive(tmp_path / 'bag', tmp_path)
     for image, words in zip(run.panoramas.images, pictures, strict=True):
         np.testing.assert_array_equal(image[..., 0], words >> (bits - 8))
         assert ImageWatch().judge(np.asarray(image)) == ''

@@ -32,13 +32,10 @@ PLACES = np.zeros((5, 3))
 
 # Who writes otherwise, and why it may.
 OTHERS = {
-    'bags/run_loader': 'decoded pictures, in a folder that its caller removes',
-    'bags/storage': 'a decompressed copy, in a temporary folder',
-    'bags/sqlite': 'a copy of what is whole, in a temporary folder',
+    'bags/files': 'what is decompressed or salvaged, in a temporary folder',
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
     'commands/processes': 'what a program prints, while it prints it',
-    'bags/drives': 'the folder of decoded images, which it removes',
     'cli': 'to /dev/null, what is printed to a closed stream',
 }
 

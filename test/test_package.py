@@ -172,7 +172,7 @@ def test_modules_import_only_what_their_rooms_may():
 
 def test_a_wrong_import_is_found():
     for module, imported in {
-        'metric.phases': f'{NAME}.bags.run_loader.load_run',
+        'metric.phases': f'{NAME}.bags.drives.read_drive',
         'camera.capture': f'{NAME}.nodes.settings.NodeConfig',
         'config': f'{NAME}.nodes.lifecycle.BaseNode',
         'data.run': 'scipy.linalg',

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sfa_localization.bags.run_loader import load_run
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.inspection import PANORAMA, inspect
 
 BAGS = Path(__file__).parents[1] / 'bags'
@@ -35,7 +35,7 @@ def test_the_sample_holds_what_its_readme_lists(name: str, enough: bool, tmp_pat
     assert not any(topic.problems for topic in report.topics) and report.problems == []
     assert report.images is not None and report.images.geometry == PANORAMA
     assert (report.lacks == []) is enough
-    run = load_run(BAGS / name, cache=tmp_path, want_truth=True, strict=True)
+    run = read_drive(BAGS / name, tmp_path, want_truth=True, strict=True)
     assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == images
 
 

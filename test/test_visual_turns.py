@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
-from sfa_localization.bags.run_loader import load_run
+from sfa_localization.bags.drives import read_drive
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
@@ -122,7 +122,7 @@ def test_where_nothing_shows_the_delay_none_is_claimed(kind):
 
 @pytest.mark.parametrize('name', ['sample', 'sample_test'])
 def test_the_sample_is_on_one_clock(name, tmp_path):
-    run = load_run(BAGS / name, cache=tmp_path)
+    run = read_drive(BAGS / name, tmp_path)
     for delay in (0.0, 0.15):
         clock = clock_of(late(run, delay))
         assert clock.known and abs(clock.delay_s - delay) < 3 * clock.std_s

@@ -1,95 +1,78 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read the drives of a training or evaluation as runs, by a recipe: topics, camera, panorama."""
+"""Read drives as runs by a recipe: panoramas on disk, joined to odometry, each bag in one pass."""
 
 from __future__ import annotations
 
-import fcntl
-import glob
 import logging
-import os
-import shutil
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sfa_localization.bags import decoding
+from sfa_localization.bags.motion_arrays import StampedValues, to_trajectory, to_yaw_rate
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.run_loader import ODOMETRY_TOLERANCE_S, load_run
 from sfa_localization.bags.settings import BagConfig, TopicNames
-from sfa_localization.camera.panorama import Unwrapper
+from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
-from sfa_localization.data.errors import DataError, ModelError
+from sfa_localization.camera.watch import FrozenWatch
+from sfa_localization.data.errors import BagError, DataError, MessageError, ModelError
 from sfa_localization.data.files import replaced_mode
+from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Image, Run
+from sfa_localization.data.run import Image, PanoramaArray, Run, Stamps
 
+ODOMETRY_TOLERANCE_S = 0.5
+"""An image is used when odometry lies this near on both sides (s): interpolating over a longer
+pause would invent a path."""
 SAME_IMAGE_NS = 1_000_000
 """Stamps this near to each other are those of one image: no camera takes a thousand a second."""
-_LOCK = 'lock'
 logger = logging.getLogger(__name__)
 R = TypeVar('R', bound='ReadingRecipe')
 
 
 @dataclass(frozen=True, slots=True)
 class ReadingRecipe:
-    """Everything that decides how a bag becomes a run of panoramas."""
+    """Everything that decides how a bag becomes a run of panoramas.
+
+    Images farther than `odometry_tolerance_s` from odometry (0: outside all of it) are left out;
+    where only `distinct` ones are wanted, also those that repeat the one before, which was taken
+    elsewhere.
+    """
 
     topics: TopicNames = field(default_factory=TopicNames)
     bag: BagConfig = field(default_factory=BagConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
+    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S
+    distinct: bool = False
 
 
-@contextmanager
-def image_cache(output: Path) -> Iterator[Path]:
-    """A folder beside `output` for decoded images; also clears those that killed runs left.
+def as_live(recipe: R, panorama: PanoramaConfig) -> R:
+    """The recipe to read a drive with a model's panorama, as the nodes do: the filter also fuses
+    images far from any odometry.
+    """
+    return replace(recipe, panorama=panorama, odometry_tolerance_s=0.0)
+
+
+def image_cache(output: Path) -> AbstractContextManager[Path]:
+    """The folder of `output`, for decoded images: files without a name, gone with their process.
 
     Raises ModelError when it cannot be made, or `output` not be written in the end.
     """
-    name = f'.{output.name}.cache-'
     try:
         replaced_mode(output)
         output.parent.mkdir(parents=True, exist_ok=True)
-        for stale in output.parent.glob(f'{glob.escape(name)}*'):
-            _clear_unused(stale)
-        folder = Path(tempfile.mkdtemp(prefix=name, dir=output.parent))
-        lock = _lock(folder, os.O_CREAT)
     except OSError as error:
         raise ModelError(f'{output}: cannot be written: {error.strerror or error}') from None
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
-
-
-def _lock(folder: Path, flags: int = 0) -> int:
-    """A handle that locks the folder until it is closed, or its process ends.
-
-    Raises OSError where another process has it.
-    """
-    handle = os.open(folder / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o600)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise
-    return handle
-
-
-def _clear_unused(folder: Path) -> None:
-    """Remove a cache whose process has ended; one without a lock is just being made."""
-    try:
-        lock = _lock(folder)
-    except OSError:
-        return
-    shutil.rmtree(folder, ignore_errors=True)
-    os.close(lock)
+    return nullcontext(output.parent)
 
 
 def read_drives(
@@ -104,9 +87,8 @@ def read_drives(
 
     Images that repeat the one before are left out. Raises BagError or DataError.
     """
-    runs = tuple(
-        read_drive(bag, cache, recipe, progress, strict=strict, distinct=True) for bag in bags
-    )
+    distinct = replace(recipe, distinct=True)
+    runs = tuple(read_drive(bag, cache, distinct, progress, strict=strict) for bag in bags)
     for k, run in enumerate(runs):
         for other in runs[:k]:
             if _same_recording(run, other):
@@ -142,35 +124,133 @@ def _same_recording(run: Run, other: Run) -> bool:
 
 
 def read_drive(
-    bag: Path,
+    path: Path | str,
     cache: Path,
-    recipe: ReadingRecipe,
+    recipe: ReadingRecipe | None = None,
     progress: bool = False,
     *,
     want_truth: bool = False,
     strict: bool = False,
-    odometry_tolerance_s: float = ODOMETRY_TOLERANCE_S,
-    distinct: bool = False,
 ) -> Run:
-    """Read one bag as a run of panoramas; raw camera images are unwrapped. Raises BagError."""
-    with progress_bar(f'read {Path(bag).name}', shown=progress) as bar:
+    """Read one bag in one pass; camera images are unwrapped to panoramas, and lie in `cache`.
 
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
+    Without `want_truth` no topic of true poses is even opened. Images of another size than the
+    first are skipped and counted. Raises BagError.
+    """
+    recipe = recipe or ReadingRecipe()
+    with Bag(path, strict=strict, config=recipe.bag) as bag:
+        stored = _Images(Path(cache), recipe)
+        streams = {'images': bag.stream(bag.find('image', recipe.topics.image), stored.panorama)}
+        streams |= _other_streams(bag, recipe.topics, want_truth)
+        try:
+            values = _read(bag, streams, stored, progress)
+            odometry = bag.to_odometry(streams['odometry'], values['odometry'])
+            near_ns = int(recipe.odometry_tolerance_s * 1e9)
+            covered = odometry.trajectory.covers(stored.stamps_ns, near_ns)
+            panoramas = stored.finish(_used(bag, streams['images'], covered, near_ns))
+        except OSError as error:
+            raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
+        for problem in bag.problems:
+            logger.warning('%s: %s', path, problem)
+    counts = {use: stream.tally.count for use, stream in streams.items()}
+    yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
+    truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, counts)
 
-        return load_run(
-            bag,
-            topics=recipe.topics,
-            unwrap=Unwrapper(recipe.camera, recipe.panorama),
-            cache=cache,
-            progress=show,
-            want_truth=want_truth,
-            strict=strict,
-            config=recipe.bag,
-            odometry_tolerance_s=odometry_tolerance_s,
-            distinct=distinct,
-        )
+
+class _Images:
+    """Makes panoramas of one size, and stores them in a file without a name."""
+
+    def __init__(self, folder: Path, recipe: ReadingRecipe) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
+        self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
+        self._watch = FrozenWatch() if recipe.distinct else None
+        self._stamps: list[int] = []
+        self._shape: tuple[int, ...] = ()
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """Stamps of the images so far."""
+        return np.array(self._stamps, np.int64)
+
+    def panorama(self, message: Any) -> Image:
+        """The panorama of a message. Raises LocalizationError."""
+        image = decoding.image_of(message)
+        if not looks_like_panorama(*image.shape[:2]):
+            image = self._unwrap(image)
+        if self._watch is not None and not self._watch.add(image):
+            raise MessageError('image repeats the one before')
+        self._shape = self._shape or image.shape
+        if image.shape != self._shape:
+            height, width = self._shape[:2]
+            raise MessageError(f'size is not {width}x{height} like the first image')
+        return image
+
+    def add(self, stamp_ns: int, image: Image) -> None:
+        """Append a panorama."""
+        self._file.write(np.ascontiguousarray(image).data)
+        self._stamps.append(stamp_ns)
+
+    def finish(self, keep: NDArray[np.bool_]) -> PanoramaArray:
+        """The panoramas marked in `keep` (N,), moved to the beginning of the file."""
+        self._file.flush()
+        images = np.memmap(self._file, np.uint8, 'r+', shape=(len(keep), *self._shape))
+        kept = np.flatnonzero(keep)
+        for target, source in enumerate(kept):
+            if target != source:
+                images[target] = images[source]
+        return PanoramaArray(self.stamps_ns[kept], images[: len(kept)], self._file)
+
+
+def _other_streams(bag: Bag, topics: TopicNames, want_truth: bool) -> dict[str, Stream]:
+    """The topics beside the images that make a run, by their use."""
+    streams = {'odometry': bag.odometry_stream(topics.odometry)}
+    if topics.imu or _has_imu(bag):
+        streams['imu'] = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
+        streams['imu'].required = bool(topics.imu)
+    if want_truth:
+        name = bag.find('ground_truth', topics.ground_truth)
+        streams['ground_truth'] = bag.stream(name, decoding.pose_of)
+    return streams
+
+
+def _has_imu(bag: Bag) -> bool:
+    """Whether a gyroscope was recorded; topics that are all empty are only warned of."""
+    found = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
+    if found and not any(topic.count for topic in found):
+        names = ', '.join(topic.name for topic in found)
+        logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
+        return False
+    return bool(found)
+
+
+def _read(
+    bag: Bag, streams: dict[str, Stream], stored: _Images, progress: bool
+) -> dict[str, StampedValues]:
+    """Store the images; return the values of the other streams by their use."""
+    uses = {id(stream): use for use, stream in streams.items()}
+    values: dict[str, StampedValues] = {use: [] for use in streams}
+    total = bag.topics[streams['images'].topic].count
+    with progress_bar(f'read {bag.path.name}', total, shown=progress) as bar:
+        for stream, stamp_ns, value in bag.read(streams.values()):
+            if stream is streams['images']:
+                stored.add(stamp_ns, value)
+                bar.update(stream.received - bar.n)
+            else:
+                values[uses[id(stream)]].append((stamp_ns, value))
+    return values
+
+
+def _used(bag: Bag, images: Stream, covered: NDArray[np.bool_], near_ns: int) -> NDArray[np.bool_]:
+    """The images with odometry, of which the others are counted. Raises BagError without any."""
+    lost = int(np.count_nonzero(~covered))
+    near = f'within {near_ns * 1e-9:g} s' if near_ns else 'before and after'
+    images.tally.withdraw(f'no odometry {near}', lost)
+    if not covered.any():
+        raise BagError(f'{bag.path}: none of {lost} images of {images.topic} has odometry {near}; '
+                       'are both stamped by one clock (stamp_source: receive)?')  # fmt: skip
+    return covered
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
@@ -188,12 +268,3 @@ def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> d
             if len(found) == len(wanted):
                 break
     return found
-
-
-def as_live(recipe: R, panorama: PanoramaConfig) -> R:
-    """The recipe to read a drive with a model's panorama, as the nodes do.
-
-    Read it with `odometry_tolerance_s` 0: training leaves out images far from any odometry, but
-    the filter fuses them too.
-    """
-    return replace(recipe, panorama=panorama)

@@ -154,7 +154,7 @@ class Recording:
                 self.problems.append(f'{path.name}: {damage}')
         start = start_of(plain, max(map(len, READERS)))
         if not start:
-            raise BagError(f'{path}: is empty ({damage or "0 bytes"}); record it again')
+            raise BagError(f'{path}: holds nothing ({damage or "0 bytes"}); record it again')
         for magic, reader in READERS.items():
             if start.startswith(magic):
                 try:

@@ -4,9 +4,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,10 +139,13 @@ class Panoramas(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PanoramaArray:
-    """Panoramas held in an array, or in a memory-mapped file: `images` (N, H, W, C) uint8."""
+    """Panoramas in an array, `images` (N, H, W, C) uint8, or at the beginning of a `file` that the
+    array maps.
+    """
 
     stamps_ns: Stamps
     images: Image
+    file: IO[bytes] | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -151,14 +155,15 @@ class PanoramaArray:
         return len(self.images)
 
     def read(self, start: int, stop: int) -> Image:
-        if not isinstance(self.images, np.memmap) or self.images.filename is None:
+        if self.file is None:
             return np.asarray(self.images[start:stop])
         # Read, not mapped: mapped pages would count as memory that grows with the bag.
-        stop = min(stop, len(self))
-        size = int(np.prod(self.shape))
-        offset = self.images.offset + start * size
-        flat = np.fromfile(self.images.filename, np.uint8, (stop - start) * size, offset=offset)
-        return flat.reshape(stop - start, *self.shape)
+        # Several threads read at once: each from a place of its own, in parts of at most 2 GiB.
+        found = np.empty((max(min(stop, len(self)) - start, 0), *self.shape), np.uint8)
+        rest, offset = memoryview(found.reshape(-1)), start * int(np.prod(self.shape))
+        while rest and (read := os.preadv(self.file.fileno(), [rest], offset)):
+            rest, offset = rest[read:], offset + read
+        return found
 
     def batches(self, size: int) -> Iterator[Image]:
         for start in range(0, len(self), size):

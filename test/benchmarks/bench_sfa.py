@@ -82,7 +82,9 @@ def panoramas(path: Path, count: int, seed: int = 0) -> ImageSequence:
         images[t] = np.roll(np.clip(blend, 0, 255), turn[t], axis=1)
     images.flush()
     read_only = np.memmap(path, np.uint8, 'r', shape=images.shape)
-    return ImageSequence(PanoramaArray(np.arange(count), read_only), np.ones(count - 1, bool))
+    return ImageSequence(
+        PanoramaArray(np.arange(count), read_only, path.open('rb')), np.ones(count - 1, bool)
+    )
 
 
 def _texture(rng: np.random.Generator) -> np.ndarray:
@@ -362,7 +364,9 @@ def bench_memory(folder: Path, quick: bool = False) -> dict[str, float]:
 def peak(path: Path, count: int) -> float:
     """Peak memory (MiB) of this process after training on a file's first pictures."""
     images = np.memmap(path, np.uint8, 'r', shape=(count, *SIZE, 3))
-    drive = ImageSequence(PanoramaArray(np.arange(count), images), np.ones(count - 1, bool))
+    drive = ImageSequence(
+        PanoramaArray(np.arange(count), images, path.open('rb')), np.ones(count - 1, bool)
+    )
     layers = tuple(replace(layer, linear=16, outputs=16) for layer in ARCHITECTURE.layers)
     train_network(replace(ARCHITECTURE, layers=layers), [drive])
     # Not ru_maxrss: a process inherits it from the one that started it.

@@ -132,8 +132,7 @@ def read(bag):
     """Run and panoramas (M, H, W, 3) of a bag, with the truth."""
     recipe = as_live(Recipe(), model().panorama)
     with tempfile.TemporaryDirectory() as folder:
-        options = {'want_truth': True, 'odometry_tolerance_s': 0.0}
-        run = read_drive(bag, Path(folder), recipe, **options)
+        run = read_drive(bag, Path(folder), recipe, want_truth=True)
         return run, np.array(run.panoramas.read(0, len(run.panoramas)))
 
 
