@@ -8,14 +8,14 @@ import argparse
 import importlib
 import io
 import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 from sfa_localization import __version__
-from sfa_localization.commands.processes import terminable
 from sfa_localization.data.errors import LocalizationError, NodeError
 from sfa_localization.nodes.entry import NODES, asks_for_help, node_help
 
@@ -34,8 +34,6 @@ COMMANDS = {
 LONGEST_ERROR = 4000
 """Characters of an error: the last lines of a program that failed, or a list of topics."""
 _NO_ROOM = 'failed to map segment'  # of a library, where there is no memory for it
-ROS_COMMANDS = ('play',)
-"""Commands that ROS ends at a signal; the others end at SIGTERM as at Ctrl-C, and clean up."""
 OPTIONAL = {
     'trimesh': 'trimesh embreex',
     'embreex': 'trimesh embreex',
@@ -51,13 +49,27 @@ OPTIONAL = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command or node named by the first argument; return the exit code."""
     _prepare_streams()
-    # Only imports would read these, of numpy.f2py and matplotlib, and fail where they are wrong.
-    for name in ('SOURCE_DATE_EPOCH', 'MPLBACKEND'):
-        os.environ.pop(name, None)
     words = list(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ''
-    with nullcontext() if name in (*NODES, *ROS_COMMANDS) else terminable():
+    with nullcontext() if name in NODES else _terminable():
         return guarded(lambda: _run(name, words))
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end a command like Ctrl-C, so that it can clean up."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    # Signals that are ignored, as after nohup, stay ignored.
+    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _run(name: str, words: Sequence[str]) -> int:
@@ -71,8 +83,7 @@ def _run(name: str, words: Sequence[str]) -> int:
     if name not in COMMANDS:
         _overview().parse_args(words)  # prints help, version or error, and exits
         return 2
-    with terminable():  # also those of ROS_COMMANDS
-        arguments = command_parser(name).parse_intermixed_args(words[1:])
+    arguments = command_parser(name).parse_intermixed_args(words[1:])
     return int(arguments.run(arguments))
 
 

@@ -78,7 +78,7 @@ def test_tune_leaves_out_the_same_pictures(bag):
         tuning.read_drive(bag, PictureReader(), Recipe(), watch, False)
         for watch in (None, WatchConfig(novelty_limit=1.5))
     ]
-    counts = [len(drive.images.poses) for drive in drives]
+    counts = [len(drive.poses) for drive in drives]
     assert counts == [102, 102 - 3]
 
 

@@ -41,33 +41,26 @@ def children():
     return lambda: [c for c in psutil.Process().children() if c not in before]
 
 
-@pytest.mark.parametrize('code', [WAIT, STUBBORN], ids=['obedient', 'stubborn'])
-def test_all_have_ended_afterwards(tmp_path, children, code):
-    with Processes(tmp_path / 'logs', os.environ, stop_timeout_s=0.5) as processes:
-        processes.start('one', python(code))
-        processes.start('two', python(code))
-        wait_until(ready(processes, 'one'))
-        wait_until(ready(processes, 'two'))
-        processes.require_alive(['one', 'two'])
+def test_all_have_ended_afterwards_also_after_an_error(tmp_path, children):
+    with (
+        pytest.raises(ZeroDivisionError),
+        Processes(tmp_path / 'logs', os.environ, stop_timeout_s=0.5) as processes,
+    ):
+        for name, code in {'obedient': WAIT, 'stubborn': STUBBORN}.items():
+            processes.start(name, python(code))
+            wait_until(ready(processes, name))
+        processes.require_alive(['obedient', 'stubborn'])
         assert len(children()) == 2
+        raise ZeroDivisionError
     assert children() == []
 
 
-def test_a_dead_program_is_named_with_its_last_words(tmp_path):
+def test_a_dead_program_is_named_with_its_last_words(tmp_path, children):
     code = 'import sys; [print("line", i) for i in range(9)]; sys.exit("no model")'
     with Processes(tmp_path, os.environ, 5.0) as processes:
-        processes.start('alive', python(WAIT))
         processes.start('sfa_node', python(code))
-        wait_until(lambda: 'no model' in processes.log('sfa_node').read_text())
         with pytest.raises(NodeError) as caught:
-            wait_until(lambda: processes.require_alive(['alive', 'sfa_node']))
-    text = str(caught.value)
-    assert 'sfa_node ended (exit code 1)' in text
-    assert 'line 8' in text and 'no model' in text and 'line 3' not in text
-
-
-def test_a_program_that_should_end_may_and_a_killed_one_shows_its_signal(tmp_path, children):
-    with pytest.raises(ZeroDivisionError), Processes(tmp_path, os.environ, 5.0) as processes:
+            wait_until(lambda: processes.require_alive(['sfa_node']))
         processes.start('player', python('print("done")'))
         wait_until(lambda: processes.ended('player'))
         processes.start('killed', python(WAIT))
@@ -75,23 +68,30 @@ def test_a_program_that_should_end_may_and_a_killed_one_shows_its_signal(tmp_pat
         children()[-1].kill()
         with pytest.raises(NodeError, match='SIGKILL'):
             wait_until(lambda: processes.ended('killed'))
-        processes.start('other', python(WAIT))
-        raise ZeroDivisionError
-    assert children() == [], 'all have ended also after an error'
+    text = str(caught.value)
+    assert 'sfa_node ended (exit code 1)' in text
+    assert 'line 8' in text and 'no model' in text and 'line 3' not in text
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_nothing_is_left_when_the_starter_is_told_to_end(tmp_path, number):
+def test_nothing_is_left_when_the_command_is_told_to_end(tmp_path, number):
     code = f"""
-import os, time
+import os, sys, time
 from pathlib import Path
-from sfa_localization.commands.processes import Processes, terminable
-with terminable(), Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as processes:
-    processes.start('node', [{sys.executable!r}, '-c', {WAIT!r}])
-    while 'ready' not in processes.log('node').read_text():
-        time.sleep(0.01)
-    print('started', flush=True)
-    time.sleep(60)
+from sfa_localization import cli
+from sfa_localization.commands import config
+from sfa_localization.commands.processes import Processes
+
+def run(arguments):
+    with Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as processes:
+        processes.start('node', [{sys.executable!r}, '-c', {WAIT!r}])
+        while 'ready' not in processes.log('node').read_text():
+            time.sleep(0.01)
+        print('started', flush=True)
+        time.sleep(60)
+
+config.run = run
+sys.exit(cli.main(['config']))
 """
     starter = subprocess.Popen(
         python(code), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -103,5 +103,5 @@ with terminable(), Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as proces
         _, errors = starter.communicate(timeout=DEADLINE_S)
     finally:
         starter.kill()
-    assert 'KeyboardInterrupt' in errors
+    assert (starter.returncode, errors) == (130, 'interrupted\n')
     assert not node.is_running()

@@ -111,8 +111,8 @@ def test_nodes_run_as_described(folder, monkeypatch):
     live = live_nodes.run_live(programs, folder / 'logs')
     with Bag(folder / 'demo/test') as bag:
         truth, pictures = bag.trajectory(), len(list(bag.images()))
-    assert len(live['sfa']) > 0.8 * pictures
-    for name, estimate in live.items():
+    assert len(live.sfa) > 0.8 * pictures
+    for name, estimate in {'sfa': live.sfa, 'ekf': live.ekf}.items():
         true = truth.at(estimate.stamps_ns)[:, :2]
         aligned = align(estimate.poses[:, :2], true).apply(estimate.poses[:, :2])
         assert np.hypot(*(aligned - true).T).mean() < 0.5, name

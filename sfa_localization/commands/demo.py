@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +19,7 @@ from sfa_localization.data.files import atomic_write
 from sfa_localization.data.settings import Settings, setting
 
 if TYPE_CHECKING:
+    from sfa_localization.commands.live_nodes import Live
     from sfa_localization.data.run import Trajectory
     from sfa_localization.evaluation import Evaluation
     from sfa_localization.training import Recipe, Trained
@@ -72,12 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     recipe = Recipe(camera=CameraConfig(camera_model='mirror'))
     trained = train([out / 'coverage'], out / 'model.npz', recipe, progress=True, resume=True)
     announce('run the three nodes live on the second')
-    live = run_live(
-        commands(out / 'model.npz', out / 'test', config.rate),
-        out / 'logs',
-        on_end=lambda state: announce(f'the robot is {state or "silent"}'),
-    )
-    announce('compare with the truth')
+    live = run_live(commands(out / 'model.npz', out / 'test', config.rate), out / 'logs')
+    announce(f'the robot is {live.state or "silent"}; compare with the truth')
     result, offline_m = _compare(trained, live, out, recipe)
     _write_results(out, result, trained)
     announce(f'live and offline differ by {offline_m:.3f} m on average; see {out / "report"}')
@@ -86,22 +81,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def prepare_folder(out: Path, config: DemoConfig) -> None:
-    """Create the folder, or clear the results of a demonstration with other settings.
+    """Create the folder, or go on in that of a demonstration with the same settings.
 
-    Bags and an unfinished training with the same settings stay. Raises LocalizationError.
+    Bags and an unfinished training stay. Raises LocalizationError.
     """
     marker, kept = out / MARKER, {**asdict(config), 'version': __version__}
     del kept['rate']
     text = json.dumps(kept)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()) and not marker.exists():
+        if any(out.iterdir()) and not (marker.exists() and marker.read_text('utf-8') == text):
             raise LocalizationError(
-                f'{out}: not a folder of the demo: choose another one with --out'
+                f'{out}: not a folder of this demo: remove it, or choose another one with --out'
             )
-        if marker.exists() and marker.read_text(encoding='utf-8') != text:
-            for name in (*DRIVES, 'logs', 'report'):
-                shutil.rmtree(out / name, ignore_errors=True)
         for name in ('model.npz', 'results.json'):
             (out / name).unlink(missing_ok=True)
     except OSError as error:
@@ -110,20 +102,18 @@ def prepare_folder(out: Path, config: DemoConfig) -> None:
         file.write(text.encode())
 
 
-def _compare(
-    trained: Trained, live: Mapping[str, Trajectory], out: Path, recipe: Recipe
-) -> tuple[Evaluation, float]:
+def _compare(trained: Trained, live: Live, out: Path, recipe: Recipe) -> tuple[Evaluation, float]:
     """Evaluate the live estimates; also return their mean distance (m) from the offline ones."""
     from sfa_localization.evaluation import evaluate, moved, score
 
     offline = evaluate(
         trained.model, out / 'test', align_bags=[out / 'coverage'], recipe=recipe, progress=True
     )
-    in_truth = {name: moved(estimate, offline.transform) for name, estimate in live.items()}
+    in_truth = {name: moved(getattr(live, name), offline.transform) for name in ('sfa', 'ekf')}
     estimates = {**offline.estimates, **in_truth}
     scores = {name: score(offline.truth, estimate) for name, estimate in estimates.items()}
     counts = {name: count for name, count in offline.counts.items() if name != 'fusion'}
-    counts['published'] = {name: len(estimate) for name, estimate in live.items()}
+    counts['published'] = {name: len(estimate) for name, estimate in in_truth.items()}
     result = replace(offline, estimates=estimates, scores=scores, counts=counts)
     return result, mean_distance(estimates['ekf'], offline.estimates['ekf'])
 

@@ -5,20 +5,32 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
 from sfa_localization.commands.options import add_settings, settings
-from sfa_localization.commands.pace import PlayConfig
-from sfa_localization.commands.processes import terminable
+from sfa_localization.data.settings import Settings, setting
 
 WRITES = 'no file: it publishes'
 EXAMPLES = """\
   play bags/sample
   play bags/sample --rate 2 --loop --clock
-  play bags/sample --start-offset 10 --topics /panorama/compressed /odom
+  play bags/sample --start-offset 10 --topics /panorama/compressed /odom"""
 
-keys: space pauses, s or right arrow plays one message, up and down change the rate,
-Ctrl-C ends the replay"""
+
+@dataclass(frozen=True, slots=True)
+class PlayConfig(Settings):
+    """How a bag is replayed."""
+
+    rate: float = setting(1.0, 'speed of the replay', unit='x', low=1e-3, high=1e6)
+    start_offset: float = setting(0.0, 'begin this far into the bag', unit='s', low=0.0, high=1e9)
+    wait: float = setting(
+        20.0,
+        'longest wait for subscribers of images and odometry before the start',
+        unit='s',
+        low=0.0,
+        high=3600.0,
+    )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,31 +41,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--clock', action='store_true', help='publish the time of the bag on /clock'
     )
     parser.add_argument('--topics', nargs='+', default=(), metavar='T', help='only these topics')
-    parser.add_argument(
-        '--wait-for',
-        nargs='+',
-        default=(),
-        metavar='T',
-        help='topics that need a subscriber first; none: one of images and one of odometry',
-    )
-    parser.add_argument('--strict', action='store_true', help='reject a damaged bag')
     add_settings(parser, PlayConfig)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay; print the number of messages by topic."""
-    with terminable():
-        from sfa_localization.commands.bag_player import play
+    from sfa_localization.commands.bag_player import play
 
     played = play(
         arguments.bag,
-        config=settings(PlayConfig, arguments),
+        settings(PlayConfig, arguments),
         loop=arguments.loop,
         clock=arguments.clock,
         topics=arguments.topics,
-        wait_for=arguments.wait_for,
-        strict=arguments.strict,
     )
-    for topic, count in sorted(played.messages.items()):
+    for topic, count in sorted(played.items()):
         print(f'{topic}: {count} messages')
     return 0

@@ -5,12 +5,10 @@
 from __future__ import annotations
 
 import signal
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
-from types import FrameType
 
 from sfa_localization.data.errors import NodeError
 
@@ -31,10 +29,16 @@ class Processes:
         return self
 
     def __exit__(self, *_error: object) -> None:
-        """Interrupt all, then terminate and finally kill those that do not end in time."""
-        with _interrupt_ignored():
+        """Interrupt all, then terminate and finally kill those that do not end in time.
+
+        A second Ctrl-C is ignored meanwhile: no program must be left running.
+        """
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
                 self._stop(number)
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     def start(self, name: str, command: Sequence[str]) -> None:
         """Start a program under a unique name."""
@@ -72,41 +76,5 @@ class Processes:
         for process in alive:
             process.send_signal(number)
         for process in alive:
-            try:
+            with suppress(TimeoutExpired):
                 process.wait(self._stop_timeout_s)
-            except TimeoutExpired:
-                continue
-
-
-@contextmanager
-def _interrupt_ignored() -> Iterator[None]:
-    """Ignore a second Ctrl-C: no program must be left running."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block like Ctrl-C, so that it can clean up."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signals = (signal.SIGTERM, signal.SIGHUP)
-    # Signals that are ignored, as after nohup, stay ignored.
-    handled = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, interrupt) for number in handled}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -42,15 +42,15 @@ def plain_ekf(odometry: filtering.Table, positions: filtering.Table, start: np.n
     result: Result = [], [], [], []
     for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, positions.stamps_ns):
         if kind == IMAGE:
-            z = np.array([positions.columns['x'][i], positions.columns['y'][i]])
-            s = p[:2, :2] + np.diag([positions.columns['var_x'][i], positions.columns['var_y'][i]])
+            z = positions.values[i, :2]
+            s = p[:2, :2] + np.diag(positions.values[i, 2:4])
             fits = bool((z - x[:2]) @ np.linalg.solve(s, z - x[:2]) < GATE)
             if fits:
                 gain = p[:, :2] @ np.linalg.inv(s)
                 x, p = x + gain @ (z - x[:2]), p - gain @ p[:2]
             result[3].append((stamp_ns, fits))
             continue
-        v, omega = odometry.columns['v'][i], odometry.columns['omega'][i]
+        v, omega = odometry.values[i, :2]
         dt, before = (stamp_ns - before) * 1e-9, stamp_ns
         c, s = np.cos(x[2]), np.sin(x[2])
         f = np.array([[1, 0, -v * dt * s], [0, 1, v * dt * c], [0, 0, 1]])
@@ -70,8 +70,7 @@ def judged(truth: Trajectory, stamps_ns: np.ndarray, poses: np.ndarray, covarian
     miss = poses[late] - truth.at(stamps_ns[late])
     yaw = wrap_angle(miss[:, 2])
     solved = np.linalg.solve(covariances[late, :2, :2], miss[:, :2, None])[:, :, 0]
-    measured = np.column_stack([positions.columns['x'], positions.columns['y']])
-    off = np.hypot(*(measured - truth.at(positions.stamps_ns)[:, :2]).T)
+    off = np.hypot(*(positions.values[:, :2] - truth.at(positions.stamps_ns)[:, :2]).T)
     good = positions.stamps_ns[off < GOOD_M]
     inside = (miss[:, :2] * solved).sum(1) <= chi2.ppf(0.95, 2)
     yaw_inside = yaw**2 <= chi2.ppf(0.95, 1) * covariances[late, 2, 2]
@@ -89,8 +88,8 @@ def compare(log: str) -> dict[str, dict[str, float]]:
     with tempfile.TemporaryDirectory() as folder:
         paths = [_plain(Path(f'{log}_{end}'), Path(folder)) for end in
                  ('odom.csv', 'positions.csv', 'truth.tum')]  # fmt: skip
-        odometry = filtering.read_odometry_table(paths[0])
-        positions = filtering.read_position_table(paths[1])
+        odometry = filtering.read_table(paths[0], filtering.ODOMETRY)
+        positions = filtering.read_table(paths[1], filtering.POSITIONS)
         truth = read_tum(paths[2])
     stamps, poses, covariances, fates = plain_ekf(
         odometry, positions, truth.at(odometry.stamps_ns[:1])[0]

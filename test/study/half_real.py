@@ -18,7 +18,7 @@ from sfa_localization.commands.options import add_settings, numbers, settings
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, integrate
-from sfa_localization.filtering import read_odometry_table, read_truth
+from sfa_localization.filtering import ODOMETRY, read_table
 from sfa_localization.simulation.drive import START_NS, Drive, record
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig
@@ -79,13 +79,19 @@ def _image_stamps(truth: Trajectory, config: SimulationConfig) -> Stamps:
 
 def measured(log: Path) -> Odometry:
     """What a log says; its poses are zero, and variances that it does not state."""
-    table = read_odometry_table(log)
-    columns = [
-        np.nan_to_num(table.columns.get(name, np.zeros(len(table))))
-        for name in ('v', 'omega', 'var_v', 'var_omega')
-    ]
-    stamps, values = table.stamps_ns, np.column_stack(columns)
+    table = read_table(log, ODOMETRY)
+    stamps, values = table.stamps_ns, np.nan_to_num(table.values)
     return Odometry(stamps, np.zeros((len(stamps), 3)), values[:, :2], values[:, 2:])
+
+
+def read_truth(path: Path) -> Trajectory:
+    """True poses: columns stamp_s,x_m,y_m,yaw_rad, or TUM lines. Raises DataError."""
+    table = read_table(path, ('stamp_s', 'x_m', 'y_m', 'z', 'qx', 'qy', 'qz', 'qw', 'yaw_rad'))
+    x, y, _, qx, qy, qz, qw, yaw = table.values.T
+    turned = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
+    stamps, first = np.unique(table.stamps_ns, return_index=True)
+    poses = np.column_stack([x, y, np.where(np.isfinite(yaw), yaw, turned)])
+    return Trajectory(stamps, poses[first])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
