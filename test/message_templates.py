@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The texts of errors and states in the code, with … for what is filled in."""
+"""The texts of states in the code, with … for what is filled in."""
 
 import ast
 import re
@@ -10,7 +10,6 @@ from pathlib import Path
 from sfa_localization.data import errors
 
 PACKAGE = Path(errors.__file__).parents[1]
-ERRORS = {name for name in vars(errors) if name.endswith('Error')}
 REASONS = {
     'fusion/status.py': (
         'status_of',
@@ -51,26 +50,6 @@ def template(node: ast.AST) -> str:
 def is_sentence(text: str) -> bool:
     """Whether it says something by itself."""
     return len(re.findall(r'[A-Za-z]{2,}', text.replace('…', ' '))) >= 2
-
-
-def error_templates() -> Iterator[tuple[str, str]]:
-    """File and text of each error in the code."""
-    for path in sorted(PACKAGE.rglob('*.py')):
-        tree = ast.parse(path.read_text('utf-8'))
-        named = {
-            target.id: template(node.value)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.Assign)
-            for target in node.targets
-            if isinstance(target, ast.Name)
-        }
-        for node in ast.walk(tree):
-            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
-                continue
-            what = node.args[0]
-            text = named.get(what.id, '') if isinstance(what, ast.Name) else template(what)
-            if node.func.id in ERRORS and is_sentence(text):
-                yield str(path.relative_to(PACKAGE)), text
 
 
 def reason_templates() -> Iterator[tuple[str, str]]:
