@@ -220,7 +220,7 @@ def test_a_late_subscriber_of_images_misses_none(context, tmp_path, messages):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_a_loop_cleanly(number, context, tmp_path, messages):
+def test_signals_end_it_cleanly(number, context, tmp_path, messages):
     path = reliable(messages, tmp_path / 'bag')
     command = [sys.executable, '-m', 'sfa_localization', 'play', str(path), '--loop', '--rate=9']
     environment = {**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN)}

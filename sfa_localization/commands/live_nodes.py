@@ -54,7 +54,7 @@ class Timeouts:
 
     start_s: float = 60.0  # until all nodes are connected, on a busy machine
     settle_s: float = 2.0  # without an output after the replay, which ends the recording
-    stop_s: float = 10.0  # until a process has ended after a signal
+    stop_s: float = 10.0  # until outputs, or a process after a signal, have ended
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,9 @@ def run_live(
             recorder.spin(0.2)
             processes.require_alive(NODES)
         ended_s, state = time.monotonic(), recorder.state
-        while time.monotonic() - max(recorder.last_s, ended_s) < timeouts.settle_s:
+        while (now_s := time.monotonic()) < ended_s + timeouts.stop_s:
+            if now_s - max(recorder.last_s, ended_s) > timeouts.settle_s:
+                break
             recorder.spin(0.1)
         processes.require_alive(NODES)
         for name in NODES:
