@@ -4,7 +4,6 @@
 
 import ast
 import os
-import re
 import runpy
 import statistics
 import subprocess
@@ -46,7 +45,7 @@ ROS = {
 }
 # The rooms: which other rooms each may import (always its own), and which packages beyond the
 # standard library. A module belongs to its folder, or is a room of its own; there is no
-# default, so a new one must be added here, and to the diagram and the table of CONTRIBUTING.
+# default, so a new one must be added here, and to the diagram of CONTRIBUTING.
 NUMERIC = {'numpy', 'scipy'}
 CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
@@ -143,11 +142,11 @@ def room(module: str) -> str:
     return module.split('.')[1] if '.' in module else '__init__'
 
 
-def wrong_imports(module: str, imported: Iterable[str]) -> set[str]:
+def wrong_imports(module: str) -> set[str]:
     """Return which of the full names that a module imports its room may not have."""
     rooms, packages = ROOMS[room(module)]
     wrong = set()
-    for name in imported:
+    for name in imports(module):
         top = name.split('.')[0]
         if top != NAME:
             allowed = top in packages or top in sys.stdlib_module_names
@@ -164,36 +163,15 @@ def wrong_imports(module: str, imported: Iterable[str]) -> set[str]:
 def test_modules_import_only_what_their_rooms_may():
     """And nothing runs code from files that it reads; only nodes and commands know ROS."""
     assert set(ROOMS) == {room(module) for module in MODULES}
-    assert {m: wrong for m in MODULES if (wrong := wrong_imports(m, imports(m)))} == {}
+    assert {m: wrong for m in MODULES if (wrong := wrong_imports(m))} == {}
     assert [m for m in MODULES if {name.split('.')[0] for name in imports(m)} & UNSAFE] == []
     with_ros = {room(module) for module in MODULES if foreign(module) & ROS}
     assert with_ros == {'nodes', 'commands'}
 
 
-def test_a_wrong_import_is_found():
-    for module, imported in {
-        'metric.phases': f'{NAME}.bags.drives.read_drive',
-        'camera.capture': f'{NAME}.nodes.settings.NodeConfig',
-        'config': f'{NAME}.nodes.lifecycle.BaseNode',
-        'data.run': 'scipy.linalg',
-        'localizer': f'{NAME}.training.train',
-        'cli': 'study.tables.Work',
-    }.items():
-        assert wrong_imports(f'{NAME}.{module}', [imported]) == {imported}
-    with pytest.raises(KeyError):
-        wrong_imports(f'{NAME}.helpers', ['numpy'])
-
-
-def test_contributing_shows_the_same_rooms_and_arrows():
-    text = (ROOT / 'CONTRIBUTING.md').read_text('utf-8')
-    rows = re.findall(r'^\| `(\w+)` \| ((?:`\w+`(?:, )?)+|nothing) \|$', text, re.MULTILINE)
-    assert {name: set(re.findall(r'`(\w+)`', others)) for name, others in rows} == {
-        name: others for name, (others, _packages) in ROOMS.items()
-    }
-    diagram = text.split('```')[1]
-    assert [
-        name for name in ROOMS if name[0] != '_' and not re.search(rf'\b{name}\b', diagram)
-    ] == []
+def test_contributing_shows_each_room():
+    diagram = (ROOT / 'CONTRIBUTING.md').read_text('utf-8').split('```')[1]
+    assert [name for name in ROOMS if name[0] != '_' and name not in diagram] == []
 
 
 LONGEST_FUNCTION, TYPICAL_FUNCTION = 40, 8
@@ -277,10 +255,10 @@ def test_pip_installs_one_command_and_the_nodes_and_colcon_every_command_for_ros
         assert executables(command) == {n: e for n, e in expected.items() if n not in scripts}
 
 
-def run_python(*words, cwd=ROOT, **environment):
+def run_python(*words, **environment):
     """Run a program of Python until it ends."""
     return subprocess.run(
-        [sys.executable, *map(str, words)], cwd=cwd, env={**os.environ, **environment},
+        [sys.executable, *map(str, words)], cwd=ROOT, env={**os.environ, **environment},
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
 
@@ -347,14 +325,6 @@ def test_commands_show_examples_before_their_options():
         assert ' '.join(summary.split()) in ' '.join(text.split()) and f'  {name}' in examples
 
 
-@pytest.mark.parametrize('command', ['filter x.csv x.csv --output x.tum', 'inspect x --report y'])
-def test_a_wrong_variable_that_nothing_needs_is_ignored(command, tmp_path):
-    variables = {'SOURCE_DATE_EPOCH': '99999999999999999', 'MPLBACKEND': 'abc'}
-    done = run_python('-m', NAME, *command.split(), cwd=tmp_path, PYTHONPATH=str(ROOT), **variables)
-    assert done.returncode == 1 and 'Traceback' not in done.stderr
-    assert 'no such' in done.stderr.lower()
-
-
 def test_a_missing_package_is_named_with_its_remedy_if_it_is_optional(capsys):
     def run(name):
         raise ModuleNotFoundError(f'No module named {name!r}', name=name)
@@ -379,18 +349,3 @@ def test_ctrl_c_while_a_command_is_imported_is_one_line(cause, monkeypatch, caps
     for words in (['config'], ['ekf_node']):
         assert cli.main(words) == 130
         assert capsys.readouterr().err == 'interrupted\n'
-
-
-def test_sigterm_while_play_is_imported_is_one_line():
-    code = """
-import os, signal, sys
-from sfa_localization import cli
-class Finder:
-    def find_spec(self, name, *_):
-        if name == 'sfa_localization.commands.bag_player':
-            os.kill(os.getpid(), signal.SIGTERM)
-sys.meta_path.insert(0, Finder())
-sys.exit(cli.main(['play', 'bag']))
-"""
-    done = run_python('-c', code)
-    assert (done.returncode, done.stderr) == (130, 'interrupted\n')

@@ -60,9 +60,10 @@ def require_kind(output: Path, *suffixes: str) -> None:
 
 def require_report(folder: Path | None, other: Path | None) -> None:
     """Raise LocalizationError before the work where a report cannot have its folder, or where it
-    would replace the other output.
+    would replace the other output, or files that no report has written.
     """
     from sfa_localization.bags.recording import METADATA
+    from sfa_localization.reports.page import MARK, PAGE
 
     if folder is None:
         return
@@ -70,28 +71,15 @@ def require_report(folder: Path | None, other: Path | None) -> None:
         raise LocalizationError(f'{folder}: is no folder: give --report another name')
     if (folder / METADATA).exists():
         raise LocalizationError(f'{folder}: is a bag: give --report a folder of its own')
-    if folder.is_dir():
-        _require_own_page(folder)
-    if other is None:
-        return
-    place, file = resolved(folder), resolved(other)
-    in_report = file.parent == place and file.suffix.lower() in REPORT_FILES
-    if in_report or file in (place, *place.parents):
-        raise LocalizationError(f'{other}: named for two outputs: give each its own')
-
-
-def _require_own_page(folder: Path) -> None:
-    """Raise LocalizationError where a folder without a page of these reports holds files such as
-    they write.
-    """
-    from sfa_localization.reports.page import MARK, PAGE
-
-    require_outputs([folder / PAGE], [])
-    if MARK.encode() in first_bytes(folder / PAGE):
-        return
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() in REPORT_FILES and first_bytes(file):
-            raise LocalizationError(f'{file}: is no report: give --report another folder')
+    if MARK.encode() not in first_bytes(folder / PAGE):
+        for file in sorted(folder.glob('*')):
+            if file.suffix.lower() in REPORT_FILES and first_bytes(file):
+                raise LocalizationError(f'{file}: is no report: give --report another folder')
+    if other is not None:
+        place, file = resolved(folder), resolved(other)
+        in_report = file.parent == place and file.suffix.lower() in REPORT_FILES
+        if in_report or file in (place, *place.parents):
+            raise LocalizationError(f'{other}: named for two outputs: give each its own')
 
 
 def add_settings(
