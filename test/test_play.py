@@ -146,7 +146,7 @@ def test_every_message_arrives_as_recorded(ros1, context, tmp_path, messages):
     path = tmp_path / 'bag'
     path = write_ros1(path / 'a.bag', messages) if ros1 else reliable(messages, path)
     with Listener(context, TOPICS) as listener:
-        played = play(path, config=FAST, context=context)
+        played = play(path, FAST, context=context)
         until(lambda: len(listener.heard['/image_raw']) == IMAGES)
         until(lambda: len(listener.heard['/imu']) == COUNTS['/imu'])
     assert played == COUNTS
@@ -208,9 +208,7 @@ def test_a_late_subscriber_of_images_misses_none(context, tmp_path, messages):
     """The subscriber of odometry was there long before: nodes start one after another."""
     path, played = reliable(messages, tmp_path / 'bag'), []
     with Listener(context, {'/odom': Odometry}):
-        thread = threading.Thread(
-            target=lambda: played.append(play(path, config=FAST, context=context))
-        )
+        thread = threading.Thread(target=lambda: played.append(play(path, FAST, context=context)))
         thread.start()
         thread.join(3 * SETTLED_S)
         with Listener(context, {'/image_raw': Image}) as late:

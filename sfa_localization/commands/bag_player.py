@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -33,9 +33,11 @@ from rosgraph_msgs.msg import Clock
 
 from sfa_localization.bags.decoding import COMPRESSED, IMAGE, ODOMETRY, typestore
 from sfa_localization.bags.reader import Bag
-from sfa_localization.commands.play import PlayConfig
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.rejections import encodable
+
+if TYPE_CHECKING:
+    from sfa_localization.commands.play import PlayConfig
 
 DEPTH = 10  # of a publisher's queue, in messages
 LATCHED_DEPTH = 100  # of the queue that late subscribers receive, in messages
@@ -45,7 +47,7 @@ CLOCK_PERIOD_S = 0.025  # of /clock, as `ros2 bag play --clock` has
 
 def play(
     path: Path | str,
-    config: PlayConfig | None = None,
+    config: PlayConfig,
     *,
     loop: bool = False,
     clock: bool = False,
@@ -58,7 +60,7 @@ def play(
     their number is stable, or after the configured wait. `context` must be initialized; by default
     one is created. Raises BagError.
     """
-    config, played = config or PlayConfig(), Counter[str]()
+    played = Counter[str]()
     with _node(context) as node, Bag(path) as bag:
         publishers = _publishers(node, bag, topics)
         start_ns = bag.recording.start_ns + int(config.start_offset * 1e9)

@@ -62,11 +62,11 @@ def require_report(folder: Path | None, other: Path | None) -> None:
     """Raise LocalizationError before the work where a report cannot have its folder, or where it
     would replace the other output, or files that no report has written.
     """
+    if folder is None:
+        return
     from sfa_localization.bags.recording import METADATA
     from sfa_localization.reports.page import MARK, PAGE
 
-    if folder is None:
-        return
     if folder.exists() and not folder.is_dir():
         raise LocalizationError(f'{folder}: is no folder: give --report another name')
     if (folder / METADATA).exists():
