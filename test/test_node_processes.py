@@ -162,7 +162,7 @@ UNREADABLE = [
     (['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
     (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
     (['-r', 'odom'], "remap rule: '-r odom'"),
-    (['--lost_std', '2'], 'unknown arguments after --ros-args: '),
+    (['--lost_std', '2'], "ROS cannot use its arguments: ['--lost_std', '2']"),
     (['--', '--lost_std', '2'], 'unknown arguments --lost_std 2: give parameters as --ros-args -p'),
 ]
 

@@ -17,13 +17,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import (
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    Quaternion,
-    QuaternionStamped,
-    TransformStamped,
-)
+from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import CompressedImage
@@ -32,22 +26,16 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 from sfa_localization.camera.encodings import encode_jpeg, read_compressed, read_raw
 from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data import messages
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError, MessageError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.messages import (
-    NANOSECONDS,
-    read_planar,
-    read_stamp,
-    read_twist,
-    read_yaw,
-    require_sane,
-)
+from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
 from sfa_localization.data.run import Image
 
 _FIXED_VARIANCE = 1e-6
 """Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""
-_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+_PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
 _CORRELATION = 'share, distance_m'
 
 
@@ -69,9 +57,9 @@ def to_stamp(stamp_ns: int) -> Time:
     return Time(sec=seconds, nanosec=rest)
 
 
-def to_quaternion(yaw_rad: float) -> Quaternion:
+def to_quaternion(yaw_rad: float) -> geometry.Quaternion:
     """Turn about the vertical."""
-    return Quaternion(z=float(math.sin(yaw_rad / 2)), w=float(math.cos(yaw_rad / 2)))
+    return geometry.Quaternion(z=float(math.sin(yaw_rad / 2)), w=float(math.cos(yaw_rad / 2)))
 
 
 def read_image(message: ImageMessage | CompressedImage) -> tuple[int, Image]:
@@ -84,7 +72,7 @@ def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
     """A bgr8 message of an image (H, W, 3) uint8."""
     image = np.ascontiguousarray(image, np.uint8)
     message = ImageMessage(encoding='bgr8', is_bigendian=0)
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    _head(message, stamp_ns, frame)
     message.height, message.width = int(image.shape[0]), int(image.shape[1])
     message.step = message.width * 3
     message.data = array.array('B', image.tobytes())
@@ -94,7 +82,7 @@ def to_image(image: Image, stamp_ns: int, frame: str) -> ImageMessage:
 def to_compressed(image: Image, stamp_ns: int, frame: str, quality: int) -> CompressedImage:
     """A JPEG message of an image (H, W, 3) uint8 BGR."""
     message = CompressedImage(format='bgr8; jpeg compressed bgr8')
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    _head(message, stamp_ns, frame)
     message.data = array.array('B', encode_jpeg(image, quality))
     return message
 
@@ -120,11 +108,11 @@ def read_info(message: String) -> PanoramaConfig:
 
 def read_odometry(message: Odometry) -> Motion:
     """The planar motion of an odometry message; variances of 0 mean that they are unknown."""
-    v, omega, *variances = read_twist(message)
+    v, omega, *variances = messages.read_twist(message)
     pose = message.pose.pose
     return Motion(
         stamp_ns=read_stamp(message.header.stamp),
-        pose=np.array(read_planar(pose.position, pose.orientation)),
+        pose=np.array(messages.read_planar(pose.position, pose.orientation)),
         twist=(v, omega),
         variances=(variances[0], variances[1]),
         frame=message.header.frame_id,
@@ -132,9 +120,9 @@ def read_odometry(message: Odometry) -> Motion:
     )
 
 
-def read_pose(message: PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
+def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
     """Stamp, pose (3,) and covariance (3, 3) of [x, y, yaw]; all zeros where it is unknown."""
-    pose = np.array(read_planar(message.pose.pose.position, message.pose.pose.orientation))
+    pose = np.array(messages.read_planar(message.pose.pose.position, message.pose.pose.orientation))
     covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[_PLANAR]
     require_sane('covariance', *covariance.ravel().tolist())
     if np.any(np.diag(covariance) < 0):
@@ -144,22 +132,22 @@ def read_pose(message: PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
     return read_stamp(message.header.stamp), pose, covariance
 
 
-def to_pose(pose: ArrayLike, stamp_ns: int, frame: str) -> PoseStamped:
+def to_pose(pose: ArrayLike, stamp_ns: int, frame: str) -> geometry.PoseStamped:
     """A pose (3,) as a message; an unknown (NaN) yaw becomes 0, because a pose has none."""
-    message = PoseStamped()
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
-    _fill(message.pose, np.asarray(pose, float))
+    message = geometry.PoseStamped()
+    _head(message, stamp_ns, frame)
+    _fill(message.pose, pose)
     return message
 
 
 def to_pose_with_covariance(
     pose: ArrayLike, covariance: Array, stamp_ns: int, frame: str
-) -> PoseWithCovarianceStamped:
+) -> geometry.PoseWithCovarianceStamped:
     """A pose (3,) and its covariance (3, 3) as a message."""
-    message = PoseWithCovarianceStamped()
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
-    _fill(message.pose.pose, np.asarray(pose, float))
-    message.pose.covariance = to_covariance(covariance)
+    message = geometry.PoseWithCovarianceStamped()
+    _head(message, stamp_ns, frame)
+    _fill(message.pose.pose, pose)
+    message.pose.covariance = _full(covariance, _PLANAR)
     return message
 
 
@@ -173,26 +161,23 @@ def to_odometry(
 ) -> Odometry:
     """Pose in frames[0] and twist (v, omega) in frames[1], with (3, 3) and (2, 2) covariances."""
     message = Odometry(child_frame_id=frames[1])
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frames[0]
-    _fill(message.pose.pose, np.asarray(pose, float))
-    message.pose.covariance = to_covariance(covariance)
-    v, omega = (float(value) for value in np.asarray(twist, float))
+    _head(message, stamp_ns, frames[0])
+    _fill(message.pose.pose, pose)
+    message.pose.covariance = _full(covariance, _PLANAR)
+    v, omega = np.asarray(twist, float).tolist()
     message.twist.twist.linear.x, message.twist.twist.angular.z = v, omega
-    full = np.diag([_FIXED_VARIANCE] * 6)
-    full[np.ix_([0, 5], [0, 5])] = twist_covariance
-    message.twist.covariance = full.ravel()
+    message.twist.covariance = _full(twist_covariance, _TWIST)
     return message
 
 
-def to_transform(pose: ArrayLike, stamp_ns: int, frames: tuple[str, str]) -> TransformStamped:
+def to_transform(pose: ArrayLike, stamp_ns: int, frames: tuple[str, str]) -> Any:
     """Pose (3,) of frames[1] in frames[0] as a transform from the one to the other."""
-    value = np.asarray(pose, float)
-    require_sane('output', *value.tolist())
-    message = TransformStamped(child_frame_id=frames[1])
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frames[0]
-    message.transform.translation.x = float(value[0])
-    message.transform.translation.y = float(value[1])
-    message.transform.rotation = to_quaternion(float(value[2]))
+    x, y, yaw = np.asarray(pose, float).tolist()
+    require_sane('output', x, y, yaw)
+    message = geometry.TransformStamped(child_frame_id=frames[1])
+    _head(message, stamp_ns, frames[0])
+    message.transform.translation.x, message.transform.translation.y = x, y
+    message.transform.rotation = to_quaternion(yaw)
     return message
 
 
@@ -204,17 +189,17 @@ def to_array(values: ArrayLike, label: str) -> Float64MultiArray:
     return message
 
 
-def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> QuaternionStamped:
+def to_turned(yaw_rad: float, stamp_ns: int, frame: str) -> geometry.QuaternionStamped:
     """How far images have turned about the vertical, from any start."""
     require_sane('output', yaw_rad)
-    message = QuaternionStamped(quaternion=to_quaternion(yaw_rad))
-    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+    message = geometry.QuaternionStamped(quaternion=to_quaternion(yaw_rad))
+    _head(message, stamp_ns, frame)
     return message
 
 
-def read_turned(message: QuaternionStamped) -> tuple[int, float]:
+def read_turned(message: geometry.QuaternionStamped) -> tuple[int, float]:
     """Stamp ns and yaw rad. Raises MessageError."""
-    return read_stamp(message.header.stamp), read_yaw(message.quaternion)
+    return read_stamp(message.header.stamp), messages.read_yaw(message.quaternion)
 
 
 def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:
@@ -232,14 +217,19 @@ def read_error_correlation(message: Float64MultiArray) -> ErrorCorrelation:
         raise MessageError(str(error)) from None
 
 
-def to_covariance(covariance: Array) -> NDArray[np.float64]:
-    """The 36 numbers of a message from a (3, 3) covariance of [x, y, yaw]."""
+def _full(covariance: Array, places: Any) -> NDArray[np.float64]:
+    """The 36 numbers of a message, of which those at these places are known."""
     full = np.diag([_FIXED_VARIANCE] * 6)
-    full[_PLANAR] = np.asarray(covariance, float)
+    full[places] = covariance
     return full.ravel()
 
 
-def _fill(message: Any, pose: Array) -> None:
-    require_sane('output', *pose[:2].tolist())
-    message.position.x, message.position.y = float(pose[0]), float(pose[1])
-    message.orientation = to_quaternion(float(pose[2]) if math.isfinite(pose[2]) else 0.0)
+def _head(message: Any, stamp_ns: int, frame: str) -> None:
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), frame
+
+
+def _fill(message: Any, pose: ArrayLike) -> None:
+    x, y, yaw = np.asarray(pose, float).tolist()
+    require_sane('output', x, y)
+    message.position.x, message.position.y = x, y
+    message.orientation = to_quaternion(yaw if math.isfinite(yaw) else 0.0)

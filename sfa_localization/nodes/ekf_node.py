@@ -15,7 +15,6 @@ from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -29,13 +28,7 @@ from sfa_localization.fusion.status import uncertainty
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.broadcast import Broadcast
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import (
-    LocalizationNode,
-    latched_qos,
-    reliable_qos,
-    run_node,
-    sensor_qos,
-)
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, run_node, sensor_qos
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.saved_pose import SAVE_PERIOD_S, SavedPose, load_pose, save_pose
 from sfa_localization.nodes.settings import EkfNodeConfig
@@ -97,7 +90,7 @@ class EkfNode(LocalizationNode):
         ):
             self.subscribe(kind, topic, receive, latched_qos(), while_inactive=True)
         for topic in ('initialpose', '~/set_pose'):
-            self.subscribe(pose, topic, self._set_pose, reliable_qos(1))
+            self.subscribe(pose, topic, self._set_pose, 1)
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
@@ -118,7 +111,7 @@ class EkfNode(LocalizationNode):
         self._transform = self.publisher(geometry.TransformStamped, 'ekf/map_to_odom')
         self._tf = None
         if self._config.publish_tf and TFMessage is not None:
-            self._tf = self.publisher(TFMessage, '/tf', QoSProfile(depth=100))
+            self._tf = self.publisher(TFMessage, '/tf', 100)
         elif self._config.publish_tf:
             self.get_logger().warning(
                 'tf2_msgs is not installed: map -> odom goes to ekf/map_to_odom only, not to /tf'

@@ -23,6 +23,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from std_msgs.msg import Header
 
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.rejections import short_line
@@ -33,6 +34,7 @@ from sfa_localization.nodes.discovery import PATIENCE_S
 from sfa_localization.nodes.monitor import Monitor, steady_s
 from sfa_localization.nodes.settings import NodeConfig
 
+_PACKAGE = 'sfa_localization'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
 _AWAKE_S = 0.5  # between looks whether a signal has come
@@ -45,17 +47,9 @@ def sensor_qos(depth: int = 5) -> QoSProfile:
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def reliable_qos(depth: int = 10) -> QoSProfile:
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
-
-
 def latched_qos() -> QoSProfile:
     """The last message reaches those who come later."""
-    return QoSProfile(
-        depth=1,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
+    return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class LocalizationNode(LifecycleNode):  # type: ignore[misc]
@@ -66,9 +60,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def __init__(self, name: str, kinds: Sequence[type[Settings]], **options: Any) -> None:
         super().__init__(name, **options)
-        # rclpy makes this one without `create_service`.
-        change = self._service_change_state
-        change.callback = self._guarded('change_state', change.callback)
+        # What rclpy itself makes: services of parameters and of the life cycle, and /clock.
+        for made in self.services:
+            made.callback = self._guarded(made.srv_name.rpartition('/')[2], made.callback)
+        for heard in self.subscriptions:
+            heard.callback = self._guarded(heard.topic_name, heard.callback)
         self.active = False
         self.failure = ''
         self.monitors: dict[str, Monitor] = {}
@@ -116,21 +112,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     ) -> DiagnosticArray:
         """One status, with the node's name and namespace, about a part of it."""
         name = f'{self.get_fully_qualified_name().lstrip("/")}: {part}'
-        status = DiagnosticStatus(
-            level=level, name=name, message=text, hardware_id='sfa_localization'
-        )
+        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=_PACKAGE)
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = stamp
-        return message
+        return DiagnosticArray(header=Header(stamp=stamp), status=[status])
 
-    def publisher(self, kind: Any, topic: str, qos: QoSProfile | None = None) -> Any:
-        """A publisher that is silent until activation; its QoS can be overridden by parameters."""
+    def publisher(self, kind: Any, topic: str, qos: QoSProfile | int = 10) -> Any:
+        """A publisher that is silent until activation; its QoS can be overridden by parameters.
+
+        A number is the depth of a reliable one.
+        """
         made = self.create_lifecycle_publisher(
-            kind,
-            topic,
-            qos or reliable_qos(),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
         self._entities.append((self.destroy_lifecycle_publisher, made))
         return made
@@ -140,7 +132,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         kind: Any,
         topic: str,
         callback: Callable[[Any], None],
-        qos: QoSProfile | None = None,
+        qos: QoSProfile | int,
         *,
         while_inactive: bool = False,
         instead: str = '',
@@ -155,7 +147,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             kind,
             instead or topic,
             self.receiver(topic, callback, while_inactive),
-            qos or sensor_qos(),
+            qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self._entities.append((self.destroy_subscription, made))
@@ -208,18 +200,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return f'{resolved}/{transport}'
 
     def service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        """A service that answers with success and message also where its callback raises."""
+        """A service of success and message; a LocalizationError gives the reason why not."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
                 return callback(request, response)
             except LocalizationError as error:
-                response.success, response.message = False, str(error)
-            except Exception as error:
-                response.success, response.message = False, self.defect(name, error)
+                response.message = str(error)
             return response
 
-        self._entities.append((self.destroy_service, self.create_service(kind, name, answer)))
+        made = self.create_service(kind, name, self._guarded(name, answer))
+        self._entities.append((self.destroy_service, made))
 
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call at a steady period: simulated time may stop, and wall time may step back."""
@@ -246,7 +237,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
         Returns how many of this reason there have been.
         """
-        count = self.monitor(topic).refuse(reason)
+        count = self.monitor(topic).refused.add(reason)
         if count == 1 or count % 1000 == 0:
             self.get_logger().warning(f'{self.shown(topic)}: {short_line(reason)} ({count} so far)')
         return count
@@ -261,24 +252,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self.get_logger().error(traceback.format_exc())
         return reason
 
-    # What rclpy itself makes: the services of parameters and of the life cycle, and /clock.
-
-    def create_service(
-        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any
-    ) -> Any:
-        """A service, by rclpy too, whose requests end nothing."""
-        guarded = self._guarded(srv_name.rpartition('/')[2], callback)
-        return super().create_service(srv_type, srv_name, guarded, **options)
-
-    def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[..., Any], *more: Any, **options: Any
-    ) -> Any:
-        """A subscription, by rclpy too, whose messages end nothing: /clock may be negative."""
-        guarded = self._guarded(topic, callback)
-        return super().create_subscription(msg_type, topic, guarded, *more, **options)
-
     def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """A callback that counts what it raises; the answer of a service is empty then."""
+        """A callback that counts what it raises: a clock may be negative, a transition may not fit.
+
+        The answer of a service is empty then.
+        """
 
         def call(*given: Any) -> Any:
             try:
@@ -384,7 +362,7 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     try:
         problem = _initialise(words)
         if problem:
-            rclpy.logging.get_logger('sfa_localization').fatal(problem)
+            rclpy.logging.get_logger(_PACKAGE).fatal(problem)
             return entry.CANNOT_START
         entry.leave_to_ros()
         # Made first: after a signal it could not be made any more.
@@ -403,9 +381,8 @@ def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = 
     except Exception as error:
         if isinstance(error, rclpy_implementation.RCLError) and not rclpy.ok():
             return 0
-        known = isinstance(error, LocalizationError)
-        text = str(error) if known else traceback.format_exc()
-        rclpy.logging.get_logger('sfa_localization').fatal(text)
+        text = str(error) if isinstance(error, LocalizationError) else traceback.format_exc()
+        rclpy.logging.get_logger(_PACKAGE).fatal(text)
         return entry.DIED if node is not None and node.active else entry.CANNOT_START
     finally:
         if node is not None:
@@ -419,11 +396,8 @@ def _initialise(words: list[str]) -> str:
     """Initialize ROS; the reason where its arguments or files cannot be used, else ''."""
     try:
         rclpy.init(args=words)
-    # Of unknown arguments its text is their list, and no more.
-    except rclpy_implementation.UnknownROSArgsError as error:
-        return f'unknown arguments after --ros-args: {error}'
-    except RuntimeError as error:  # the base of all of rclpy's
-        return str(error)
+    except RuntimeError as error:  # the base of all of rclpy's; some texts are a list of arguments
+        return f'ROS cannot use its arguments: {error}'
     others = ' '.join(rclpy.utilities.remove_ros_args(words)[1:])
     if not others:
         return ''

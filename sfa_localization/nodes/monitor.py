@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 
@@ -23,58 +24,39 @@ class Monitor:
     """Counts of messages received, used, and rejected by reason; latency of the last messages."""
 
     def __init__(self) -> None:
-        self.received = 0
-        self.used = 0
+        self.received = self.used = 0
         self.refused = RejectionCounter()
-        self.last_received_s: float | None = None
-        self._arrivals: deque[float] = deque(maxlen=_WINDOW)
-        self._latencies: deque[float] = deque(maxlen=_WINDOW)
+        self._arrivals_s: deque[float] = deque(maxlen=_WINDOW)
+        self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
 
     def receive(self) -> float:
         """Note an arrival; returns its steady time in seconds, for `use`."""
-        now = steady_s()
         self.received += 1
-        self.last_received_s = now
-        self._arrivals.append(now)
-        return now
+        self._arrivals_s.append(steady_s())
+        return self._arrivals_s[-1]
 
-    def use(self, received_s: float | None = None) -> None:
+    def use(self, received_s: float) -> None:
         """Note that the message that arrived at `received_s` has been processed by now."""
         self.used += 1
-        if received_s is not None:
-            self._latencies.append(steady_s() - received_s)
-
-    def refuse(self, reason: str) -> int:
-        """Count a rejection; returns how many of this reason there have been."""
-        return self.refused.add(reason)
+        self._latencies_s.append(steady_s() - received_s)
 
     def silent_for_s(self) -> float:
         """Seconds since the last arrival; infinite before the first."""
-        if self.last_received_s is None:
-            return float('inf')
-        return steady_s() - self.last_received_s
-
-    def rate_hz(self) -> float:
-        """Arrivals per second over the window; 0 with fewer than two."""
-        if len(self._arrivals) < 2:
-            return 0.0
-        span = max(steady_s(), self._arrivals[-1]) - self._arrivals[0]
-        return (len(self._arrivals) - 1) / max(span, 1e-9)
-
-    def latency_ms(self, percent: float) -> float:
-        """Percentile of the time from arrival to completion; 0 where there was none."""
-        if not self._latencies:
-            return 0.0
-        return float(np.percentile(self._latencies, percent) * 1e3)
+        return steady_s() - self._arrivals_s[-1] if self._arrivals_s else math.inf
 
     def values(self, prefix: str = '') -> dict[str, str]:
-        """Names and texts for a diagnostic status."""
+        """Names and texts for a diagnostic status: counts, arrivals per second over the window, and
+        percentiles of the time from arrival to completion.
+        """
+        span_s = steady_s() - self._arrivals_s[0] if self._arrivals_s else 0.0
+        rate_hz = max(len(self._arrivals_s) - 1, 0) / max(span_s, 1e-9)
+        p50, p99 = np.percentile(self._latencies_s or [0.0], [50, 99]) * 1e3
         texts = {
             f'{prefix}received': str(self.received),
             f'{prefix}used': str(self.used),
-            f'{prefix}rate [Hz]': f'{self.rate_hz():.1f}',
-            f'{prefix}latency p50 [ms]': f'{self.latency_ms(50):.2f}',
-            f'{prefix}latency p99 [ms]': f'{self.latency_ms(99):.2f}',
+            f'{prefix}rate [Hz]': f'{rate_hz:.1f}',
+            f'{prefix}latency p50 [ms]': f'{p50:.2f}',
+            f'{prefix}latency p99 [ms]': f'{p99:.2f}',
         }
         # Copied, because the thread of a feed may add to it meanwhile.
         refused = sorted(dict(self.refused).items())

@@ -8,7 +8,7 @@ without a subscriber, and of images that come too fast only the newest is used.
 
 from __future__ import annotations
 
-import threading
+from collections import deque
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -52,17 +52,16 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._listening_since_s: float | None = None
         self._feed: Feed | None = None
         self._arrival: Any = None
-        self._newest: tuple[int, Image] | None = None
-        self._newest_lock = threading.Lock()
+        self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
 
     # Life cycle.
 
     def setup(self) -> None:
         self._build_tables(self._unwrapper)
         self._frozen = FrozenWatch()
-        self._panoramas = self.publisher(ImageMessage, 'panorama', lifecycle.reliable_qos(2))
+        self._panoramas = self.publisher(ImageMessage, 'panorama', 2)
         compressed = self.following('panorama/compressed')
-        self._compressed = self.publisher(CompressedImage, compressed, lifecycle.reliable_qos(2))
+        self._compressed = self.publisher(CompressedImage, compressed, 2)
         info = self.following('panorama/info')
         self._info = self.publisher(String, info, lifecycle.latched_qos())
         raw = self._config.image_transport == 'raw'
@@ -94,7 +93,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._feed is not None:
             self._feed.stop()
             self.destroy_guard_condition(self._arrival)
-        self._feed = self._arrival = self._newest = self._listening_since_s = None
+        self._feed = self._arrival = self._listening_since_s = None
+        self._newest.clear()
 
     # Demand: without subscribers there is no subscription, and files wait.
 
@@ -131,22 +131,17 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _deliver(self, image: Image) -> None:
         """Called in the feed's thread: keep the newest image only, and wake the executor."""
-        with self._newest_lock:
-            self._newest = self.get_clock().now().nanoseconds, image
+        self._newest.append((self.get_clock().now().nanoseconds, image))
         self._arrival.trigger()
 
     def _reject(self, reason: str) -> None:
         self.refuse(self._input, reason)
 
     def _use_newest(self, _: None) -> None:
-        with self._newest_lock:
-            newest, self._newest = self._newest, None
-        if newest is None:
-            return
-        stamp_ns, image = newest
-        if stamp_ns <= 0:
-            raise MessageError('the clock has not started')
-        if self._wanted():
+        if self._newest and self._wanted():
+            stamp_ns, image = self._newest.pop()
+            if stamp_ns <= 0:
+                raise MessageError('the clock has not started')
             self._publish(image, stamp_ns, self._config.frame_id)
 
     def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
@@ -176,10 +171,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     @staticmethod
     def _new_unwrapper(settings: Current) -> Unwrapper:
-        return Unwrapper(
-            cast(CameraConfig, settings[CameraConfig]),
-            cast(PanoramaConfig, settings[PanoramaConfig]),
-        )
+        camera, panorama = settings[CameraConfig], settings[PanoramaConfig]
+        return Unwrapper(cast(CameraConfig, camera), cast(PanoramaConfig, panorama))
 
     def _build_tables(self, unwrapper: Unwrapper) -> None:
         """Build the tables for the size of image that is, or will be, in use, if it is known."""

@@ -54,7 +54,6 @@ class SfaNode(LocalizationNode):
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
-        self._undeclared_logged = False
         self._info = self.following('panorama/info')
         self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
         compressed = self._config.image_transport == 'compressed'
@@ -124,26 +123,12 @@ class SfaNode(LocalizationNode):
 
     def _declared_problem(self, expected: PanoramaConfig) -> str:
         """How the panoramas are declared to differ from those of training; '' when they do not."""
-        if self._declared is None:
-            self._log_undeclared(expected)
-            return ''
-        differences = expected.differences(self._declared)
+        differences = expected.differences(self._declared) if self._declared is not None else ''
         if not differences:
             return ''
         return (
             f'panorama is declared to differ from those of training: {differences}; '
             'set these parameters of omnicam_node'
-        )
-
-    def _log_undeclared(self, expected: PanoramaConfig) -> None:
-        """Log once that elevations and direction of a foreign source's panoramas are assumed."""
-        if self._undeclared_logged or self.count_publishers(self.resolve_topic_name(self._info)):
-            return
-        self._undeclared_logged = True
-        self.get_logger().info(
-            f'nobody publishes on {self.shown(self._info)} what the panoramas show: assumed are '
-            f'{expected.elevation_min:g} to {expected.elevation_max:g} deg, '
-            f'{"clockwise" if expected.clockwise else "counterclockwise"}, as in training'
         )
 
     def _receive(self, message: Image | CompressedImage) -> None:

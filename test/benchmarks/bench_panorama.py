@@ -203,7 +203,7 @@ def bench_omnicam(rounds: int = 150, domain_id: int = 65) -> dict[str, float]:
             [[loop.time_one(which, message) for which in range(3)] for _ in range(rounds)]
         )
         remap = np.median(interleaved([lambda: unwrap(raw)], rounds))
-        inside = loop.node.monitor('image_raw').latency_ms(50) / 1e3
+        inside = float(loop.node.monitor('image_raw').values()['latency p50 [ms]']) / 1e3
     finally:
         loop.close()
     # Large messages take one of several times at random: compare the undisturbed ones.
