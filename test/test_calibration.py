@@ -16,14 +16,15 @@ from real_cameras import DESK_CENTER, DESK_RADII, desk_mirror, ordinary
 from sfa_localization import cli
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.calibration import (
+    ImageFiles,
+    calibrate,
     check_image,
     find_circles,
-    given_circles,
-    read_images,
+    given_circle,
 )
 from sfa_localization.camera.calibration_files import read_calibration
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
+from sfa_localization.camera.settings import CalibrationConfig, CameraConfig, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 
 CENTER, RADII = (330.3, 241.7), (42.0, 205.0)
@@ -113,7 +114,7 @@ def test_memory_does_not_grow_with_the_images(tmp_path):
     peaks = []
     for count in (3, 9):
         tracemalloc.start()
-        find_circles(read_images(paths[:count]))
+        find_circles(ImageFiles(paths[:count]))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < peaks[0] + 4e6
@@ -195,7 +196,7 @@ def test_from_a_calibration_file(tmp_path):
         ([], 'give images'),
         (['missing.png'], 'missing.png'),
         (['notes.txt'], 'notes.txt'),
-        (['raw.png', 'small.png'], 'differ in size'),
+        (['raw.png', 'small.png'], 'image 2 differs in size'),
         (['raw.png', '--center', '3'], '--radii'),
         (['--calibration', 'missing.yaml'], 'missing.yaml'),
         (['filled.png'], 'inner circle'),
@@ -240,28 +241,30 @@ def test_the_check_image_marks_the_directions():
     assert red[319:321, 460:590].any(axis=0).all()
 
 
+def circled(picture, center, radii):
+    return calibrate([picture], None, CalibrationConfig(), given_circle(center, radii))
+
+
 def test_a_rim_may_lie_partly_outside_the_image_but_not_wholly():
     picture = np.zeros((480, 640, 3), np.uint8)
     for center in ((320.0, 240.0), (0.0, 480.0), (640.0, 240.0)):
         farthest = float(np.hypot(max(center[0], 640 - center[0]), max(center[1], 480 - center[1])))
-        given_circles(center, (40.0, farthest - 1), [picture])
+        circled(picture, center, (40.0, farthest - 1))
         beyond, beside = (center, (40.0, farthest + 1)), ((-1.0, 240.0), (4.0, 9.0))
-        for wrong_center, radii in (beyond, beside, ((9.0, float('nan')), (0.0, 9.0))):
+        for wrong_center, radii in (beyond, beside):
             with pytest.raises(CameraError, match='not in an image of 640x480 pixels'):
-                given_circles(wrong_center, radii, [picture])
+                circled(picture, wrong_center, radii)
+    for center, radii in (((1.0, 2.0), (5.0, 4.0)), ((9.0,), None), (None, (1.0, float('nan')))):
+        with pytest.raises(CameraError, match='--radii takes INNERxOUTER'):
+            given_circle(center, radii)
 
 
 def test_of_center_and_radii_what_is_not_given_is_found():
     picture = scene(1)
     found = find_circles([picture])
-    center = given_circles((300.0, 200.0), None, [picture])
-    assert (center.rim.column, center.rim.row) == (300.0, 200.0)
-    assert (center.rim.radius, center.hole.radius) == (found.rim.radius, found.hole.radius)
-    radii = given_circles(None, (50.0, 180.0), [picture])
-    assert (radii.rim.column, radii.rim.row) == (found.rim.column, found.rim.row)
-    assert (radii.hole.radius, radii.rim.radius) == (50.0, 180.0)
-    with pytest.raises(CameraError, match='both --center and --radii'):
-        given_circles((300.0, 200.0), None)
-    with pytest.raises(CameraError, match='--radii'):
-        given_circles((1.0, 2.0), (5.0, 4.0))
-    assert given_circles((1.0, 2.0), (0.0, 4.0)).hole is None
+    center = circled(picture, (300.0, 200.0), None)
+    assert (center.cx, center.cy) == (300.0, 200.0)
+    assert (center.radius_max, center.radius_min) == (found.rim.radius, found.hole.radius)
+    radii = circled(picture, None, (50.0, 180.0))
+    assert (radii.cx, radii.cy) == (found.rim.column, found.rim.row)
+    assert (radii.radius_min, radii.radius_max) == (50.0, 180.0)

@@ -8,7 +8,6 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ _ENOUGH_FOR_MOTION = 3  # images; the change between two is mostly noise
 _BESIDE = np.array([0.03, 0.06, 0.09])
 _CONTRAST = 0.06  # of the range of a cue: more than its noise, less than a dim scene beside the rim
 _RIM_SUPPORT, _HOLE_SUPPORT = 0.3, 0.6  # a rim may be cut off, a hole is whole
+_CIRCLE = 'cx', 'cy', 'radius_min', 'radius_max'
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class MirrorCircles:
     hole: Circle | None
 
 
-class _Files(Sequence[Image]):
+class ImageFiles(Sequence[Image]):
     """Image files, each read anew when it is asked for: some kB may hold 200 MB of pixels."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -71,19 +71,6 @@ class _Files(Sequence[Image]):
 
     def __getitem__(self, index: Any) -> Any:
         return read_image(self._paths[index])
-
-
-def read_images(paths: Sequence[Path]) -> Sequence[Image]:
-    """Images of one camera, of which one at a time is in memory.
-
-    Raises CameraError naming the file that is unusable.
-    """
-    images = _Files(paths)
-    shapes = list(map(np.shape, images))  # as no loop does, map drops an image before the next
-    for path, shape in zip(paths, shapes, strict=True):
-        if shape != shapes[0]:
-            raise CameraError(f'{path} and {paths[0]} differ in size: give images of one camera')
-    return images
 
 
 def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
@@ -121,23 +108,21 @@ def _enlarged(circle: Circle, scale: float) -> Circle:
 
 def _cues(images: Sequence[Image], scale: float) -> list[Array]:
     """What distinguishes the mirror from its surroundings (h, w), 0..255: brightness, change."""
-    shape = _shrunk(images[0], scale).shape
-    brightness, squares = np.zeros(shape), np.zeros(shape)
-    for shrunk in map(partial(_shrunk, scale=scale), images):
-        gray = cv2.GaussianBlur(shrunk, (0, 0), 1.0)
-        cv2.accumulate(gray, brightness)
-        cv2.accumulateSquare(gray, squares)
-    brightness /= len(images)
+    brightness = squares = np.zeros(0)
+    for number, image in enumerate(images):
+        gray = _scaled(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), scale)
+        gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), 1.0), float)
+        if number and gray.shape != brightness.shape:
+            raise CameraError(
+                f'image {number + 1} differs in size from the first: give images of one camera'
+            )
+        brightness, squares = (brightness + gray, squares + gray**2) if number else (gray, gray**2)
+    brightness = brightness / len(images)
     if len(images) < _ENOUGH_FOR_MOTION:
         return [brightness]
     variance = squares / len(images) - brightness**2
     change = cv2.GaussianBlur(np.sqrt(np.maximum(variance, 0)), (0, 0), 2.0)
     return [brightness, np.asarray(change, float)]
-
-
-def _shrunk(image: Image, scale: float) -> Array:
-    """The image in gray, each side of it times a scale."""
-    return _scaled(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), scale)
 
 
 def _scaled(cue: Any, scale: float) -> Array:
@@ -277,83 +262,60 @@ def _agree(points: Array, circle: Array) -> NDArray[np.bool_]:
 def calibrate(
     images: Sequence[Image],
     calibration_file: Path | None,
-    circles: MirrorCircles | None,
     config: CalibrationConfig,
-    overrides: Mapping[str, Any],
+    given: Mapping[str, Any],
 ) -> LensCalibration:
-    """The lens from a calibration file, or from circles, given or to be found.
+    """The lens from a calibration file, or from a circle in images (H, W, 3), found there or given.
 
-    With a file, given circles only limit what is visible. `overrides` holds further fields of
-    LensCalibration, such as its angles. Raises CameraError when this is not enough.
+    `given` holds fields of LensCalibration that count as they are: those of the circle, of which
+    with a file the radii only limit what is visible, and others. Raises CameraError when this is
+    not enough.
     """
     if calibration_file is not None:
-        calibration = read_calibration(calibration_file)
-        limits = _limits(circles) if circles else {}
-        return dataclasses.replace(calibration, **{**limits, **overrides})
+        used = {name: value for name, value in given.items() if name not in _CIRCLE[:2]}
+        return dataclasses.replace(read_calibration(calibration_file), **used)
     if not images:
         raise CameraError('give images of the camera, or --calibration')
-    circles = circles or find_circles(images)
-    fields = fields_of_circles(circles, (images[0].shape[0], images[0].shape[1]), config)
-    return LensCalibration.from_mapping({**fields, **overrides}, 'calibration')
-
-
-def fields_of_circles(
-    circles: MirrorCircles, size: tuple[int, int], config: CalibrationConfig
-) -> dict[str, Any]:
-    """Fields of LensCalibration of a camera from its circles; `size` is rows and columns."""
-    fields: dict[str, Any] = {
-        'camera_model': config.model,
-        'cx': circles.rim.column,
-        'cy': circles.rim.row,
-        'image_width': size[1],
-        'image_height': size[0],
-        **_limits(circles),
-    }
+    height, width = images[0].shape[:2]
+    fields = {'camera_model': config.model, 'image_width': width, 'image_height': height}
+    if not given.keys() >= set(_CIRCLE):
+        circles = find_circles(images)
+        hole, rim = circles.hole.radius if circles.hole else 0.0, circles.rim
+        found = (rim.column, rim.row, hole, rim.radius)
+        fields |= dict(zip(_CIRCLE, found, strict=True))
+    fields |= given
     if config.model == 'fisheye':
-        focal = float(circles.rim.radius / np.radians(config.field_of_view / 2))
-        return {**fields, 'fx': focal, 'fy': focal, 'radius_min': 0.0}
-    if circles.hole is None:
+        focal = float(fields['radius_max'] / np.radians(config.field_of_view / 2))
+        fields |= {'fx': focal, 'fy': focal, 'radius_min': 0.0}
+    elif fields['radius_min'] == 0.0:
         raise CameraError(
             'no inner circle was found, which the polar model needs: give --center and --radii'
         )
+    lens = LensCalibration.from_mapping(fields, 'calibration')
+    _require_inside(lens)
+    return lens
+
+
+def given_circle(center: Sequence[float] | None, radii: Sequence[float] | None) -> dict[str, Any]:
+    """Fields of a lens from its center (column, row) and radii (hole, rim) in pixels, or from one
+    of both. Raises CameraError.
+    """
+    fields: dict[str, Any] = {}
+    for names, numbers in ((_CIRCLE[:2], center), (_CIRCLE[2:], radii)):
+        if numbers and (
+            len(numbers) != 2 or (numbers is radii and not 0 <= numbers[0] < numbers[1])
+        ):
+            raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
+        fields |= dict(zip(names, numbers or (), strict=False))
     return fields
 
 
-def _limits(circles: MirrorCircles) -> dict[str, float]:
-    hole = circles.hole.radius if circles.hole else 0.0
-    return {'radius_min': hole, 'radius_max': circles.rim.radius}
-
-
-def given_circles(
-    center: Sequence[float] | None, radii: Sequence[float] | None, images: Sequence[Image] = ()
-) -> MirrorCircles:
-    """Circles given by the user: center as column, row, and radii as hole, rim, in pixels.
-
-    What is not given is found in the images (H, W, 3), in which the rim must lie. Raises
-    CameraError.
-    """
-    if center is None or radii is None:
-        if not images:
-            raise CameraError('without images, give both --center and --radii')
-        found = find_circles(images)
-        center = center or (found.rim.column, found.rim.row)
-        radii = radii or (found.hole.radius if found.hole else 0.0, found.rim.radius)
-    if len(center) != 2 or len(radii) != 2 or not 0 <= radii[0] < radii[1]:
-        raise CameraError('--center takes COLUMNxROW, --radii takes INNERxOUTER in pixels')
-    column, row = center
-    hole = Circle(column, row, radii[0], 1.0) if radii[0] else None
-    circles = MirrorCircles(Circle(column, row, radii[1], 1.0), hole)
-    if images:
-        _require_inside(circles, images[0])
-    return circles
-
-
-def _require_inside(circles: MirrorCircles, image: Image) -> None:
-    rim, (height, width) = circles.rim, image.shape[:2]
-    farthest = math.hypot(max(rim.column, width - rim.column), max(rim.row, height - rim.row))
-    if not (0 <= rim.column <= width and 0 <= rim.row <= height and rim.radius <= farthest):
+def _require_inside(lens: LensCalibration) -> None:
+    column, row, width, height = lens.cx, lens.cy, lens.image_width, lens.image_height
+    farthest = math.hypot(max(column, width - column), max(row, height - row))
+    if not (0 <= column <= width and 0 <= row <= height and lens.radius_max <= farthest):
         raise CameraError(
-            f'a center at {rim.column:g}x{rim.row:g} with a rim of {rim.radius:g} pixels is not in '
+            f'a center at {column:g}x{row:g} with a rim of {lens.radius_max:g} pixels is not in '
             f'an image of {width}x{height} pixels: correct --center or --radii'
         )
 

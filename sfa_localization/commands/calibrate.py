@@ -92,11 +92,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.check:
         require_kind(arguments.check, '.png')
     images = _images(arguments)
-    circles = None
-    if arguments.center or arguments.radii:
-        circles = calibration.given_circles(arguments.center, arguments.radii, images)
     config, known = settings(CalibrationConfig, arguments), given(LensCalibration, arguments)
-    lens = calibration.calibrate(images, arguments.calibration, circles, config, known)
+    known |= calibration.given_circle(arguments.center, arguments.radii)
+    lens = calibration.calibrate(images, arguments.calibration, config, known)
     camera = settings(CameraConfig, arguments)
     text = calibration_files.calibration_text(lens, camera.mount_rpy)
     if images:
@@ -117,11 +115,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _images(arguments: argparse.Namespace) -> Sequence[Image]:
     """The images of files, or some from all over the drive of a bag."""
     from sfa_localization.bags.reader import Bag
-    from sfa_localization.camera.calibration import read_images
+    from sfa_localization.camera.calibration import ImageFiles
 
     bags = [path for path in arguments.images if path.is_dir() or _BAGS & set(path.suffixes)]
     if not bags:
-        return read_images(arguments.images)
+        return ImageFiles(arguments.images)
     if len(arguments.images) > 1:
         raise LocalizationError('give one bag, or images')
     with Bag(bags[0]) as bag:
