@@ -14,7 +14,7 @@ import pytest
 
 from sfa_localization.camera import capture as capture_module
 from sfa_localization.camera import watch
-from sfa_localization.camera.capture import Device, Feed, Lost, opener
+from sfa_localization.camera.capture import Feed, Source, opener
 from sfa_localization.camera.settings import CaptureConfig
 from sfa_localization.data.errors import CameraError, ConfigError
 
@@ -52,25 +52,22 @@ class Script:
         steps = self.captures.pop(0) if len(self.captures) > 1 else self.captures[0]
         if isinstance(steps, Exception):
             raise steps
-        return Player(self, list(steps))
+        return Source(self.live, self.play(list(steps)))
 
-
-class Player:
-    def __init__(self, script, steps):
-        self.script, self.steps, self.live = script, steps, script.live
-
-    def read(self):
-        time.sleep(0.001)
-        step = self.steps[0] if self.script.forever and len(self.steps) == 1 else self.steps.pop(0)
-        if isinstance(step, Exception):
-            raise step
-        if isinstance(step, threading.Event):
-            step.wait(PATIENCE_S)
-            return picture(255)
-        return None if step is None else picture(step)
-
-    def close(self):
-        self.script.closed += 1
+    def play(self, steps):
+        try:
+            while True:
+                time.sleep(0.001)
+                step = steps[0] if self.forever and len(steps) == 1 else steps.pop(0)
+                if isinstance(step, Exception):
+                    raise step
+                if step is None:
+                    return
+                if isinstance(step, threading.Event):
+                    step.wait(PATIENCE_S)
+                yield picture(255 if isinstance(step, threading.Event) else step)
+        finally:
+            self.closed += 1
 
 
 @pytest.fixture
@@ -111,7 +108,7 @@ def test_pictures_arrive_in_order_until_the_end(run_feed):
 
 
 def test_a_disconnected_camera_is_opened_again(run_feed):
-    script = Script([1, 2, Lost('unplugged')], CameraError('not there'), [3, 4, 5, None])
+    script = Script([1, 2, CameraError('unplugged')], CameraError('not there'), [3, 4, 5, None])
     feed, received = run_feed(script)
     assert [received.get(timeout=PATIENCE_S) for _ in range(5)] == [1, 2, 3, 4, 5]
     assert script.opened == 3
@@ -250,11 +247,11 @@ def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
     monkeypatch.setattr(cv2, 'VideoCapture', Capture)
     (tmp_path / 'video0').touch()
     path = str(tmp_path / 'video0')
-    Device(CaptureConfig(source_path=path, source_size=(1280.0, 720.0), source_rate=15.0))
+    opener(config(source='device', source_path=path, source_size=(1280, 720), source_rate=15.0))()
     wanted = {cv2.CAP_PROP_FRAME_WIDTH: 1280, cv2.CAP_PROP_FRAME_HEIGHT: 720, cv2.CAP_PROP_FPS: 15}
     assert asked.items() >= wanted.items()
     asked.clear()
-    Device(CaptureConfig(source_path=path))
+    opener(config(source='device', source_path=path))()
     assert not asked.keys() & wanted.keys(), 'a device keeps its own'
     with pytest.raises(ConfigError, match='columns and rows'):
         config(source_size=(640.0,))

@@ -12,10 +12,10 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -37,141 +37,100 @@ _REOPEN_FIRST_S = 0.5  # pause before a source is reopened: a USB camera needs i
 _REOPEN_LONGEST_S = 30.0  # pauses double up to this, so that a camera is found soon after repair
 
 
-class Capture(Protocol):
-    """An opened source of images."""
+Images = Generator[Image | CameraError, None, None]
+"""Images (H, W, 3) uint8 BGR in order, with the errors of those that are unusable."""
+
+
+class Source(NamedTuple):
+    """An opened source: whether it is `live`, as a device and no file is, and its images.
+
+    A live one raises CameraError when there will be no more. Closing the images closes it.
+    """
 
     live: bool
-    """Whether it goes on by itself: a device, as opposed to files."""
-
-    def read(self) -> Image | None:
-        """The next image (H, W, 3) uint8 BGR; None at the end of files.
-
-        Blocks until there is one. Raises CameraError when there will be no more, or when one
-        image of several is unusable.
-        """
-
-    def close(self) -> None:
-        """Let go of the device or file."""
+    images: Images
 
 
-def opener(config: CaptureConfig) -> Callable[[], Capture]:
+def opener(config: CaptureConfig) -> Callable[[], Source]:
     """A function that opens the source of the parameters. Raises CameraError without a source."""
     if config.source == 'topic':
         raise CameraError('images from a topic need no source to be opened')
     if not config.source_path:
         raise CameraError(f'source_path is empty: name the {config.source} to take images from')
-    kinds: dict[str, Callable[[CaptureConfig], Capture]] = {
-        'device': Device,
-        'video': Video,
-        'folder': Folder,
-    }
+    kinds = {'device': _device, 'video': _video, 'folder': _folder}
     return lambda: kinds[config.source](config)
 
 
-class Device:
+def _device(config: CaptureConfig) -> Source:
     """A V4L2 device, through OpenCV."""
-
-    live = True
-
-    def __init__(self, config: CaptureConfig) -> None:
-        self._path = path = config.source_path
-        if not path.isdigit() and not os.path.exists(path):
-            raise CameraError(f'device {path} is not there')
-        self._capture = cv2.VideoCapture(int(path) if path.isdigit() else path, cv2.CAP_V4L2)
-        if not self._capture.isOpened():
-            raise CameraError(f'device {path} cannot be opened: is it there, and not in use?')
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        if config.source_size:
-            self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.source_size[0])
-            self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.source_size[1])
-        if config.source_rate:
-            self._capture.set(cv2.CAP_PROP_FPS, config.source_rate)
-
-    def read(self) -> Image | None:
-        done, image = self._capture.read()
-        if not done or image is None:
-            raise Lost(f'device {self._path} is disconnected')
-        return _bgr(image)
-
-    def close(self) -> None:
-        self._capture.release()
+    path = config.source_path
+    if not path.isdigit() and not os.path.exists(path):
+        raise CameraError(f'device {path} is not there')
+    capture = cv2.VideoCapture(int(path) if path.isdigit() else path, cv2.CAP_V4L2)
+    if not capture.isOpened():
+        raise CameraError(f'device {path} cannot be opened: is it there, and not in use?')
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    if config.source_size:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.source_size[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.source_size[1])
+    if config.source_rate:
+        capture.set(cv2.CAP_PROP_FPS, config.source_rate)
+    return Source(True, _frames(capture, f'device {path} is disconnected'))
 
 
-class Lost(CameraError):
-    """The source has to be opened again."""
-
-
-class _Pacer:
-    """Waits so that images come at a rate; a reader that is late does not catch up."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._period = 1.0 / rate_hz
-        self._due = time.monotonic()
-
-    def wait(self) -> None:
-        now = time.monotonic()
-        if self._due > now:
-            time.sleep(self._due - now)
-        self._due = max(self._due, now) + self._period
-
-
-class Video:
+def _video(config: CaptureConfig) -> Source:
     """A video file, at its own rate or another."""
-
-    live = False
-
-    def __init__(self, config: CaptureConfig) -> None:
-        self._path = config.source_path
-        # Asked first: a pipe never ends, and of a missing file OpenCV would warn on its own.
-        missing = f'video {self._path} is missing, or of a kind OpenCV cannot read'
-        if not is_regular(self._path):
-            raise CameraError(missing)
-        self._capture = cv2.VideoCapture(self._path)
-        if not self._capture.isOpened():
-            raise CameraError(missing)
-        own = self._capture.get(cv2.CAP_PROP_FPS)
-        self._pacer = _Pacer(config.source_rate or (own if 0.1 < own < 1000 else _USUAL_RATE_HZ))
-
-    def read(self) -> Image | None:
-        self._pacer.wait()
-        done, image = self._capture.read()
-        return _bgr(image) if done else None
-
-    def close(self) -> None:
-        self._capture.release()
+    path = config.source_path
+    # Asked first: a pipe never ends, and of a missing file OpenCV would warn on its own.
+    capture = cv2.VideoCapture(path) if is_regular(path) else None
+    if capture is None or not capture.isOpened():
+        raise CameraError(f'video {path} is missing, or of a kind OpenCV cannot read')
+    own = capture.get(cv2.CAP_PROP_FPS)
+    rate_hz = config.source_rate or (own if 0.1 < own < 1000 else _USUAL_RATE_HZ)
+    return Source(False, _paced(_frames(capture), rate_hz))
 
 
-class Folder:
+def _folder(config: CaptureConfig) -> Source:
     """The images of a folder in the order of their names."""
+    folder = Path(config.source_path)
+    if not os.path.isdir(folder):
+        raise CameraError(f'folder {folder} is missing')
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise CameraError(f'folder {folder} holds no images ({" ".join(_SUFFIXES)})')
+    return Source(False, _paced(map(_read, files), config.source_rate or _USUAL_RATE_HZ))
 
-    live = False
 
-    def __init__(self, config: CaptureConfig) -> None:
-        folder = Path(config.source_path)
-        if not os.path.isdir(folder):
-            raise CameraError(f'folder {folder} is missing')
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
-        if not files:
-            raise CameraError(f'folder {folder} holds no images ({" ".join(_SUFFIXES)})')
-        self._files = iter(files)
-        self._pacer = _Pacer(config.source_rate or _USUAL_RATE_HZ)
-
-    def read(self) -> Image | None:
-        path = next(self._files, None)
-        if path is None:
-            return None
-        self._pacer.wait()
+def _read(path: Path) -> Image | CameraError:
+    try:
         return read_image(path)
+    except CameraError as error:
+        return error
 
-    def close(self) -> None:
-        """Nothing is open between two images."""
+
+def _frames(capture: cv2.VideoCapture, at_end: str = '') -> Images:
+    """What OpenCV captures; the end raises CameraError where it should not come."""
+    try:
+        while True:
+            done, image = capture.read()
+            if not done or image is None:
+                break
+            gray = image.ndim == 2 or image.shape[2] == 1  # some devices deliver it
+            yield np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if gray else image, np.uint8)
+        if at_end:
+            raise CameraError(at_end)
+    finally:
+        capture.release()
 
 
-def _bgr(image: Any) -> Image:
-    """What OpenCV captured as BGR: some devices deliver gray."""
-    if image.ndim == 2 or image.shape[2] == 1:
-        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    return np.asarray(image, np.uint8)
+def _paced(images: Iterable[Image | CameraError], rate_hz: float) -> Images:
+    """The images at a rate; a reader that is late does not catch up."""
+    due = time.monotonic()
+    for image in images:
+        now = time.monotonic()
+        time.sleep(max(due - now, 0.0))
+        due = max(due, now) + 1.0 / rate_hz
+        yield image
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +146,7 @@ class FeedStatus:
 
 
 class Feed:
-    """Reads a capture in a thread of its own and opens it again when it fails.
+    """Reads a source in a thread of its own and opens it again when it fails.
 
     `deliver` takes each image and `reject` the reason why one is unusable, both in that thread.
     Files wait while `wanted` returns False. `check` must be called now and then from elsewhere:
@@ -196,14 +155,14 @@ class Feed:
 
     def __init__(
         self,
-        open_capture: Callable[[], Capture],
+        open_source: Callable[[], Source],
         deliver: Callable[[Image], None],
         config: CaptureConfig,
         reject: Callable[[str], None] = lambda reason: None,
         wanted: Callable[[], bool] = lambda: True,
     ) -> None:
         self.config = config
-        self._open, self._deliver = open_capture, deliver
+        self._open, self._deliver = open_source, deliver
         self._reject, self._wanted = reject, wanted
         self._stopped = threading.Event()
         self._status = FeedStatus()
@@ -280,38 +239,35 @@ class Feed:
         self._deadline_s = time.monotonic() + _OPENING_S + self.config.silence_timeout
         if self._status.state == 'new':
             self._set_state('opening')
-        capture = self._open()
+        source = self._open()
         try:
-            while self._goes_on() and self._read_one(capture):
+            while self._goes_on() and self._read_one(source):
                 pass
         finally:
-            capture.close()
+            source.images.close()
 
-    def _read_one(self, capture: Capture) -> bool:
+    def _read_one(self, source: Source) -> bool:
         """Deliver one image; False at the end."""
-        silence = self.config.silence_timeout if capture.live else np.inf
+        silence = self.config.silence_timeout if source.live else np.inf
         self._deadline_s = time.monotonic() + silence
-        if not capture.live and not self._wanted():
+        if not source.live and not self._wanted():
             return not self._stopped.wait(_IDLE_PAUSE_S)
-        try:
-            image = capture.read()
-        except Lost:
-            raise
-        except CameraError as error:
-            self._reject(str(error))
-            return True
+        image = next(source.images, None)
         if not self._goes_on():
             return False
         if image is None:
             self._deadline_s = np.inf
             self._set_state('ended')
             return False
-        if not capture.live or self._frozen.add(image):
+        if isinstance(image, CameraError):
+            self._reject(str(image))
+            return True
+        if not source.live or self._frozen.add(image):
             if self._status.state == 'running':
                 self._pause_s = _REOPEN_FIRST_S
             self._set_state('running')
         # The device repeats its last image, perhaps also when it was opened again.
-        if capture.live and self._frozen.frozen_for_s():
-            raise Lost(f'the last image has been repeated for {FROZEN_S:g} s')
+        if source.live and self._frozen.frozen_for_s():
+            raise CameraError(f'the last image has been repeated for {FROZEN_S:g} s')
         self._deliver(image)
         return True
