@@ -49,7 +49,7 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer, Observation, Observer
-from sfa_localization.metric.basis import Basis
+from sfa_localization.metric.basis import Basis, expand
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -454,7 +454,7 @@ def _supervised(model: PlaceModel, trained: Sequence[_Located], drive: _Located)
         features.append(one.features[mask])
         places.append(one.truth.at(stamps[mask])[:, :2])
     weights = regression(model.metric.basis, np.concatenate(features), np.concatenate(places))
-    positions = model.metric.basis.expand(drive.features) @ weights
+    positions = expand(model.metric.basis, drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
     stamps = drive.images.poses.stamps_ns
     return Trajectory(stamps, np.column_stack([positions, unknown]))
@@ -462,7 +462,7 @@ def _supervised(model: PlaceModel, trained: Sequence[_Located], drive: _Located)
 
 def regression(basis: Basis, features: Array, places: Array) -> Array:
     """Weights (m, 2) from the expansion of features (M, K) to true places (M, 2) m."""
-    expanded = basis.expand(features)
+    expanded = expand(basis, features)
     normal = expanded.T @ expanded + np.diag(basis.ridge)
     return np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
 

@@ -40,7 +40,7 @@ from sfa_localization.features.rotation import Map
 from sfa_localization.features.rotation_spread import Agreement, disagreement
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
 from sfa_localization.metric.refinement import Refinement
-from sfa_localization.metric.saved_map import Predictor, map_from_arrays
+from sfa_localization.metric.saved_map import MetricMap
 
 FORMAT = 'sfa_localization place model'
 VERSION = 9
@@ -148,7 +148,7 @@ class PlaceModel:
     """
 
     network: Network
-    metric: Predictor
+    metric: MetricMap
     panorama: PanoramaConfig
     keyframes: Keyframes
     agreement: Agreement
@@ -294,7 +294,7 @@ class PlaceModel:
         )
         return cls(
             network_from(arrays, header),
-            map_from_arrays(_under(arrays, 'metric/')),
+            MetricMap.from_arrays(_under(arrays, 'metric/')),
             PanoramaConfig.from_mapping(header['panorama'], 'panorama'),
             Keyframes.from_arrays(_under(arrays, 'keyframes/')),
             Agreement.from_arrays(_under(arrays, 'agreement/')),

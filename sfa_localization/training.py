@@ -41,7 +41,6 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
 )
 from sfa_localization.metric.refinement import refined
-from sfa_localization.metric.saved_map import fast_map
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import Span
 from sfa_localization.place_model import PlaceModel
@@ -155,7 +154,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     quality |= {**segments.quality, **result.quality, **known.quality}
     model = PlaceModel(
         network,
-        fast_map(first.map),
+        first.map,
         given.panorama,
         known.keyframes,
         agreement,

@@ -5,7 +5,6 @@
 import json
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +19,9 @@ from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
 from sfa_localization.data.geometry import rotation
-from sfa_localization.data.run import PanoramaArray, Trajectory
+from sfa_localization.data.run import Trajectory
 from sfa_localization.fusion import pose_filter
 from sfa_localization.fusion.health import health_of
-from sfa_localization.fusion.odometry import COAST_S
-from sfa_localization.fusion.status import Level
 from sfa_localization.fusion.track import Track
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
@@ -108,17 +105,6 @@ def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(
     assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
 
 
-def test_a_pause_of_the_recording_is_no_time_in_any_state():
-    stamps = np.array([0, 1, 2, 10**9, 10**9 + 1], np.int64) * 10**9
-    odometry = SimpleNamespace(stamps_ns=stamps)
-    run = SimpleNamespace(odometry=odometry, panoramas=[], name='paused')
-    localizer = SimpleNamespace(
-        status=SimpleNamespace(level=Level.LOCALISED),
-        replay=lambda _: ((int(stamp_ns), None, None) for stamp_ns in stamps),
-    )
-    assert evaluation._replayed(localizer, run, False)[2] == {'LOCALISED': 2 + COAST_S + 1}
-
-
 class Torn(PictureReader):
     """Reads positions beyond x = 7 m as ten meters farther: half of its map is apart."""
 
@@ -191,24 +177,6 @@ def test_errors_that_neighbors_share_leave_the_squared_error_of_a_drive_uncertai
     assert np.median(widths) == pytest.approx(4 * np.sqrt(shared / count), rel=0.25)
 
 
-def test_exact_estimates_have_a_range_too():
-    truth = spread_out(4, np.zeros((2, 2)), count=50)[0]
-    claimed = np.broadcast_to(np.eye(3), (50, 3, 3))
-    low, high = evaluation.calibration(truth, truth, np.eye(2), claimed)['nees_right']
-    assert low < 1 < high
-
-
-def test_no_heading_and_no_truth_give_no_shares():
-    truth, estimate = spread_out(1, 0.01 * np.eye(2), count=50)
-    poses = estimate.poses.copy()
-    poses[:, 2] = np.nan
-    claimed = np.broadcast_to(np.diag([0.01, 0.01, 3.3]), (50, 3, 3))
-    blind = Trajectory(estimate.stamps_ns, poses)
-    assert evaluation.calibration(truth, blind, np.eye(2), claimed)['yaw_within_95'] is None
-    later = Trajectory(estimate.stamps_ns + 10**12, poses)
-    assert evaluation.calibration(truth, later, np.eye(2), claimed)['within_95'] is None
-
-
 def test_a_map_from_wheels_of_a_wrong_radius_fits_the_truth_when_scaled():
     truth, estimate = spread_out(2, 1e-6 * np.eye(2))
     places = 0.97 * estimate.poses[:, :2] @ rotation(0.4) + [3.0, 1.0]
@@ -244,26 +212,6 @@ def test_each_aligning_drive_is_named_and_the_reference_is_fitted_on_all(
     aligning = '--align', str(bag), '--align', str(tmp_path / 'second')
     assert main(['evaluate', 'reader.npz', str(bag), *aligning]) == 0
     assert f'aligned on {bag}, {tmp_path / "second"}' in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_the_map_is_laid_on_the_truth_where_late_images_were_taken(tmp_path, monkeypatch):
-    """Drives of one late camera, and of one in time: the model that both get is judged alike."""
-    from test_other_robots import placed
-
-    _, trained = placed(0.0, 1)
-    run = trained.runs[0]
-    truth = run.odometry.trajectory
-    stamps = run.panoramas.stamps_ns + 300_000_000
-    late = replace(run, ground_truth=truth, panoramas=PanoramaArray(stamps, run.panoramas.images))
-    in_time = replace(run, ground_truth=truth)
-    means = {}
-    for name, one in (('late', late), ('in time', in_time)):
-        monkeypatch.setattr(evaluation, 'read_drive', lambda *_, one=one, **__: one)
-        judged = evaluation.evaluate(trained.model, tmp_path)
-        means[name] = judged.scores['sfa']['mean'], judged.counts.get('camera_delay_s', 0.0)
-    assert means['late'][1] == pytest.approx(0.3, abs=0.05) and means['in time'][1] == 0.0
-    assert means['late'][0] < 1.2 * means['in time'][0] + 0.005
 
 
 def test_topics_are_named_for_the_aligning_drive_only_where_it_has_them(tmp_path):

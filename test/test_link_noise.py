@@ -11,7 +11,7 @@ from metric_worlds import drive, garden_features, meander
 from sfa_localization.data.geometry import align
 from sfa_localization.metric.basis import Process
 from sfa_localization.metric.map_fit import MetricProblem
-from sfa_localization.metric.segments import cut, join
+from sfa_localization.metric.segments import cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 
@@ -100,17 +100,6 @@ def test_a_wheel_that_slips_once_costs_one_link():
     assert np.median(move[~wrong]) < 1.5 * np.median(before)
 
 
-def test_each_run_has_its_own():
-    good, bad = recorded(seed=2), recorded(seed=3)
-    parts = [cut(run.odometry, run.stamps_ns, SegmentConfig()) for run in (good, bad)]
-    parts[1] = worse(parts[1], 16.0)
-    places = np.concatenate([good.poses, bad.poses])
-    fit = solved(join(parts, [0, len(good.poses)]), garden_features(places[:, :2], noise=0.05))
-    _, move = factors(fit)
-    run = fit.links.run
-    assert np.median(move[run == 0]) < 1.5 < 3.0 < np.median(move[run == 1])
-
-
 @pytest.mark.parametrize('name', ['turn', 'displacement'])
 def test_links_without_weight_stay_without(name):
     run = recorded(seed=2)
@@ -122,11 +111,3 @@ def test_links_without_weight_stay_without(name):
     assert np.isinf(getattr(fit.links, f'{name}_variance')).all()
     other = {'turn': 'displacement', 'displacement': 'turn'}[name]
     assert np.isfinite(getattr(fit.links, f'{other}_variance')).all()
-
-
-def test_a_few_links_change_little():
-    run = recorded(seed=2)
-    whole = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    short = worse(dataclasses.replace(whole, items=whole.items[:8]), 16.0)
-    _, move = factors(solved(short, garden_features(run.poses[:, :2], noise=0.05)))
-    assert np.median(move) < 8.0

@@ -9,17 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, recipe, visit
+from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
 
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.localizer import Localizer
-from sfa_localization.metric.basis import MetricMap
 from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
-from sfa_localization.metric.learning import learn_metric
-from sfa_localization.metric.saved_map import FastProcess, fast_map
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 
@@ -139,44 +136,6 @@ def test_turned_maps_refine_what_slow_features_find(model, pictures):
 def test_other_pictures_are_refused(model, picture):
     with pytest.raises(ModelError):
         model.locate(picture)
-
-
-class TestFastMap:
-    """The compiled metric map predicts what the map predicts."""
-
-    def features(self, model: PlaceModel) -> np.ndarray:
-        seen = place().features[::7]
-        return np.concatenate([seen, 3 * np.random.default_rng(0).normal(size=(20, 8))])
-
-    def slow_map(self) -> MetricMap:
-        """Of slow features; `place` refines it."""
-        trained = place()
-        return learn_metric(trained.features, trained.segments, recipe().metric).map
-
-    def test_equals_the_map(self, model):
-        features, fast = self.features(model), fast_map(self.slow_map())
-        assert isinstance(fast, FastProcess)
-        positions, covariances = self.slow_map().predict(features)
-        fast_positions, fast_covariances = fast.predict(features)
-        assert np.allclose(fast_positions, positions, atol=1e-6)
-        scale = np.trace(covariances, axis1=1, axis2=2)[:, None, None]
-        assert (np.abs(fast_covariances - covariances) / scale).max() < 0.02
-
-    def test_a_single_row_equals_many(self, model):
-        features, fast = self.features(model), model.metric
-        together = fast.predict(features)
-        for row, position, covariance in zip(features, *together, strict=True):
-            alone = fast.predict(row[None])
-            assert np.allclose(alone[0][0], position, atol=1e-9)
-            assert np.allclose(alone[1][0], covariance, rtol=1e-2)
-
-    def test_monomials_are_quick_as_they_are(self, model):
-        other = replace(place().metric.map, basis=_Other())
-        assert fast_map(other) is other
-
-
-class _Other:
-    """Some basis that is no process."""
 
 
 class TestFile:

@@ -10,7 +10,7 @@ from metric_worlds import criss_cross, drive, meander, stand, straight, turn
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
-from sfa_localization.data.run import Odometry, Trajectory, YawRate
+from sfa_localization.data.run import Odometry, YawRate
 from sfa_localization.metric import segments as segments_module
 from sfa_localization.metric.segments import PIECE_LENGTH_M, assignment, cut, join
 from sfa_localization.metric.settings import SegmentConfig
@@ -50,13 +50,6 @@ def test_a_square_gives_its_four_sides():
     check_segments(segments, run.poses)
 
 
-def test_turns_keep_their_sign():
-    left = cut(*drive_of(straight(3.0), turn(0.5), straight(3.0)), STRAIGHT)
-    right = cut(*drive_of(straight(3.0), turn(-0.5), straight(3.0)), STRAIGHT)
-    assert left[0].turn_rad == pytest.approx(0.5, abs=1e-6)
-    assert right[0].turn_rad == pytest.approx(-0.5, abs=1e-6)
-
-
 def drive_of(*parts):
     run = drive(np.vstack(parts))
     return run.odometry, run.stamps_ns
@@ -69,14 +62,6 @@ def test_pieces_of_a_curved_drive_follow_the_truth():
     assert all(s.length_m <= PIECE_LENGTH_M + 1e-6 for s in segments)
     assert segments.images.used == len(run.stamps_ns)
     check_segments(segments, run.poses)
-
-
-def test_pieces_bounded_by_error_are_shorter(monkeypatch):
-    run = drive(meander(60.0)[0])
-    loose = cut(run.odometry, run.stamps_ns, ANY)
-    monkeypatch.setattr(segments_module, 'PIECE_STD_M', 0.04)
-    tight = cut(run.odometry, run.stamps_ns, ANY)
-    assert len(tight) > len(loose)
 
 
 def test_every_picture_is_used_once_or_counted():
@@ -247,8 +232,7 @@ def turned_frame(run, yaw, shift=(0.0, 0.0)):
     return dataclasses.replace(run.odometry, poses=poses)
 
 
-@pytest.mark.parametrize('config', [ANY, STRAIGHT])
-@pytest.mark.parametrize('gyro', [True, False])
+@pytest.mark.parametrize(('config', 'gyro'), [(ANY, True), (STRAIGHT, False)])
 def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyro):
     twists, start = criss_cross(6)
     run = drive(twists, start=start)
@@ -265,21 +249,12 @@ def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyr
             assert a.displacement == pytest.approx(b.displacement)
 
 
-def test_the_start_of_a_segment_is_its_pose_in_the_odometry_frame_with_a_gyro_too():
-    run = drive(SQUARE)
-    poses = turned_frame(run, 1.0)
-    for s in cut(poses, run.stamps_ns, ANY, run.gyro):
-        at = Trajectory(poses.stamps_ns, poses.poses).at(run.stamps_ns[s.images[:1]])[0]
-        assert np.allclose(relative(at, s.start), 0, atol=0.02)
-
-
 def pieces_of_gyro(gyro, keep):
     return YawRate(gyro.stamps_ns[keep], gyro.omega[keep], gyro.variance[keep])
 
 
-@pytest.mark.parametrize('gap', [(2.0, 10.0), (15.0, 1e9), (-1.0, 12.0)])
-@pytest.mark.parametrize('bias', [0.0, 0.02])
-def test_where_the_gyro_pauses_the_wheels_go_on(gap, bias):
+@pytest.mark.parametrize('gap', [(2.0, 10.0), (15.0, 1e9)])
+def test_where_the_gyro_pauses_the_wheels_go_on(gap, bias=0.02):
     run = drive(np.vstack([SQUARE, SQUARE]))
     seconds = (run.gyro.stamps_ns - run.gyro.stamps_ns[0]) * 1e-9
     biased = dataclasses.replace(run.gyro, omega=run.gyro.omega + bias)

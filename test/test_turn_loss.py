@@ -102,6 +102,6 @@ def test_wheels_that_lose_way_in_turns_give_nearly_as_good_a_map(monkeypatch):
     assert plain.model.quality['turn_loss'] == [0.0]
     assert trained.model.quality['turn_loss'] == [pytest.approx(0.15, abs=0.06)]
     assert 'm per radian in turns: taken into account' in summary(trained)
-    monkeypatch.setattr('sfa_localization.training.way_of', lambda *_: None)
+    monkeypatch.setattr('sfa_localization.metric.drives.way_of', lambda *_: None)
     bent, _ = errors(0.15)
     assert lost < exact + 0.5 * (bent - exact)

@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps from slow features to meters: monomials (section 4 of the paper), or a Gaussian process.
+"""What a map is linear in: monomials (section 4 of the paper), or a Gaussian process.
 
 The paper estimates p = W^T s (section 3). Both are linear in an expansion phi(s), position = Phi w,
 with a Gaussian prior on w. A Gaussian process is its expansion over the training features
@@ -9,35 +9,53 @@ themselves, so one solver serves both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from sfa_localization.data.errors import DataError
+from sfa_localization.data.array_files import Arrays
 from sfa_localization.data.geometry import Array
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class Basis(Protocol):
-    """An expansion of slow features, with the precision of its prior."""
+    """An expansion of slow features, phi(s) = [k(s) turn, 1], with the precision of its prior."""
+
+    @property
+    def features(self) -> int:
+        """K: how many of the slowest features it reads."""
+
+    @property
+    def turn(self) -> Array:
+        """(k, m - 1)"""
 
     @property
     def ridge(self) -> Array:
         """(m,) prior precision of each weight over the precision of a point; 0: no prior."""
 
     @property
-    def features(self) -> int:
-        """K: how many of the slowest features it reads."""
+    def prior(self) -> float:
+        """Prior variance of a position over a point's variance; 0: there is no prior."""
 
-    def expand(self, features: Array) -> Array:
-        """Expansion (M, m) of slow features (M, >= K)."""
+    def kernel(self, features: Array) -> Array:
+        """k(s) (M, k) of slow features (M, >= K)."""
 
-    def missing(self, expanded: Array) -> Array:
-        """(M,) prior variance that the expansion leaves out, over a point's variance."""
+    def to_arrays(self) -> Arrays:
+        """What `basis_from` restores it from."""
+
+
+def expand(basis: Basis, features: Array) -> Array:
+    """Expansion (M, m) of slow features (M, >= K)."""
+    terms = basis.kernel(features) @ basis.turn
+    return np.column_stack([terms, np.ones(len(terms))])
+
+
+def missing(basis: Basis, expanded: Array) -> Array:
+    """(M,) prior variance that an expansion leaves out, over a point's variance."""
+    held = np.einsum('ij,ij->i', expanded[:, :-1], expanded[:, :-1])
+    return np.asarray(np.maximum(1.0 - held, 0.0) * basis.prior)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +66,10 @@ class Monomials:
     """
 
     center: Array
-    """(m,) mean of the monomials."""
+    """(k,) mean of the monomials."""
     turn: Array
-    """(m, r) to orthonormal columns."""
-    ridge_: Array
+    """(k, r) to orthonormal columns."""
+    ridge: Array
     """(r + 1,)"""
     features: int
     """K."""
@@ -69,28 +87,15 @@ class Monomials:
         return cls(center, turn, np.append(penalty, 0.0), count)
 
     @property
-    def ridge(self) -> Array:
-        return self.ridge_
+    def prior(self) -> float:
+        return 0.0
 
-    def expand(self, features: Array) -> Array:
-        terms = (monomials(features[:, : self.features])[:, 1:] - self.center) @ self.turn
-        return np.column_stack([terms, np.ones(len(terms))])
-
-    def missing(self, expanded: Array) -> Array:
-        return np.zeros(len(expanded))
+    def kernel(self, features: Array) -> Array:
+        return monomials(features[:, : self.features])[:, 1:] - self.center
 
     def to_arrays(self) -> Arrays:
-        return {
-            'center': self.center,
-            'turn': self.turn,
-            'ridge': self.ridge_,
-            'features': np.array(self.features),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> Monomials:
-        features = int(arrays['features'])
-        return cls(arrays['center'], arrays['turn'], arrays['ridge'], features)
+        count = np.array(self.features)
+        return {'center': self.center, 'turn': self.turn, 'ridge': self.ridge, 'features': count}
 
 
 def monomials(features: Array) -> Array:
@@ -105,51 +110,58 @@ class Process:
     """A Gaussian process with a Matern 5/2 kernel of unit variance and a free constant mean.
 
     It is spanned by m inducing points chosen among the training features; all of them when m
-    allows, and then it is the exact process.
+    allows, and then it is the exact process. Points are rounded as model files hold them.
     """
 
     scale: Array
     """(K,) weight of each feature over the kernel's length."""
     points: Array
     """(m, K) scaled inducing features."""
-    whiten: Array
-    """(m, m) inverse of the lower Cholesky factor of their kernel."""
     noise: float
     """Variance of a point over the process's variance."""
+    turn: Array = field(init=False, repr=False)
+    """(m, m) transposed inverse of the lower Cholesky factor of the points' kernel."""
+
+    def __post_init__(self) -> None:
+        points = self.points.astype(np.float32).astype(np.float64)
+        kernel = matern(points, points)
+        kernel[np.diag_indices_from(kernel)] += 1e-9
+        factor = scipy.linalg.cholesky(kernel, lower=True)
+        whiten = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
+        object.__setattr__(self, 'points', points)
+        object.__setattr__(self, 'turn', whiten.T)
 
     @classmethod
     def fit(cls, features: Array, scale: Array, noise: float, size: int) -> Process:
         """On features (M, >= K), scaled by `scale` (K,), with at most `size` inducing points."""
         scaled = np.asarray(features[:, : len(scale)], float) * scale
-        chosen = spread(scaled, size)
-        return cls.at(scaled[chosen], scale, noise)
+        return cls(np.asarray(scale, float), scaled[spread(scaled, size)], noise)
 
-    @classmethod
-    def at(cls, points: Array, scale: Array, noise: float) -> Process:
-        """With given inducing points (m, K), already scaled; rounded as model files hold them."""
-        points = points.astype(np.float32).astype(np.float64)
-        kernel = matern(points, points)
-        kernel[np.diag_indices_from(kernel)] += 1e-9
-        factor = scipy.linalg.cholesky(kernel, lower=True)
-        whiten = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
-        return cls(np.asarray(scale, float), points, whiten, noise)
+    @property
+    def features(self) -> int:
+        return len(self.scale)
 
     @property
     def ridge(self) -> Array:
         return np.append(np.full(len(self.points), self.noise), 0.0)
 
     @property
-    def features(self) -> int:
-        return len(self.scale)
+    def prior(self) -> float:
+        return 1.0 / self.noise
 
-    def expand(self, features: Array) -> Array:
-        scaled = features[:, : len(self.scale)] * self.scale
-        terms = matern(scaled, self.points) @ self.whiten.T
-        return np.column_stack([terms, np.ones(len(terms))])
+    def kernel(self, features: Array) -> Array:
+        return matern(features[:, : len(self.scale)] * self.scale, self.points)
 
-    def missing(self, expanded: Array) -> Array:
-        held = np.einsum('ij,ij->i', expanded[:, :-1], expanded[:, :-1])
-        return np.asarray(np.maximum(1.0 - held, 0.0) / self.noise)
+    def to_arrays(self) -> Arrays:
+        points, noise = self.points.astype(np.float32), np.array(self.noise)
+        return {'scale': self.scale, 'points': points, 'noise': noise}
+
+
+def basis_from(arrays: Arrays) -> Basis:
+    """The basis of saved arrays. Raises KeyError when an array is missing."""
+    if 'points' in arrays:
+        return Process(arrays['scale'], arrays['points'], float(arrays['noise']))
+    return Monomials(arrays['center'], arrays['turn'], arrays['ridge'], int(arrays['features']))
 
 
 def matern(a: Array, b: Array) -> Array:
@@ -170,77 +182,3 @@ def spread(points: Array, size: int) -> NDArray[np.int64]:
         chosen[k] = np.argmax(distance)
         distance = np.minimum(distance, ((points - points[chosen[k]]) ** 2).sum(1))
     return chosen
-
-
-@dataclass(frozen=True, slots=True)
-class MetricMap:
-    """From slow features to meters in the map frame, with covariance."""
-
-    basis: Basis
-    weights: Array
-    """(m, 2)"""
-    spread: Array
-    """(m, m) square root of the weights' posterior covariance, meters."""
-    sway: Array
-    """(m, r, 2) weights' change per standard deviation of the joint errors of the segments, m."""
-    noise_m: float
-    """Standard deviation of an image's residual per axis, meters."""
-    inflation: float
-    """Factor on the variance that makes left-out segments consistent."""
-
-    @property
-    def features(self) -> int:
-        """How many of the slowest features it reads."""
-        return self.basis.features
-
-    def predict(self, features: Array) -> tuple[Array, Array]:
-        """Positions (M, 2) in meters and covariances (M, 2, 2) of slow features (M, >= K).
-
-        Raises DataError when there are fewer features than it was learned from.
-        """
-        features = checked_features(features, self.features)
-        expanded = self.basis.expand(features)
-        return expanded @ self.weights, self._covariance(expanded)
-
-    def _covariance(self, expanded: Array) -> Array:
-        own = ((expanded @ self.spread) ** 2).sum(1)
-        own += self.noise_m**2 * (1.0 + self.basis.missing(expanded))
-        sway = np.einsum('ij,jkl->ikl', expanded, self.sway)
-        joint = np.einsum('ikl,ikm->ilm', sway, sway)
-        return np.asarray(self.inflation * (joint + own[:, None, None] * np.eye(2)))
-
-    def to_arrays(self) -> Arrays:
-        """Plain arrays, from which `from_arrays` restores a map of monomials.
-
-        That of a process is saved in its fast form, see saved_map.py.
-        """
-        assert isinstance(self.basis, Monomials)
-        own = {
-            'kind': np.array('monomials'),
-            'weights': self.weights,
-            'spread': self.spread,
-            'sway': self.sway,
-            'noise_m': np.array(self.noise_m),
-            'inflation': np.array(self.inflation),
-        }
-        return own | {f'basis_{name}': value for name, value in self.basis.to_arrays().items()}
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> MetricMap:
-        """Raises KeyError when an array is missing."""
-        parts = {k[6:]: v for k, v in arrays.items() if k.startswith('basis_')}
-        basis = Monomials.from_arrays(parts)
-        weights, spread, sway = (np.asarray(arrays[n], float) for n in _ARRAYS)
-        noise_m, inflation = float(arrays['noise_m']), float(arrays['inflation'])
-        return cls(basis, weights, spread, sway, noise_m, inflation)
-
-
-_ARRAYS = ('weights', 'spread', 'sway')
-
-
-def checked_features(features: Array, count: int) -> Array:
-    """Features (M, >= count), of one row also (K,). Raises DataError when there are fewer."""
-    features = np.atleast_2d(np.asarray(features, float))
-    if features.shape[1] < count:
-        raise DataError(f'the map reads {count} slow features, not {features.shape[1]}')
-    return features

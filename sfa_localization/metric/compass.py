@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.linalg import blas
 
 from sfa_localization.data.array_files import packed, unpacked
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.metric.lower_factor import squares
 
 Complex = NDArray[np.complex128]
 UNKNOWN_YAW_VARIANCE = float(np.pi**2 / 3)
@@ -64,7 +63,7 @@ class Compass:
         s, f = self._scaled(features, harmonic)
         near = _near(s, self.features, self.length)
         kernel = near.astype(np.float32) * (f.astype(np.complex64) @ self._adjoint)
-        left = np.maximum(prior_variance(f) - _explained(kernel, self.factor), 0.0)
+        left = np.maximum(prior_variance(f) - squares(kernel, self.factor), 0.0)
         return kernel @ self.weights, left + self.noise
 
     def _scaled(self, features: Array, harmonic: Complex) -> tuple[Array, Complex]:
@@ -98,27 +97,6 @@ class Compass:
             sign,
             np.asarray(arrays['calibration'], float),
         )
-
-
-def triangular(hermitian: Complex) -> NDArray[np.complex64]:
-    """Lower triangular L in Fortran order with L L^H = a matrix, its negative part left out."""
-    try:
-        root = linalg.cholesky(hermitian, lower=True)
-    except linalg.LinAlgError:
-        # Rounding.
-        values, axes = linalg.eigh(hermitian)
-        root = axes * np.sqrt(np.maximum(values, 0.0))
-        root = linalg.qr(root.conj().T, mode='r')[0].conj().T
-    return np.asfortranarray(root, np.complex64)
-
-
-def _explained(kernel: NDArray[np.complex64], factor: NDArray[np.complex64]) -> Array:
-    """|k factor|^2 (T,), reading only the lower triangle for a single image."""
-    if len(kernel) > 1:
-        product = kernel @ factor
-    else:
-        product = blas.ctrmv(factor, kernel[0], lower=1, trans=1)[None]
-    return np.asarray((product.real**2 + product.imag**2).sum(1, dtype=np.float64))
 
 
 def scaled_inputs(

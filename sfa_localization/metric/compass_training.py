@@ -22,10 +22,10 @@ from sfa_localization.metric.compass import (
     phase_variance,
     prior_variance,
     scaled_inputs,
-    triangular,
 )
 from sfa_localization.metric.forecast import nearest_used
 from sfa_localization.metric.learning import MetricResult, headings, positions
+from sfa_localization.metric.lower_factor import lower_root
 from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.shared_tracks import tracks
 
@@ -54,33 +54,15 @@ _COVERAGE = 0.95
 
 @dataclass(frozen=True, slots=True)
 class LearnedHeading:
-    """A compass, and its errors at parts of the drive that it was learned without."""
+    """A compass that was learned from labeled `images` (T,), indices among all; the factor on its
+    variance by the `agreement` of an image's views, and figures of merit on paths between the
+    trained ones.
+    """
 
     compass: Compass
     images: Indices
-    """(T,) labeled images, of all images."""
-    left_out_error: Array
-    """(T,) rad."""
-    left_out_std: Array
-    """(T,) rad: what the compass claimed."""
-    certainty: Array
-    """(T,) |g|."""
-    weight: Array
-    """(T,) of sum 1: how well each error represents paths between the trained ones."""
     agreement: Agreement
-    """Factor on the variance of yaw by the disagreement of the views."""
-    variance_factor: Array
-    """(T,) that factor for the labeled images."""
-
-    @property
-    def quality(self) -> dict[str, float]:
-        """Figures of merit on paths between the trained ones."""
-        ratio = self.left_out_error**2 / (self.left_out_std**2 * self.variance_factor)
-        error = np.average(np.abs(self.left_out_error), weights=self.weight)
-        return {
-            'expected_yaw_error_deg': float(np.degrees(error)),
-            'left_out_yaw_within_95': share_within(ratio, 1, 0.95, self.weight),
-        }
+    quality: dict[str, float]
 
 
 def compass_layers(depth: int) -> tuple[int, ...]:
@@ -106,10 +88,13 @@ def learn_heading(
     weight = result.forecast.importance(distances)
     disagreement = images.disagreement[labeled]
     agreement = Agreement.fit(disagreement, fit.error**2, fit.std**2, axes=1, weight=weight)
-    factor = agreement.factor(disagreement)
-    return LearnedHeading(
-        fit.compass, labeled, fit.error, fit.std, fit.certainty, weight, agreement, factor
-    )
+    ratio = fit.error**2 / (fit.std**2 * agreement.factor(disagreement))
+    mean = np.average(np.abs(fit.error), weights=weight)
+    quality = {
+        'expected_yaw_error_deg': float(np.degrees(mean)),
+        'left_out_yaw_within_95': share_within(ratio, 1, 0.95, weight),
+    }
+    return LearnedHeading(fit.compass, labeled, agreement, quality)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +104,6 @@ class CompassFit:
     compass: Compass
     error: Array
     std: Array
-    certainty: Array
-    """(T,) |g|."""
 
 
 def fit_compass(features: Array, harmonic: Complex, yaw: Array, folds: Indices) -> CompassFit:
@@ -142,7 +125,7 @@ def fit_compass(features: Array, harmonic: Complex, yaw: Array, folds: Indices) 
     calibration = _calibrate(error, raw)
     std = np.sqrt(calibrated(raw, calibration))
     compass = problem.compass(sign, length, noise, calibration)
-    return CompassFit(compass, error, std, np.abs(g))
+    return CompassFit(compass, error, std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +184,7 @@ class _CompassProblem:
             kernel.conj().T @ kernel, moment, kernel_between(s, f, s, f, length), noise
         )
         scales = self.feature_scale, self.harmonic_scale
-        factor = triangular(uncertainty)
+        factor = np.asfortranarray(lower_root(uncertainty), np.complex64)
         return Compass(s, f, *scales, weights, factor, length, noise, sign, calibration)
 
 

@@ -19,7 +19,6 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, wrap_angle
 from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
-from sfa_localization.metric.basis import MetricMap
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
 from sfa_localization.metric.forecast import Forecast, forecast, nearest_used
 from sfa_localization.metric.map_covariance import angle_covariance, metric_map, plane, sway
@@ -27,6 +26,7 @@ from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import Span, choose, leave_out, part_of
 from sfa_localization.metric.settings import MetricConfig

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.metric import phases
-from sfa_localization.metric.basis import MetricMap
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.quadratic_form import schur
+from sfa_localization.metric.saved_map import MetricMap, Weights
 
 Complex = NDArray[np.complex128]
 
@@ -81,11 +81,8 @@ def metric_map(
     factor = fit.elimination.factor
     inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
     turned = turn * weights_sway
-    return MetricMap(
-        basis=fit.basis,
-        weights=plane(weights),
-        spread=np.ascontiguousarray(np.sqrt(fit.variance) * inverse.T),
-        sway=np.stack([turned.real, turned.imag], axis=-1),
-        noise_m=float(np.sqrt(fit.variance)),
-        inflation=inflation,
-    )
+    std = np.sqrt(fit.variance)
+    spread = np.ascontiguousarray(std * inverse.T)
+    in_plane = np.stack([turned.real, turned.imag], axis=-1)
+    learned = Weights(plane(weights), spread, in_plane, float(std))
+    return MetricMap.of(fit.basis, learned, inflation)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.basis import Basis
+from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.link_noise import learned
 from sfa_localization.metric.loops import Loops
 from sfa_localization.metric.quadratic_form import (
@@ -80,8 +80,8 @@ class MetricProblem:
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
         """Alternate solution and noise until the noise settles; a near `start` saves rounds."""
-        expanded = basis.expand(self.features)
-        noise_ratio = 1.0 + basis.missing(expanded)
+        expanded = expand(basis, self.features)
+        noise_ratio = 1.0 + missing(basis, expanded)
         solution = start.solution if start else None
         variance = start.variance if start else _FIRST_VARIANCE
         correlation = start.correlation if start else LINK_WEIGHT

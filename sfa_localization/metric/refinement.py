@@ -37,7 +37,7 @@ from sfa_localization.metric.learning import (
     learn_metric,
     left_out_agreement,
 )
-from sfa_localization.metric.saved_map import FastProcess
+from sfa_localization.metric.saved_map import MetricMap as FastProcess
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import Span
 from sfa_localization.metric.settings import MetricConfig
@@ -167,7 +167,7 @@ class Refinement:
         yaws = np.add.outer(steps, yaw).ravel()
         features = self.features(np.tile(spectra, (len(steps), 1, 1)), yaws)
         places, covariances = self.metric.predict(features[:count])
-        ahead, behind = np.split(self.metric.positions(features[count:]), 2)
+        ahead, behind = np.split(self.metric.predict(features[count:])[0], 2)
         slope = (ahead - behind) / (2.0 * _YAW_STEP_RAD)
         return places, self._doubted(covariances, views), np.asarray(slope)
 
@@ -230,7 +230,7 @@ def learn_refinement(
     metric = learn_metric(features, segments, process, seed, Span(POINTS, scale), first)
     agreement = left_out_agreement(disagreement, metric)
     assert isinstance(metric.map.basis, Process)
-    fast = FastProcess.of(metric.map, metric.map.basis)
+    fast = metric.map
     refinement = Refinement(projection, fast, agreement, sign, _usual(first, metric))
     return LearnedRefinement(refinement, metric)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, align_complex
-from sfa_localization.metric.basis import Basis, Monomials, Process, spread
+from sfa_localization.metric.basis import Basis, Monomials, Process, expand, missing, spread
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
 from sfa_localization.metric.quadratic_form import Stack, eliminate, schur
@@ -137,8 +137,8 @@ def evidence(basis: Basis, now: MapFit) -> float:
 
     Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
     """
-    expanded = basis.expand(now.problem.features)
-    weights = 1.0 / (1.0 + basis.missing(expanded))
+    expanded = expand(basis, now.problem.features)
+    weights = 1.0 / (1.0 + missing(basis, expanded))
     noise = float(basis.ridge[0])
     elimination = eliminate(expanded, basis.ridge, weights, now.stack)
     system = now.form(elimination).system(now.solution.bias)
@@ -254,7 +254,7 @@ def _search(
     points = scaled[spread(scaled, size)]
 
     def make(length: float, noise: float) -> Process:
-        return Process.at(points / length, scale / length, noise)
+        return Process(scale / length, points / length, noise)
 
     now = problem.fit(make(*hyper), start, 3)
     return now, _descend(make, hyper, now)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,8 +27,6 @@ from sfa_localization.metric.basis import Monomials, monomials
 from sfa_localization.metric.drive_check import check, diagnose
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, descend, odometry_start
-from sfa_localization.metric.phases import phase_cost
-from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack, eliminate
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -40,6 +37,7 @@ CONFIG = MetricConfig(metric_map='monomials', slow_features=8)
 SUCCESS = 1.1
 # Section 4 of the paper: a garden of 16 m x 18 m.
 HALF_AREA_M = np.array([8.0, 9.0])
+KINDS = ('random', 'grid', 'pieces')
 
 
 @dataclass
@@ -50,43 +48,28 @@ class Problem:
     segments: Segments
     features: np.ndarray
 
-
-def random_lines(seed: int) -> Problem:
-    twists, start = criss_cross(10, seed=seed)
-    return problem(drive(twists, start=start, seed=seed, **NOISE), 'straight', seed)
-
-
-def grid_lines(seed: int) -> Problem:
-    start = (-6.5, -6.5, 0.0)
-    return problem(drive(grid(13.0, 1.5, 9), start=start, seed=seed, **NOISE), 'straight', seed)
-
-
-def pieces(seed: int) -> Problem:
-    twists, start = meander(230.0, seed=seed)
-    return problem(drive(twists, start=start, seed=seed, **NOISE), 'any', seed)
-
-
-def problem(run: Drive, kind: str, seed: int) -> Problem:
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig(segments=kind))
-    features = garden_features(run.poses[:, :2], noise=0.05, count=8, seed=seed, world=seed)
-    return Problem(run, segments, features)
-
-
-KINDS: dict[str, Callable[[int], Problem]] = {
-    'random': random_lines,
-    'grid': grid_lines,
-    'pieces': pieces,
-}
+    @classmethod
+    def of(cls, kind: str, seed: int) -> Problem:
+        """Lines at random, lines of a grid, or pieces of any drive."""
+        twists, start = {
+            'random': lambda: criss_cross(10, seed=seed),
+            'grid': lambda: (grid(13.0, 1.5, 9), (-6.5, -6.5, 0.0)),
+            'pieces': lambda: meander(230.0, seed=seed),
+        }[kind]()
+        run = drive(twists, start=start, seed=seed, **NOISE)
+        cutter = SegmentConfig(segments='any' if kind == 'pieces' else 'straight')
+        segments = cut(run.odometry, run.stamps_ns, cutter)
+        features = garden_features(run.poses[:, :2], noise=0.05, count=8, seed=seed, world=seed)
+        return cls(run, segments, features)
 
 
 def certified(trial: Problem) -> dict[str, float]:
     """Solve one problem; its certificate, time, and error beside regression on ground truth."""
     problem = MetricProblem.of(trial.features, trial.segments, CONFIG)
-    stack = problem.stack
     started = time.perf_counter()
     result = problem.fit(Monomials.fit(problem.features, 8, 0.0))
     seconds = time.perf_counter() - started
-    truth = trial.run.poses[stack.images, :2]
+    truth = trial.run.poses[problem.stack.images, :2]
     found = result.expanded @ result.map_weights
     own = np.column_stack([found.real, found.imag])
     weights = np.linalg.lstsq(result.expanded, truth, rcond=None)[0]
@@ -95,8 +78,8 @@ def certified(trial: Problem) -> dict[str, float]:
         'ms': 1e3 * seconds,
         'uml': error(align(own, truth).apply(own), truth),
         'supervised': error(result.expanded @ weights, truth),
+        'segments': problem.stack.segments,
         'sufficient': sufficient(result),
-        'segments': stack.segments,
     }
 
 
@@ -116,12 +99,15 @@ def error(a: np.ndarray, b: np.ndarray) -> float:
 def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
     """Cost of the paper's descent over the least that its own cost can be, by start.
 
-    The least is that of equation 1 at certified angles, found without turns from the true ones.
+    The least is that of equation 1 at certified angles, found without turns.
     """
-    stack = Stack.of(trial.segments)
-    regressors = monomials(trial.features[stack.images])
+    unused = {'turn_variance': np.inf, 'displacement_variance': np.inf}
+    alone = tuple(replace(segment, **unused) for segment in trial.segments)
+    problem = MetricProblem.of(trial.features, replace(trial.segments, items=alone), CONFIG)
+    least = problem.fit(Monomials.fit(problem.features, 8, 0.0)).solution.cost
+    stack = problem.stack
+    regressors = monomials(problem.features)
     lines = Lines(regressors, stack.path.real, stack.owner, np.zeros(0))
-    least = best_cost(trial, stack)
     starts = {
         'random': random_start(lines, seed),
         'odometry': odometry_start(lines, stack.starts),
@@ -129,19 +115,6 @@ def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
     return {
         name: descend(lines, start, iterations)[1][-1] / least for name, start in starts.items()
     }
-
-
-def best_cost(trial: Problem, stack: Stack) -> float:
-    """Global minimum of equation 1 (certified; the cost of noisy lines is never zero)."""
-    features = trial.features[stack.images]
-    basis = Monomials.fit(features, 8, 0.0)
-    elimination = eliminate(basis.expand(features), basis.ridge, np.ones(len(features)), stack)
-    links = Links.of(trial.segments)
-    unused = np.full(len(links.at), np.inf)
-    links = replace(links, turn_variance=unused, displacement_variance=unused)
-    form = QuadraticForm(elimination.gram, links, stack.period, 1.0, 0.0)
-    solution = form.solve(None, np.zeros(stack.period[-1] + 1))
-    return phase_cost(solution.h, solution.z)
 
 
 def random_start(lines: Lines, seed: int) -> Parameters:
@@ -155,53 +128,31 @@ def random_start(lines: Lines, seed: int) -> Parameters:
     )
 
 
-def run(problems: int, descended: int) -> dict[str, object]:
-    """All figures; the descent, thousands of times slower, on the first problems only."""
+def bench_metric(problems: int = 1000) -> dict[str, object]:
+    """Medians by kind; the descent, thousands of times slower, on the first problems only."""
     rows: dict[str, list[dict[str, float]]] = {kind: [] for kind in KINDS}
     ratios: dict[str, list[float]] = {}
     for seed in range(problems):
-        kind = list(KINDS)[seed % len(KINDS)]
-        trial = KINDS[kind](seed)
+        kind = KINDS[seed % len(KINDS)]
+        trial = Problem.of(kind, seed)
         rows[kind].append(certified(trial))
-        if kind == 'random' and seed < descended * len(KINDS):
-            for iterations in (1000, 10000):
-                for start, ratio in descents(trial, seed, iterations).items():
-                    ratios.setdefault(f'{start} start, {iterations}', []).append(ratio)
-    return figures(rows, ratios)
-
-
-def figures(
-    rows: dict[str, list[dict[str, float]]], ratios: dict[str, list[float]]
-) -> dict[str, object]:
-    every = [row for group in rows.values() for row in group]
-    enough = [row for row in every if row['sufficient']]
-    over = [row['uml'] / row['supervised'] for row in enough]
-    success = {name: float(np.mean(np.array(r) < SUCCESS)) for name, r in ratios.items()}
+        if kind == 'random' and seed < 20 * len(KINDS):
+            for start, ratio in descents(trial, seed, 1000).items():
+                ratios.setdefault(start, []).append(ratio)
+    names = ('segments', 'ms', 'uml', 'supervised')
+    every = [row for group in rows.values() for row in group if row['sufficient']]
     return {
-        'uml_certified_share': float(np.mean([row['certified'] for row in enough])),
+        'uml_certified_share': float(np.mean([row['certified'] for row in every])),
         'uml_median_ms': float(np.median([row['ms'] for row in every])),
-        'uml_over_supervised': float(np.median(over)),
-        'paper_solver_success_share': success.get('random start, 1000', float('nan')),
-        'sufficient_share': len(enough) / len(every),
-        'by_kind': {kind: summary(group) for kind, group in rows.items() if group},
-        'paper_success': success,
+        'uml_over_supervised': float(np.median([r['uml'] / r['supervised'] for r in every])),
+        'by_kind': {
+            kind: {name: float(np.median([row[name] for row in group])) for name in names}
+            for kind, group in rows.items()
+            if group
+        },
+        'paper_solver_success_share': float(np.mean(np.array(ratios['random']) < SUCCESS)),
         'paper_cost_over_least': {name: float(np.median(r)) for name, r in ratios.items()},
     }
-
-
-def summary(group: list[dict[str, float]]) -> dict[str, float]:
-    names = ('segments', 'ms', 'uml', 'supervised')
-    medians = {name: float(np.median([row[name] for row in group])) for name in names}
-    shares = {name: float(np.mean([row[name] for row in group])) for name in SHARES}
-    return medians | shares
-
-
-SHARES = ('certified', 'sufficient')
-
-
-def bench_metric(n: int = 1000) -> dict[str, object]:
-    """Figures over `n` problems, and over at most 20 of them for the paper's descent."""
-    return run(n, min(20, -(-n // len(KINDS))))
 
 
 if __name__ == '__main__':

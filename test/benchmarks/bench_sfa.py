@@ -49,16 +49,17 @@ from sfa_localization.features.network_training import (
 )
 from sfa_localization.features.rotation_spread import Agreement
 from sfa_localization.features.sfa import Statistics, solve
-from sfa_localization.metric.basis import MetricMap, Process
-from sfa_localization.metric.compass import Compass, kernel_between, triangular
+from sfa_localization.metric.basis import Process, expand
+from sfa_localization.metric.compass import Compass, kernel_between
 from sfa_localization.metric.compass_training import (
     INDUCING_IMAGES,
     PLACE_FEATURES,
     _solve,
     compass_layers,
 )
+from sfa_localization.metric.lower_factor import lower_root
 from sfa_localization.metric.refinement import DIMENSIONS, Projection, Refinement, turned_back
-from sfa_localization.metric.saved_map import FastProcess
+from sfa_localization.metric.saved_map import MetricMap, Weights
 from sfa_localization.metric.selection import INDUCING_POINTS
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import COARSE_POINTS
@@ -203,16 +204,15 @@ def made_up_model(network) -> PlaceModel:
     )
 
 
-def _map(rng: np.random.Generator, count: int, features: int) -> FastProcess:
+def _map(rng: np.random.Generator, count: int, features: int) -> MetricMap:
     """A map of random inducing points."""
     points = rng.normal(size=(count, features))
-    basis = Process.at(points * 0.3, np.full(features, 0.3), 0.01)
-    expanded = basis.expand(points)
+    basis = Process(np.full(features, 0.3), points * 0.3, 0.01)
+    expanded = expand(basis, points)
     posterior = linalg.inv(expanded.T @ expanded + np.diag(basis.ridge) + 1e-9 * np.eye(count + 1))
     spread = linalg.cholesky(0.05**2 * posterior, lower=True)
     sway = 1e-3 * rng.normal(size=(count + 1, 12, 2))
-    metric = MetricMap(basis, rng.normal(size=(count + 1, 2)), spread, sway, 0.05, 1.0)
-    return FastProcess.of(metric, basis)
+    return MetricMap.of(basis, Weights(rng.normal(size=(count + 1, 2)), spread, sway, 0.05), 1.0)
 
 
 def _keyframes(rng: np.random.Generator) -> Keyframes:
@@ -233,7 +233,15 @@ def _compass(rng: np.random.Generator, count: int, features: int, width: int) ->
     scales = np.ones(features), np.ones(width)
     weights, uncertainty = solution
     return Compass(
-        s, f, *scales, weights, triangular(uncertainty), 2.0, 0.1, -1.0, np.array([1.0, 1e-3])
+        s,
+        f,
+        *scales,
+        weights,
+        np.asfortranarray(lower_root(uncertainty), np.complex64),
+        2.0,
+        0.1,
+        -1.0,
+        np.array([1.0, 1e-3]),
     )
 
 
@@ -306,12 +314,11 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
     close = keyframes.spectra[:CLOSE].transpose(2, 0, 1)
     made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
     maps = model.network.maps(image[None])
-    assert isinstance(model.metric, FastProcess)
     made += bare_process(model.metric, slow_features(maps))
     if model.refinement is not None:
         projection, finer = model.refinement.projection, model.refinement.metric
         made.append(_product(np.ones((1, len(projection.axes)), np.float32), projection.axes))
-        made += bare_process(finer, np.ones((1, len(finer.scale))))
+        made += bare_process(finer, np.ones((1, finer.features)))
     if model.compass is not None:
         compass = model.compass
         for layer in model.heading_layers:
@@ -324,12 +331,14 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
     return made
 
 
-def bare_process(fast: FastProcess, features: np.ndarray) -> list[Callable[[], object]]:
+def bare_process(learned: MetricMap, features: np.ndarray) -> list[Callable[[], object]]:
     """The products of a map of features (1, K)."""
-    scaled = features[:, : len(fast.scale)] * fast.scale
-    kernel = np.ones((1, len(fast.points)))
-    made = [_product(scaled, fast.points.T.copy()), _product(kernel, fast.linear)]
-    return [*made, _triangular(fast.factor)]
+    basis = learned.basis
+    assert isinstance(basis, Process)
+    scaled = features[:, : basis.features] * basis.scale
+    kernel = np.ones((1, len(basis.points)))
+    made = [_product(scaled, basis.points.T.copy()), _product(kernel, learned.linear)]
+    return [*made, _triangular(learned.factor)]
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> Callable[[], object]:

@@ -27,9 +27,10 @@ from sfa_localization.features.image_features import REFINING_LAYER, slow_featur
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.metric.basis import expand
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.paper_solver import PAPER_FEATURES
-from sfa_localization.metric.saved_map import Predictor
+from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
@@ -165,7 +166,7 @@ class Trial:
     def of(
         cls,
         study: Study,
-        metric: Predictor,
+        metric: MetricMap,
         features: tuple[Array, Array],
         rows: Rows,
         fitted: Rows,
@@ -184,7 +185,7 @@ class Trial:
             transform,
             raw,
             (transform.apply(raw[0]), transform.apply(raw[1])),
-            (metric.basis.expand(training[rows]) @ weights, metric.basis.expand(test) @ weights),
+            (expand(metric.basis, training[rows]) @ weights, expand(metric.basis, test) @ weights),
             turn @ covariances @ turn.T,
         )
 
