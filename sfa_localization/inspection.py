@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,34 +16,24 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
+from sfa_localization.bags.motion_arrays import StampedValues, to_yaw_rate
 from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
-from sfa_localization.camera.calibration import MirrorCircles, find_circles
-from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.camera import kinds
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
-from sfa_localization.data.errors import BagError, CameraError
+from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
-from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
+from sfa_localization.metric.motion_check import MotionCheck, check_motion
+from sfa_localization.metric.motion_sources import IMAGES, POSE, late
 from sfa_localization.metric.segments import PIECE_LENGTH_M
 
-PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
-MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'
-# Parameters of omnicam_node to start from; a strip needs none.
-_CALIBRATE = 'calibration_file: camera.yaml  # by: sfa_localization calibrate {bag}'
-_OUTPUTS = '--output camera.yaml --check check.png'
-_ENTRIES = {
-    MIRROR: f'{_CALIBRATE} {_OUTPUTS}',
-    FISHEYE: f'{_CALIBRATE} --model fisheye --field-of-view 185 {_OUTPUTS}',
-    DUAL_FISHEYE: 'calibration_file: camera.yaml  # with camera_model: dual_fisheye',
-    EQUIRECTANGULAR: 'camera_model: equirectangular',
-    PANORAMA: 'camera_model: panorama',
-}
 SAMPLES, SAMPLE_SIDE = 16, 640
 """Images on the contact sheet, and their longer side (pixels)."""
 SECTORS = 6
@@ -58,9 +48,6 @@ REPEATED = 0.05  # share of images that repeat the one before that is worth a wo
 STANDING_M = 0.02  # images nearer to each other were taken standing
 GRID = 100  # points per axis at which coverage is evaluated: steps of 1 % of the area's extent
 DARK = 12.0  # mean gray level of 255 below which an image is dark
-DELAY_SHOWN_S = 0.02  # a smaller delay of the camera is within the period of usual odometry
-# Of an unrolled circle; the inner third shows the robot or the camera itself.
-_RADII, _ANGLES, _INNER = 30, 400, 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,69 +119,12 @@ class TopicReport:
 
 
 @dataclass
-class ImageTopic:
-    """A topic of images: size, guessed geometry, and samples from all over the drive.
-
-    `seen` is what shows the geometry.
-    """
-
-    topic: str
-    width: int
-    height: int
-    geometry: str
-    seen: str
-    stamps_ns: Stamps
-    samples: list[Image]
-
-    def entry(self, bag: str) -> str:
-        """The parameter that describes the camera of a bag to omnicam_node; '' if none does."""
-        needed = self.geometry in _ENTRIES and not looks_like_panorama(self.height, self.width)
-        return _ENTRIES[self.geometry].format(bag=bag) if needed else ''
-
-    def as_dict(self) -> dict[str, Any]:
-        names = ('topic', 'width', 'height', 'geometry', 'seen')
-        return {name: getattr(self, name) for name in names}
-
-
-@dataclass
-class DrivenPath:
-    """The path of the robot by its odometry, and the poses (M, 3) of images with odometry.
-
-    `clock` says by how much images are stamped late, as far as turns show it.
-    """
-
-    topic: str
-    odometry: Odometry
-    places: Array
-    clock: CameraClock
-
-    def clock_text(self) -> str:
-        """What turns show about the clocks; '' where they show nothing."""
-        delay_s = self.clock.delay_s
-        if not self.clock.known or abs(delay_s) < DELAY_SHOWN_S:
-            return 'images and odometry agree' if self.clock.known else ''
-        late = 'late' if delay_s > 0 else 'early'
-        corrected = abs(self.clock.delay_ns) <= DELAY_LIMIT_NS
-        remedy = 'train and the filter correct it' if corrected else 'synchronize the clocks'
-        return f'images are stamped {abs(delay_s):.2f} s {late}: {remedy}'
-
-    def as_dict(self) -> dict[str, Any]:
-        return {
-            'topic': self.topic,
-            'length_m': round(path_length(self.odometry.poses), 2),
-            'pictures': len(self.places),
-            'area_m2': round(hull_area(self.places), 2),
-            'spacing_m': round(spacing(self.places), 3),
-            'directions': directions(self.places),
-            'camera_delay_s': round(self.clock.delay_s, 3) if self.clock.known else None,
-        }
-
-
-@dataclass
 class BagReport:
     """All findings about a bag; `lacks` are the reasons why it is not enough to train on.
 
-    `error` is the reason why it cannot be read at all.
+    `error` is the reason why it cannot be read at all. `samples` are images from all over the
+    drive; `camera` says what took them. `places` (M, 3) are the poses of images with `odometry`,
+    and `motion` compares it with the images and the gyroscope.
     """
 
     path: str
@@ -202,25 +132,28 @@ class BagReport:
     topics: list[TopicReport] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    images: ImageTopic | None = None
-    drive: DrivenPath | None = None
     lacks: list[str] = field(default_factory=list)
+    image_topic: str = ''
+    camera: kinds.CameraKind | None = None
+    samples: list[Image] = field(default_factory=list)
+    odometry_topic: str = ''
+    odometry: Odometry | None = None
+    places: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    motion: MotionCheck | None = None
 
     @property
     def facts(self) -> dict[str, str]:
-        """Camera, drive and clocks, in words."""
+        """Camera and drive, in words."""
         facts = {}
-        if self.images is not None:
-            images = self.images
-            facts['images'] = f'{images.width}x{images.height}, {images.geometry}: {images.seen}'
-        if self.drive is not None:
-            found = self.drive.as_dict()
+        if self.camera is not None:
+            facts['images'] = str(self.camera)
+        if self.odometry is not None:
             facts['drive'] = (
-                f'{found["length_m"]:.0f} m by {found["topic"]}, {found["pictures"]} images over '
-                f'{found["area_m2"]:.0f} m2, {found["spacing_m"]:.2f} m apart, '
-                f'along {found["directions"]} of {SECTORS} directions'
+                f'{path_length(self.odometry.poses):.0f} m by {self.odometry_topic}, '
+                f'{len(self.places)} images over {hull_area(self.places):.0f} m2, '
+                f'{spacing(self.places):.2f} m apart, '
+                f'along {directions(self.places)} of {SECTORS} directions'
             )
-            facts |= {'clocks': text} if (text := self.drive.clock_text()) else {}
         return facts
 
     def as_dict(self) -> dict[str, Any]:
@@ -231,8 +164,8 @@ class BagReport:
             'topics': {topic.name: topic.as_dict() for topic in self.topics},
             'problems': self.problems,
             'notes': self.notes,
-            'pictures': self.images.as_dict() if self.images else None,
-            'drive': self.drive.as_dict() if self.drive else None,
+            'facts': self.facts,
+            'motion': self.motion.as_dict() if self.motion else None,
             'enough_to_train_on': not (self.lacks or self.error),
             'lacks': self.lacks,
         }
@@ -248,9 +181,10 @@ class BagReport:
             lines.append(f'  {topic.name} ({kind}): {count}')
             lines += [f'    problem: {problem}' for problem in topic.problems]
         lines += [f'  {name}: {fact}' for name, fact in self.facts.items()]
+        lines += [f'  {line}' for line in self.motion.as_text()] if self.motion else []
         lines += [f'  problem: {problem}' for problem in self.problems]
         lines += [f'  note: {note}' for note in self.notes]
-        if entry := self.images and self.images.entry(self.path):
+        if entry := self.camera and self.camera.entry(self.path):
             lines += ['  start my_localization.yaml with:', '    /**/omnicam_node:']
             lines += ['      ros__parameters:', f'        {entry}']
         lines += [f'  not enough to train on: {lack}' for lack in self.lacks]
@@ -263,21 +197,24 @@ def inspect(
     topics: TopicNames | None = None,
     config: InspectionConfig | None = None,
     bag_config: BagConfig | None = None,
+    clockwise: bool = True,
     strict: bool = False,
 ) -> BagReport:
-    """Read a bag once and report on it. Raises BagError when nothing in it can be read."""
-    config, topics = config or InspectionConfig(), topics or TopicNames()
-    report = BagReport(str(path))
+    """Read a bag once and report on it. Columns of panoramas grow `clockwise` seen from above.
+
+    Raises BagError when nothing in it can be read.
+    """
+    topics, report = topics or TopicNames(), BagReport(str(path))
     with Bag(path, strict=strict, config=bag_config) as bag:
-        image = _found(bag, 'image', topics.image, report)
-        survey = _Survey(bag, image, _found(bag, 'odometry', topics.odometry, report))
-        report.topics = [survey.topic(stream) for stream in survey.streams]
-        report.images = survey.images()
-        report.drive = survey.drive()
+        report.image_topic = _found(bag, 'image', topics.image, report)
+        report.odometry_topic = _found(bag, 'odometry', topics.odometry, report)
+        _Survey(bag, report, topics, clockwise).fill()
         report.problems, report.notes = bag.problems, bag.recording.notes
-    if report.drive is not None and _one_route(report.drive.places):
+    if _one_route(report.places):
         report.notes.append(ROUTE)
-    report.lacks += [] if report.lacks else lacks(report, config)
+    if report.lacks and report.motion:
+        report.lacks += report.motion.wrong
+    report.lacks += [] if report.lacks else lacks(report, config or InspectionConfig())
     return report
 
 
@@ -293,26 +230,42 @@ def _found(bag: Bag, kind: str, name: str, report: BagReport) -> str:
 class _Survey:
     """One pass over all topics of a bag."""
 
-    def __init__(self, bag: Bag, image: str, odometry: str) -> None:
+    def __init__(self, bag: Bag, report: BagReport, topics: TopicNames, clockwise: bool) -> None:
+        self._bag, self._report = bag, report
         # None where there is none: damaged bags also have topics without a name.
-        self._bag, self._image, self._odometry = bag, image or None, odometry
-        self._driven = odometry.partition(':')[0] or None
-        self._values: dict[str, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
-        self._gyro, self._frozen, self._repeats = VisualGyro(), FrozenWatch(), 0
+        self._image = report.image_topic or None
+        self._driven = report.odometry_topic.partition(':')[0] or None
+        has = topics.imu or any(topic.kind == decoding.IMU for topic in bag.topics.values())
+        self._imu = (_found(bag, 'imu', topics.imu, report) if has else '') or None
+        self._values: dict[str | None, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
+        self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
-        self._samples: list[Image] = []
-        self._every = max(bag.topics[image].count // SAMPLES, 1) if image else 1
-        self.streams = [self._stream(name) for name in bag.topics]
-        for stream, stamp_ns, value in bag.read(self.streams):
+        self._every = max(bag.topics[self._image].count // SAMPLES, 1) if self._image else 1
+
+    def fill(self) -> None:
+        """Read the bag, and fill the report."""
+        streams = [self._stream(name) for name in self._bag.topics]
+        for stream, stamp_ns, value in self._bag.read(streams):
             self._values[stream.topic].append((stamp_ns, value))
+        self._report.topics = [self._topic(stream) for stream in streams]
+        samples = self._report.samples
+        if samples:
+            ((height, width), _), *_ = self._sizes.most_common(1)
+            alike = [sample for sample in samples if sample.shape == samples[0].shape]
+            self._report.camera = kinds.kind_of(alike, width, height)
+        for stream in streams:
+            if stream.topic == self._driven and self._values[self._driven]:
+                self._drive(stream)
 
     def _stream(self, name: str) -> Stream:
         if name == self._driven:
-            stream = self._bag.stream(self._odometry, decoding.odometry_of)
+            stream = self._bag.stream(self._report.odometry_topic, decoding.odometry_of)
             stream.required = False
             return stream
         if name == self._image:
             return self._bag.any_stream(name, self._sample)
+        if name == self._imu:
+            return self._bag.any_stream(name, read_yaw_rate)
         image = self._bag.topics[name].kind in KINDS['image'].found
         return self._bag.any_stream(name, _checked if image else lambda message: None)
 
@@ -321,19 +274,17 @@ class _Survey:
 
         Returns how far images have turned so far, rad.
         """
-        image = decoding.image_of(message)
+        image, samples = decoding.image_of(message), self._report.samples
         self._repeats += not self._frozen.add(image)
-        if self._sizes.total() % self._every == 0 and len(self._samples) < SAMPLES:
-            self._samples.append(_small(image))
+        if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:
+            samples.append(_small(image))
         self._sizes[image.shape[:2]] += 1
-        return self._gyro.add(_unrolled(image))
+        return self._gyro.add(kinds.unrolled(image))
 
-    def _stamps(self, name: str | None) -> Stamps:
-        return np.array([stamp for stamp, _ in self._values.get(name or '', ())], np.int64)
-
-    def topic(self, stream: Stream) -> TopicReport:
+    def _topic(self, stream: Stream) -> TopicReport:
         topic = self._bag.topics[stream.topic]
-        report = TopicReport(topic.name, topic.kind, topic.count, self._stamps(topic.name))
+        stamps = np.array([stamp for stamp, _ in self._values[topic.name]], np.int64)
+        report = TopicReport(topic.name, topic.kind, topic.count, stamps)
         report.problems = list(self._problems(stream, report))
         return report
 
@@ -351,25 +302,32 @@ class _Survey:
         if self._repeats > REPEATED * report.recorded:
             yield f'{self._repeats} of {report.recorded} images repeat the one before'
 
-    def images(self) -> ImageTopic | None:
-        if not self._samples or self._image is None:
-            return None
-        ((height, width), _), *_ = self._sizes.most_common(1)
-        alike = [s for s in self._samples if s.shape == self._samples[0].shape]
-        stamps = self._stamps(self._image)
-        return ImageTopic(self._image, width, height, *guess_geometry(alike), stamps, self._samples)
-
-    def drive(self) -> DrivenPath | None:
-        """The path, and the delay of the camera's clock at images in the order of their stamps."""
-        if self._driven is None or not self._values[self._driven]:
-            return None
-        stream = next(one for one in self.streams if one.topic == self._driven)
-        odometry = self._bag.to_odometry(stream, self._values[self._driven])
-        turned = sorted(self._values.get(self._image or '', ())) if self._image else []
+    def _drive(self, stream: Stream) -> None:
+        """The path, and what images and gyroscope, in the order of their stamps, say of it."""
+        report, camera = self._report, self._report.camera
+        odometry = self._odometry(stream, self._values[self._driven])
+        turned = sorted(self._values.get(self._image, ()))
         stamps = np.array([stamp for stamp, _ in turned], np.int64)
-        clock = camera_clock(odometry, stamps, [yaw for _, yaw in turned])
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
-        return DrivenPath(self._odometry, odometry, odometry.trajectory.at(near), clock)
+        report.odometry, report.places = odometry, odometry.trajectory.at(near)
+        seen = np.array([yaw for _, yaw in turned], float)
+        shown = (stamps, seen) if camera is not None and camera.shows_turns else None
+        rates = self._values.get(self._imu, [])
+        gyro = to_yaw_rate(sorted(rates)) if rates else None
+        report.motion = check_motion(
+            odometry, shown, gyro, camera is not None and camera.is_panorama
+        )
+
+    def _odometry(self, stream: Stream, values: StampedValues) -> Odometry:
+        """As it is recorded where it cannot be joined: then the comparison says what is wrong."""
+        try:
+            return self._bag.to_odometry(stream, values)
+        except BagError as error:
+            self._report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
+        stamps = np.array([stamp for stamp, _ in values], np.int64)
+        poses = np.array([pose for _, (pose, _) in values], float)
+        twists = np.array([twist for _, (_, twist) in values], float)
+        return Odometry(stamps, poses, twists[:, :2], twists[:, 2:])
 
 
 def _checked(message: Any) -> None:
@@ -380,57 +338,6 @@ def _checked(message: Any) -> None:
 def _small(image: Image) -> Image:
     scale = min(SAMPLE_SIDE / max(image.shape[:2]), 1.0)
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-
-
-def _unrolled(image: Image) -> Image:
-    """An image in which a turn of the robot is a shift: a circle, unrolled about its center."""
-    height, width = image.shape[:2]
-    if looks_like_panorama(height, width) or abs(width / height - 2) < 0.02:
-        return image
-    center, reach = ((width - 1) / 2, (height - 1) / 2), min(height, width) / 2
-    polar = cv2.warpPolar(image, (_RADII, _ANGLES), center, reach, cv2.INTER_LINEAR)
-    return np.ascontiguousarray(polar[:, _INNER:].transpose(1, 0, 2))
-
-
-def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
-    """The kind of camera that took images (H, W, 3) of one size, and what shows it."""
-    height, width = samples[0].shape[:2]
-    if looks_like_panorama(height, width):
-        return PANORAMA, f'{width / height:.1f} times as wide as high'
-    twice = abs(width / height - 2) < 0.02
-    halves = np.arange(2) * (width // 2)
-    if twice and all(_circles([s[:, at : at + height] for s in samples]) for at in halves):
-        return DUAL_FISHEYE, 'two circles'
-    if circles := None if twice else _circles(samples):
-        if circles.hole is None:
-            return FISHEYE, 'a circle'
-        share = circles.hole.radius / circles.rim.radius
-        return MIRROR, f'a circle, and the camera itself in its middle, {share:.0%} as wide'
-    if width > height and _closes(samples):
-        kind = EQUIRECTANGULAR if twice else PANORAMA
-        return (
-            kind,
-            f'{width / height:.1f} times as wide as high, the right edge goes on at the left',
-        )
-    return ORDINARY, 'no circle, and edges that do not go on at the other side'
-
-
-def _circles(samples: Sequence[Image]) -> MirrorCircles | None:
-    try:
-        return find_circles(samples)
-    except CameraError:
-        return None
-
-
-def _closes(samples: Sequence[Image]) -> bool:
-    """Whether the first column goes on where the last one ends: more than a half turn away."""
-    gray = np.stack([sample.mean(-1) for sample in samples])
-
-    def differs(columns: int) -> Array:
-        return np.asarray(np.abs(gray - np.roll(gray, columns, axis=2)).mean((0, 1)))
-
-    near, far = np.median(differs(1)), np.median(differs(gray.shape[2] // 2))
-    return bool(differs(1)[0] < np.sqrt(near * far))
 
 
 def path_length(poses: Array) -> float:
@@ -485,14 +392,16 @@ def _one_route(places: Array) -> bool:
 
 def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
     """The reasons why a bag is not enough to train on, each with the remedy."""
-    images, drive = report.images, report.drive
-    if images is None or drive is None:
-        parts = ('images', images), ('odometry', drive)
+    if report.camera is None or report.motion is None:
+        parts = ('images', report.camera), ('odometry', report.motion)
         yield f'no {" and no ".join(name for name, part in parts if part is None)} could be read'
         return
-    if abs(drive.clock.delay_ns) > DELAY_LIMIT_NS:
-        yield drive.clock_text()
-    used, recorded = len(drive.places), len(images.stamps_ns)
+    yield from report.motion.wrong
+    shown = report.motion.pair(POSE, IMAGES)
+    if shown and abs(shown.late_s) * 1e9 > DELAY_LIMIT_NS:
+        yield f'images are stamped {late(shown.late_s)}: synchronize the clocks'
+    used = len(report.places)
+    (recorded,) = (topic.count for topic in report.topics if topic.name == report.image_topic)
     if used < config.min_pictures:
         yield f'{used} images with odometry are few: drive until there are {config.min_pictures}'
     if used < (1 - MAX_LOST) * recorded:
@@ -500,14 +409,11 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
             f'{recorded - used} of {recorded} images have no odometry nearby: '
             'record both all the time, stamped by one clock'
         )
-    if images.geometry == ORDINARY:
-        yield (
-            'the images do not show all directions: an omnidirectional camera is needed (one it '
-            'is all the same: describe it with calibration_file)'
-        )
-    if float(np.mean([sample.mean() for sample in images.samples])) < DARK:
+    if report.camera.lack:
+        yield report.camera.lack
+    if float(np.mean([sample.mean() for sample in report.samples])) < DARK:
         yield 'the images are dark: open the lens or wait for daylight'
-    yield from _lacks_of_drive(drive.places, config) if used > 1 else ()
+    yield from _lacks_of_drive(report.places, config) if used > 1 else ()
 
 
 def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:

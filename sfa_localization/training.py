@@ -40,13 +40,14 @@ from sfa_localization.metric.learning import (
     correlation_along_drive,
     left_out_agreement,
 )
+from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.refinement import refined
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import Span
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe
-from sfa_localization.training_input import TrainingInput
+from sfa_localization.training_input import TrainingInput, compared
 
 COARSE_POINTS = 700
 """Inducing points of a map that is refined: with more, the refined map and the heading are no
@@ -66,6 +67,8 @@ class Trained:
     segments: Segments
     metric: MetricResult
     heading: LearnedHeading | None
+    checks: tuple[MotionCheck, ...] = ()
+    """Of each drive: what its sources of motion tell of each other."""
 
 
 def train(
@@ -76,16 +79,19 @@ def train(
     progress: bool = False,
     resume: bool = False,
     strict: bool = False,
+    force: bool = False,
 ) -> Trained:
     """Learn a place model from bags and write it to `output`.
 
-    A training that was interrupted leaves a checkpoint beside the output; with `resume` it goes on
-    from there and gives the same bytes (the engine mdp starts again). Raises BagError,
-    ConfigError, DataError or ModelError; then no model is written.
+    Images, odometry and gyroscope are compared first: what cannot be right is an error, or with
+    `force` a warning. A training that was interrupted leaves a checkpoint beside the output; with
+    `resume` it goes on from there and gives the same bytes (the engine mdp starts again). Raises
+    BagError, ConfigError, DataError or ModelError; then no model is written.
     """
     recipe, output = recipe or Recipe(), Path(output)
     with image_cache(output) as cache:
         runs = read_drives(bags, cache, recipe, progress, strict=strict)  # step 1
+        runs, checks = compared(runs, recipe, force)
         settings = (recipe.network, recipe.architecture, recipe.panorama, recipe.camera)
         checkpoint = Checkpoint.beside(output, settings, runs)
         if not resume:
@@ -97,7 +103,7 @@ def train(
             trained = _learn(network, given, strict)  # steps 4 to 9
         trained.model.save(output)
         checkpoint.remove()
-    return trained
+    return replace(trained, checks=checks)
 
 
 def _train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sfa_localization.bags.drives import ReadingRecipe
+from sfa_localization.camera.kinds import require_one_view
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.progress import announce, progress_bar
@@ -22,6 +23,7 @@ from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.drives import Drive, Drives
+from sfa_localization.metric.motion_check import MotionCheck, check_drives
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 logger = logging.getLogger(__name__)
@@ -104,6 +106,25 @@ class TrainingInput:
 def titled(step: int, text: str) -> str:
     """What a step does, with its number."""
     return f'{text} (step {step} of {STEPS})'
+
+
+def compared(
+    runs: Sequence[Run], recipe: Recipe, force: bool = False
+) -> tuple[tuple[Run, ...], tuple[MotionCheck, ...]]:
+    """The drives with corrected sources of motion, and what these tell of each other.
+
+    Raises CameraError or DataError for what cannot be right, of which `force` only warns.
+    """
+    if not force:
+        require_one_view(runs)
+    seen = [list(headings(run.panoramas, recipe.panorama.clockwise)) for run in runs]
+    found, checks = check_drives(runs, seen, force)
+    if recipe.segments.yaw_source == 'gyro':  # that is asked for, also where others contradict it
+        found = tuple(
+            replace(one, yaw_rate=one.yaw_rate or run.yaw_rate)
+            for one, run in zip(found, runs, strict=True)
+        )
+    return found, checks
 
 
 def drive_of(run: Run) -> Drive:

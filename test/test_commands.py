@@ -214,6 +214,10 @@ CASES: dict[str, dict[str, Check | Case]] = {
         '--report {out}/report': written('report/index.html'),
         '--resume': noted('resume'),
         '--strict': Case(refuses('read without --strict'), base=DAMAGED['train']),
+        '--force': Case(
+            lambda a, b: (a.code, b.code) == (1, 0),
+            base=BASE['train'].replace('small', 'counterclockwise'),
+        ),
         '--image-topic /nothing': refuses('/nothing'),
         '--odom-topic /ground_truth': QUALITY,
         '--imu-topic /nothing': refuses('/nothing'),
@@ -246,6 +250,8 @@ CASES: dict[str, dict[str, Check | Case]] = {
         '--json {out}/found.json': written('found.json'),
         '--report {out}/report': written('report/index.html'),
         '--strict': Case(refuses('read without --strict'), base=DAMAGED['inspect']),
+        '--config {data}/counterclockwise.yaml': says('images turn opposite to odometry'),
+        '--imu-topic /nothing': lambda a, b: '/nothing' in b.text,
         '--image-topic /nothing': lambda a, b: '/nothing' in b.text,
         '--odom-topic /ground_truth': says('by /ground_truth'),
         '--min-pictures 9999': says('drive until there are 9999'),
@@ -348,6 +354,9 @@ def data(tmp_path_factory: pytest.TempPathFactory, gardens: None, small_network:
     for name, count in {'small': 6, 'fewer': 4}.items():
         text = f'training:\n  ros__parameters:\n    slow_features: {count}\n'
         (folder / f'{name}.yaml').write_text(text)
+    (folder / 'counterclockwise.yaml').write_text(
+        '/**:\n  ros__parameters:\n    clockwise: false\n    slow_features: 6\n'
+    )
     (folder / 'start.yaml').write_text(
         'ekf_node:\n  ros__parameters:\n    measurement_factor: 9.0\n'
     )

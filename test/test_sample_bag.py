@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from sfa_localization.bags.drives import read_drive
-from sfa_localization.inspection import PANORAMA, inspect
+from sfa_localization.camera.kinds import PANORAMA
+from sfa_localization.inspection import inspect
 
 BAGS = Path(__file__).parents[1] / 'bags'
 README = (BAGS / 'README.md').read_text(encoding='utf-8')
@@ -33,7 +34,7 @@ def test_the_sample_holds_what_its_readme_lists(name: str, enough: bool, tmp_pat
         '/ground_truth': others,
     }
     assert not any(topic.problems for topic in report.topics) and report.problems == []
-    assert report.images is not None and report.images.geometry == PANORAMA
+    assert report.camera is not None and report.camera.name == PANORAMA
     assert (report.lacks == []) is enough
     run = read_drive(BAGS / name, tmp_path, want_truth=True, strict=True)
     assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == images

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sfa_localization.bags.settings import TopicNames
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.commands.options import (
     add_settings,
     add_topics,
@@ -42,20 +43,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--report', type=Path, metavar='DIR', help='write a contact sheet and the path as PNG'
     )
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
-    add_topics(parser, 'image', 'odometry')
+    parser.add_argument('--config', type=Path, help='parameter file: are panoramas clockwise?')
+    add_topics(parser, 'image', 'odometry', 'imu')
     add_settings(parser, InspectionConfig)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Inspect all bags; an unreadable one is reported and does not stop the others."""
     topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
+    clockwise = settings(PanoramaConfig, arguments, arguments.config).clockwise
+    strict = arguments.strict
     if arguments.json:
         require_output(arguments.json, arguments.bags, '.json')
     require_report(arguments.report, arguments.json)
     reports = []
     for path in arguments.bags:
         try:
-            reports.append(inspect(path, topics=topics, config=config, strict=arguments.strict))
+            reports.append(
+                inspect(path, topics=topics, config=config, clockwise=clockwise, strict=strict)
+            )
         except BagError as error:
             reports.append(BagReport(str(path), error=str(error)))
     if arguments.json:
@@ -86,15 +92,16 @@ def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:
     for number, report in enumerate(reports):
         stem, shown = Path(report.path).stem, dict[Path, str]()
         file = f'{number}_{stem}' if len(reports) > 1 else stem
-        if report.drive is not None:
-            target, drive = folder / f'{file}_path.png', report.drive
-            title = f'{stem}: {report.facts["drive"]}'.replace(', along', ',\nalong')
-            write_path(drive.odometry.poses, drive.places, title, target)
+        if report.odometry is not None:
+            target, title = folder / f'{file}_path.png', f'{stem}: {report.facts["drive"]}'
+            write_path(
+                report.odometry.poses, report.places, title.replace(', along', ',\nalong'), target
+            )
             shown[target] = 'The path by odometry, with the images'
-        if report.images is not None:
-            target, images = folder / f'{file}_pictures.png', report.images
-            title = f'{stem}: {images.topic}, {report.facts["images"]}'
-            write_contact_sheet(images.samples, title, target)
+        if report.samples:
+            target = folder / f'{file}_pictures.png'
+            title = f'{stem}: {report.image_topic}, {report.camera}'
+            write_contact_sheet(report.samples, title, target)
             shown[target] = 'Images from all over the drive'
         sections += bag_sections(report.as_dict(), [*map(': '.join, report.facts.items())], shown)
     write_page(folder, 'What is in the recording', *sections)

@@ -51,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures of the training')
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
+    parser.add_argument('--force', action='store_true', help='train on what contradicts itself too')
     add_topics(parser, 'image', 'odometry', 'imu')
     add_settings(parser, SegmentConfig, ('segments',))
     add_settings(parser, MetricConfig, ('solver', 'metric_map'))
@@ -74,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress=True,
         resume=arguments.resume,
         strict=arguments.strict,
+        force=arguments.force,
     )
     print(summary(trained))
     if arguments.report:
@@ -84,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _update(arguments: argparse.Namespace) -> int:
     """Extend a model; say what was added."""
-    unused = [name for name in ('report', 'resume') if getattr(arguments, name)]
+    unused = [name for name in ('report', 'resume', 'force') if getattr(arguments, name)]
     for group in (SegmentConfig, MetricConfig, NetworkConfig):
         unused += given(group, arguments)
     if unused:

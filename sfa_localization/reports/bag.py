@@ -53,7 +53,16 @@ def bag_sections(
         page.verdict(page.GOOD if enough else page.BAD, f'{Path(found["path"]).name} {answer}'),
         page.section('What do I drive or change next?', page.items(lacks)),
         page.section('What is in it?', page.items(facts), page.table(head, rows) if rows else ''),
+        motion_section(found['motion']) if found['motion'] else '',
         page.section('What is damaged?', page.items([*found['problems'], *damage])),
         page.section('Path and images', *(page.figure(*one) for one in shown.items())),
         page.section('Notes', page.items(found['notes'])),
     ]
+
+
+def motion_section(found: Mapping[str, Any]) -> str:
+    """The section about the sources of motion, of the plain values of a `MotionCheck`."""
+    pairs = [[*row.values()] for row in found['pairs']]
+    table = page.table([*found['pairs'][0]], pairs) if pairs else ''
+    said = page.items([*found['wrong'], *found['corrected'], *found['notes']])
+    return page.section('Do images, odometry and gyroscope agree?', said, table)

@@ -6,9 +6,6 @@ from __future__ import annotations
 
 from sfa_localization.training import Trained
 
-# s: a smaller delay of the camera is within the period of usual odometry.
-_DELAY_SHOWN_S = 0.02
-
 
 def summary(trained: Trained) -> str:
     """Amount of data, certificate, expected errors, and what was skipped; without ground truth."""
@@ -31,12 +28,8 @@ def summary(trained: Trained) -> str:
         lines.append(
             f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
         )
-    for run, delay in zip(trained.runs, quality['camera_delay_s'], strict=True):
-        if delay is not None and abs(delay) > _DELAY_SHOWN_S:
-            late = 'late' if delay > 0 else 'early'
-            lines.append(
-                f'{run.name}: images are stamped {abs(delay):.2f} s {late}: taken into account'
-            )
+    for run, check in zip(trained.runs, trained.checks, strict=False):
+        lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]
     for run, loss in zip(trained.runs, quality['turn_loss'], strict=True):
         if loss:
             lines.append(

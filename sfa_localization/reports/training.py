@@ -15,6 +15,7 @@ from sfa_localization.data.run import Image
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.learning import positions
 from sfa_localization.reports import figures, page
+from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure
 from sfa_localization.reports.figures import WorstImage
 from sfa_localization.reports.summary import summary
@@ -76,6 +77,7 @@ def write_training_report(
         page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage']),
         page.section('May I trust it?', page.items(trust_lines(trained))),
         page.section('What do I drive next?', page.items(advice(trained))),
+        *(motion_section(check.as_dict()) for check in trained.checks),
         page.section('Slow features', parts['firing_maps']),
         page.section('Worst images', parts.get('worst_images', '')),
     )  # fmt: skip

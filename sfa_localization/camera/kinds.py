@@ -1,0 +1,155 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which kind of camera took images, from the images alone, and how to describe it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sfa_localization.camera.calibration import MirrorCircles, find_circles
+from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.data.errors import CameraError
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image, Run
+
+PANORAMA, EQUIRECTANGULAR, ORDINARY = 'panorama', 'equirectangular', 'ordinary camera'
+MIRROR, FISHEYE, DUAL_FISHEYE = 'mirror', 'fisheye', 'dual fisheye'
+STEREO = 'stereo pair'
+# Parameters of omnicam_node to start from; a strip needs none.
+_CALIBRATE = 'calibration_file: camera.yaml  # by: sfa_localization calibrate {bag}'
+_OUTPUTS = '--output camera.yaml --check check.png'
+_ENTRIES = {
+    MIRROR: f'{_CALIBRATE} {_OUTPUTS}',
+    FISHEYE: f'{_CALIBRATE} --model fisheye --field-of-view 185 {_OUTPUTS}',
+    DUAL_FISHEYE: 'calibration_file: camera.yaml  # with camera_model: dual_fisheye',
+    EQUIRECTANGULAR: 'camera_model: equirectangular',
+    PANORAMA: 'camera_model: panorama',
+}
+# Of an unrolled circle; the inner third shows the robot or the camera itself.
+_RADII, _ANGLES, _INNER = 30, 400, 10
+# Two views side by side are as alike as 1, or 0.5 where they are shifted by parallax, up to such a
+# share of their width; what lies opposite in a panorama by 0.1.
+_SAME, _PARALLAX = 0.35, 0.1
+_SAMPLES = 16  # images of a drive that are looked at
+
+
+@dataclass(frozen=True, slots=True)
+class CameraKind:
+    """The kind of camera of images of a size, and what was `seen` that shows it."""
+
+    name: str
+    width: int
+    height: int
+    seen: str
+
+    def __str__(self) -> str:
+        return f'{self.width}x{self.height}, {self.name}: {self.seen}'
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the images show all around as columns."""
+        return self.name in (PANORAMA, EQUIRECTANGULAR)
+
+    @property
+    def shows_turns(self) -> bool:
+        """Whether a turn of the robot shifts the images, once they are unrolled."""
+        return self.is_panorama or self.name in (MIRROR, FISHEYE)
+
+    @property
+    def lack(self) -> str:
+        """Why it cannot be used; '' for nothing."""
+        if self.name not in (ORDINARY, STEREO):
+            return ''
+        return (
+            'the images do not show all directions: an omnidirectional camera is needed (one it '
+            'is all the same: describe it with calibration_file)'
+        )
+
+    def entry(self, bag: str) -> str:
+        """The parameter that describes the camera of a bag to omnicam_node; '' if none does."""
+        needed = self.name in _ENTRIES and not looks_like_panorama(self.height, self.width)
+        return _ENTRIES[self.name].format(bag=bag) if needed else ''
+
+
+def kind_of(samples: Sequence[Image], width: int, height: int) -> CameraKind:
+    """The kind of camera that took images (H, W, 3) of one size, of which these are small."""
+    name, seen = guess_geometry(samples)
+    return CameraKind(name, width, height, seen)
+
+
+def guess_geometry(samples: Sequence[Image]) -> tuple[str, str]:
+    """The name of the kind, and what shows it."""
+    height, width = samples[0].shape[:2]
+    ratio, twice = f'{width / height:.1f} times as wide as high', abs(width / height - 2) < 0.02
+    closes = width > height and _closes(samples)
+    halves = np.arange(2) * (width // 2)
+    if not closes and _same_twice(samples):
+        return STEREO, 'the left half shows the same as the right one'
+    if looks_like_panorama(height, width):
+        return PANORAMA, ratio
+    if twice and all(_circles([s[:, at : at + height] for s in samples]) for at in halves):
+        return DUAL_FISHEYE, 'two circles'
+    if circles := None if twice else _circles(samples):
+        if circles.hole is None:
+            return FISHEYE, 'a circle'
+        share = circles.hole.radius / circles.rim.radius
+        return MIRROR, f'a circle, and the camera itself in its middle, {share:.0%} as wide'
+    if closes:
+        kind = EQUIRECTANGULAR if twice else PANORAMA
+        return kind, f'{ratio}, the right edge goes on at the left'
+    return ORDINARY, 'no circle, and edges that do not go on at the other side'
+
+
+def require_one_view(runs: Sequence[Run]) -> None:
+    """Raises CameraError for drives whose panoramas are two views side by side."""
+    for run in runs:
+        at = np.unique(np.linspace(0, len(run.panoramas) - 1, _SAMPLES).astype(int))
+        samples = [run.panoramas.read(k, k + 1)[0] for k in at.tolist()]
+        if not _closes(samples) and _same_twice(samples):
+            raise CameraError(
+                f'{run.name}: the images are two views side by side: record one omnidirectional '
+                'camera (train --force goes on)'
+            )
+
+
+def unrolled(image: Image) -> Image:
+    """An image in which a turn of the robot is a shift: a circle, unrolled about its center."""
+    height, width = image.shape[:2]
+    if looks_like_panorama(height, width) or abs(width / height - 2) < 0.02:
+        return image
+    center, reach = ((width - 1) / 2, (height - 1) / 2), min(height, width) / 2
+    polar = cv2.warpPolar(image, (_RADII, _ANGLES), center, reach, cv2.INTER_LINEAR)
+    return np.ascontiguousarray(polar[:, _INNER:].transpose(1, 0, 2))
+
+
+def _circles(samples: Sequence[Image]) -> MirrorCircles | None:
+    try:
+        return find_circles(samples)
+    except CameraError:
+        return None
+
+
+def _closes(samples: Sequence[Image]) -> bool:
+    """Whether the first column goes on where the last one ends: more than a half turn away."""
+    gray = np.stack([sample.mean(-1) for sample in samples])
+
+    def differs(columns: int) -> Array:
+        return np.asarray(np.abs(gray - np.roll(gray, columns, axis=2)).mean((0, 1)))
+
+    near, far = np.median(differs(1)), np.median(differs(gray.shape[2] // 2))
+    return bool(differs(1)[0] < np.sqrt(near * far))
+
+
+def _same_twice(samples: Sequence[Image]) -> bool:
+    """Whether the left half shows the same as the right one."""
+    edges = np.diff(np.stack([sample.mean(-1) for sample in samples]), axis=2, append=0.0)
+    edges[..., -1] = 0.0
+    power = np.abs(np.fft.rfft(edges, axis=2)) ** 2
+    likeness = np.fft.irfft(power.sum((0, 1)), edges.shape[2])
+    half = edges.shape[2] // 2
+    near = likeness[half - round(_PARALLAX * half) : half + 1]
+    return bool(near.max() > _SAME * likeness[0] > 0)

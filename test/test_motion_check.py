@@ -1,0 +1,330 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Sources of motion that contradict each other: which of them is wrong, and what is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from metric_worlds import criss_cross, drive, lanes, meander
+
+from sfa_localization.bags.reader import Bag
+from sfa_localization.bags.writer import BagWriter
+from sfa_localization.camera.turns import VisualGyro
+from sfa_localization.data.errors import CameraError, DataError
+from sfa_localization.data.geometry import compose, wrap_angle
+from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, YawRate, integrate
+from sfa_localization.inspection import BagReport, InspectionConfig, inspect
+from sfa_localization.metric.motion_check import check_drives, check_motion, without_jumps
+from sfa_localization.metric.motion_sources import GYRO, IMAGES, POSE, TWIST, Source, compare
+from sfa_localization.training import train
+
+ENOUGH = InspectionConfig(min_pictures=100)
+Images = list[tuple[int, Image]]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a robot has recorded."""
+
+    images: Images
+    odometry: Odometry
+    gyro: YawRate | None = None
+
+    def showing(self, change: Callable[[Image], Image]) -> Recorded:
+        return replace(self, images=[(at, change(image)) for at, image in self.images])
+
+    def locked(self) -> Recorded:
+        """The camera turns its images back to where they first looked."""
+        stamps = np.array([at for at, _ in self.images])
+        yaw = np.unwrap(self.odometry.poses[:, 2])
+        turned = np.interp(stamps, self.odometry.stamps_ns, yaw)
+        columns = np.round(turned / (2 * np.pi) * self.images[0][1].shape[1]).astype(int)
+        pairs = zip(self.images, columns.tolist(), strict=True)
+        return replace(self, images=[(at, np.roll(i, -by, axis=1)) for (at, i), by in pairs])
+
+    def later(self, images_s: float = 0.0, gyro_s: float = 0.0) -> Recorded:
+        images = [(at + round(images_s * 1e9), image) for at, image in self.images]
+        gyro = self.gyro and replace(self.gyro, stamps_ns=self.gyro.stamps_ns + round(gyro_s * 1e9))
+        return replace(self, images=images, gyro=gyro)
+
+    def posed(self, *factors: float) -> Recorded:
+        """With poses times factors of x, y and yaw."""
+        return replace(self, odometry=replace(self.odometry, poses=self.odometry.poses * factors))
+
+    def twisted(self, *factors: float) -> Recorded:
+        """With twists times factors of v and omega."""
+        return replace(self, odometry=replace(self.odometry, twists=self.odometry.twists * factors))
+
+    def mirrored(self) -> Recorded:
+        return self.posed(1, -1, -1).twisted(1, -1)
+
+    def turned(self, factor: float) -> Recorded:
+        """With this factor on the gyroscope's rate."""
+        return replace(self, gyro=self.gyro and replace(self.gyro, omega=factor * self.gyro.omega))
+
+    def stamped_in(self, unit_ns: int) -> Recorded:
+        """With another unit in the nanoseconds of the odometry's stamps."""
+        second, part = np.divmod(self.odometry.stamps_ns, 10**9)
+        stamps = second * 10**9 + part // unit_ns
+        return replace(self, odometry=replace(self.odometry, stamps_ns=stamps))
+
+    def jumping(self, seconds: Iterable[float], meters: float) -> Recorded:
+        """With poses that jump at these times in different directions."""
+        odometry, rng = self.odometry, np.random.default_rng(0)
+        poses, time_s = odometry.poses.copy(), (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
+        for at in seconds:
+            bearing = rng.uniform(-np.pi, np.pi)
+            poses[time_s >= at, :2] += meters * np.array([np.cos(bearing), np.sin(bearing)])
+        return replace(self, odometry=replace(odometry, poses=poses))
+
+    def without_gyro(self) -> Recorded:
+        return replace(self, gyro=None)
+
+    def write(self, path: Path) -> Path:
+        with BagWriter(path) as bag:
+            for at, image in self.images:
+                bag.image('/images', at, image, 'camera', 'jpeg')
+            rows = self.odometry.stamps_ns.tolist(), self.odometry.poses, self.odometry.twists
+            for at, pose, twist in zip(*rows, strict=True):
+                bag.odometry('/odom', at, tuple(pose), tuple(twist), (0.0, 0.0))
+            for at, omega in zip(*self._rates(), strict=True):
+                bag.imu('/imu', at, omega, 0.0)
+        return path
+
+    def _rates(self) -> tuple[list[int], list[float]]:
+        return (self.gyro.stamps_ns.tolist(), self.gyro.omega.tolist()) if self.gyro else ([], [])
+
+    def run(self) -> Run:
+        stamps = np.array([at for at, _ in self.images])
+        panoramas = PanoramaArray(stamps, np.stack([image for _, image in self.images]))
+        return Run('drive', panoramas, self.odometry, self.gyro)
+
+    def seen(self) -> np.ndarray:
+        gyro = VisualGyro()
+        return np.array([gyro.add(image) for _, image in self.images])
+
+
+@pytest.fixture(scope='module')
+def sample() -> Recorded:
+    """The sample's test drive."""
+    with Bag(Path(__file__).parents[1] / 'bags/sample_test') as bag:
+        images, odometry = list(bag.images()), bag.odometry()
+        return Recorded(images, odometry, bag.yaw_rate())
+
+
+def inspected(recorded: Recorded, folder: Path) -> BagReport:
+    return inspect(recorded.write(folder / 'bag'), config=ENOUGH)
+
+
+def two_views(image: Image) -> Image:
+    """Half of a panorama, as two cameras side by side see it."""
+    return np.concatenate([image[:, 100:400], image[:, 110:410]], axis=1)
+
+
+def a_third(image: Image) -> Image:
+    """A third of a panorama, stretched to its shape."""
+    return cv2.resize(image[:, 200:400], image.shape[1::-1])
+
+
+WRONG = {
+    'mirrored images': (lambda s: s.showing(lambda i: i[:, ::-1]),
+                        'images turn opposite to odometry and gyroscope: set `clockwise`'),
+    'images or odometry': (lambda s: s.showing(lambda i: i[:, ::-1]).without_gyro(),
+                           'or swap left and right wheel'),
+    'mirrored odometry': (lambda s: s.mirrored(),
+                          'odometry turns opposite to gyroscope and images: swap left and right'),
+    'locked': (lambda s: s.locked(), 'images turn independently of odometry and gyroscope: switch'),
+    'ordinary': (lambda s: s.showing(a_third), 'times as far as odometry and gyroscope: a'),
+    'millimeters per second': (lambda s: s.twisted(1000, 1), '(odometry twist in millimeters?)'),
+    'millimeters': (lambda s: s.posed(1000, 1000, 1), '(odometry pose in millimeters?)'),
+    'both': (lambda s: s.posed(1000, 1000, 1).twisted(1000, 1), 'odometry pose drives at'),
+    'degrees per second': (lambda s: s.twisted(1, 180 / np.pi), '(odometry twist in degrees?)'),
+    'sign of the twist': (lambda s: s.twisted(1, -1), 'odometry twist turns opposite to'),
+    'milliseconds': (lambda s: s.stamped_in(10**6), 'stamps holds milliseconds: correct'),
+    'microseconds': (lambda s: s.stamped_in(10**3), 'stamps holds microseconds: correct'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', WRONG)
+def test_what_cannot_be_right_is_not_enough_to_train_on(sample, tmp_path, name):
+    change, text = WRONG[name]
+    report = inspected(change(sample), tmp_path)
+    assert any(text in lack for lack in report.lacks), report.lacks
+    assert text in report.as_text()
+
+
+def test_a_right_drive_is_enough(sample, tmp_path):
+    report = inspected(sample, tmp_path)
+    assert report.lacks == [] and report.motion is not None
+    assert report.motion.corrected == report.motion.notes == []
+    assert len(report.motion.pairs) == 7
+
+
+def test_two_views_side_by_side_are_no_panorama(sample, tmp_path):
+    report = inspected(sample.showing(two_views), tmp_path)
+    assert 'stereo pair: the left half shows the same' in report.facts['images']
+    assert any('do not show all directions' in lack for lack in report.lacks)
+
+
+CORRECTED = {
+    'upside down': (lambda s: s.turned(-1), 'gyroscope turns opposite to odometry and images'),
+    'degrees': (lambda s: s.turned(180 / np.pi), 'converted from degrees'),
+    'degrees the other way': (lambda s: s.turned(-180 / np.pi), 'converted from degrees'),
+    '2 s late': (lambda s: s.later(gyro_s=2.0), 'gyroscope: stamped 2.02 s late'),
+    '0.3 s late': (lambda s: s.later(gyro_s=0.3), 'gyroscope: stamped 0.32 s late'),
+    '1 s early': (lambda s: s.later(gyro_s=-1.0), 'gyroscope: stamped 0.98 s early'),
+}
+
+
+@pytest.mark.parametrize('name', CORRECTED)
+def test_a_gyroscope_is_corrected(sample, name):
+    change, text = CORRECTED[name]
+    recorded = change(sample)
+    (run,), (check,) = check_drives([recorded.run()], [recorded.seen()])
+    assert any(text in said for said in check.corrected), check.corrected
+    seconds = (sample.gyro.stamps_ns - sample.gyro.stamps_ns[0]) * 1e-9
+    at = (run.yaw_rate.stamps_ns - sample.gyro.stamps_ns[0]) * 1e-9
+    expected = np.interp(at + 0.02, seconds, sample.gyro.omega)
+    assert np.abs(run.yaw_rate.omega - expected)[60:-60].max() < 0.05
+
+
+def test_a_gyroscope_that_shows_something_else_is_left_out(sample):
+    other = replace(sample.gyro, omega=np.random.default_rng(0).normal(size=len(sample.gyro.omega)))
+    (run,), (check,) = check_drives([replace(sample, gyro=other).run()], [sample.seen()])
+    assert run.yaw_rate is None and 'left out' in check.corrected[0]
+
+
+@pytest.mark.parametrize(
+    ('late_s', 'circle', 'text'),
+    [
+        (0.0, False, ''),
+        (0.3, False, 's late; taken into account'),
+        (-0.3, True, 's early; taken into account'),
+        (0.9, False, 's late: synchronize the clocks'),
+    ],
+)
+def test_clocks_that_differ_are_found(sample, tmp_path, late_s, circle, text):
+    late = sample.showing(rolled_up if circle else np.asarray).later(images_s=late_s).without_gyro()
+    report = inspected(late, tmp_path)
+    pair = report.motion.pair(POSE, IMAGES)
+    assert pair.delay_known and pair.delay_s == pytest.approx(late_s, abs=0.03)
+    assert text in report.as_text() and ('stamped' in report.as_text()) == bool(text)
+    assert any('synchronize' in lack for lack in report.lacks) == (abs(late_s) > 0.5)
+
+
+def rolled_up(panorama: Image) -> Image:
+    """The image (200, 200, 3) of a mirror that shows a panorama around its center."""
+    rows, columns = np.mgrid[:200, :200] - 99.5
+    radius = np.hypot(rows, columns)
+    across = (np.arctan2(rows, columns) / (2 * np.pi) % 1 * panorama.shape[1]).astype(int)
+    along = ((95 - radius) / 60 * panorama.shape[0]).astype(int)
+    seen = (along >= 0) & (along < panorama.shape[0])
+    circle = panorama[np.clip(along, 0, panorama.shape[0] - 1), across % panorama.shape[1]]
+    return np.where(seen[..., None], circle, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ('seconds', 'meters', 'text'),
+    [
+        ([12.0], 1.1, 'odometry pose jumps once, by up to 1.1'),
+        (np.arange(3.0, 32.0, 3.0), 0.2, 'record the frame odom instead of map'),
+    ],
+)
+def test_odometry_that_jumps_goes_on_as_before(sample, tmp_path, seconds, meters, text):
+    jumping = sample.jumping(seconds, meters)
+    report = inspected(jumping, tmp_path)
+    assert text in report.as_text()
+    (run,), _ = check_drives([jumping.run()], [sample.seen()])
+    assert np.abs(run.odometry.poses - sample.odometry.poses)[:, :2].max() < 0.03
+
+
+def test_training_stops_unless_it_is_forced(sample, tmp_path, caplog):
+    bag = sample.mirrored().write(tmp_path / 'bag')
+    with pytest.raises(DataError, match='swap left and right wheel'):
+        train([bag], tmp_path / 'model.npz')
+    assert not (tmp_path / 'model.npz').exists()
+    runs, (check,) = check_drives([sample.mirrored().run()], [sample.seen()], force=True)
+    assert len(runs) == 1 and check.wrong[0] in caplog.text
+
+
+def test_training_refuses_two_views(sample, tmp_path):
+    bag = sample.showing(two_views).write(tmp_path / 'bag')
+    with pytest.raises(CameraError, match='two views side by side'):
+        train([bag], tmp_path / 'model.npz')
+
+
+def test_columns_may_grow_counterclockwise(sample, tmp_path):
+    bag = sample.showing(lambda i: i[:, ::-1]).write(tmp_path / 'bag')
+    assert inspect(bag, config=ENOUGH, clockwise=False).lacks == []
+
+
+# The comparison itself, of drives whose motion is known.
+
+DRIVES = {
+    'straight legs': criss_cross(12, seed=1),
+    'wandering': meander(120.0, seed=3),
+    'lanes': (lanes(8.0, 1.0, 8), (0.0, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize('name', DRIVES)
+@pytest.mark.parametrize(('sign', 'delay_s'), [(1.0, 0.0), (-1.0, 0.7)])
+def test_sign_and_delay_of_images_are_found_although_some_shifts_are_wrong(name, sign, delay_s):
+    twists, start = DRIVES[name]
+    run = drive(twists, start=start, yaw_noise=0.1, bias=0.01, seed=2)
+    pose = Source(POSE, run.odometry.stamps_ns, np.unwrap(run.odometry.poses[:, 2]))
+    rng, number = np.random.default_rng(0), len(run.poses)
+    steps = sign * np.diff(np.unwrap(run.poses[:, 2]), prepend=run.poses[0, 2])
+    steps += 0.01 * rng.standard_normal(number)
+    steps += np.where(rng.random(number) < 0.05, rng.uniform(-3, 3, number), 0.0)
+    found = compare(pose, Source(IMAGES, run.stamps_ns + round(delay_s * 1e9), np.cumsum(steps)))
+    assert found.scale == pytest.approx(sign, rel=0.1) and found.correlation > 0.7
+    assert found.delay_known and found.delay_s == pytest.approx(delay_s, abs=0.05)
+
+
+def test_turns_of_another_robot_are_not_alike():
+    one, other = (drive(*DRIVES['wandering'][:1], seed=1), drive(meander(120.0, seed=8)[0]))
+    check = check_motion(one.odometry, None, other.gyro)
+    assert check.pair(POSE, GYRO).correlation < 0.6 and check.gyro is None
+
+
+def test_a_drive_that_hardly_turns_says_nothing():
+    run = drive(np.tile([1.0, 0.001], (2000, 1)))
+    check = check_motion(run.odometry, (run.stamps_ns, 0 * run.stamps_ns), run.gyro)
+    assert [(pair.b, pair.what) for pair in check.pairs] == [(TWIST, 'way')]
+    assert check.wrong == check.corrected == check.notes == []
+
+
+def test_wheels_that_skid_are_worth_a_word():
+    run = drive(*DRIVES['straight legs'][:1])
+    wheels = replace(run.odometry, twists=run.odometry.twists * [1.0, 2.0])
+    wheels = replace(wheels, poses=integrate(wheels.stamps_ns, wheels.twists))
+    check = check_motion(wheels, (run.stamps_ns, run.poses[:, 2]), run.gyro)
+    assert check.wrong == check.corrected == [] and 'do the wheels skid' in check.notes[0]
+
+
+@pytest.mark.parametrize('every', [1, 5, 25])
+def test_messages_in_bundles_or_at_a_low_rate_do_not_jump(every):
+    for twists, start in DRIVES.values():
+        odometry = drive(twists, start=start, yaw_noise=0.2, speed_noise=0.2, seed=1).odometry
+        part = slice(None, None, every)
+        slow = Odometry(*(getattr(odometry, name)[part] for name in odometry.__slots__))
+        assert without_jumps(slow)[1] == ''
+    bundled = odometry.stamps_ns // 10**8 * 10**8 + np.arange(len(odometry.stamps_ns))
+    assert without_jumps(replace(odometry, stamps_ns=bundled))[1] == ''
+
+
+def test_a_jump_of_the_heading_turns_what_follows_back():
+    odometry = drive(*DRIVES['wandering'][:1]).odometry
+    later = compose(np.array([0.5, -0.3, 0.4]), odometry.poses)
+    poses = np.where(np.arange(len(later))[:, None] < 3000, odometry.poses, later)
+    joined, text = without_jumps(replace(odometry, poses=poses))
+    assert 'jumps once' in text
+    off = joined.poses - odometry.poses
+    assert np.abs(wrap_angle(off[:, 2])).max() < 0.02 and np.abs(off[:, :2]).max() < 0.3
