@@ -11,9 +11,15 @@ import pytest
 import yaml
 
 from sfa_localization.camera import watch
+from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.encodings import decode_compressed
 from sfa_localization.camera.panorama import Unwrapper
-from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
+from sfa_localization.camera.settings import (
+    CameraConfig,
+    CaptureConfig,
+    LensCalibration,
+    PanoramaConfig,
+)
 from sfa_localization.config import load_settings, write_config
 
 pytest.importorskip('rclpy')
@@ -73,9 +79,16 @@ def test_the_panorama_has_the_stamp_and_frame_of_the_picture(bench):
     np.testing.assert_array_equal(pixels(told), Unwrapper(MIRROR, PANORAMA)(raw_picture()))
 
 
-def test_frame_and_quality_of_service_by_parameter(bench):
-    node, heard = start(bench, frame_id='mast')
-    assert answer(bench, heard, message()).header.frame_id == 'mast'
+def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
+    """And the camera by a file of `calibrate`; test_simulation.py shows that the lens is undone."""
+    path, turned = tmp_path / 'camera.yaml', (0.0, 0.0, 40.0)
+    path.write_text(calibration_text(LensCalibration(), turned))
+    given = {'calibration_file': str(path), 'mount_rpy': list(turned), 'camera_model': ''}
+    node, heard = start(bench, frame_id='mast', **given)
+    shown = answer(bench, heard, message())
+    assert shown.header.frame_id == 'mast'
+    camera = dataclasses.replace(MIRROR, mount_rpy=turned)
+    np.testing.assert_array_equal(pixels(shown), Unwrapper(camera, PANORAMA)(raw_picture()))
     assert node.get_parameter('qos_overrides./image_raw.subscription.depth').value == 1
 
 
@@ -144,7 +157,15 @@ def test_masks_elevation_and_mount_change_while_running_and_are_declared(bench):
     assert until(lambda: np.array_equal(pixels(answer(bench, heard, message())), expected))
 
 
-def test_impossible_changes_are_rejected_with_the_reason(bench):
+def test_impossible_cameras_do_not_start_and_impossible_changes_are_rejected(bench):
+    for parameters, words in (
+        ({'source': 'video'}, 'source_path'),
+        ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
+        ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
+    ):
+        node = bench.run(OmnicamNode, start=False, **SMALL | parameters)
+        assert not node.start() and words in node.failure
+        bench.end(node)
     node, _ = start(bench)
     before = node.get_parameter('elevation_max').value
     for change, words in (
@@ -156,19 +177,6 @@ def test_impossible_changes_are_rejected_with_the_reason(bench):
         result = changed(node, **change)
         assert not result.successful and words in result.reason
     assert node.get_parameter('elevation_max').value == before
-
-
-@pytest.mark.parametrize(
-    ('parameters', 'words'),
-    [
-        ({'source': 'video'}, 'source_path'),
-        ({'calibration_file': 'nowhere.yaml'}, 'nowhere.yaml'),
-        ({'elevation_min': 60.0, 'elevation_max': 80.0}, 'sees no part'),
-    ],
-)
-def test_an_impossible_camera_says_so_and_does_not_start(bench, parameters, words):
-    node = bench.run(OmnicamNode, start=False, **SMALL | parameters)
-    assert not node.start() and words in node.failure
 
 
 def with_rules(*rules):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -94,17 +95,14 @@ class Driver:
         self.odometry = {name: make(Odometry, f'/{name}/odom', 10) for name in names}
         for name in names:
             kind, topic = STAGES[-1]
-            self.node.create_subscription(kind, f'/{name}/{topic}', self.listener(name), 10)
+            listen = partial(self.hear, name)
+            self.node.create_subscription(kind, f'/{name}/{topic}', listen, 10)
 
-    def listener(self, name: str) -> Any:
-        """What to do with a pose of this robot."""
-
-        def hear(message: PoseWithCovarianceStamped) -> None:
-            sent = self.sent.get(read_stamp(message.header.stamp))
-            if sent is not None:
-                self.latencies[name].append(time.perf_counter() - sent)
-
-        return hear
+    def hear(self, name: str, message: PoseWithCovarianceStamped) -> None:
+        """Note when a pose of this robot comes."""
+        sent_s = self.sent.get(read_stamp(message.header.stamp))
+        if sent_s is not None:
+            self.latencies[name].append(time.perf_counter() - sent_s)
 
     def run(self, names: list[str], rate_hz: float, seconds: float) -> int:
         """Send for some seconds; how many pictures each of the robots got."""
@@ -112,29 +110,28 @@ class Driver:
         start, pictures, moves = time.perf_counter(), 0, 0
         while (now := time.perf_counter() - start) < seconds:
             if now >= moves / ODOMETRY_HZ:
-                self.move(names)
+                self.move(names, time.time_ns(), np.zeros(3), (0.0, 0.0))
                 moves += 1
             elif now >= pictures / rate_hz:
-                self.picture(names)
+                self.panorama[3::6, ::3, 0] ^= 1  # never the same twice
+                self.panorama[0, 0] = time.time_ns() % 251
+                self.show(names, self.panorama, time.time_ns())
                 pictures += 1
             else:
                 time.sleep(0.0005)
         time.sleep(LAST_S)
         return pictures
 
-    def move(self, names: list[str]) -> None:
-        """One odometry message of robots that stand."""
-        zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
-        message = to_odometry(zero, one, zero[:2], one[:2, :2] * 1e-4, time.time_ns(), frames)
+    def move(self, names: list[str], stamp_ns: int, pose: Any, twist: Any) -> None:
+        """One odometry message."""
+        frames, one = ('odom', 'base_link'), np.eye(3)
+        message = to_odometry(pose, one, twist, one[:2, :2] * 1e-6, stamp_ns, frames)
         for name in names:
             self.odometry[name].publish(message)
 
-    def picture(self, names: list[str]) -> None:
-        """One picture, never the same twice."""
-        stamp_ns = time.time_ns()
-        self.panorama[0, 0] = stamp_ns % 251
-        self.panorama[3::6, ::3, 0] ^= 1
-        message = to_image(self.panorama, stamp_ns, 'omnicam')
+    def show(self, names: list[str], image: np.ndarray, stamp_ns: int) -> None:
+        """One image."""
+        message = to_image(image, stamp_ns, 'omnicam')
         self.sent[stamp_ns] = time.perf_counter()
         for name in names:
             self.images[name].publish(message)
@@ -154,18 +151,24 @@ class Driver:
         rclpy.try_shutdown(context=self.context)
 
 
+def parameters_of(model: PlaceModel, path: Path) -> dict[str, list[str]]:
+    """Parameters of the nodes, by their names, for images that are the model's panoramas."""
+    size = model.panorama
+    return {
+        'omnicam_node': ['camera_model:=panorama', f'width:={size.width}',
+                         f'height:={size.height}', f'elevation_min:={size.elevation_min}',
+                         f'elevation_max:={size.elevation_max}'],
+        'sfa_node': [f'model:={path.resolve()}'],
+        'ekf_node': [],
+    }  # fmt: skip
+
+
 class Processes:
     """Three processes for each robot; `kinds` are chain or relay, by namespace."""
 
     def __init__(self, model_path: Path, model: PlaceModel, kinds: dict[str, str]) -> None:
-        size = model.panorama
-        parameters = {
-            'omnicam_node': ['camera_model:=panorama', f'width:={size.width}',
-                             f'height:={size.height}', f'elevation_min:={size.elevation_min}',
-                             f'elevation_max:={size.elevation_max}'],
-            'sfa_node': [f'model:={model_path.resolve()}'],
-            'ekf_node': ['initial_pose:=[0.0, 0.0, 0.0]'],
-        }  # fmt: skip
+        parameters = parameters_of(model, model_path)
+        parameters['ekf_node'] = ['initial_pose:=[0.0, 0.0, 0.0]']
         self.driver = Driver(model, [*kinds])
         self.running = {
             name: [

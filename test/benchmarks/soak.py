@@ -20,25 +20,26 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
-import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from cylinder_worlds import PLACE_SIZE, Spheres, place, recipe
-from ros_bench import DOMAIN, Spinner, end_process, start_node
+from bench_chain import Driver, parameters_of
+from cylinder_worlds import Spheres, place, recipe
+from ros_bench import end_process, start_node
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.data.threads import one_core
-from sfa_localization.nodes.conversions import to_image, to_odometry
 from sfa_localization.nodes.lifecycle import latched_qos
+from sfa_localization.place_model import PlaceModel
 
+NAME = 'robot'
 START_NS = 1_700_000_000_000_000_000
 ODOMETRY_HZ, EVERY = 50, 10
 STEP_NS = 10**9 // ODOMETRY_HZ
@@ -62,39 +63,29 @@ def lap(steps: np.ndarray) -> np.ndarray:
     return np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), yaw], -1)
 
 
-class Robot:
-    """Sends odometry and pictures, and hears the poses that come back."""
+class Robot(Driver):
+    """Drives round, and hears the poses that come back."""
 
-    def __init__(self) -> None:
+    def __init__(self, model: PlaceModel) -> None:
+        super().__init__(model, [NAME])
         angles = np.arange(VIEWS) * (2 * np.pi / VIEWS)
         poses = lap(angles * RADIUS * ODOMETRY_HZ / SPEED)
         self.views = Spheres.about(1).panoramas(poses, recipe().panorama)
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN)
-        self.node = rclpy.create_node('robot', context=self.context)
-        self.executor = Spinner(self.context)
-        self.executor.add_node(self.node)
-        self.pictures = self.node.create_publisher(Image, 'image_raw', 10)
-        self.odometry = self.node.create_publisher(Odometry, 'odom', 1000)
         self.state, self.errors_m = '', deque[float](maxlen=500)
         self.step = self.answered = self.unanswered = self.driven_ns = 0
-        self.waiting: dict[int, float] = {}
-        self.latencies_s: list[float] = []
         self.heard = threading.Condition()
         listen = self.node.create_subscription
-        listen(PoseWithCovarianceStamped, 'ekf/pose', self.hear, 100)
-        listen(Odometry, 'ekf/odometry', self.hear_odometry, 1)
-        listen(String, 'ekf/state', self.hear_state, latched_qos())
+        listen(Odometry, f'/{NAME}/ekf/odometry', self.hear_odometry, 1)
+        listen(String, f'/{NAME}/ekf/state', self.hear_state, latched_qos())
 
-    def hear(self, message: PoseWithCovarianceStamped) -> None:
-        """Note the answer to a picture."""
+    def hear(self, name: str, message: PoseWithCovarianceStamped) -> None:
+        """Note the answer to an image."""
         position, stamp_ns = message.pose.pose.position, read_stamp(message.header.stamp)
         true = lap(np.array((stamp_ns - START_NS) / STEP_NS))
         with self.heard:
+            super().hear(name, message)
+            self.sent.pop(stamp_ns, None)
             self.errors_m.append(math.hypot(position.x - true[0], position.y - true[1]))
-            sent_s = self.waiting.pop(stamp_ns, None)
-            if sent_s is not None:
-                self.latencies_s.append(time.monotonic() - sent_s)
             self.answered += 1
             self.heard.notify()
 
@@ -109,67 +100,56 @@ class Robot:
         self.state = message.data
 
     def drive(self) -> None:
-        """The odometry of the next moment, and its picture where there is one."""
+        """The odometry of the next moment, and its image where there is one."""
         self.step += 1
         stamp_ns, pose = START_NS + self.step * STEP_NS, lap(np.array(float(self.step)))
-        twist, spread, frames = [SPEED, SPEED / RADIUS], np.eye(2) * 1e-6, ('odom', 'base_link')
-        self.odometry.publish(to_odometry(pose, np.eye(3), twist, spread, stamp_ns, frames))
+        self.move([NAME], stamp_ns, pose, (SPEED, SPEED / RADIUS))
         if self.step % EVERY == 0:
             turn = self.step * SPEED / RADIUS / ODOMETRY_HZ / (2 * math.pi)
             with self.heard:
-                self.waiting[stamp_ns] = time.monotonic()
-            view = self.views[round(turn * VIEWS) % VIEWS]
-            self.pictures.publish(to_image(view, stamp_ns, 'omnicam'))
+                self.show([NAME], self.views[round(turn * VIEWS) % VIEWS], stamp_ns)
 
     def wait(self) -> None:
         """Until little is unanswered: to drive faster than the nodes says nothing of them."""
         with self.heard:
             if not self.heard.wait_for(self.followed, PATIENCE_S):
-                self.unanswered += len(self.waiting)
-                self.waiting.clear()
+                self.unanswered += len(self.sent)
+                self.sent.clear()
 
     def followed(self) -> bool:
         """Whether the nodes are not far behind."""
         late_ns = START_NS + self.step * STEP_NS - self.driven_ns
-        return len(self.waiting) < IN_FLIGHT and late_ns < LATEST_NS
+        return len(self.sent) < IN_FLIGHT and late_ns < LATEST_NS
 
     def awake(self, processes: Nodes) -> None:
         """Drive at a robot's own pace until all nodes answer."""
         end, self.answered = time.monotonic() + AGAIN_S, 0
-        self.waiting.clear()
+        self.sent.clear()
         while self.answered < 3:
             if time.monotonic() > end:
                 raise RuntimeError('the nodes do not answer')
             processes.held()
             self.drive()
             time.sleep(1 / ODOMETRY_HZ)
-        self.waiting.clear()
-
-    def close(self) -> None:
-        """End the node and its thread."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        self.sent.clear()
 
 
 class Nodes:
     """The three nodes as processes, by name."""
 
-    def __init__(self, folder: Path) -> None:
-        with one_core():
-            place().model.save(folder / 'model.npz')
-        self.parameters = {
-            'omnicam_node': ['camera_model:=panorama', f'height:={PLACE_SIZE[0]}',
-                             f'width:={PLACE_SIZE[1]}'],
-            'sfa_node': [f'model:={folder / "model.npz"}'],
-            'ekf_node': [],
-        }  # fmt: skip
-        self.running = {name: start_node(name, *given) for name, given in self.parameters.items()}
+    def __init__(self, model: PlaceModel, folder: Path) -> None:
+        model.save(folder / 'model.npz')
+        self.parameters = parameters_of(model, folder / 'model.npz')
+        self.running = {name: self.start(name) for name in self.parameters}
+
+    def start(self, name: str) -> Any:
+        """The process of a node."""
+        return start_node(name, *self.parameters[name], namespace=f'/{NAME}')
 
     def restart(self, name: str) -> None:
         """End a node, and start it again."""
         end_process(self.running[name])
-        self.running[name] = start_node(name, *self.parameters[name])
+        self.running[name] = self.start(name)
 
     def held(self) -> dict[str, dict[str, float]]:
         """What each process holds; RuntimeError for one that has ended."""
@@ -189,7 +169,7 @@ def drive(robot: Robot, processes: Nodes, seconds: float, pace: float) -> list[d
     robot.awake(processes)
     steps, found, start = round(seconds * ODOMETRY_HZ), [], time.perf_counter()
     robot.answered = robot.unanswered = 0
-    robot.latencies_s.clear()
+    robot.latencies[NAME].clear()
     for step in range(1, steps + 1):
         ahead = step / (ODOMETRY_HZ * pace) - (time.perf_counter() - start)
         if ahead > 0.002:
@@ -213,8 +193,10 @@ def early_and_late(course: list[float], percent: float) -> list[float]:
 
 def soak(seconds: float, pace: float) -> tuple[dict[str, object], list[str]]:
     """Figures of the drive, and what is wrong with them."""
+    with one_core():
+        model = place().model
     with tempfile.TemporaryDirectory() as folder:
-        processes, robot = Nodes(Path(folder)), Robot()
+        processes, robot = Nodes(model, Path(folder)), Robot(model)
         try:
             start = time.perf_counter()
             found = drive(robot, processes, seconds, pace)
@@ -222,7 +204,7 @@ def soak(seconds: float, pace: float) -> tuple[dict[str, object], list[str]]:
             share = answered / (answered + robot.unanswered)
             error_m, taken_ms = (
                 statistics.median(robot.errors_m),
-                [1e3 * s for s in robot.latencies_s],
+                [1e3 * s for s in robot.latencies[NAME]],
             )
             back_s = {}
             for name in processes.parameters:
