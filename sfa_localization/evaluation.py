@@ -13,7 +13,7 @@ import math
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from scipy import linalg, signal, stats
 
 from sfa_localization.bags.drives import as_live, image_cache, read_drive
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
@@ -97,50 +96,25 @@ class _Track:
 
 
 @dataclass(frozen=True, slots=True)
-class _Located:
-    """What the model makes of a drive: its usable images, of which `features` (N, K) are.
+class _Drive:
+    """What model and filter make of a drive.
 
-    `counts` are those of messages and observations.
+    `tracks` holds 'sfa', the usable images, of which `features` (N, K) are; 'ekf', the filter at
+    each odometry message, and whether it was LOCALISED there, `sure` (T,); and 'smoothed', if
+    wanted. `counts` are those of messages, of observations, of what was fused, and of states.
     """
 
     run: Run
     truth: Trajectory
-    images: _Track
-    features: Array
-    counts: dict[str, Any]
-
-    @classmethod
-    def of(cls, run: Run, observations: list[Observation]) -> _Located:
-        """From the observations of all images. Raises DataError where none can be used."""
-        usable = [one for one in observations if not one.problem]
-        if not usable:
-            raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
-        skipped = Counter(one.problem for one in observations if one.problem)
-        counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
-        counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
-        clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
-        if clock.delay_ns:
-            counts['camera_delay_s'] = round(clock.delay_s, 3)
-        if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
-            clock = CameraClock()
-        assert run.ground_truth is not None
-        features = np.array([one.estimate.slow_features for one in usable])
-        return cls(run, run.ground_truth, _images(usable, clock), features, counts)
-
-
-@dataclass(frozen=True, slots=True)
-class _Replay:
-    """What model and filter make of a drive.
-
-    `tracks` holds 'sfa', the usable images; 'ekf', the filter at each odometry message, and
-    whether it was LOCALISED there, `sure` (T,); and 'smoothed', if wanted. `counts` are those of
-    what was fused, and of states.
-    """
-
-    located: _Located
-    sure: NDArray[np.bool_]
     tracks: dict[str, _Track]
+    features: Array
+    sure: NDArray[np.bool_]
     counts: dict[str, Any]
+
+    @property
+    def images(self) -> Trajectory:
+        """The usable images in the map."""
+        return self.tracks['sfa'].poses
 
 
 def evaluate(
@@ -163,46 +137,38 @@ def evaluate(
     Raises BagError or DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
-    trained = [_locate(one, Observer(model, watch), recipe, progress) for one in align_bags]
+    trained = [
+        _driven(one, Localizer(model, config, watch), _present(one, recipe), progress)
+        for one in align_bags
+    ]
     kind = Smoother if smooth else PoseFilter
-    replay = _replay(bag, Localizer(model, config, watch, kind), recipe, progress)
-    drive = replay.located
+    drive = _driven(bag, Localizer(model, config, watch, kind), recipe, progress)
     aligned_on = ', '.join(map(str, align_bags or [bag]))
     aligned_on = 'an earlier evaluation' if transform else aligned_on
-    pairs = [(one.truth, one.images.poses) for one in trained or [drive]]
+    pairs = [(one.truth, one.images) for one in trained or [drive]]
     transform = transform or fit_transform(*pairs)
-    estimates = _in_truth(model, replay, trained, transform)
-    false_s = _false_localised_s(replay, estimates['ekf'])
+    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
+    estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
+    if trained:
+        estimates['supervised'] = _supervised(model, trained, drive)
     return Evaluation(
         drive.truth,
         estimates,
-        _scores(replay, estimates, transform),
-        {**drive.counts, **replay.counts, 'false_localised_s': false_s},
+        _scores(drive, estimates, transform),
+        {**drive.counts, 'false_localised_s': _false_localised_s(drive, estimates['ekf'])},
         drive.features,
         aligned_on,
         transform,
     )
 
 
-def _in_truth(
-    model: PlaceModel, replay: _Replay, trained: Sequence[_Located], transform: RigidTransform
-) -> dict[str, Trajectory]:
-    """All estimates in the frame of the truth."""
-    drive = replay.located
-    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
-    estimates |= {name: moved(track.poses, transform) for name, track in replay.tracks.items()}
-    if trained:
-        estimates['supervised'] = _supervised(model, trained, drive)
-    return estimates
-
-
 def _scores(
-    replay: _Replay, estimates: Mapping[str, Trajectory], transform: RigidTransform
+    drive: _Drive, estimates: Mapping[str, Trajectory], transform: RigidTransform
 ) -> Scores:
     """The errors of every estimate; of the model's also calibration and similarity."""
-    truth, turn = replay.located.truth, rotation(transform.yaw_rad)
+    truth, turn = drive.truth, rotation(transform.yaw_rad)
     scores = {name: score(truth, estimate) for name, estimate in estimates.items()}
-    for name, track in replay.tracks.items():
+    for name, track in drive.tracks.items():
         scores[name] |= calibration(truth, estimates[name], turn, track.covariances)
         scores[name]['similarity'] = similarity(truth, estimates[name])
     return scores
@@ -216,60 +182,62 @@ def observed(
 
     Its images are there until the end. Raises BagError or DataError, also without a wanted truth.
     """
-    with _cache() as cache:
-        run = _read(bag, cache, recipe, progress, want_truth)
+    with _read(bag, recipe, progress, want_truth) as run:
         title, images = _title(run), len(run.panoramas)
         yield run, [*progress_over(observer.observe_run(run), title, images, shown=progress)]
 
 
-def _locate(bag: Path, observer: Observer, recipe: Recipe, progress: bool) -> _Located:
-    """Run the model over an aligning drive. Raises BagError or DataError."""
-    recipe = replace(recipe, topics=_present(bag, recipe.topics))
-    with observed(bag, observer, recipe, progress) as found:
-        return _Located.of(*found)
-
-
-def _replay(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Replay:
-    """Run model and filter over a bag. Raises BagError or DataError."""
-    with _cache() as cache:
-        run = _read(bag, cache, recipe, progress)
-        observations, fused, states = _replayed(localizer, run, progress)
-        located = _Located.of(run, observations)
-    tracks = {'sfa': located.images, 'ekf': _Track.of([state for state, _ in fused])}
-    if isinstance(localizer.filter, Smoother):
-        tracks['smoothed'] = _Track.of(localizer.filter.smoothed())
-    counts: dict[str, Any] = {'fusion': dict(localizer.filter.counts), 'states_s': states}
-    counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
-    sure = np.array([level is Level.LOCALISED for _, level in fused], bool)
-    return _Replay(located, sure, tracks, counts)
-
-
-def _present(path: Path, topics: TopicNames) -> TopicNames:
-    """The names of topics that a bag has; others are found by their types there."""
+def _present(path: Path, recipe: Recipe) -> Recipe:
+    """The recipe with the names of topics that a bag has; others are found by their types there."""
     with Bag(path) as bag:
-        known = {f'/{name.lstrip("/")}' for name in bag.topics}
-    names = {item.name: getattr(topics, item.name) for item in fields(topics)}
-    return TopicNames(
-        **{
-            key: name if f'/{name.partition(":")[0].lstrip("/")}' in known else ''
-            for key, name in names.items()
-        }
-    )
+        there = {f'/{name.lstrip("/")}' for name in bag.topics}
+    missing = {
+        item.name: ''
+        for item in fields(recipe.topics)
+        if f'/{getattr(recipe.topics, item.name).partition(":")[0].lstrip("/")}' not in there
+    }
+    return replace(recipe, topics=replace(recipe.topics, **missing))
 
 
-def _cache() -> AbstractContextManager[Path]:
-    return image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate')
+@contextmanager
+def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Iterator[Run]:
+    with image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate') as cache:
+        run = read_drive(bag, cache, recipe, progress, want_truth=truth)
+        if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
+            raise DataError(
+                f'{bag}: no ground truth to judge by; name it with --ground-truth-topic'
+            )
+        yield run
 
 
 def _title(run: Run) -> str:
     return f'locate the images of {run.name}'
 
 
-def _read(bag: Path, cache: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
-    run = read_drive(bag, cache, recipe, progress, want_truth=truth)
-    if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
-        raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
-    return run
+def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Drive:
+    """Run model and filter over a bag. Raises BagError or DataError."""
+    with _read(bag, recipe, progress) as run:
+        observations, fused, states = _replayed(localizer, run, progress)
+        clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+    usable = [one for one in observations if not one.problem]
+    if not usable:
+        raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')
+    skipped = Counter(one.problem for one in observations if one.problem)
+    counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
+    counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
+    counts |= {'fusion': dict(localizer.filter.counts), 'states_s': states}
+    counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
+    if clock.delay_ns:
+        counts['camera_delay_s'] = round(clock.delay_s, 3)
+    if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
+        clock = CameraClock()
+    tracks = {'sfa': _images(usable, clock), 'ekf': _Track.of([state for state, _ in fused])}
+    if isinstance(localizer.filter, Smoother):
+        tracks['smoothed'] = _Track.of(localizer.filter.smoothed())
+    sure = np.array([level is Level.LOCALISED for _, level in fused], bool)
+    assert run.ground_truth is not None
+    features = np.array([one.estimate.slow_features for one in usable])
+    return _Drive(run, run.ground_truth, tracks, features, sure, counts)
 
 
 def _replayed(
@@ -388,11 +356,11 @@ def _independent(normalized: Array) -> float:
     return count / (1 + 2 * float(((shared[1:] / shared[0]) ** 2).sum())) if len(shared) else count
 
 
-def _false_localised_s(replay: _Replay, ekf: Trajectory) -> float:
+def _false_localised_s(drive: _Drive, ekf: Trajectory) -> float:
     """Seconds in which the filter was LOCALISED and more than `WRONG_M` off."""
-    stamps, truth = ekf.stamps_ns, replay.located.truth
+    stamps, truth = ekf.stamps_ns, drive.truth
     apart = np.hypot(*(ekf.poses - truth.at(stamps))[:, :2].T)
-    wrong = replay.sure & known(truth, stamps) & (apart > WRONG_M)
+    wrong = drive.sure & known(truth, stamps) & (apart > WRONG_M)
     lasted_s = np.minimum(np.diff(stamps, prepend=stamps[:1]) * 1e-9, COAST_S)
     return float(lasted_s[wrong].sum())
 
@@ -445,18 +413,18 @@ def _summary(values: Array) -> dict[str, float]:
     }
 
 
-def _supervised(model: PlaceModel, trained: Sequence[_Located], drive: _Located) -> Trajectory:
+def _supervised(model: PlaceModel, trained: Sequence[_Drive], drive: _Drive) -> Trajectory:
     """The drive by the model's own regression, fitted on the ground truth of training drives."""
     features, places = [], []
     for one in trained:
-        stamps = one.images.poses.stamps_ns
+        stamps = one.images.stamps_ns
         mask = known(one.truth, stamps)
         features.append(one.features[mask])
         places.append(one.truth.at(stamps[mask])[:, :2])
     weights = regression(model.metric.basis, np.concatenate(features), np.concatenate(places))
     positions = expand(model.metric.basis, drive.features) @ weights
     unknown = np.full(len(positions), np.nan)
-    stamps = drive.images.poses.stamps_ns
+    stamps = drive.images.stamps_ns
     return Trajectory(stamps, np.column_stack([positions, unknown]))
 
 

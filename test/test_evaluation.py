@@ -205,7 +205,7 @@ def test_each_aligning_drive_is_named_and_the_reference_is_fitted_on_all(
 ):
     def supervised(_model, trained, drive):
         assert len(trained) == 2 and len(trained[0].features) == len(drive.features)
-        return drive.images.poses
+        return drive.images
 
     monkeypatch.setattr(evaluation, '_supervised', supervised)
     shutil.copytree(bag, tmp_path / 'second')
@@ -219,5 +219,5 @@ def test_topics_are_named_for_the_aligning_drive_only_where_it_has_them(tmp_path
         writer.odometry('/odom', 10**9, (0, 0, 0), (0, 0), (0, 0))
         writer.pose('/truth', 10**9, (0, 0, 0))
     asked = TopicNames(image='/other/image', odometry='odom', ground_truth='/truth')
-    present = evaluation._present(tmp_path / 'bag', asked)
+    present = evaluation._present(tmp_path / 'bag', Recipe(topics=asked)).topics
     assert present == TopicNames(odometry='odom', ground_truth='/truth')
