@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Is the state a promise? Claimed standard deviations against errors, over all faults, by state."""
 
-import itertools
 import math
 
 import numpy as np
@@ -14,7 +13,6 @@ from sfa_localization.evaluation import WRONG_M
 LEVELS = ('LOCALISED', 'DEGRADED', 'LOST')
 WITHIN_95 = {'position': math.sqrt(-2 * math.log(0.05)), 'heading': 1.96}
 """Standard deviations that hold 95 % of the errors: of two coordinates, and of one."""
-BINS, FEWEST = 8, 20
 _SMALLEST = {'position': 1e-2, 'heading': 0.1}
 
 
@@ -58,7 +56,7 @@ def draw(outputs, path):
 
 
 def panel(axis, outputs, quantity):
-    """Density of (claim, error), and the 95th percentile of the errors by claim."""
+    """Claims and errors, and below which line 95 % of the errors lie where claims are right."""
     unit, limit = ('m', WRONG_M) if quantity == 'position' else ('deg', WRONG_DEG)
     lowest = _SMALLEST[quantity]
     axis.set(xscale='log', yscale='log', xlabel=f'claimed standard deviation [{unit}]')
@@ -66,17 +64,7 @@ def panel(axis, outputs, quantity):
     axis.axhline(limit, color='tab:red', lw=0.8, label='wrong above')
     ends = np.array([lowest, 20 * limit])
     axis.plot(ends, WITHIN_95[quantity] * ends, 'k--', lw=0.8, label='95 % if the claim is right')
-    if not outputs:
-        return
-    std, error = (np.maximum(array, lowest) for array in values(outputs, quantity))
-    axis.hexbin(
-        std, error, xscale='log', yscale='log', bins='log', gridsize=40, mincnt=1, cmap='Blues'
-    )
-    edges = np.geomspace(std.min(), std.max() * 1.001, BINS + 1)
-    bins = [error[(low <= std) & (std < high)] for low, high in itertools.pairwise(edges)]
-    middle = np.sqrt(edges[:-1] * edges[1:])
-    shown = [
-        (m, np.percentile(b, 95)) for m, b in zip(middle, bins, strict=True) if len(b) > FEWEST
-    ]
-    if shown:
-        axis.plot(*np.transpose(shown), 'o-', color='tab:orange', label='95 % of the errors')
+    if outputs:
+        std, error = (np.maximum(array, lowest) for array in values(outputs, quantity))
+        grid = {'xscale': 'log', 'yscale': 'log', 'gridsize': 40, 'mincnt': 1}
+        axis.hexbin(std, error, bins='log', cmap='Blues', **grid)
