@@ -37,18 +37,12 @@ class Spheres:
 
     @classmethod
     @cache
-    def about(cls, seed: int, count: int = 40, clear_m: float = 3.0) -> Spheres:
+    def about(cls, seed: int, count: int = 40) -> Spheres:
         rng = np.random.default_rng(seed)
-        bearing, reach = rng.uniform(-np.pi, np.pi, count), rng.uniform(clear_m, 10.0, count)
+        bearing, reach = rng.uniform(-np.pi, np.pi, count), rng.uniform(3.0, 10.0, count)
         places = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], 1)
         heights, radii = rng.uniform(-2.0, 3.0, count), rng.uniform(0.4, 1.6, count)
         return cls(places, heights, radii, rng.uniform(-90, 90, (count, 3)))
-
-    def symmetric(self) -> Spheres:
-        """The same world four times over, a quarter turn apart."""
-        turned = [self.places @ np.array([[c, s], [-s, c]]) for c, s in _QUARTERS]
-        again = (np.concatenate([part] * 4) for part in (self.heights, self.radii, self.colors))
-        return Spheres(np.concatenate(turned), *again)
 
     def panoramas(self, poses: np.ndarray, config: PanoramaConfig) -> np.ndarray:
         """Panoramas (T, H, W, 3) uint8 from poses (T, 3)."""
@@ -72,9 +66,6 @@ class Spheres:
             self.colors,
         )
         return np.clip(128 + blobs, 0, 255).round().astype(np.uint8)
-
-
-_QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 def panorama_config(size: tuple[int, int] = SIZE, clockwise: bool = True) -> PanoramaConfig:

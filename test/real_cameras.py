@@ -12,9 +12,11 @@ import numpy as np
 FOLDER = Path(__file__).parent / 'cameras'
 DESK_CENTER, DESK_RADII = (243.2, 136.1), (58.7, 149.3)
 """Of the mirror, in pixels."""
+STEP_DEG = 25.0
+"""From picture to picture."""
 
 
-def desk_mirror(count, step_deg=25.0, turns='mirror'):
+def desk_mirror(count, turns='mirror'):
     """Pictures (270, 480, 3) of a mirror in a housing; the `mirror` turns, or the whole `picture`.
 
     All have another noise.
@@ -24,28 +26,28 @@ def desk_mirror(count, step_deg=25.0, turns='mirror'):
     radius = np.hypot(columns - DESK_CENTER[0], rows - DESK_CENTER[1])
     shown = (radius > DESK_RADII[0]) & (radius < DESK_RADII[1]) | (turns == 'picture')
     for index in range(count):
-        turn = cv2.getRotationMatrix2D(DESK_CENTER, index * step_deg, 1.0)
+        turn = cv2.getRotationMatrix2D(DESK_CENTER, index * STEP_DEG, 1.0)
         turned = cv2.warpAffine(still, turn, still.shape[1::-1])
         picture = np.where(shown[..., None], turned, still)
         yield np.clip(picture + rng.normal(0, 2, picture.shape), 0, 255).astype(np.uint8)
 
 
-def street(count, step_deg=25.0):
+def street(count):
     """Equirectangular pictures (240, 480, 3)."""
     picture = cv2.imread(str(FOLDER / 'street_equirectangular.jpg'))
     for index in range(count):
-        yield np.roll(picture, round(index * step_deg / 360 * picture.shape[1]), axis=1)
+        yield np.roll(picture, round(index * STEP_DEG / 360 * picture.shape[1]), axis=1)
 
 
-def ordinary(count, step_deg=25.0, size=(240, 320), field_deg=80.0):
-    """Pictures (H, W, 3) of an ordinary camera in the same street."""
+def ordinary(count, size=(240, 320)):
+    """Pictures (H, W, 3) of an ordinary camera, of 80 degrees, in the same street."""
     height, width = size
-    focal = width / 2 / np.tan(np.radians(field_deg / 2))
+    focal = width / 2 / np.tan(np.radians(40))
     rows, columns = (
         np.mgrid[:height, :width] + 0.5 - np.array([height, width])[:, None, None] / 2
     ) / focal
     azimuth, elevation = np.arctan(columns), np.arctan2(-rows, np.hypot(columns, 1.0))
-    for picture in street(count, step_deg):
+    for picture in street(count):
         across = (azimuth / (2 * np.pi) + 0.5) * picture.shape[1]
         along = (0.5 - elevation / np.pi) * picture.shape[0]
         yield cv2.remap(
@@ -53,19 +55,19 @@ def ordinary(count, step_deg=25.0, size=(240, 320), field_deg=80.0):
         )
 
 
-def fisheye(size, soft, cut=0.0, count=1, step_deg=25.0):
+def fisheye(size, soft, count=1):
     """Pictures (H, W, 3) of a fisheye that looks up from the street.
 
-    Its light falls off over the share `soft` of the radius, and the border cuts it off by `cut`.
+    Its light falls off over the share `soft` of the radius.
     """
     height, width = size
-    center, radius = (width / 2 + 4, height / 2 - 6), min(size) / 2 * 0.97 * (1 + cut)
+    center, radius = (width / 2 + 4, height / 2 - 6), min(size) / 2 * 0.97
     rows, columns = np.mgrid[:height, :width]
     x, y = columns - center[0], rows - center[1]
     off = np.hypot(x, y) / radius
     light = 1 / (1 + np.exp(np.clip((off - 1) / soft * 4, -50, 50)))
     pictures = []
-    for picture in street(count, step_deg):
+    for picture in street(count):
         high, wide = picture.shape[:2]
         maps = (
             (np.arctan2(x, y) / (2 * np.pi) + 0.5) * (wide - 1),
