@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,9 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
     rng = np.random.default_rng(seed)
     scale = min(_SEARCHED_PX / max(images[0].shape), 1.0)
     cues = _cues(images, scale)
-    rim = _best([_find_circle(cue, rng, None) for cue in cues])
+    by_support = attrgetter('support')
+    found = filter(None, [_find_circle(cue, rng, None) for cue in cues])
+    rim = max(found, key=by_support, default=None)
     if rim is None:
         few = len(images) < _ENOUGH_FOR_MOTION
         more = f'{_ENOUGH_FOR_MOTION} or more, not {len(images)}' if few else 'others'
@@ -91,13 +94,9 @@ def find_circles(images: Sequence[Image], seed: int = 0) -> MirrorCircles:
             f'no mirror or fisheye stands out: take images ({more}) while driving in good light, '
             'or give --center and --radii'
         )
-    hole = _best([_find_circle(cue, rng, rim) for cue in cues])
+    found = filter(None, [_find_circle(cue, rng, rim) for cue in cues])
+    hole = max(found, key=by_support, default=None)
     return MirrorCircles(_enlarged(rim, scale), hole and _enlarged(hole, scale))
-
-
-def _best(circles: Sequence[Circle | None]) -> Circle | None:
-    found = [circle for circle in circles if circle is not None]
-    return max(found, key=lambda circle: circle.support, default=None)
 
 
 def _enlarged(circle: Circle, scale: float) -> Circle:
@@ -360,10 +359,8 @@ def _draw(drawn: Image, rays: Array) -> None:
     """Draw directions and elevations into an image whose pixels see rays (H, W, 3)."""
     x, y, z = np.moveaxis(rays, -1, 0)
     for elevation in range(-80, 90, 10):
-        line = _border(z > np.sin(np.radians(elevation)), x)
-        if elevation == 0:
-            line |= np.roll(line, 1, axis=0)
-        drawn[line] = _GREEN
+        above, width = z > np.sin(np.radians(elevation)), 2 if elevation else 3
+        drawn[_border(above, x, width)] = _GREEN
     for seen in (x > 0, y > 0):
         drawn[_border(seen, x)] = _RED
     for elevation in range(-80, 90, 10):
@@ -373,13 +370,12 @@ def _draw(drawn: Image, rays: Array) -> None:
         _write(drawn, name, rays, (azimuth, 0), _RED)
 
 
-def _border(inside: NDArray[np.bool_], seen: Array) -> NDArray[np.bool_]:
+def _border(inside: NDArray[np.bool_], seen: Array, width: int = 2) -> NDArray[np.bool_]:
     """Mask (H, W) of where a region ends, beside pixels that see something."""
-    border = np.zeros(inside.shape, bool)
-    visible = np.isfinite(seen)
-    border[1:] |= (inside[1:] != inside[:-1]) & visible[1:] & visible[:-1]
-    border[:, 1:] |= (inside[:, 1:] != inside[:, :-1]) & visible[:, 1:] & visible[:, :-1]
-    return border
+    square = np.ones((width, width), np.uint8)
+    border = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_GRADIENT, square)
+    visible = cv2.erode(np.isfinite(seen).astype(np.uint8), square)
+    return np.asarray((border > 0) & (visible > 0))
 
 
 def _write(

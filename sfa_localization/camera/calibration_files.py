@@ -131,11 +131,10 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """Plain YAML, and the matrices of OpenCV's FileStorage as mappings."""
 
 
-def _matrix_node(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return dict(loader.construct_mapping(node, deep=True))
-
-
-_Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _matrix_node)
+_Loader.add_constructor(
+    'tag:yaml.org,2002:opencv-matrix',
+    _Loader.construct_yaml_map,  # type: ignore[type-var]
+)
 
 
 def _from_names(text: str) -> dict[str, Any]:

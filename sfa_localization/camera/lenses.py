@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Omnidirectional camera models with one interface: ray to pixel, and pixel to ray.
 
-A lens maps between rays (N, 3) of its optical frame (x along columns, y along rows, z along the
-axis into the scene) and pixels (N, 2) as column, row of the calibrated image, pixel centers at
-integers. What a lens cannot see is NaN. `CameraModel` mounts a lens on the robot.
+A lens maps between unit rays (N, 3) of its optical frame (x along columns, y along rows, z along
+the axis into the scene) and pixels (N, 2) as column, row of the calibrated image, pixel centers at
+integers. What a lens cannot see is NaN. Radii are measured from its `center`, where it has one.
+`CameraModel` mounts a lens on the robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -26,20 +27,6 @@ _WIDEST_PLANE = 20.0  # radius in the plane of a mirror up to which its distorti
 _SAMPLES = 2048  # of a curve that is inverted, before Newton's method
 _NEWTON_STEPS = 3
 _LINEAR = (0.0,) * 4  # coefficients of no distortion
-
-
-class Lens(Protocol):
-    """A camera model in its own optical frame."""
-
-    @property
-    def center(self) -> Array | None:
-        """Column and row that radii are measured from; None where there is no such point."""
-
-    def project(self, rays: Array) -> Array:
-        """Pixels (N, 2) of unit rays (N, 3); NaN where not visible."""
-
-    def unproject(self, pixels: Array) -> Array:
-        """Unit rays (N, 3) of pixels (N, 2); NaN where a pixel sees nothing."""
 
 
 class Curve(NamedTuple):
@@ -206,6 +193,9 @@ class DualFisheyeLens:
         rays = np.where((to_second < to_first)[:, None], second @ self.turn, first)
         ahead = np.where(to_second < to_first, second[:, 2], first[:, 2]) >= 0.0
         return np.where(ahead[:, None], rays, np.nan)
+
+
+Lens = RadialLens | CylinderLens | DualFisheyeLens
 
 
 @dataclass(frozen=True)

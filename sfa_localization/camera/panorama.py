@@ -27,8 +27,6 @@ from sfa_localization.data.run import Image
 
 Mask = NDArray[np.bool_]
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
-_LONGEST_SIDE = 32_000  # rows or columns of an image; OpenCV maps hardly more
-_SIZES_KEPT = 4  # tables are kept for this many sizes of images
 
 
 def looks_like_panorama(height: int, width: int) -> bool:
@@ -59,7 +57,7 @@ class _Tables:
 
 
 class Unwrapper:
-    """Turns images of one camera into panoramas; tables are built once per size of image.
+    """Turns images of one camera into panoramas; tables are built when their size changes.
 
     Panorama pixels that the camera does not see (outside the image or its radii, masked, in a
     blind sector) repeat the nearest visible pixel of their row, or row of the panorama where the
@@ -134,10 +132,8 @@ class Unwrapper:
 
     def _tables_of(self, size: tuple[int, int]) -> _Tables:
         if size not in self._tables:
-            if len(self._tables) >= _SIZES_KEPT:
-                self._tables.clear()
             tables = build_tables(self.camera, self.calibration, self.panorama, size)
-            self._tables[size] = tables
+            self._tables = {size: tables}
         return self._tables[size]
 
 
@@ -146,9 +142,6 @@ def _check(image: Any) -> None:
         raise CameraError('an image must be an array of uint8')
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise CameraError(f'an image must have shape (H, W, 3), not {image.shape}')
-    if max(image.shape) > _LONGEST_SIDE:
-        rows, columns, _ = image.shape
-        raise CameraError(f'an image of {columns} x {rows} pixels is longer than {_LONGEST_SIDE}')
 
 
 def build_tables(
@@ -204,9 +197,8 @@ def read_mask(path: str, size: tuple[int, int]) -> Mask:
 
 def _unmasked(pixels: Array, mask: Mask) -> Mask:
     """Mask (H, W) of the lookups (H, W, 2) whose nearest pixel is True in the mask."""
-    finite = np.nan_to_num(pixels, nan=0.0)
-    rows = np.clip(np.rint(finite[..., 1]).astype(int), 0, mask.shape[0] - 1)
-    columns = np.clip(np.rint(finite[..., 0]).astype(int), 0, mask.shape[1] - 1)
+    nearest = np.rint(np.nan_to_num(pixels)).astype(int)
+    columns, rows = np.moveaxis(np.clip(nearest, 0, np.array(mask.shape[::-1]) - 1), -1, 0)
     return np.asarray(mask[rows, columns])
 
 
