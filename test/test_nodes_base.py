@@ -37,7 +37,7 @@ pytestmark = pytest.mark.ros
 class Knobs(Settings):
     gain: float = setting(0.5, 'a gain', unit='m', low=0.0, high=2.0, live=True)
     offset: float = setting(0.0, 'unbounded', live=True)
-    count: int = setting(3, 'a number', low=1, live=True)
+    count: int = setting(3, 'a number', low=1, high=9, live=True)
     mode: str = setting('a', 'a choice', choices=('a', 'b'), live=True)
     fixed: float = setting(1.0, 'read only')
     corner: tuple[float, ...] = setting((1.0, 2.0), 'an array')

@@ -35,7 +35,6 @@ from rclpy.duration import Duration
 from rclpy.time import Time
 from ros_bench import DOMAIN, until
 from std_msgs.msg import String
-from test_docs import replay
 
 from sfa_localization.data.geometry import compose
 from sfa_localization.data.messages import read_planar, read_stamp, read_yaw
@@ -81,7 +80,7 @@ def start(tmp_path):
         with open(log, 'w') as output:
             process = subprocess.Popen(
                 ['ros2', *map(str, words)], env=ENVIRONMENT, stdin=subprocess.DEVNULL,
-                stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
+                stdout=output, stderr=subprocess.STDOUT, start_new_session=True, cwd=ROOT,
             )  # fmt: skip
         process.log = log
         running.append(process)
@@ -228,11 +227,15 @@ def test_the_launched_chain_follows_a_bag_in_a_namespace(bench, start, model):
 
 
 def test_the_replay_of_the_readme_becomes_localised(bench, start, model):
-    arguments, path = replay()
-    chain = launch(start, *(f'{k}:={v}' for k, v in {**arguments, 'model': model}.items()))
+    """Its two lines, as they are typed in a clone of the repository."""
+    lines = (ROOT / 'README.md').read_text('utf-8').splitlines()
+    (k,) = (k for k, line in enumerate(lines) if line.startswith('ros2 bag play'))
+    typed = [line.replace('$PWD/model.npz', str(model)).split() for line in lines[k - 1 : k + 1]]
+    chain = start(*typed[0][1:])
     heard = states(bench)
     assert until(lambda: bench.node.count_subscribers('/panorama/compressed'), COMMAND_S)
-    played(start, path)
+    assert typed[1][:3] == ['ros2', 'bag', 'play']
+    played(start, *typed[1][3:])
     assert any(state.data.startswith('LOCALISED') for state in heard)
     assert 'omnicam_node' not in bench.node.get_node_names()
     interrupted(chain)

@@ -7,7 +7,6 @@ from __future__ import annotations
 import array
 import dataclasses
 import itertools
-import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -27,7 +26,6 @@ from sfa_localization.data.settings import Settings, nearest
 S = TypeVar('S', bound=Settings)
 Current = dict[type[Settings], Settings]
 """The settings in force, by their class."""
-_LARGEST_INTEGER = 2**63 - 1
 
 
 def declare(node: Node, kind: type[S]) -> S:
@@ -149,7 +147,7 @@ def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
 def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     """Descriptor of one setting: description with unit, range, and whether it may change.
 
-    Lists have no range in ROS; their Settings check them.
+    Lists, and what is bounded on one side, have no range in ROS; their Settings check them.
     """
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
@@ -157,12 +155,12 @@ def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     if meta['choices']:
         made.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
     low, high = meta['low'], meta['high']
-    if isinstance(item.default, float) and (low, high) != (None, None):
-        least = -sys.float_info.max if low is None else float(low)
-        most = sys.float_info.max if high is None else float(high)
-        made.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
-    elif type(item.default) is int and (low, high) != (None, None):
-        first = -_LARGEST_INTEGER if low is None else int(low)
-        last = _LARGEST_INTEGER if high is None else int(high)
-        made.integer_range = [IntegerRange(from_value=first, to_value=last)]
+    if low is None or high is None:
+        return made
+    if isinstance(item.default, float):
+        made.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high))
+        ]
+    elif type(item.default) is int:
+        made.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return made

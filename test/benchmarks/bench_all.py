@@ -35,7 +35,6 @@ HEADLINES = {
     'unwrap_over_remap': 'unwrapping over a bare cv2.remap',
     'omnicam_latency_over_relay': "the omnicam node's latency beyond a relay's, over a remap",
     'filter_over_filterpy': 'a filter step over bare filterpy',
-    'chain_latency_over_relay': "latency of the chain of nodes over three relays'",
     'chain_latency_p99_ms': 'ms of the chain, 99th percentile',
     'chain_cpu_share': 'share of one core that the chain takes',
     'bag_over_rosbags': 'iteration of a bag over bare rosbags',
@@ -51,7 +50,7 @@ def benches(folder: Path, quick: bool, model: Path | None) -> Iterator[tuple[str
     yield 'bench_panorama', lambda m: {**m.bench_unwrap(), **m.bench_roundtrip()}
     yield 'bench_panorama', lambda m: m.bench_omnicam()
     if model is not None:
-        yield 'bench_chain', lambda m: {**m.bench_chain(str(model)), **m.bench_robots(str(model))}
+        yield 'bench_chain', lambda m: m.bench_chain(str(model))
 
 
 def flat(figures: Figures, prefix: str = '') -> dict[str, float]:

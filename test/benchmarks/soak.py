@@ -103,11 +103,11 @@ class Robot(Driver):
         """The odometry of the next moment, and its image where there is one."""
         self.step += 1
         stamp_ns, pose = START_NS + self.step * STEP_NS, lap(np.array(float(self.step)))
-        self.move([NAME], stamp_ns, pose, (SPEED, SPEED / RADIUS))
+        self.move(stamp_ns, pose, (SPEED, SPEED / RADIUS))
         if self.step % EVERY == 0:
             turn = self.step * SPEED / RADIUS / ODOMETRY_HZ / (2 * math.pi)
             with self.heard:
-                self.show([NAME], self.views[round(turn * VIEWS) % VIEWS], stamp_ns)
+                self.show(self.views[round(turn * VIEWS) % VIEWS], stamp_ns)
 
     def wait(self) -> None:
         """Until little is unanswered: to drive faster than the nodes says nothing of them."""
