@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
 
 from sfa_localization import __version__
 from sfa_localization.data.errors import LocalizationError, NodeError
@@ -38,9 +37,7 @@ OPTIONAL = {
     'trimesh': 'trimesh embreex',
     'embreex': 'trimesh embreex',
     'mdp': 'MDP==3.6',
-    'lz4': 'lz4',
     'mcap': 'mcap',
-    'zstandard': 'zstandard',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }
 """Packages that only some commands need, and how to install them."""
@@ -95,29 +92,17 @@ def _prepare_streams() -> None:
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors='backslashreplace')
-    if sys.stdout is sys.__stdout__ and isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(_Output(sys.stdout.fileno(), 'w', closefd=False)),
-            sys.stdout.encoding,
-            sys.stdout.errors,
-            line_buffering=sys.stdout.line_buffering or sys.stdout.write_through,
-        )
 
 
-class _Output(io.FileIO):
-    """Standard output that names itself where it cannot be written, and is given up then."""
-
-    def write(self, data: Any) -> int:
-        """Raises BrokenPipeError or LocalizationError."""
-        try:
-            return super().write(data)
-        except OSError as error:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
-            if isinstance(error, BrokenPipeError):
-                raise
-            raise LocalizationError(
-                f'standard output: cannot be written: {error.strerror}'
-            ) from None
+def _flush() -> None:
+    """Write what was printed, or give it up. Raises BrokenPipeError or LocalizationError."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise LocalizationError(f'standard output: cannot be written: {error.strerror}') from None
 
 
 def executable() -> int:
@@ -169,29 +154,21 @@ def guarded(run: Callable[[], int]) -> int:
     """Turn expected errors into one line and exit code 1, Ctrl-C into 130."""
     try:
         try:
-            code = run()
-        except SystemExit:  # of argparse, which has printed help
-            sys.stdout.flush()
-            raise
-        sys.stdout.flush()
-        return code
+            return run()
+        finally:  # also after help of argparse
+            _flush()
     except BrokenPipeError:  # the reader, such as head, has closed the pipe
         return 0
     except LocalizationError as error:
-        print(f'error: {_shortened(_in_one_line(error))}', file=sys.stderr)
-        return 1
+        reason = _in_one_line(error)
     except ModuleNotFoundError as error:
         package = (error.name or '').partition('.')[0]
         if package not in OPTIONAL:
             raise
-        remedy = f'pip install {OPTIONAL[package]}'
-        print(f'error: {package} is not installed; this needs it: {remedy}', file=sys.stderr)
-        return 1
+        reason = f'{package} is not installed; this needs it: pip install {OPTIONAL[package]}'
     except (OSError, MemoryError) as error:
         # Of the machine: a full disk, too many open files.
         reason = ' '.join(str(error).split()) or 'not enough memory'
-        print(f'error: {_shortened(reason)}', file=sys.stderr)
-        return 1
     except (KeyboardInterrupt, ImportError) as error:
         # Of a C++ library that was interrupted while it was loaded it is the cause.
         if isinstance(error.__cause__ or error, KeyboardInterrupt):
@@ -199,5 +176,6 @@ def guarded(run: Callable[[], int]) -> int:
             return 130
         if _NO_ROOM not in str(error):
             raise
-        print('error: not enough memory', file=sys.stderr)
-        return 1
+        reason = 'not enough memory'
+    print(f'error: {_shortened(reason)}', file=sys.stderr)
+    return 1

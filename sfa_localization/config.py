@@ -22,7 +22,7 @@ from sfa_localization.camera.settings import (
     WatchConfig,
 )
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.data.files import atomic_write, first_bytes, read_regular
+from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
@@ -237,18 +237,6 @@ def render(changes: Mapping[str, Mapping[str, Any]] | None = None) -> str:
         parts += [_group(kind, changed) for kind in kinds]
         parts.append(_ros_group({n: value for n, value in changed.items() if _is_of_ros(n)}))
     return ''.join(parts)
-
-
-def require_defaults(
-    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None, found: Collection[str] = ()
-) -> None:
-    """Raise ConfigError for a file with lines that are neither those of `render(changes)` nor
-    values of the parameters `found`: a user's own.
-    """
-    lines = first_bytes(path, LONGEST).decode(errors='replace').splitlines()
-    own = set(lines) - set(render(changes).splitlines())
-    if any(line.strip().partition(':')[0] not in found for line in own):
-        raise ConfigError(f'{path}: holds more than defaults: give another name, or remove it')
 
 
 def write_config(path: Path | str, changes: Mapping[str, Mapping[str, Any]] | None = None) -> None:

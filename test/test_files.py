@@ -35,7 +35,7 @@ OTHERS = {
     'bags/files': 'what is decompressed or salvaged, in a temporary folder',
     'bags/writer': 'a folder, which is renamed when whole',
     'data/files': 'the one writer',
-    'commands/processes': 'what a program prints, while it prints it',
+    'commands/live_nodes': 'what a program prints, while it prints it',
     'cli': 'to /dev/null, what is printed to a closed stream',
 }
 
@@ -169,8 +169,8 @@ def test_a_reader_that_has_seen_enough_is_no_error():
 ])  # fmt: skip
 def test_a_standard_output_that_is_full_is_named(command, unbuffered):
     done = shell(f'{command} > /dev/full', PYTHONUNBUFFERED=unbuffered)
-    reason = 'standard output: cannot be written: No space left on device'
-    assert (done.returncode, done.stderr) == (1, f'error: {reason}\n')
+    assert done.returncode == 1
+    assert re.fullmatch(r'error: .*No space left on device\n', done.stderr)
 
 
 def test_streams_may_be_closed(tmp_path):
@@ -190,23 +190,21 @@ REFUSED = {
         'evaluate model.npz other --align bag --json bag/sample.mcap',
         'evaluate model.npz bag --config a.yaml --json a.yaml',
         'train bag --output bag/sample.mcap', 'train bag --update model.npz --output link/a.mcap',
-        'tune bag --model model.npz --output model.npz',
     ], 'would be replaced by an output'),
     **dict.fromkeys([
         'inspect bag --json diary.txt', 'evaluate model.npz bag --json diary.txt',
         'train bag --output diary.txt', 'train bag --update model.npz --output diary.txt',
-        'tune bag --model model.npz --output diary.txt', 'config --output diary.txt',
-        'calibrate picture.png --output diary.txt', 'config --output model.npz',
         'train bag --output a.yaml', 'calibrate picture.png --check model.npz',
         'filter odom.csv positions.csv --output picture.png', 'train bag --output link.npz',
     ], 'is there and no .'),
     **dict.fromkeys([
-        'config --output bag/metadata.yaml', 'calibrate picture.png --output bag/metadata.yaml',
-    ], 'bag/metadata.yaml: is the description of a bag'),
+        'tune bag --model model.npz --output model.npz', 'config --output diary.txt',
+        'tune bag --model model.npz --output diary.txt', 'config --output bag/metadata.yaml',
+    ], ': is there: give another name'),
     **dict.fromkeys([
-        'inspect bag --report bag', 'evaluate none.npz bag --report bag',
-        'train bag --output a.npz --report bag',
-    ], 'bag: is a bag'),
+        'calibrate picture.png --output bag/metadata.yaml',
+        'calibrate picture.png --output diary.txt',
+    ], ': is no file of calibrate'),
     'inspect bag --report bag/metadata.yaml': 'bag/metadata.yaml: is no folder',
     **dict.fromkeys([
         'evaluate none.npz bag --report=new --json=new/index.html',
@@ -262,32 +260,24 @@ def test_a_working_directory_that_was_removed_is_named(tmp_path, monkeypatch, ca
         )
 
 
-def test_an_output_replaces_a_file_of_its_kind_or_an_empty_one(tmp_path):
-    for name, text in {'a.yaml': 'training:', 'b.YML': '/**/ekf_node:', 'c.txt': ''}.items():
-        path = tmp_path / name
-        path.write_text(text)
-        assert main(['config', '--output', str(path)]) == 0
-        assert 'ekf_node' in path.read_text()
-
-
-def test_a_parameter_file_with_settings_of_the_user_stays(tmp_path, monkeypatch, capsys):
+def test_an_output_replaces_an_empty_file_and_what_the_command_wrote(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    mine, calibrated = tmp_path / 'mine.yaml', tmp_path / 'camera.yaml'
     cv2.imwrite('picture.png', scene(1))
+    for name in ('a.yaml', 'camera.yaml'):
+        (tmp_path / name).touch()
+    assert main(['config', '--output', 'a.yaml']) == 0
     for _ in range(2):
-        assert main(['config', '--output', 'mine.yaml']) == 0
         assert main(['calibrate', 'picture.png', '--output', 'camera.yaml']) == 0
-    mine.write_text(mine.read_text().replace('lost_std: 2.0', 'lost_std: 7.5'))
-    before = mine.read_bytes(), calibrated.read_bytes()
+    before = (tmp_path / 'a.yaml').read_bytes(), (tmp_path / 'camera.yaml').read_bytes()
     capsys.readouterr()
     for command, why in {
-        'config --output mine.yaml': 'mine.yaml: holds more than defaults',
-        'config --output camera.yaml': 'camera.yaml: holds more than defaults',
-        'calibrate picture.png --output mine.yaml': 'mine.yaml: is no file of calibrate',
+        'config --output a.yaml': 'a.yaml: is there',
+        'tune bag --model model.npz --output camera.yaml': 'camera.yaml: is there',
+        'calibrate picture.png --output a.yaml': 'a.yaml: is no file of calibrate',
     }.items():
         assert main(command.split()) == 1
         assert f'{why}: give another name, or remove it' in capsys.readouterr().err
-    assert before == (mine.read_bytes(), calibrated.read_bytes())
+    assert before == ((tmp_path / 'a.yaml').read_bytes(), (tmp_path / 'camera.yaml').read_bytes())
 
 
 def test_a_report_replaces_its_own_files_only(tmp_path, capsys):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Programs are started, watched and stopped, whatever they or their starter do."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -11,8 +10,10 @@ import time
 import psutil
 import pytest
 
-from sfa_localization.commands.processes import Processes
 from sfa_localization.data.errors import NodeError
+
+pytest.importorskip('rclpy')
+from sfa_localization.commands.live_nodes import Processes
 
 DEADLINE_S = 60
 WAIT = 'import time; print("ready", flush=True); time.sleep(60)'
@@ -44,7 +45,7 @@ def children():
 def test_all_have_ended_afterwards_also_after_an_error(tmp_path, children):
     with (
         pytest.raises(ZeroDivisionError),
-        Processes(tmp_path / 'logs', os.environ, stop_timeout_s=0.5) as processes,
+        Processes(tmp_path / 'logs', 0.5) as processes,
     ):
         for name, code in {'obedient': WAIT, 'stubborn': STUBBORN}.items():
             processes.start(name, python(code))
@@ -57,7 +58,7 @@ def test_all_have_ended_afterwards_also_after_an_error(tmp_path, children):
 
 def test_a_dead_program_is_named_with_its_last_words(tmp_path, children):
     code = 'import sys; [print("line", i) for i in range(9)]; sys.exit("no model")'
-    with Processes(tmp_path, os.environ, 5.0) as processes:
+    with Processes(tmp_path, 5.0) as processes:
         processes.start('sfa_node', python(code))
         with pytest.raises(NodeError) as caught:
             wait_until(lambda: processes.require_alive(['sfa_node']))
@@ -76,14 +77,14 @@ def test_a_dead_program_is_named_with_its_last_words(tmp_path, children):
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_nothing_is_left_when_the_command_is_told_to_end(tmp_path, number):
     code = f"""
-import os, sys, time
+import sys, time
 from pathlib import Path
 from sfa_localization import cli
 from sfa_localization.commands import config
-from sfa_localization.commands.processes import Processes
+from sfa_localization.commands.live_nodes import Processes
 
 def run(arguments):
-    with Processes(Path({str(tmp_path)!r}), os.environ, 5.0) as processes:
+    with Processes(Path({str(tmp_path)!r}), 5.0) as processes:
         processes.start('node', [{sys.executable!r}, '-c', {WAIT!r}])
         while 'ready' not in processes.log('node').read_text():
             time.sleep(0.01)

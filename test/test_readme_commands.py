@@ -100,6 +100,8 @@ def test_nodes_run_as_described(folder, monkeypatch):
 
     monkeypatch.chdir(folder)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
+    for name in ('DOMAIN_ID', 'AUTOMATIC_DISCOVERY_RANGE', 'LOG_DIR'):  # which run_live sets
+        monkeypatch.setenv(f'ROS_{name}', os.environ.get(f'ROS_{name}', ''))
     complete(raw_drive(), folder)
     os.link(folder / 'model.npz', folder / 'demo/model.npz')
     size = PlaceModel.load(folder / 'model.npz').panorama

@@ -9,8 +9,6 @@ import pytest
 from filter_drives import Drive
 
 from sfa_localization import tuning
-from sfa_localization.cli import main
-from sfa_localization.config import load_changes, write_config
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.run import Odometry, Trajectory
 from sfa_localization.fusion.settings import FilterConfig
@@ -80,12 +78,3 @@ def test_the_models_error_correlation_is_used():
         for one in (ErrorCorrelation(0.0, 1.0), ErrorCorrelation(0.7, 0.6))
     )
     assert shared < white
-
-
-def test_settings_of_the_user_stay_where_it_would_write(tmp_path, capsys):
-    mine = tmp_path / 'mine.yaml'
-    write_config(mine, {'ekf_node': {'lost_std': 7.5}})
-    assert main(['tune', 'bag', '--model', 'none.npz', '--output', str(mine)]) == 1
-    error = f'error: {mine}: holds more than defaults: give another name, or remove it\n'
-    assert capsys.readouterr().err == error
-    assert load_changes(mine)['ekf_node']['lost_std'] == 7.5

@@ -11,9 +11,7 @@ from __future__ import annotations
 import importlib
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
-from functools import cache
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,12 +24,10 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Qos, QosDurability, QosReliability
-from rosbags.typesys import Stores
 from rosgraph_msgs.msg import Clock
 
-from sfa_localization.bags.decoding import COMPRESSED, IMAGE, ODOMETRY, typestore
+from sfa_localization.bags.decoding import COMPRESSED, IMAGE, ODOMETRY
 from sfa_localization.bags.reader import Bag
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.rejections import encodable
@@ -52,48 +48,33 @@ def play(
     loop: bool = False,
     clock: bool = False,
     topics: Collection[str] = (),
-    context: Context | None = None,
 ) -> Counter[str]:
     """Replay a bag until its end, or with `loop` until Ctrl-C; return the messages of each topic.
 
     `topics` limits it to those named. It starts when images and odometry have subscribers and
-    their number is stable, or after the configured wait. `context` must be initialized; by default
-    one is created. Raises BagError.
+    their number is stable, or after the configured wait. Raises BagError.
     """
-    played = Counter[str]()
-    with _node(context) as node, Bag(path) as bag:
-        publishers = _publishers(node, bag, topics)
-        start_ns = bag.recording.start_ns + int(config.start_offset * 1e9)
-        if next(bag.messages(publishers, start_ns), None) is None:
-            raise BagError(f'{bag.path}: nothing to play after {config.start_offset:g} s')
-        _await_subscribers(node, bag, publishers, config.wait)
-        ticker = node.create_publisher(Clock, '/clock', DEPTH) if clock else None
-        while True:
-            pace = ReplayClock(start_ns, config.rate, ticker)
-            played += _publish(bag, publishers, pace)
-            if not loop:
-                break
-        for publisher in publishers.values():
-            publisher.wait_for_all_acked(Duration(seconds=1))
-        for problem in bag.problems:
-            node.get_logger().warning(encodable(f'{bag.path}: {problem}'))
-    return played
-
-
-@contextmanager
-def _node(context: Context | None) -> Iterator[Node]:
-    """A node in the context, or in a new one that is shut down afterwards."""
-    used = context or Context()
-    if context is None:
-        # No arguments: among those of the command may be a name that is not UTF-8.
-        rclpy.init(args=[], context=used, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node('bag_player', context=used, start_parameter_services=False)
+    context, played = Context(), Counter[str]()
+    # No arguments: among those of the command may be a name that is not UTF-8.
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        yield node
+        with Bag(path) as bag:
+            node = Node('bag_player', context=context, start_parameter_services=False)
+            publishers = _publishers(node, bag, topics)
+            _await_subscribers(node, bag, publishers, config.wait)
+            ticker = node.create_publisher(Clock, '/clock', DEPTH) if clock else None
+            while True:
+                pace = ReplayClock(bag.recording.start_ns, config.rate, ticker)
+                played += _publish(bag, publishers, pace)
+                if not (loop and played):
+                    break
+            for publisher in publishers.values():
+                publisher.wait_for_all_acked(Duration(seconds=1))
+            for problem in bag.problems:
+                node.get_logger().warning(encodable(f'{bag.path}: {problem}'))
     finally:
-        node.destroy_node()
-        if context is None:
-            rclpy.try_shutdown(context=used)
+        rclpy.try_shutdown(context=context)
+    return played
 
 
 def _publishers(node: Node, bag: Bag, names: Collection[str]) -> dict[str, Publisher]:
@@ -105,8 +86,8 @@ def _publishers(node: Node, bag: Bag, names: Collection[str]) -> dict[str, Publi
             raise BagError(f'{bag.path}: has no topic {name}; --topics can be: {known}')
         topic = topics[name]
         kind = message_class(topic.kind)
-        if topic.serialization not in ('cdr', 'ros1'):
-            reasons.append(f'{name}: is serialized as {topic.serialization!r}')
+        if topic.serialization != 'cdr':
+            reasons.append(f'{name}: is serialized as {topic.serialization!r}; convert it to ROS 2')
         elif kind is None:
             reasons.append(f'{name}: type {topic.kind or "unknown"} is not installed')
         else:
@@ -178,26 +159,9 @@ def _publish(bag: Bag, publishers: dict[str, Publisher], pace: ReplayClock) -> C
     played = Counter[str]()
     for topic, receive_ns, data in bag.messages(publishers, pace.start_ns):
         pace.wait_until(receive_ns)
-        if topic.serialization == 'ros1':
-            data = to_ros2(data, topic.kind)
         publishers[topic.name].publish(bytes(data))
         played[topic.name] += 1
     return played
-
-
-@cache
-def _typestores() -> tuple[Any, Any, dict[str, object]]:
-    return typestore(Stores.ROS1_NOETIC), typestore(Stores.ROS2_JAZZY), {}
-
-
-def to_ros2(data: bytes, kind: str) -> bytes:
-    """Convert a serialized message of ROS 1 of a standard type. Raises BagError if damaged."""
-    ros1, ros2, known = _typestores()
-    try:
-        converted = migrate_bytes(ros1, ros2, kind, kind, known, data, src_is2=False, dst_is2=True)
-    except Exception as error:  # parsing damaged bytes fails in many ways
-        raise BagError(f'a {kind} of ROS 1 cannot be converted ({error})') from None
-    return bytes(converted)
 
 
 def message_class(kind: str) -> Callable[..., Any] | None:

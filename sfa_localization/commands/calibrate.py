@@ -17,14 +17,7 @@ from sfa_localization.camera.settings import (
     LensCalibration,
     PanoramaConfig,
 )
-from sfa_localization.commands.options import (
-    add_settings,
-    add_topics,
-    given,
-    numbers,
-    require_kind,
-    settings,
-)
+from sfa_localization.commands import options
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import require_outputs
 from sfa_localization.data.run import Image
@@ -44,13 +37,9 @@ panorama below the horizon. Correct the directions with --mount-rpy (ROLLxPITCHx
 degrees above its line, take 5 off both. From circles alone nobody knows these angles.
 omnicam_node reads the file as its parameter calibration_file.
 
-how to get each model:
-  mirror    (most exact) Kalibr, omni-radtan; OpenCV omnidir; camodocal, MEI; a fisheye
-            calibrated in this way needs --mirrored no --axis up
-  fisheye   Kalibr, pinhole-equi; OpenCV fisheye; ROS camera_calibration with its
-            fisheye model; or from the rim alone with --model fisheye
-  ocam      OCamCalib: export calib_results.txt; a mirror needs --mirrored yes --axis down
-  polar     (no calibration) from images, --angle-min and --angle-max"""
+models: mirror (Kalibr omni-radtan, OpenCV omnidir, camodocal MEI; of a fisheye with --mirrored no
+--axis up), fisheye (Kalibr pinhole-equi, OpenCV and ROS fisheye, or from the rim alone), ocam
+(OCamCalib calib_results.txt; of a mirror with --mirrored yes --axis down), polar (from images)"""
 LENS = ('angle_min', 'angle_max', 'axis', 'mirrored')
 _BAGS = {'.mcap', '.db3', '.bag'}  # with folders; all else is an image
 _SAMPLES = 8  # images of a bag: enough to show what changes
@@ -61,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'images', nargs='*', type=Path, metavar='IMAGE', help='raw images, or a bag of them'
     )
-    add_topics(parser, 'image')
+    options.add_topics(parser, 'image')
     parser.add_argument(
         '--calibration',
         type=Path,
@@ -69,14 +58,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'stella_vslam or ORB-SLAM3',
     )
     parser.add_argument(
-        '--center', type=numbers, help='COLUMNxROW of the mirror (px); default: detected'
+        '--center', type=options.numbers, help='COLUMNxROW of the mirror (px); default: detected'
     )
-    parser.add_argument('--radii', type=numbers, help='INNERxOUTER radius (px); default: detected')
+    parser.add_argument('--radii', type=options.numbers, help='INNERxOUTER (px); default: detected')
     parser.add_argument('--output', type=Path, help='calibration file to write (YAML)')
     parser.add_argument('--check', type=Path, help='image to write, for a check by eye (PNG)')
-    add_settings(parser, CalibrationConfig)
-    add_settings(parser, LensCalibration, LENS)
-    add_settings(parser, CameraConfig, ('mount_rpy',))
+    options.add_settings(parser, CalibrationConfig)
+    options.add_settings(parser, LensCalibration, LENS)
+    options.add_settings(parser, CameraConfig, ('mount_rpy',))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -87,15 +76,15 @@ def run(arguments: argparse.Namespace) -> int:
     outputs = [path for path in (arguments.output, arguments.check) if path]
     require_outputs(outputs, [*arguments.images, arguments.calibration])
     if arguments.output:
-        require_kind(arguments.output, '.yaml', '.yml')
         calibration.require_own(arguments.output)
     if arguments.check:
-        require_kind(arguments.check, '.png')
+        options.require_kind(arguments.check, '.png')
     images = _images(arguments)
-    config, known = settings(CalibrationConfig, arguments), given(LensCalibration, arguments)
+    config = options.settings(CalibrationConfig, arguments)
+    known = options.given(LensCalibration, arguments)
     known |= calibration.given_circle(arguments.center, arguments.radii)
     lens = calibration.calibrate(images, arguments.calibration, config, known)
-    camera = settings(CameraConfig, arguments)
+    camera = options.settings(CameraConfig, arguments)
     text = calibration_files.calibration_text(lens, camera.mount_rpy)
     if images:
         # Without --check too: what is written can be used.
@@ -123,6 +112,6 @@ def _images(arguments: argparse.Namespace) -> Sequence[Image]:
     if len(arguments.images) > 1:
         raise LocalizationError('give one bag, or images')
     with Bag(bags[0]) as bag:
-        topic = bag.find('image', settings(TopicNames, arguments).image)
+        topic = bag.find('image', options.settings(TopicNames, arguments).image)
         every = max(bag.topics[topic].count // _SAMPLES, 1)
         return [image for _, image in itertools.islice(bag.images(topic), 0, None, every)]

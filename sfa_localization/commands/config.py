@@ -7,8 +7,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sfa_localization.commands.options import require_kind
-from sfa_localization.config import render, require_defaults, write_config
+from sfa_localization.commands import options
+from sfa_localization.config import render, write_config
 
 WRITES = 'the parameter file, or standard output'
 EXAMPLES = '  config\n  config --output localization.yaml'
@@ -22,8 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write or print every parameter with its default."""
     if arguments.output:
-        require_kind(arguments.output, '.yaml', '.yml')
-        require_defaults(arguments.output)
+        options.require_new(arguments.output)
         write_config(arguments.output)
     else:
         print(render(), end='')

@@ -8,15 +8,13 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfa_localization import __version__
-from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.files import atomic_write
-from sfa_localization.data.settings import Settings, setting
 
 if TYPE_CHECKING:
     from sfa_localization.commands.live_nodes import Live
@@ -29,21 +27,12 @@ MARKER = '.sfa_localization_demo.json'
 DRIVES = ('coverage', 'test')
 
 
-@dataclass(frozen=True, slots=True)
-class DemoConfig(Settings):
-    """The demonstration: which garden and drives, and the speed of the replay."""
-
-    world: int = setting(1, 'garden', low=0, high=2**63 - 1)
-    seed: int = setting(1, 'drives and sensor errors', low=0, high=2**63 - 1)
-    rate: float = setting(1.0, 'speed of the replay', unit='x real time', low=0.1, high=20.0)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the folder and the settings of the demonstration."""
+    """Add the folder and the garden."""
     parser.add_argument(
         '--out', type=Path, default=Path('demo'), metavar='DIR', help='folder to write [demo]'
     )
-    add_settings(parser, DemoConfig)
+    parser.add_argument('--world', type=int, default=1, help='garden [1]')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -55,13 +44,13 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.simulation.settings import SimulationConfig
     from sfa_localization.training import Recipe, train
 
-    out, config, start = arguments.out, settings(DemoConfig, arguments), time.monotonic()
+    out, start = arguments.out, time.monotonic()
+    garden = SimulationConfig(world=arguments.world, compression='jpeg')
 
     def announce(step: str) -> None:
         print(f'[{time.monotonic() - start:4.0f} s] {step}', file=sys.stderr)
 
-    prepare_folder(out, config)
-    garden = SimulationConfig(world=config.world, seed=config.seed, compression='jpeg')
+    prepare_folder(out, arguments.world)
     announce('simulate two drives through a garden')
     for drive in DRIVES:
         if not (out / drive).exists():
@@ -70,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     recipe = Recipe(camera=CameraConfig(camera_model='mirror'))
     trained = train([out / 'coverage'], out / 'model.npz', recipe, progress=True, resume=True)
     announce('run the three nodes live on the second')
-    live = run_live(commands(out / 'model.npz', out / 'test', config.rate), out / 'logs')
+    live = run_live(commands(out / 'model.npz', out / 'test'), out / 'logs')
     announce(f'the robot is {live.state or "silent"}; compare with the truth')
     result = _compare(trained, live, out, recipe)
     _write_results(out, result, trained)
@@ -79,14 +68,12 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def prepare_folder(out: Path, config: DemoConfig) -> None:
-    """Create the folder, or go on in that of a demonstration with the same settings.
+def prepare_folder(out: Path, world: int) -> None:
+    """Create the folder, or go on in that of a demonstration in the same garden.
 
     Bags and an unfinished training stay. Raises LocalizationError.
     """
-    marker, kept = out / MARKER, {**asdict(config), 'version': __version__}
-    del kept['rate']
-    text = json.dumps(kept)
+    marker, text = out / MARKER, json.dumps({'world': world, 'version': __version__})
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()) and not (marker.exists() and marker.read_text('utf-8') == text):

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.commands.options import (
-    TOPIC_OPTIONS,
-    add_topics,
-    recipe,
-    require_output,
-    require_report,
-    require_same_panorama,
-    settings,
-)
+from sfa_localization.commands import options
 from sfa_localization.fusion.settings import FilterConfig
 
 if TYPE_CHECKING:
@@ -53,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures and the table')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the errors as JSON')
-    add_topics(parser, *TOPIC_OPTIONS)
+    options.add_topics(parser, *options.TOPIC_OPTIONS)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -64,17 +56,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     read = arguments.model, arguments.bag, *arguments.align, arguments.config
     if arguments.json:
-        require_output(arguments.json, read, '.json')
-    require_report(arguments.report, arguments.json)
+        options.require_output(arguments.json, read, '.json')
+    options.require_report(arguments.report, arguments.json)
     model = PlaceModel.load(arguments.model)
-    require_same_panorama(arguments.config, model.panorama)
+    options.require_same_panorama(arguments.config, model.panorama)
     result = evaluation.evaluate(
         model,
         arguments.bag,
         align_bags=arguments.align,
-        recipe=recipe(arguments),
-        config=settings(FilterConfig, arguments, arguments.config),
-        watch=settings(WatchConfig, arguments, arguments.config),
+        recipe=options.recipe(arguments),
+        config=options.settings(FilterConfig, arguments),
+        watch=options.settings(WatchConfig, arguments),
         progress=True,
         smooth=arguments.smooth,
     )
@@ -101,7 +93,7 @@ def _write_report(arguments: argparse.Namespace, result: Evaluation) -> None:
     late_ns = round(result.counts.get('camera_delay_s', 0.0) * 1e9)
     worst = worst_of(result.truth, result.estimates['sfa'])
     stamps = {one: stamp + late_ns for one, stamp in worst.items()}
-    read = images_at(arguments.bag, stamps.values(), recipe(arguments))
+    read = images_at(arguments.bag, stamps.values(), options.recipe(arguments))
     samples = {one: read[stamp] for one, stamp in stamps.items() if stamp in read}
     title = f'{arguments.model.name} on {arguments.bag.name}'
     write_evaluation_page(folder, title, *drive, result.counts, samples)

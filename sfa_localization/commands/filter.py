@@ -7,15 +7,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sfa_localization.commands.options import destination, require_output, settings
+from sfa_localization.commands import options
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.settings import FilterConfig
 
 WRITES = 'poses in the format of TUM, which evo reads, and beside them a file of their covariances'
 EXAMPLES = """\
   filter odom.csv positions.csv --output poses.tum
-  filter odom.csv gps.csv --config localization.yaml --initial-pose 0 0 1.57 \\
-      --output poses.tum
+  filter odom.csv gps.csv --config localization.yaml --output poses.tum
 
 ODOM.csv: stamp_s,v_mps,omega_radps[,var_v,var_omega]
 POSITIONS.csv: stamp_s,x_m,y_m[,var_x,var_y][,var_xy][,yaw_rad,var_yaw]
@@ -24,19 +23,10 @@ A heading without its variance is not used."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add tables, parameter file, initial pose and output."""
+    """Add tables, parameter file and output."""
     parser.add_argument('odometry', type=Path, metavar='ODOM.csv')
     parser.add_argument('positions', type=Path, metavar='POSITIONS.csv')
     parser.add_argument('--config', type=Path, help='parameter file; section ekf_node is read')
-    parser.add_argument(
-        '--initial-pose',
-        dest=destination(FilterConfig, 'initial_pose'),
-        nargs=3,
-        type=float,
-        metavar=('X', 'Y', 'YAW'),
-        default=argparse.SUPPRESS,
-        help='initial pose (m, m, rad), where it is known',
-    )
     parser.add_argument(
         '--output', type=Path, required=True, help='TUM file to write; covariances beside it'
     )
@@ -47,12 +37,12 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization import filtering
 
     read = arguments.odometry, arguments.positions, arguments.config
-    require_output(arguments.output, read, '.tum', '.txt')
+    options.require_output(arguments.output, read, '.tum', '.txt')
     beside = arguments.output.with_suffix('.covariance.csv')
-    require_output(beside, read, '.csv')
+    options.require_output(beside, read, '.csv')
     odometry = filtering.read_table(arguments.odometry, filtering.ODOMETRY)
     positions = filtering.read_table(arguments.positions, filtering.POSITIONS)
-    config = settings(FilterConfig, arguments, arguments.config)
+    config = options.settings(FilterConfig, arguments)
     result = filtering.run_filter(odometry, positions, config, progress=True)
     for table in (odometry, positions):
         if table.skipped:
@@ -63,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     if len(result.poses) == 0:
         raise DataError(
             'the filter never started: positions without heading need some meters of motion; '
-            'or give --initial-pose X Y YAW'
+            'or set initial_pose in the parameter file of --config'
         )
     filtering.write(result, arguments.output, beside)
     rows = len(odometry.stamps_ns)

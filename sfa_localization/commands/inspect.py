@@ -12,13 +12,7 @@ from pathlib import Path
 
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.commands.options import (
-    add_settings,
-    add_topics,
-    require_output,
-    require_report,
-    settings,
-)
+from sfa_localization.commands import options
 from sfa_localization.data.errors import BagError
 from sfa_localization.data.files import atomic_write
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
@@ -44,18 +38,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
     parser.add_argument('--config', type=Path, help='parameter file: are panoramas clockwise?')
-    add_topics(parser, 'image', 'odometry', 'imu')
-    add_settings(parser, InspectionConfig)
+    options.add_topics(parser, 'image', 'odometry', 'imu')
+    options.add_settings(parser, InspectionConfig)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Inspect all bags; an unreadable one is reported and does not stop the others."""
-    topics, config = settings(TopicNames, arguments), settings(InspectionConfig, arguments)
-    clockwise = settings(PanoramaConfig, arguments, arguments.config).clockwise
+    topics = options.settings(TopicNames, arguments)
+    config = options.settings(InspectionConfig, arguments)
+    clockwise = options.settings(PanoramaConfig, arguments).clockwise
     strict = arguments.strict
     if arguments.json:
-        require_output(arguments.json, arguments.bags, '.json')
-    require_report(arguments.report, arguments.json)
+        options.require_output(arguments.json, arguments.bags, '.json')
+    options.require_report(arguments.report, arguments.json)
     reports = []
     for path in arguments.bags:
         try:

@@ -43,19 +43,20 @@ def require_output(output: Path, inputs: Iterable[Path | None], *suffixes: str) 
 
 
 def require_kind(output: Path, *suffixes: str) -> None:
-    """Raise LocalizationError where an output would replace a file of another kind, by its name, or
-    the description of a bag; of a link, what it names counts.
+    """Raise LocalizationError where an output would replace a file of another kind, by its name; of
+    a link, what it names counts.
     """
-    from sfa_localization.bags.recording import METADATA
-
     replaced = resolved(output)
-    if not (replaced.is_file() and replaced.stat().st_size):
-        return
-    if replaced.name == METADATA:
-        raise LocalizationError(f'{output}: is the description of a bag: give another name')
-    if replaced.suffix.lower() not in suffixes:
+    if first_bytes(replaced) and replaced.suffix.lower() not in suffixes:
         kinds = ' or '.join(suffixes)
         raise LocalizationError(f'{output}: is there and no {kinds} file: give another name')
+
+
+def require_new(output: Path) -> None:
+    """Raise LocalizationError where an output would replace what a user may have written."""
+    require_outputs([output], [])
+    if first_bytes(output):
+        raise LocalizationError(f'{output}: is there: give another name, or remove it')
 
 
 def require_report(folder: Path | None, other: Path | None) -> None:
@@ -64,13 +65,10 @@ def require_report(folder: Path | None, other: Path | None) -> None:
     """
     if folder is None:
         return
-    from sfa_localization.bags.recording import METADATA
     from sfa_localization.reports.page import MARK, PAGE
 
     if folder.exists() and not folder.is_dir():
         raise LocalizationError(f'{folder}: is no folder: give --report another name')
-    if (folder / METADATA).exists():
-        raise LocalizationError(f'{folder}: is a bag: give --report a folder of its own')
     if MARK.encode() not in first_bytes(folder / PAGE):
         for file in sorted(folder.glob('*')):
             if file.suffix.lower() in REPORT_FILES and first_bytes(file):
@@ -137,10 +135,11 @@ def given(group: type[Settings], arguments: argparse.Namespace) -> dict[str, Any
     return {names[key]: value for key, value in vars(arguments).items() if key in names}
 
 
-def settings(group: type[S], arguments: argparse.Namespace, path: Path | None = None) -> S:
+def settings(group: type[S], arguments: argparse.Namespace) -> S:
     """Return the group's settings: defaults, then the parameter file, then the command line."""
+    path = getattr(arguments, 'config', None)
     section = next((name for name, kinds in SECTIONS.items() if group in kinds), '')
-    base = load_settings(path, section, group) if path else group()
+    base = load_settings(path, section, group) if path and section else group()
     from_file = {item.name: getattr(base, item.name) for item in dataclasses.fields(group)}
     return group.from_mapping({**from_file, **given(group, arguments)}, 'command line')
 
@@ -153,7 +152,7 @@ def recipe(arguments: argparse.Namespace) -> Recipe:
     for item in dataclasses.fields(Recipe):
         group = getattr(default, item.name)
         if isinstance(group, Settings):
-            chosen[item.name] = settings(type(group), arguments, arguments.config)
+            chosen[item.name] = settings(type(group), arguments)
     return Recipe(**chosen)  # type: ignore[arg-type]
 
 

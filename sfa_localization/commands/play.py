@@ -8,14 +8,14 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
-from sfa_localization.commands.options import add_settings, settings
+from sfa_localization.commands import options
 from sfa_localization.data.settings import Settings, setting
 
 WRITES = 'no file: it publishes'
 EXAMPLES = """\
   play bags/sample
   play bags/sample --rate 2 --loop --clock
-  play bags/sample --start-offset 10 --topics /panorama/compressed /odom"""
+  play bags/sample --topics /panorama/compressed /odom"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +23,7 @@ class PlayConfig(Settings):
     """How a bag is replayed."""
 
     rate: float = setting(1.0, 'speed of the replay', unit='x', low=1e-3, high=1e6)
-    start_offset: float = setting(0.0, 'begin this far into the bag', unit='s', low=0.0, high=1e9)
-    wait: float = setting(
-        20.0,
-        'longest wait for subscribers of images and odometry before the start',
-        unit='s',
-        low=0.0,
-        high=3600.0,
-    )
+    wait: float = setting(20.0, 'longest wait for subscribers', unit='s', low=0.0, high=3600.0)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--clock', action='store_true', help='publish the time of the bag on /clock'
     )
     parser.add_argument('--topics', nargs='+', default=(), metavar='T', help='only these topics')
-    add_settings(parser, PlayConfig)
+    options.add_settings(parser, PlayConfig)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     played = play(
         arguments.bag,
-        settings(PlayConfig, arguments),
+        options.settings(PlayConfig, arguments),
         loop=arguments.loop,
         clock=arguments.clock,
         topics=arguments.topics,

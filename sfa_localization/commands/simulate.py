@@ -8,37 +8,29 @@ import argparse
 from pathlib import Path
 
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.commands.options import add_settings, destination, numbers, settings
+from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.simulation.settings import SimulationConfig
 
 WRITES = 'a bag with images, odometry, turn rates and the ground truth'
 EXAMPLES = """\
   simulate bags/coverage --trajectory coverage --seed 1
-  simulate bags/test --trajectory test --seed 2 --compressed
+  simulate bags/test --trajectory test --seed 2 --compression jpeg
   simulate bags/tiny --area 8x8 --length 30 --images panorama --size 300x30"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add bag, panorama size and every setting of the simulation."""
     parser.add_argument('out', type=Path, metavar='OUT_BAG', help='folder of the bag to write')
-    parser.add_argument('--size', type=numbers, help='columns x rows of --images panorama [600x60]')
-    parser.add_argument(
-        '--compressed',
-        action='store_const',
-        dest=destination(SimulationConfig, 'compression'),
-        const='jpeg',
-        default=argparse.SUPPRESS,
-        help='short for --compression jpeg',
-    )
-    add_settings(parser, SimulationConfig)
+    parser.add_argument('--size', type=options.numbers, help='of panoramas, in pixels [600x60]')
+    options.add_settings(parser, SimulationConfig)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate; print the number of images and the duration."""
     from sfa_localization.simulation.drive import simulate
 
-    config = settings(SimulationConfig, arguments)
+    config = options.settings(SimulationConfig, arguments)
     drive = simulate(config, arguments.out, _panorama(arguments.size), progress=True)
     seconds = (drive.truth.stamps_ns[-1] - drive.truth.stamps_ns[0]) * 1e-9
     print(f'{arguments.out}: {len(drive.image_stamps_ns)} images in {seconds:.0f} s')

@@ -10,16 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.commands.options import (
-    add_settings,
-    add_topics,
-    given,
-    recipe,
-    require_output,
-    require_report,
-    require_same_panorama,
-    settings,
-)
+from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
@@ -52,22 +43,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--resume', action='store_true', help='continue an interrupted training')
     parser.add_argument('--strict', action='store_true', help='reject damaged bags')
     parser.add_argument('--force', action='store_true', help='train on what contradicts itself too')
-    add_topics(parser, 'image', 'odometry', 'imu')
-    add_settings(parser, SegmentConfig, ('segments',))
-    add_settings(parser, MetricConfig, ('solver', 'metric_map'))
-    add_settings(parser, NetworkConfig, ('engine', 'normalization'))
+    options.add_topics(parser, 'image', 'odometry', 'imu')
+    options.add_settings(parser, SegmentConfig, ('segments',))
+    options.add_settings(parser, MetricConfig, ('solver', 'metric_map'))
+    options.add_settings(parser, NetworkConfig, ('engine', 'normalization'))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Train or update; print the summary."""
-    require_output(arguments.output, [*arguments.bags, arguments.config], '.npz')
-    require_report(arguments.report, arguments.output)
+    options.require_output(arguments.output, [*arguments.bags, arguments.config], '.npz')
+    options.require_report(arguments.report, arguments.output)
     if arguments.update:
         return _update(arguments)
     from sfa_localization import training
     from sfa_localization.reports.summary import summary
 
-    used = recipe(arguments)
+    used = options.recipe(arguments)
     trained = training.train(
         arguments.bags,
         arguments.output,
@@ -88,7 +79,7 @@ def _update(arguments: argparse.Namespace) -> int:
     """Extend a model; say what was added."""
     unused = [name for name in ('report', 'resume', 'force') if getattr(arguments, name)]
     for group in (SegmentConfig, MetricConfig, NetworkConfig):
-        unused += given(group, arguments)
+        unused += options.given(group, arguments)
     if unused:
         option = unused[0].replace('_', '-')
         raise ConfigError(f'--{option} has no effect on --update: leave one of them out')
@@ -96,14 +87,14 @@ def _update(arguments: argparse.Namespace) -> int:
     from sfa_localization.updating import update
 
     model = PlaceModel.load(arguments.update)
-    require_same_panorama(arguments.config, model.panorama)
+    options.require_same_panorama(arguments.config, model.panorama)
     updated = update(
         model,
         arguments.bags,
         arguments.output,
-        recipe(arguments),
-        config=settings(FilterConfig, arguments, arguments.config),
-        watch=settings(WatchConfig, arguments, arguments.config),
+        options.recipe(arguments),
+        config=options.settings(FilterConfig, arguments),
+        watch=options.settings(WatchConfig, arguments),
         progress=True,
         strict=arguments.strict,
     )

@@ -9,15 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.commands.options import (
-    TOPIC_OPTIONS,
-    add_topics,
-    recipe,
-    require_output,
-    require_same_panorama,
-    settings,
-)
-from sfa_localization.config import load_changes, require_defaults, write_config
+from sfa_localization.commands import options
+from sfa_localization.config import load_changes, write_config
 from sfa_localization.fusion.settings import FilterConfig
 
 WRITES = 'a parameter file with the noise parameters that were found'
@@ -36,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, help='parameter file to start from')
     parser.add_argument('--output', type=Path, required=True, help='parameter file to write')
     parser.add_argument('--method', choices=('likelihood', 'grid'), default='likelihood')
-    add_topics(parser, *TOPIC_OPTIONS)
+    options.add_topics(parser, *options.TOPIC_OPTIONS)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -44,13 +37,12 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization import tuning
     from sfa_localization.place_model import PlaceModel
 
-    config = settings(FilterConfig, arguments, arguments.config)
-    require_output(arguments.output, [*arguments.bags, arguments.model], '.yaml', '.yml')
+    options.require_new(arguments.output)
+    config = options.settings(FilterConfig, arguments)
     changes = load_changes(arguments.config) if arguments.config else {}
-    require_defaults(arguments.output, changes, tuning.TUNED)
     model, grid = PlaceModel.load(arguments.model), arguments.method == 'grid'
-    require_same_panorama(arguments.config, model.panorama)
-    reading, watch = recipe(arguments), settings(WatchConfig, arguments, arguments.config)
+    options.require_same_panorama(arguments.config, model.panorama)
+    reading, watch = options.recipe(arguments), options.settings(WatchConfig, arguments)
     search, cost = tuning.tune_by_likelihood, tuning.likelihood_cost
     if grid:
         search, cost = tuning.tune_by_grid, tuning.error_cost
