@@ -119,7 +119,7 @@ class Listener:
     """Subscribes and keeps all messages, spinning in a thread."""
 
     def __init__(self, context, topics: dict[str, Any]):
-        self.node = rclpy.create_node('listener')
+        self.node = rclpy.create_node('listener', context=context)
         self.heard: dict[str, list[Any]] = {topic: [] for topic in topics}
         for topic, kind in topics.items():
             self.node.create_subscription(kind, topic, self.heard[topic].append, 500)
