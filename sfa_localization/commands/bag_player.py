@@ -65,7 +65,10 @@ def play(
             ticker = node.create_publisher(Clock, '/clock', DEPTH) if clock else None
             while True:
                 pace = ReplayClock(bag.recording.start_ns, config.rate, ticker)
-                played += _publish(bag, publishers, pace)
+                for topic, receive_ns, data in bag.messages(publishers):
+                    pace.wait_until(receive_ns)
+                    publishers[topic.name].publish(bytes(data))
+                    played[topic.name] += 1
                 if not (loop and played):
                     break
             for publisher in publishers.values():
@@ -139,29 +142,19 @@ class ReplayClock:
     """
 
     def __init__(self, start_ns: int, rate: float, ticker: Publisher | None = None) -> None:
-        self.start_ns, self._rate, self._ticker = start_ns, rate, ticker
+        self._start_ns, self._rate, self._ticker = start_ns, rate, ticker
         self._start = self._ticked = time.monotonic()
 
     def wait_until(self, stamp_ns: int) -> None:
         """Return when the bag's time is `stamp_ns`."""
-        due = self._start + (stamp_ns - self.start_ns) * 1e-9 / self._rate
+        due = self._start + (stamp_ns - self._start_ns) * 1e-9 / self._rate
         while (now := time.monotonic()) < due:
             if self._ticker is not None and now >= self._ticked:
                 passed_ns = int((now - self._start) * self._rate * 1e9)
-                seconds, nanoseconds = divmod(self.start_ns + passed_ns, 10**9)
+                seconds, nanoseconds = divmod(self._start_ns + passed_ns, 10**9)
                 self._ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
                 self._ticked = now + CLOCK_PERIOD_S
             time.sleep(min(due - now, CLOCK_PERIOD_S))
-
-
-def _publish(bag: Bag, publishers: dict[str, Publisher], pace: ReplayClock) -> Counter[str]:
-    """Publish the bag from the start of the clock; the messages of each topic."""
-    played = Counter[str]()
-    for topic, receive_ns, data in bag.messages(publishers, pace.start_ns):
-        pace.wait_until(receive_ns)
-        publishers[topic.name].publish(bytes(data))
-        played[topic.name] += 1
-    return played
 
 
 def message_class(kind: str) -> Callable[..., Any] | None:
