@@ -4,21 +4,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
-
-import numpy as np
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import symmetric
-from sfa_localization.fusion.motion import SIZE, State, Twist
+from sfa_localization.fusion.motion import State, Twist
 from sfa_localization.fusion.track import Image, Pose, Track
 from sfa_localization.fusion.turn_noise import TurnNoise
-
-LARGEST_STD_M = 100.0
-"""The standard deviation of the position never exceeds this: larger than the places mapped."""
-DOUBT_STDS = 2.0
-"""While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
 
 
 class OdometryEvent(NamedTuple):
@@ -59,7 +51,6 @@ class Update(NamedTuple):
 
     `d2` is the squared Mahalanobis distance of the full innovation, with `threshold` its gate;
     both NaN where there was nothing to compare with. `innovation` (2,) or (3,) with its covariance.
-    `far`: if the measurement is right, the estimate is LOST.
     """
 
     stamp_ns: int
@@ -69,22 +60,20 @@ class Update(NamedTuple):
     reason: str
     innovation: Array | None = None
     covariance: Array | None = None
-    far: bool = False
 
 
 class Memory(NamedTuple):
     """The record of measurements since the last start.
 
     `support` counts accepted images, `rejected` those outside the gate in a row. `accepted_ns` is
-    the stamp of the last accepted image, `precise_ns` of the last that shows the place well by
-    itself; `images` are the latest. `scatter`, the usual squared distance of images over that
-    expected, and `period_s`, the usual time between images, outlive restarts.
+    the stamp of the last accepted image; `images` are the latest. `scatter`, the usual squared
+    distance of images over that expected, and `period_s`, the usual time between images, outlive
+    restarts.
     """
 
     support: int = 0
     rejected: int = 0
     accepted_ns: int | None = None
-    precise_ns: int | None = None
     images: tuple[Image, ...] = ()
     update: Update | None = None
     scatter: float = 1.0
@@ -96,7 +85,7 @@ class Belief(NamedTuple):
 
     `added` are the variances that driving has added so far, to the heading (as expected, without
     the factor of `turns`) and to the position along each axis. `omega` rad/s is the mean turn rate,
-    as odometry shows it, over the time before its last message. `track` is what `health` judges.
+    as odometry shows it, over the time before its last message. `track` is the path beside images.
     """
 
     stamp_ns: int
@@ -120,36 +109,6 @@ class Belief(NamedTuple):
         return self.turns.factor if self.turns else 1.0
 
     @property
-    def contradicted(self) -> Array | None:
-        """The innovation (2,) or (3,) of the newest image, where those in a row were rejected."""
-        update = self.memory.update
-        return update.innovation if update and self.memory.rejected >= ENOUGH_IMAGES else None
-
-    @property
     def state(self) -> State | None:
-        """The estimate, if there is any. While lost, it is as uncertain as images differ from it;
-        the gate is not: wrong images must not open it.
-        """
-        if not self.located:
-            return None
-        covariance, off = symmetric(self.covariance), self.contradicted
-        if off is not None:
-            x, y, *yaw = off.tolist()
-            place, turned = (x * x + y * y) / DOUBT_STDS**2, sum(turn**2 for turn in yaw)
-            covariance[:3, :3] += np.diag([place, place, turned / DOUBT_STDS**2])
-        return State(self.stamp_ns, self.mean, covariance)
-
-
-ENOUGH_IMAGES = 5
-"""Images in a row that overrule an established estimate: half a second to a second of a camera."""
-
-
-def capped(covariance: Array) -> Array:
-    """A covariance (11, 11) with the pose's standard deviations held at LARGEST_STD_M and pi.
-
-    The correlations stay what they are.
-    """
-    stds = np.sqrt(np.diag(covariance)[:3])
-    factor = np.ones(SIZE)
-    factor[:3] = np.minimum(1.0, np.array([LARGEST_STD_M, LARGEST_STD_M, math.pi]) / stds)
-    return np.asarray(covariance * np.outer(factor, factor))
+        """The estimate, if there is any."""
+        return State(self.stamp_ns, self.mean, symmetric(self.covariance)) if self.located else None

@@ -25,33 +25,19 @@ from sfa_localization.fusion.belief import (
     OdometryEvent,
     PoseEvent,
     Update,
-    capped,
 )
 from sfa_localization.fusion.inputs import lower_root, symmetric
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
 from sfa_localization.fusion.odometry import COAST_S, Interval, interval
-from sfa_localization.fusion.relocation import (
-    FEW_IMAGES,
-    Relocation,
-    relocate,
-    remembered,
-)
+from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.fusion.track import Image
+from sfa_localization.fusion.track import Image, Track, remembered
 from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, restarted, updated
 
-ELSEWHERE = 'restarted elsewhere'
-STARTS = ('started', ELSEWHERE)
+STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
 """Reasons of updates that take a pose from measurements alone."""
-WIDENING, OF_STANDING = 1.3, 0.1
-"""In doubt, the pose's variance grows by this factor per new place that contradicts it: the
-standard deviation doubles within five, while one or two wrong images do little. It grows by a tenth
-of that where the robot has not moved: the same image is hardly new evidence."""
 ALIKE_SHARE = 0.2
 """Where neighbors share less of their errors, positions are those of a sensor with white errors."""
-FAR_M, FAR_RAD = 1.0, 0.3
-"""One image that lies farther off than this, and than 80 % of right ones do, makes an estimate
-doubtful: images that contradict by less leave it near enough to find a way by."""
 _LEARNING = 0.1
 """Relative change per image of the usual distance and period: learned over about twenty."""
 _LEAST_SCATTER = 0.05
@@ -145,7 +131,8 @@ class Ekf:
         belief = self.coast(belief, event.stamp_ns)
         if isinstance(event, PoseEvent):
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
-            return placed._replace(memory=Memory(), track=belief.track.trusted())
+            trusted = Track(belief.track.knots, since_m=-math.inf)
+            return placed._replace(memory=Memory(), track=trusted)
         return self._measured(belief, event)
 
     # Predict.
@@ -160,8 +147,6 @@ class Ekf:
                 odometry_pose=event.pose,
             )
         held = interval(belief, event)
-        if held.now is None:
-            belief = belief._replace(track=belief.track.interrupted())
         if not held.bridged:  # most of so long a silence was spent somehow else
             belief = self.coast(belief, event.stamp_ns)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
@@ -186,8 +171,6 @@ class Ekf:
                 dt = (end_ns - belief.stamp_ns) * 1e-9
                 step = move(belief.mean, belief.twist, dt, self._noise)
                 belief = self._moved(belief, end_ns, step)
-                if move is motion.halt:
-                    belief = belief._replace(covariance=capped(belief.covariance))
         return belief
 
     def _moved(
@@ -206,7 +189,8 @@ class Ekf:
         c, s = math.cos(yaw - before_yaw), math.sin(yaw - before_yaw)
         turned = wrap(yaw + after_yaw - before_yaw)
         reckoned = (x + c * dx - s * dy, y + s * dx + c * dy, turned)
-        located = belief.located
+        located, images = belief.located, belief.memory.images
+        oldest_ns = images[0].stamp_ns if images else stamp_ns
         # Positional, and not _replace, which would cost half as much as the arithmetic above.
         return Belief(
             stamp_ns,
@@ -221,7 +205,7 @@ class Ekf:
             event.pose if event else belief.odometry_pose,
             _added(belief, step),
             belief.turns,
-            belief.track.driven(stamp_ns, reckoned),
+            belief.track.driven(stamp_ns, reckoned, oldest_ns),
             held.omega if held else belief.omega,
         )
 
@@ -229,14 +213,10 @@ class Ekf:
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
-        image = _image(belief, event)
-        belief = self._fused(self._turns_updated(belief, event), event, image)
-        update, track = belief.memory.update, belief.track
-        assert update is not None
-        track = track.driven(event.stamp_ns, image.dead_reckoned).seen(image)
-        if update.reason in STARTS:
-            return belief._replace(track=track, turns=self._turns_restarted(belief))
-        return belief if track is belief.track else belief._replace(track=track)
+        belief, image = self._turns_updated(belief, event), _image(belief, event)
+        if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
+            return self._gated(belief, event, image)
+        return self._found(belief, event, image)
 
     def _turns_restarted(self, belief: Belief) -> TurnNoise:
         """What is known about the noise of turns, from another pose on."""
@@ -258,104 +238,76 @@ class Ekf:
     def _heading_lost(self, belief: Belief) -> bool:
         return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
 
-    def _fused(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
-        """Fuse, or start from one image with heading or the path along which several lie."""
-        if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
-            return self._gated(belief, event, image)
+    def _found(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+        """Start from one image with heading, or from the path along which several lie."""
         images, config = remembered(belief.memory.images, image), self._config
         if event.value.size == 3:
             x, y, yaw = event.covariance.diagonal().tolist()
             if max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2:
-                return self._restarted(belief, event, None, 'started')
+                return self._restarted(belief, event, None, STARTED)
             reason = 'too uncertain to start from'
         else:
             found = relocate(images, self._correlation.distance_m)
             if found is not None and found.shows_heading(len(images)):
-                return self._restarted(belief, event, found, 'started')
+                return self._restarted(belief, event, found, STARTED)
             reason = 'heading unknown yet'
         update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
         return belief._replace(memory=belief.memory._replace(images=images, update=update))
 
     def _gated(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
         """Accept what lies inside the gate; what is outlying within loses weight."""
-        mean, covariance, d2 = self._kalman.corrected(belief, event)
-        size, kalman, inside = event.value.size, self._kalman, d2 <= _GATE[event.value.size]
-        reason, far = 'accepted' if inside else 'outside the gate', _lies_far(belief, event)
-        shown = kalman.y, kalman.S, far
-        update = Update(event.stamp_ns, inside, d2, _GATE[size], reason, *shown)
+        kalman, memory, size = self._kalman, belief.memory, event.value.size
+        mean, covariance, d2 = kalman.corrected(belief, event)
+        inside = d2 <= _GATE[size]
+        reason = 'accepted' if inside else 'outside the gate'
+        update = Update(event.stamp_ns, inside, d2, _GATE[size], reason, kalman.y, kalman.S)
+        memory = memory._replace(update=update, period_s=_period_s(memory, event.stamp_ns))
         if not inside:
-            return self._rejected(belief, event, image, update)
-        scatter = belief.memory.scatter
-        outlying = d2 / (scatter * _OUTLYING[size])
+            return self._rejected(belief._replace(memory=memory), event, image)
+        outlying = d2 / (memory.scatter * _OUTLYING[size])
         if outlying > 1 and self._alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
         # At most 1: an image that claims too little is not believed more than it claims.
-        scatter = min(max(_nearer(scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0)
-        images = remembered(belief.memory.images, image.fused())
-        memory = self._accepted(belief, event, belief.memory.support + 1, images, update, scatter)
-        return belief._replace(mean=mean, covariance=covariance, memory=memory)
-
-    def _accepted(
-        self,
-        belief: Belief,
-        event: MeasurementEvent,
-        support: int,
-        images: tuple[Image, ...],
-        update: Update,
-        scatter: float,
-    ) -> Memory:
-        """The memory after an accepted image; what makes weak ones weak is the same for all."""
-        std_m, before = motion.largest_std(event.covariance), belief.memory
-        weak = self._alike and std_m > self._config.degraded_std
-        return Memory(
-            support=support,
+        scatter = min(max(_nearer(memory.scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0)
+        memory = memory._replace(
+            support=memory.support + 1,
+            rejected=0,
             accepted_ns=event.stamp_ns,
-            precise_ns=before.precise_ns if weak else event.stamp_ns,
-            images=images,
-            update=update,
+            images=remembered(memory.images, image._replace(accepted=True)),
             scatter=scatter,
-            period_s=_period_s(before, event.stamp_ns),
         )
+        return belief._replace(mean=mean, covariance=covariance, memory=memory)
 
     # Start, and start anew.
 
-    def _rejected(
-        self, belief: Belief, event: MeasurementEvent, image: Image, update: Update
-    ) -> Belief:
+    def _rejected(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
         """After a rejected image: restarted where those rejected outweigh the estimate."""
         memory = belief.memory
         images = remembered(memory.images, image)
         found = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
         if found is not None and found.outweighs(belief):
-            track = belief.track.placed(event.stamp_ns, belief.traveled_m - found.distance_m)
-            return self._restarted(belief._replace(track=track), event, found, ELSEWHERE)
-        memory = memory._replace(
-            rejected=memory.rejected + 1,
-            images=images,
-            update=update,
-            period_s=_period_s(memory, event.stamp_ns),
-        )
-        belief = belief._replace(memory=memory)
-        return self._widened(belief) if memory.rejected >= FEW_IMAGES else belief
+            return self._restarted(belief, event, found, ELSEWHERE)
+        return belief._replace(memory=memory._replace(rejected=memory.rejected + 1, images=images))
 
     def _restarted(
         self, belief: Belief, event: MeasurementEvent, found: Relocation | None, reason: str
     ) -> Belief:
         """At the pose that several images show, or at the event's own."""
         pose, covariance = found[:2] if found else event[1:3]
-        update = Update(event.stamp_ns, True, math.nan, math.nan, reason)
+        since_m = belief.traveled_m - (found.distance_m if found else 0.0)
+        track = belief.track
+        track = track.placed(since_m) if reason == ELSEWHERE else track._replace(since_m=since_m)
+        memory = Memory(
+            support=1,
+            accepted_ns=event.stamp_ns,
+            update=Update(event.stamp_ns, True, math.nan, math.nan, reason),
+            scatter=belief.memory.scatter,
+            period_s=belief.memory.period_s,
+        )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
-        memory = self._accepted(belief, event, 1, (), update, belief.memory.scatter)
-        return placed._replace(memory=memory)
-
-    def _widened(self, belief: Belief) -> Belief:
-        """In doubt, the pose becomes less certain with every new place that contradicts it."""
-        moved_m = belief.traveled_m - belief.memory.images[-2:][0].traveled_m
-        fresh = 1 - math.exp(-moved_m / self._correlation.distance_m)
-        factor = np.ones(SIZE)
-        factor[:3] = math.sqrt(1 + (WIDENING - 1) * max(fresh, OF_STANDING))
-        return belief._replace(covariance=capped(belief.covariance * np.outer(factor, factor)))
+        placed = placed._replace(memory=memory, track=track)
+        return placed._replace(turns=self._turns_restarted(placed))
 
 
 def _added(belief: Belief, step: Step) -> tuple[float, float]:
@@ -378,22 +330,6 @@ def _image(belief: Belief, event: MeasurementEvent) -> Image:
         belief.dead_reckoned,
         belief.traveled_m,
     )
-
-
-def is_far(offset: Array) -> bool:
-    """Whether an image at an offset (2,) or (3,) from the estimate would make it LOST."""
-    x, y, *yaw = offset.tolist()
-    return math.hypot(x, y) > FAR_M or any(abs(turn) > FAR_RAD for turn in yaw)
-
-
-def _lies_far(belief: Belief, event: MeasurementEvent) -> bool:
-    """Whether one image shows that the estimate is LOST, whatever errors it may share."""
-    size = event.value.size
-    offset = _residual(event.value, belief.mean[:size])
-    if not is_far(offset):
-        return False
-    both = belief.covariance[:size, :size] + event.covariance
-    return bool(offset @ np.linalg.solve(both, offset) > _OUTLYING[size])
 
 
 def _nearer(usual: float, now: float) -> float:

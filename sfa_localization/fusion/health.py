@@ -6,7 +6,6 @@ The last images i lie beside the path d that the odometry drove, with headings h
 one rigid transform T lays the path on the images; or something else explains them better:
 
     as it is    z_i = T d(t_i) + noise
-    carried     the same, with another T from some image on, where the filter was placed anew
     late        z_i = T d(t_i - tau): images show the robot of tau seconds ago, or of later
     lever       z_i = T (d(t_i) + R(h_i) l): the camera sits l beside its place on the robot
     turned      headings of images are off by one angle
@@ -16,25 +15,25 @@ one rigid transform T lays the path on the images; or something else explains th
 The noise is that of the images and of the odometry's drift; a share of outliers lies anywhere.
 Neighboring images err alike: all together count as about one a meter. T is eliminated in closed
 form (weighted: Umeyama 1991) and by Laplace's method, tau by a sum over a grid. Nothing of this
-reaches the filter's state: it is a function of what the filter remembers of the drive.
+reaches the filter's state: it is a function of what the filter remembers of the drive since images
+last placed it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Complex
-from sfa_localization.fusion.relocation import AGREEING_M, ODOMETRY_DRIFT
-from sfa_localization.fusion.track import LONGEST_DELAY_S, Track
+from sfa_localization.fusion.relocation import AGREEING_M
+from sfa_localization.fusion.track import LONGEST_DELAY_S, Columns, Image, Track
 
 LIKELY = 0.9
 """Probability of nothing harmful from which the estimate is trusted."""
-PRIOR = {'carried': 3e-3, 'late': 1e-2, 'lever': 5e-3, 'turned': 5e-3, 'scale': 5e-3,
-         'unrelated': 5e-3}  # fmt: skip
+PRIOR = {'late': 1e-2, 'lever': 5e-3, 'turned': 5e-3, 'scale': 5e-3, 'unrelated': 5e-3}
 """Probabilities of what is the matter, in any window: once in some hundred meters."""
 LEVER_STD_M, TURNED_STD_RAD, SCALE_STD = 1.0, 0.6, 0.5
 """How large nuisances are, if there are any: cameras move by a meter and half a right angle, wheels
@@ -56,12 +55,10 @@ _TINY = 1e-9  # part of an image's weight that is left, so that some path fits b
 _STEPS = 2  # of reweighting, from where the fit hardly changes
 _LEVER, _TURNED, _SCALE = 1, 2, 3  # kinds of rows
 _AHEAD_S = 0.3  # of the path: odometry may be a little behind
-_BEFORE = 8  # images before it was placed anew, from which on the robot may have been elsewhere
 
 
 class Health(NamedTuple):
-    """The probability that all is `well`, the likeliest fault with its size, and what faults may
-    add to the variances of x, y and yaw.
+    """The probability that all is `well`, and the likeliest fault with its size.
 
     `confirmed_m` of `needed_m` were driven since the estimate was placed.
     """
@@ -69,7 +66,6 @@ class Health(NamedTuple):
     well: float
     fault: str
     size: complex
-    variances: tuple[float, float, float]
     confirmed_m: float
     needed_m: float
 
@@ -100,36 +96,22 @@ def _told(fault: str, size: complex) -> str:
     return 'images and odometry show different motions'
 
 
-def health_of(track: Track) -> Health:
-    """What the images of a track show."""
-    confirmed_m, needed_m = _confirmed(track)
-    if len(track.images) <= 3:  # so few always lie on some path
-        return Health(1.0, '', 0j, (0.0, 0.0, 0.0), confirmed_m, needed_m)
-    window = _Window(track)
-    found = window.hypotheses()
+def health_of(track: Track, images: Sequence[Image]) -> Health:
+    """What images beside a track show."""
+    traveled_m = images[-1].traveled_m if images else 0.0
+    # Each time that it is placed anew, by images that agree over as many meters, doubles them.
+    placed_m = (track.since_m, *track.placed_m)
+    needed_m = min(AGREEING_M * 2.0 ** max(len(placed_m) - 2, 0), LONGEST_M)
+    confirmed_m = max(traveled_m - placed_m[-1], 0.0)
+    new = [image for image in images if image.is_new]
+    if len(new) <= 3:  # so few always lie on some path
+        return Health(1.0, '', 0j, confirmed_m, needed_m)
+    found = _Window(track, new).hypotheses()
     largest = max(item.log_odds for item in found)
     odds = np.exp([item.log_odds - largest for item in found])
     odds = np.where([item.is_harmful for item in found], odds, 0.0) / odds.sum()
     worst = found[int(np.argmax(odds))]
-    place = float(odds @ [item.off_m**2 for item in found]) / 2
-    turned = float(odds @ [item.off_rad**2 for item in found])
-    well, confirmed_m = 1.0 - float(odds.sum()), min(confirmed_m, window.unbroken_m)
-    if well >= LIKELY:  # what nothing shows, as a delay on a circle, makes nobody doubt
-        place = turned = 0.0
-    return Health(
-        well, worst.name, complex(worst.size), (place, place, turned), confirmed_m, needed_m
-    )
-
-
-def _confirmed(track: Track) -> tuple[float, float]:
-    """Meters driven from where the filter was placed to the newest image, and those needed: twice
-    as many each time that it was placed anew, by images that agreed over as many as the first time.
-    """
-    times, traveled_m = len(track.placings), track.images[-1].traveled_m if track.images else 0.0
-    if times == 0:
-        return max(traveled_m - track.since_m, 0.0), AGREEING_M
-    driven_m = traveled_m - track.placings[-1].traveled_m
-    return max(driven_m, 0.0), min(AGREEING_M * 2.0 ** (times - 1), LONGEST_M)
+    return Health(1 - float(odds.sum()), worst.name, complex(worst.size), confirmed_m, needed_m)
 
 
 class _Hypothesis(NamedTuple):
@@ -153,25 +135,18 @@ class _Window:
     have followed; positions in the plane are complex numbers.
     """
 
-    def __init__(self, track: Track) -> None:
-        images, newest_ns = track.images, track.images[-1].stamp_ns
-        columns = [(i.stamp_ns - newest_ns, i.yaw, i.traveled_m, i.variance) for i in images]
-        stamps, yaws, self._way_m, variance = np.array(columns).T
-        yaw_variance = np.array([image.yaw_variance for image in images])
-        self._seconds, self._places = stamps * 1e-9, np.array([image.place for image in images])
-        has_yaw, behind_m = np.isfinite(yaws), self._way_m[-1] - self._way_m
-        self._yaws = np.where(has_yaw, yaws, 0.0)
-        self._variance = CAUTION * variance + FLOOR_M**2 + (ODOMETRY_DRIFT * behind_m) ** 2
-        self._yaw_variance = CAUTION * yaw_variance + FLOOR_RAD**2 + (YAW_DRIFT * behind_m) ** 2
-        yaw_width = np.sqrt(2 * np.pi * np.where(has_yaw, self._yaw_variance, 2 * np.pi))
+    def __init__(self, track: Track, images: Sequence[Image]) -> None:
+        seen, newest_ns = Columns(images), images[-1].stamp_ns
+        self._seconds, self._places = (seen.stamps_ns - newest_ns) * 1e-9, seen.place
+        self._yaws, yaw_drift = seen.yaw, (YAW_DRIFT * seen.behind_m) ** 2
+        self._variance = CAUTION * seen.variance + FLOOR_M**2 + seen.drift
+        self._yaw_variance = CAUTION * seen.yaw_variance + FLOOR_RAD**2 + yaw_drift
+        yaw_width = np.sqrt(2 * np.pi * np.where(seen.has_yaw, self._yaw_variance, 2 * np.pi))
         self._peak = (1 - OUTLIERS) / (2 * np.pi * self._variance * yaw_width)
         knots = np.array([(knot[0] - newest_ns, *knot[1:]) for knot in track.knots])
         self._times, (x, y, yaw) = knots[:, 0] * 1e-9, knots[:, 1:].T
         self._path, self._path_yaw = x + 1j * y, np.unwrap(yaw)
-        self._power = min(1.0, max(1 + behind_m[0], 3.0) / len(images))
-        placed_ns = track.placings[-1].stamp_ns if track.placings else 0
-        self._placed = int(np.searchsorted(stamps, placed_ns - newest_ns))
-        self.unbroken_m = math.inf
+        self._power = min(1.0, max(1 + seen.behind_m[0], 3.0) / len(images))
 
     def hypotheses(self) -> list[_Hypothesis]:
         """All, with log odds up to a constant."""
@@ -190,7 +165,6 @@ class _Window:
             _Hypothesis('turned', logs[-2], turned[-2], 0.0, abs(turned[-2])),
             _Hypothesis('scale', logs[-1], scale[-1], abs(scale[-1] - 1) * AGREEING_M),
             _Hypothesis('unrelated', nothing, 0j, AGREEING_M),
-            *self._carried(rows[:1], yaws[:1]),
             *late[1:],
         ]
         shares = {**PRIOR, 'as it is': 1 - sum(PRIOR.values()), 'late': PRIOR['late'] / len(DELAYS)}
@@ -208,35 +182,18 @@ class _Window:
         places, yaws = (np.interp(at, self._times, x) for x in (self._path, self._path_yaw))
         return places, yaws, delays
 
-    def _carried(self, row: Complex, yaw: Array) -> list[_Hypothesis]:
-        """Another T from some image on, before the filter was placed anew."""
-        if self._placed == 0:
-            return []
-        count = len(self._places)
-        breaks = np.arange(max(self._placed - _BEFORE, 1), min(self._placed, count - 3) + 1)
-        if len(breaks) == 0:
-            self.unbroken_m = 0.0
-            return []
-        before = np.arange(count) < breaks[:, None]
-        both = np.concatenate([before, ~before])
-        rows, yaws = np.repeat(row, len(both), 0), np.repeat(yaw, len(both), 0)
-        logs = self._fitted(rows, yaws, np.zeros(len(both)), both)[0].reshape(2, -1).sum(0)
-        best = int(np.argmax(logs))
-        self.unbroken_m = float(self._way_m[-1] - self._way_m[breaks[best]])
-        return [_Hypothesis('carried', float(logs[best]))]
-
     def _fitted(
-        self, rows: Complex, yaws: Array, kinds: Array, used: NDArray[np.bool_] | None = None
+        self, rows: Complex, yaws: Array, kinds: Array
     ) -> tuple[Array, tuple[Complex, Array, Array]]:
-        """Log evidence (R,) of paths by the images `used` (R, N), and nuisances (R, 1): lever,
-        angle and factor, each where it is the kind of the row.
+        """Log evidence (R,) of paths, and nuisances (R, 1): lever, angle and factor, each where it
+        is the kind of the row.
 
         With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
         """
         is_lever, is_turned, is_scale = (kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE))
         look, arm = np.exp(1j * (self._yaws - yaws)), np.exp(1j * yaws)
-        weight = counted = np.ones(rows.shape) if used is None else used.astype(float)
+        weight = np.ones(rows.shape)
         angle, factor = np.zeros((len(rows), 1)), np.ones((len(rows), 1))
         lever = np.asarray(angle, complex)
         for step in range(_STEPS):
@@ -257,9 +214,9 @@ class _Window:
             apart += 2 * (1 - (look * np.conj(u * np.exp(1j * angle))).real) / self._yaw_variance
             fits = self._peak * np.exp(-0.5 * apart)
             anything = fits + OUTLIERS * _ANYWHERE
-            weight = counted * (fits / anything + _TINY)
+            weight = fits / anything + _TINY
         square = (w * np.abs(path) ** 2).sum(1, keepdims=True) + of_yaw + _TINY
-        log = (counted * np.log(anything)).sum(1, keepdims=True) - np.log(total)
+        log = np.log(anything).sum(1, keepdims=True) - np.log(total)
         log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5) - 0.5 * np.log(square)
         sizes = lever, angle, factor
         log -= _prior(kinds, sizes, (of_arm, of_angle, of_path))

@@ -32,21 +32,17 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import Level, Status, status_of
 from sfa_localization.fusion.timeline import (
     HISTORY_NS,
-    JUMP_NS,
     MEASUREMENT,
     ODOMETRY,
     POSE,
     ClockWentBack,
     Timeline,
 )
-from sfa_localization.fusion.track import Image, Placing
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
 DELAY_LIMIT_NS = 500_000_000
 """Largest delay of the camera's stamps, either way, that is compensated."""
-_BLIND = 2
-"""So many unusable images in a row are no flicker: the camera is covered, or in the dark."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
@@ -93,8 +89,7 @@ class PoseFilter:
         self._camera = CameraClockFinder(_CLOCK_MEMORY, self._camera.clock)
         self._history = self._fresh(self._ekf.blank(0))
         self._timeline, self._open_loop = Timeline(), OpenLoop()
-        self._unusable_ns = self._unusable = 0
-        self._judged: tuple[tuple[Image, ...], tuple[Placing, ...], Health] | None = None
+        self._judged: tuple[object, Health] | None = None
         self._waiting: tuple[Array, Array] | None = None
         if self.config.initial_pose:
             self._waiting = np.array(self.config.initial_pose), self._initial_covariance()
@@ -151,7 +146,6 @@ class PoseFilter:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
-        self._unusable_ns = 0
         self._open_loop.add(twist.v, twist.omega)
         known = pose is not None and all(map(math.isfinite, pose))
         at = tuple(map(float, pose)) if pose is not None and known else None
@@ -168,13 +162,12 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         try:
-            fused, noise = self._read(stamp_ns, value, covariance)
+            fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
             taken_ns = self._taken(stamp_ns)
             self._require_place(taken_ns, MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        self._unusable = 0
         noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
         event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         update = self._history.add((taken_ns, MEASUREMENT), event).memory.update
@@ -197,14 +190,6 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
-
-    def _read(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
-        try:
-            return read_measurement(value, covariance, self.config.measurement_factor)
-        except DataError:
-            self._unusable_ns = max(stamp_ns, self._unusable_ns)
-            self._unusable += 1
-            raise
 
     def _taken(self, stamp_ns: int) -> int:
         """When an image was taken, on the clock of the odometry. Where that shows far more motion
@@ -297,41 +282,25 @@ class PoseFilter:
         """A robot that is commanded is where its odometry was a delay ago, and its images right."""
         delay_ns = round(self._compensated_s * 1e9) if self._open_loop.found else 0
         robot_ns = stamp_ns - delay_ns if self._history.reaches(stamp_ns - delay_ns) else stamp_ns
-        state = self._widened(self._ekf.coast(self._history.before(robot_ns), robot_ns))
+        state = self._ekf.coast(self._history.before(robot_ns), robot_ns).state
         return state and replace(state, stamp_ns=stamp_ns)
 
     @property
     def health(self) -> Health:
         """What the last images show of the estimate."""
-        track = self._history.newest.track
-        images, placings = track.images, track.placings
-        if self._judged is None or self._judged[0] is not images or self._judged[1] is not placings:
-            self._judged = images, placings, health_of(track)
-        return self._judged[2]
-
-    def _widened(self, belief: Belief) -> State | None:
-        """The estimate, less certain by what may be the matter."""
-        state, health = belief.state, self.health
-        if state is None or not any(health.variances):
-            return state
-        covariance = state.covariance.copy()
-        covariance[:3, :3] += np.diag(health.variances)
-        return replace(state, covariance=covariance)
+        belief = self._history.newest
+        images, placed_m = belief.memory.images, belief.track.placed_m
+        newest = next((image for image in reversed(images) if image.is_new), None), placed_m
+        if self._judged is None or self._judged[0] != newest:
+            self._judged = newest, health_of(belief.track, images)
+        return self._judged[1]
 
     @property
     def status(self) -> Status:
-        """How far the estimate at the newest message can be trusted, and why not further.
-
-        While the odometry is silent, images that cannot be used show how time goes on.
-        """
-        newest = self._history.newest
-        if 0 < self._unusable_ns - newest.stamp_ns <= JUMP_NS:
-            newest = self._ekf.coast(newest, self._unusable_ns)
-        status = status_of(newest, self._widened(newest), self.health, self.config)
+        """How far the estimate at the newest message can be trusted, and why not further."""
+        status = status_of(self._history.newest, self.health, self.config)
         doubts, delay_s = self._timeline.problems, self._camera.clock.delay_s
         if abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS:
             late = 'late' if delay_s > 0 else 'early'
             doubts.append(f'images are stamped {abs(delay_s):.1f} s {late}: synchronize the clocks')
-        if self._unusable >= _BLIND:
-            doubts.append(f'{self._unusable} images in a row are unusable')
         return status.with_reasons([], doubts)

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sfa_localization.fusion.belief import Belief
-from sfa_localization.fusion.ekf import is_far
 from sfa_localization.fusion.health import Health
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.odometry import ODOMETRY_TIMEOUT_S
-from sfa_localization.fusion.relocation import FEW_IMAGES
+from sfa_localization.fusion.relocation import ENOUGH_IMAGES, FEW_IMAGES
 from sfa_localization.fusion.settings import FilterConfig
 
 LEAST_SILENCE_S, MOST_SILENCE_S, PERIODS = 1.4, 3.0, 1.25
@@ -55,25 +54,25 @@ class Status:
         return Status(max(level, self.level, key=lambda one: one.value), reasons)
 
 
-def status_of(belief: Belief, state: State | None, health: Health, config: FilterConfig) -> Status:
-    """The status of a belief with this state and health."""
+def status_of(belief: Belief, health: Health, config: FilterConfig) -> Status:
+    """The status of a belief with this health."""
+    state, memory = belief.state, belief.memory
     if state is None:
         return Status(Level.UNINITIALISED, (_missing(belief),))
-    lost = uncertainty(state, config) + _contradictions(belief)
-    degraded = _weakness(state, config) + _rejections(belief)
-    return Status.of(lost, degraded + health.problems + _silences(belief, config))
+    lost = uncertainty(state, config)
+    found = _known_to(state, config.degraded_std, DEGRADED_YAW_RAD)
+    degraded = [reason for reason in found if reason not in lost] + health.problems
+    # An estimate that rests on one or two images is doubted by the first that contradicts it.
+    if memory.rejected >= ENOUGH_IMAGES:
+        lost.append(f'{memory.rejected} images in a row contradict the estimate')
+    elif memory.rejected >= (FEW_IMAGES if memory.support >= FEW_IMAGES else 1):
+        degraded.append(f'{memory.rejected} images in a row did not match')
+    return Status.of(lost, degraded + _silences(belief))
 
 
 def uncertainty(state: State, config: FilterConfig) -> list[str]:
     """Why a state is LOST by its standard deviations alone."""
     return _known_to(state, config.lost_std, config.lost_yaw_std)
-
-
-def _weakness(state: State, config: FilterConfig) -> list[str]:
-    """Why a state is DEGRADED by its standard deviations alone."""
-    lost = uncertainty(state, config)
-    found = _known_to(state, config.degraded_std, DEGRADED_YAW_RAD)
-    return [reason for reason in found if reason not in lost]
 
 
 def _known_to(state: State, std_m: float, std_rad: float) -> list[str]:
@@ -91,40 +90,17 @@ def _missing(belief: Belief) -> str:
     return 'no odometry and no images yet' if belief.odometry_ns is None else 'no usable image yet'
 
 
-def _contradictions(belief: Belief) -> list[str]:
-    off = belief.contradicted
-    if off is None or not is_far(off):
-        return []
-    return [f'{belief.memory.rejected} images in a row contradict the estimate']
-
-
-def _rejections(belief: Belief) -> list[str]:
-    """What the last images say, where they contradict the estimate or were not fused."""
-    memory, update = belief.memory, belief.memory.update
-    if update is None:
-        return []
-    # An estimate that rests on one or two images is doubted by the first that contradicts it.
-    few = FEW_IMAGES if memory.support >= FEW_IMAGES else 1
-    if (update.far or memory.rejected >= few) and not _contradictions(belief):
-        one = 'an image did not match'
-        return [one if memory.rejected <= 1 else f'{memory.rejected} images in a row did not match']
-    return []
-
-
-def _silences(belief: Belief, config: FilterConfig) -> list[str]:
+def _silences(belief: Belief) -> list[str]:
     reasons, memory = [], belief.memory
-    limit_s = silence_limit_s(memory.period_s)
-    images_s, precise_s, odometry_s = (
+    images_s, odometry_s = (
         math.inf if last_ns is None else (belief.stamp_ns - last_ns) * 1e-9
-        for last_ns in (memory.accepted_ns, memory.precise_ns, belief.odometry_ns)
+        for last_ns in (memory.accepted_ns, belief.odometry_ns)
     )
     if memory.accepted_ns is None:
         reasons.append('no image has confirmed the start yet')
-    elif images_s > limit_s:
+    elif images_s > silence_limit_s(memory.period_s):
         fits = 'fitting' if memory.rejected else 'usable'
         reasons.append(f'no {fits} image for {images_s:.0f} s')
-    elif precise_s > limit_s:
-        reasons.append(f'single images show the position to no better than {config.degraded_std} m')
     if belief.odometry_ns is None:
         reasons.append('no odometry')
     elif odometry_s > ODOMETRY_TIMEOUT_S:

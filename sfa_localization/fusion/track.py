@@ -5,9 +5,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
-from sfa_localization.data.geometry import wrap_angle
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array, wrap_angle
 
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
@@ -16,18 +20,23 @@ Knot = tuple[int, float, float, float]
 SPACING_M, SPACING_RAD = 0.5, 0.2
 """An image that shows less motion than this, as the odometry does, shows nothing new: neighboring
 images err alike."""
-WINDOW, WINDOW_M = 32, 12.0
-"""Images that are compared, over this distance at most: then the odometry has drifted."""
+LATEST, CAPACITY = 30, 60
+"""Of the images before the LATEST only those that show something new are kept, CAPACITY in all."""
+REACH_M, REACH_STDS = 12.0, 30.0
+"""Images farther behind, in m and in standard deviations of the newest, are forgotten: there the
+odometry has drifted."""
 LONGEST_DELAY_S = 10.0
 """The path is remembered for so long before the first image: images may be late."""
-_KNOT_NS, _LASTING_NS, _LONGEST_NS = 100_000_000, 1_000_000_000, 60_000_000_000
+ODOMETRY_DRIFT = 0.05
+"""Error of odometry that is allowed for, per meter: m, and rad; a poor robot's 5 %."""
+_KNOT_NS = 100_000_000
 _FORGIVEN_M = 30.0
 """An estimate that was right for so long was not moved for nothing."""
 
 
 class Image(NamedTuple):
     """What one image showed, at x + iy m and `yaw` rad (NaN where unknown), with variances m^2 per
-    axis and rad^2, beside the dead-reckoned pose at its stamp.
+    axis and rad^2, beside the dead-reckoned pose at its stamp. `is_new`: the robot had moved.
     """
 
     stamp_ns: int
@@ -38,82 +47,69 @@ class Image(NamedTuple):
     dead_reckoned: Pose
     traveled_m: float
     accepted: bool = False
-
-    def fused(self) -> Image:
-        """The image after it was accepted."""
-        return Image(*self[:-1], True)
+    is_new: bool = True
 
 
-class Placing(NamedTuple):
-    """The filter was placed anew at a stamp, by images that it had rejected; the first of those
-    that agreed came at `traveled_m`.
+def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
+    """The images with one more, without what is too far behind."""
+    last = next((image for image in reversed(images) if image.is_new), None)
+    if last is not None and not _moved(last, newest):
+        newest = newest._replace(is_new=False)
+    reach_m, first = max(REACH_M, REACH_STDS * math.sqrt(newest.variance)), 0
+    while first < len(images) and newest.traveled_m - images[first].traveled_m > reach_m:
+        first += 1
+    kept = (*images[first:], newest)
+    if len(kept) <= CAPACITY:
+        return kept
+    older = [image for image in kept[:-LATEST] if image.is_new]
+    return (*older[LATEST - CAPACITY :], *kept[-LATEST:])
+
+
+def _moved(last: Image, image: Image) -> bool:
+    turn = float(wrap_angle(image.dead_reckoned[2] - last.dead_reckoned[2]))
+    return image.traveled_m - last.traveled_m >= SPACING_M or abs(turn) >= SPACING_RAD
+
+
+class Columns:
+    """Images as arrays (N,), the newest last: `place` and the dead-reckoned `path` as complex
+    numbers in the plane, `yaw` with the mask `has_yaw`, variances, and meters `behind_m`.
     """
 
-    stamp_ns: int
-    traveled_m: float
+    def __init__(self, images: Sequence[Image]) -> None:
+        self.stamps_ns = np.array([image.stamp_ns for image in images])
+        self.place = np.array([image.place for image in images])
+        rows = [(*i.dead_reckoned, i.yaw, i.variance, i.yaw_variance, i.traveled_m) for i in images]
+        x, y, self.path_yaw, yaw, self.variance, self.yaw_variance, traveled_m = np.array(rows).T
+        self.path, self.behind_m = x + 1j * y, traveled_m[-1] - traveled_m
+        self.has_yaw: NDArray[np.bool_] = np.isfinite(yaw)
+        self.yaw = np.where(self.has_yaw, yaw, 0.0)
+        self.drift = (ODOMETRY_DRIFT * self.behind_m) ** 2
 
 
 class Track(NamedTuple):
-    """The path by its `knots`, the images in a window, and where the filter was placed.
+    """The path by its `knots`, and where images placed the filter anew, `placed_m` traveled.
 
     `since_m` is the distance traveled at the first image, before which nothing is confirmed.
     """
 
     knots: tuple[Knot, ...] = ()
-    images: tuple[Image, ...] = ()
-    placings: tuple[Placing, ...] = ()
+    placed_m: tuple[float, ...] = ()
     since_m: float = math.inf
 
-    def driven(self, stamp_ns: int, pose: Pose) -> Track:
-        """With the pose that dead reckoning leads to."""
+    def driven(self, stamp_ns: int, pose: Pose, oldest_ns: int) -> Track:
+        """With the pose that dead reckoning leads to; what is older than `oldest_ns` goes."""
         knots, knot = self.knots, (stamp_ns, *pose)
         if knots and 0 <= stamp_ns - knots[-1][0] < _KNOT_NS:
             return self
         if len(knots) > 1 and knots[-1][1:] == pose == knots[-2][1:]:
             return self._replace(knots=(*knots[:-1], knot))  # it stands
-        oldest_ns = self.images[0].stamp_ns if self.images else stamp_ns
         oldest_ns -= round(LONGEST_DELAY_S * 1e9)
         first = 0
         while first + 1 < len(knots) and knots[first + 1][0] <= oldest_ns:
             first += 1
         return self._replace(knots=(*knots[first:], knot))
 
-    def seen(self, image: Image) -> Track:
-        """With one more image, if it shows something new."""
-        images = self.images
-        if not images:
-            return self._replace(images=(image,), since_m=min(self.since_m, image.traveled_m))
-        if not _is_new(images[-1], image):
-            return self
-        first = max(len(images) + 1 - WINDOW, 0)
-        while first < len(images) and (
-            image.traveled_m - images[first].traveled_m > WINDOW_M
-            or image.stamp_ns - images[first].stamp_ns > _LONGEST_NS
-        ):
-            first += 1
-        return self._replace(images=(*images[first:], image))
-
-    def interrupted(self) -> Track:
-        """After a silence of the odometry: the path begins anew."""
-        return Track((), (), self.placings, self.since_m)
-
-    def trusted(self) -> Track:
-        """After the pose was set from outside, by somebody who knows."""
-        return Track(self.knots, since_m=-math.inf)
-
-    def placed(self, stamp_ns: int, traveled_m: float) -> Track:
-        """After images that agree from a distance traveled on placed the filter anew."""
-        kept = (item for item in self.placings if traveled_m - item.traveled_m < _FORGIVEN_M)
-        return self._replace(placings=(*kept, Placing(stamp_ns, traveled_m)))
-
-
-def _is_new(last: Image, image: Image) -> bool:
-    """Whether the robot moved between two images, by the odometry, or, lasting longer than an
-    outlier does, by more than they may err.
-    """
-    if abs(image.traveled_m - last.traveled_m) >= SPACING_M:
-        return True
-    if abs(float(wrap_angle(image.dead_reckoned[2] - last.dead_reckoned[2]))) >= SPACING_RAD:
-        return True
-    seen_m = abs(image.place - last.place) - 3 * math.sqrt(last.variance + image.variance)
-    return seen_m >= SPACING_M and image.stamp_ns - last.stamp_ns >= _LASTING_NS
+    def placed(self, traveled_m: float) -> Track:
+        """After images placed the filter anew, here."""
+        kept = (before for before in self.placed_m if traveled_m - before < _FORGIVEN_M)
+        return self._replace(placed_m=(*kept, traveled_m))
