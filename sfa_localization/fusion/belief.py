@@ -10,7 +10,6 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import State, Twist
 from sfa_localization.fusion.track import Image, Pose, Track
-from sfa_localization.fusion.turn_noise import TurnNoise
 
 
 class OdometryEvent(NamedTuple):
@@ -83,9 +82,8 @@ class Memory(NamedTuple):
 class Belief(NamedTuple):
     """Everything that the next event changes. `located` is False before the first pose.
 
-    `added` are the variances that driving has added so far, to the heading (as expected, without
-    the factor of `turns`) and to the position along each axis. `omega` rad/s is the mean turn rate,
-    as odometry shows it, over the time before its last message. `track` is the path beside images.
+    `omega` rad/s is the mean turn rate, as odometry shows it, over the time before its last
+    message. `track` is the path beside images.
     """
 
     stamp_ns: int
@@ -98,15 +96,8 @@ class Belief(NamedTuple):
     odometry_ns: int | None
     memory: Memory
     odometry_pose: Pose | None = None
-    added: tuple[float, float] = (0.0, 0.0)
-    turns: TurnNoise | None = None
     track: Track = Track()
     omega: float = 0.0
-
-    @property
-    def turn_factor(self) -> float:
-        """By how much turns are noisier than expected, on the standard deviation."""
-        return self.turns.factor if self.turns else 1.0
 
     @property
     def state(self) -> State | None:

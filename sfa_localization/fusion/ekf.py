@@ -26,13 +26,12 @@ from sfa_localization.fusion.belief import (
     PoseEvent,
     Update,
 )
-from sfa_localization.fusion.inputs import lower_root, symmetric
+from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
 from sfa_localization.fusion.odometry import COAST_S, Interval, interval
 from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.track import Image, Track, remembered
-from sfa_localization.fusion.turn_noise import SPACING_NS, Driven, TurnNoise, restarted, updated
 
 STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
 """Reasons of updates that take a pose from measurements alone."""
@@ -58,7 +57,7 @@ def measurement_event(
     """
     size = len(value)
     jacobian = _OBSERVED[:size].copy()
-    jacobian[:, ERROR : ERROR + size] = lower_root(covariance.tolist(), math.sqrt(share))
+    jacobian[:, ERROR : ERROR + size] = math.sqrt(share) * np.linalg.cholesky(covariance)
     return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
 
 
@@ -150,13 +149,9 @@ class Ekf:
         if not held.bridged:  # most of so long a silence was spent somehow else
             belief = self.coast(belief, event.stamp_ns)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
-        factor, noise, twist = belief.turn_factor, self._noise, held.twist
-        if factor != 1.0:
-            twist = twist._replace(omega_variance=twist.omega_variance * factor**2)
-            noise = noise._replace(yaw_per_radian=noise.yaw_per_radian * factor)
-        step = motion.drive(belief.mean, twist, dt, noise, held.now)
+        step = motion.drive(belief.mean, held.twist, dt, self._noise, held.now)
         if held.unknown_s > 0:
-            motion.add_unknown_motion(step.noise, twist, min(dt, held.unknown_s))
+            motion.add_unknown_motion(step.noise, held.twist, min(dt, held.unknown_s))
         return self._moved(belief, event.stamp_ns, step, event, held)
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
@@ -203,8 +198,6 @@ class Ekf:
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
             event.pose if event else belief.odometry_pose,
-            _added(belief, step),
-            belief.turns,
             belief.track.driven(stamp_ns, reckoned, oldest_ns),
             held.omega if held else belief.omega,
         )
@@ -213,27 +206,10 @@ class Ekf:
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
-        belief, image = self._turns_updated(belief, event), _image(belief, event)
+        image = _image(belief, event)
         if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
             return self._gated(belief, event, image)
         return self._found(belief, event, image)
-
-    def _turns_restarted(self, belief: Belief) -> TurnNoise:
-        """What is known about the noise of turns, from another pose on."""
-        faded = belief.traveled_m / self._correlation.distance_m
-        driven = Driven(belief.stamp_ns, belief.dead_reckoned, faded, *belief.added)
-        return restarted(driven, belief.mean, belief.covariance, belief.turns)
-
-    def _turns_updated(self, belief: Belief, event: MeasurementEvent) -> Belief:
-        """The belief with what a measurement shows about the noise of turns."""
-        if not belief.located or self._heading_lost(belief):
-            return belief
-        last = belief.turns
-        if last is not None and belief.stamp_ns < last.driven.stamp_ns + SPACING_NS:
-            return belief
-        now = self._turns_restarted(belief)
-        turns = updated(last or now, now.driven, event.value, event.jacobian, event.white)
-        return belief._replace(turns=turns)
 
     def _heading_lost(self, belief: Belief) -> bool:
         return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
@@ -306,16 +282,7 @@ class Ekf:
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
-        placed = placed._replace(memory=memory, track=track)
-        return placed._replace(turns=self._turns_restarted(placed))
-
-
-def _added(belief: Belief, step: Step) -> tuple[float, float]:
-    """Without the motion that a turn of the heading adds to the position: it is small."""
-    yaw, variance = belief.added
-    noise = step.noise
-    x, y, turned = noise.item(0), noise.item(SIZE + 1), noise.item(2 * SIZE + 2)
-    return yaw + turned / belief.turn_factor**2, variance + (x + y) / 2
+        return placed._replace(memory=memory, track=track)
 
 
 def _image(belief: Belief, event: MeasurementEvent) -> Image:

@@ -29,10 +29,8 @@ _LEAST_TWIST_STDS, _LEAST_STDS = (0.01, 0.005), (0.05, 0.05, 0.02)
 # Twists, some seconds of them, of which so many are repeated by odometry that repeats commands:
 # 0.66 to 0.82 on four small robots.
 _COMMANDS, _REPEATED = 200, 0.5
-# m; m/s and rad/s; rad, beyond which an angle has no digits left; and of a covariance.
-_LARGEST_COORDINATE, _LARGEST_TWIST, _LARGEST_YAW, _LARGEST_ENTRY = 1e9, 100.0, 1e6, 1e12
-_SINGULAR = 1e-10  # part of a variance that is left where a correlation is 1
-_NO_COVARIANCE = 'covariance is not symmetric positive'
+_LARGEST_M, _LARGEST_TWIST = 1e9, 100.0  # m; m/s and rad/s: beyond, nothing is a robot's
+_SKEW = 1e-6  # of the largest entry: rounding
 
 
 class OpenLoop:
@@ -70,10 +68,8 @@ def read_twist(
     `commands`. Raises DataError, with the reason, for one that is impossible.
     """
     v, omega = float(v), float(omega)
-    if not (math.isfinite(v) and math.isfinite(omega)):
-        raise DataError('not finite')
-    if abs(v) > _LARGEST_TWIST or abs(omega) > _LARGEST_TWIST:
-        raise DataError('absurdly fast')
+    if not (abs(v) <= _LARGEST_TWIST and abs(omega) <= _LARGEST_TWIST):
+        raise DataError('not finite, or absurdly fast')
     rate_std = max(config.rate_std, COMMAND_RATE_STD) if commands else config.rate_std
     known = zip(variances, _LEAST_TWIST_STDS, (config.speed_std, rate_std), strict=True)
     return Twist(v, omega, *(_variance(config.odometry_factor, *each) for each in known))
@@ -90,71 +86,44 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
 
     A heading too uncertain is left out. Raises DataError, with the reason, where nothing is left.
     """
-    given, matrix = np.asarray(value, float), np.asarray(covariance, float)
-    if given.shape not in ((2,), (3,)) or matrix.shape != (given.size, given.size):
+    pose, matrix = np.asarray(value, float), np.asarray(covariance, float)
+    if pose.shape not in ((2,), (3,)) or matrix.shape != (pose.size, pose.size):
         raise DataError('shape is not that of a position or a pose')
-    pose, size = given.tolist(), given.size
-    if not (abs(pose[0]) <= _LARGEST_COORDINATE and abs(pose[1]) <= _LARGEST_COORDINATE):
+    if not np.abs(pose[:2]).max() <= _LARGEST_M:
         raise DataError('position is not finite')
-    if size == 3 and not _has_yaw(pose[2], matrix):
-        size, matrix = 2, matrix[:2, :2]
+    known = math.isfinite(pose[-1]) and matrix[-1, -1] <= YAW_STD_LIMIT**2
+    if pose.size == 3 and not (known and (matrix[2, 2] > 0 or not matrix.any())):
+        pose, matrix = pose[:2], matrix[:2, :2]
     if not matrix.any():
-        matrix = np.diag(np.square(_UNKNOWN_STDS[:size]))
-    rows = matrix.tolist()  # arrays of two or three cost more than what is done with them
-    lower_root(rows, 1.0)
-    largest = max(map(max, rows))
-    skew = max(abs(rows[i][j] - rows[j][i]) for i in range(size) for j in range(i))
-    if not largest < _LARGEST_ENTRY or skew > 1e-6 * largest:
-        raise DataError(_NO_COVARIANCE)
-    if max(rows[0][0], rows[1][1]) >= LARGEST_VARIANCE:
+        matrix = np.diag(np.square(_UNKNOWN_STDS[: pose.size]))
+    require_covariance(matrix)
+    variances = matrix.diagonal()
+    if max(variances[:2]) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
     noise = factor * symmetric(matrix)
-    for k in range(size):
-        noise[k, k] = max(factor * rows[k][k], _LEAST_STDS[k] ** 2)
-    return np.array(pose[:size]), noise
-
-
-def _has_yaw(yaw: float, matrix: Array) -> bool:
-    variance = matrix[2, 2]
-    known = abs(yaw) < _LARGEST_YAW and variance <= YAW_STD_LIMIT**2
-    return bool(known and (variance > 0 or not matrix.any()))
-
-
-def lower_root(rows: list[list[float]], factor: float) -> list[list[float]]:
-    """`factor` times the lower triangular root (Cholesky) of a covariance (2, 2) or (3, 3).
-
-    Raises DataError where there is none; for NaN, comparisons are false.
-    """
-    xx, (xy, yy) = rows[0][0], rows[1][:2]
-    a = math.sqrt(xx) if xx > 0 else math.nan
-    b = xy / a
-    d = math.sqrt(yy - b * b) if yy - b * b > _SINGULAR * yy else math.nan
-    root = [[factor * a, 0.0], [factor * b, factor * d]]
-    if len(rows) == 3:
-        xt, yt, tt = rows[2]
-        c = xt / a
-        e = (yt - b * c) / d
-        left = tt - c * c - e * e
-        f = math.sqrt(left) if left > _SINGULAR * tt else math.nan
-        root = [[*root[0], 0.0], [*root[1], 0.0], [factor * c, factor * e, factor * f]]
-    if not math.isfinite(root[-1][-1]):
-        raise DataError(_NO_COVARIANCE)
-    return root
+    np.fill_diagonal(noise, np.maximum(factor * variances, np.square(_LEAST_STDS[: pose.size])))
+    return pose, noise
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
     """A pose (3,) and covariance (3, 3) set from outside; DataError where they cannot be one."""
     value, matrix = np.asarray(pose, float), np.asarray(covariance, float)
-    if value.shape != (3,) or not np.all(np.isfinite(value)):
+    if value.shape != (3,) or not np.abs(value).max() <= _LARGEST_M:
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
-    if np.abs(value).max() > _LARGEST_COORDINATE:
-        raise DataError(f'initial pose {pose!r} is absurdly far away')
-    wrong = 'covariance of the initial pose is not a symmetric positive (3, 3) one'
-    if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, 1e-6, 1e-6 * abs(matrix[0, 0])):
-        raise DataError(wrong)
-    if not np.abs(matrix).max() < _LARGEST_ENTRY or np.linalg.eigvalsh(symmetric(matrix))[0] <= 0:
-        raise DataError(wrong)
+    if matrix.shape != (3, 3):
+        raise DataError('covariance of the initial pose is not (3, 3)')
+    require_covariance(matrix)
     return value, symmetric(matrix)
+
+
+def require_covariance(matrix: Array) -> None:
+    """Raise DataError for a matrix that is not finite, symmetric and positive."""
+    try:
+        fits = np.isfinite(np.linalg.cholesky(matrix)).all()
+    except np.linalg.LinAlgError:
+        fits = False
+    if not fits or np.abs(matrix - matrix.T).max() > _SKEW * matrix.max():
+        raise DataError('covariance is not symmetric positive')
 
 
 def symmetric(matrix: Array) -> Array:
