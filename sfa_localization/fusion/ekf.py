@@ -145,13 +145,11 @@ class Ekf:
                 odometry_ns=event.stamp_ns,
                 odometry_pose=event.pose,
             )
-        held = interval(belief, event)
-        if not held.bridged:  # most of so long a silence was spent somehow else
-            belief = self.coast(belief, event.stamp_ns)
+        held, reading = interval(belief, event), event.twist
+        if held is None:
+            belief, held = self.coast(belief, event.stamp_ns), Interval(reading, reading)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         step = motion.drive(belief.mean, held.twist, dt, self._noise, held.now)
-        if held.unknown_s > 0:
-            motion.add_unknown_motion(step.noise, held.twist, min(dt, held.unknown_s))
         return self._moved(belief, event.stamp_ns, step, event, held)
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
@@ -194,12 +192,12 @@ class Ekf:
             located,
             reckoned,
             belief.traveled_m + math.hypot(dx, dy),
-            (held and held.now) or (event.twist if event else belief.twist),
+            held.now if held else belief.twist,
             event.stamp_ns if event else belief.odometry_ns,
             belief.memory,
             event.pose if event else belief.odometry_pose,
             belief.track.driven(stamp_ns, reckoned, oldest_ns),
-            held.omega if held else belief.omega,
+            held.twist.omega if held else belief.omega,
         )
 
     # Update.

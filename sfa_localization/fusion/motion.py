@@ -247,24 +247,10 @@ def halt(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
 
     What a robot may have done since is bounded by UNKNOWN_SPEED or its last reading, `twist`.
     """
-    step = _stand(mean)
-    speed = add_unknown_motion(step.noise, twist, dt)
-    fade = math.exp(-speed * dt / noise.decorrelation_m)
-    errors = _DIAGONAL[ERROR:]
-    step.mean[errors] *= fade
-    step.jacobian[errors, errors] = fade
-    step.noise[errors, errors] += 1 - fade * fade
-    step.noise[V, V] = speed**2
-    step.noise[OMEGA, OMEGA] = UNKNOWN_RATE**2
+    step, speed = _stand(mean), max(UNKNOWN_SPEED, abs(twist.v))
+    step.noise[[X, Y, V], [X, Y, V]] += speed**2 * np.array([2 * dt, 2 * dt, 1.0])
+    step.noise[[YAW, OMEGA], [YAW, OMEGA]] += UNKNOWN_RATE**2 * np.array([dt, 1.0])
     return step
-
-
-def add_unknown_motion(covariance: Array, twist: Twist, dt: float) -> float:
-    """Add to a covariance (11, 11) what a robot may have done unseen for `dt` s; its speed, m/s."""
-    speed = max(UNKNOWN_SPEED, abs(twist.v))
-    covariance[[X, Y], [X, Y]] += 2 * speed**2 * dt
-    covariance[YAW, YAW] += UNKNOWN_RATE**2 * dt
-    return speed
 
 
 def _stand(mean: Array) -> Step:

@@ -20,8 +20,6 @@ ODOMETRY_TIMEOUT_S = 0.5
 """Odometry silent for longer is a gap: many times the period of any odometry."""
 COAST_S = 2.0
 """Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
-_BRIDGED_S = 10.0
-"""A longer silence is not bridged by the twist after it: most of it was spent somehow else."""
 _RESET = 0.4
 """A pose that moves this far, m or rad, beyond its twist was reset."""
 _ROUNDED_M = 2e-3
@@ -31,29 +29,24 @@ _JUMP = 0.05
 
 
 class Interval(NamedTuple):
-    """The mean `twist` since the belief, the twist to go on with `now` if it is another, and the
-    mean turn rate `omega` since the last message. Of `unknown_s` nothing is known.
-    """
+    """The mean `twist` since the message before, and the twist to go on with, `now`."""
 
     twist: Twist
-    now: Twist | None
-    omega: float
-    unknown_s: float = 0.0
-    bridged: bool = True
+    now: Twist
 
 
-def interval(belief: Belief, event: OdometryEvent) -> Interval:
-    """The motion that led to an odometry message."""
+def interval(belief: Belief, event: OdometryEvent) -> Interval | None:
+    """The motion that led to an odometry message; None after a silence, where nothing shows it."""
+    reading, before = event.twist, belief.twist
     silence_s = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
-    if belief.odometry_ns is not None and silence_s > ODOMETRY_TIMEOUT_S:
-        twist, shown = _over_gap(belief, event, silence_s)
-        now, omega = None, event.twist.omega
-    else:
-        whole = _shown(belief, event, silence_s, event.twist) or event.twist
-        twist, shown = _remaining(belief, event, whole), False
-        now, omega = _going_on(belief, whole, event.twist, silence_s), whole.omega
-    unknown_s = 0.0 if shown else max(silence_s - COAST_S, 0.0)
-    return Interval(twist, now, omega, unknown_s, silence_s <= _BRIDGED_S)
+    if belief.odometry_ns is None or silence_s <= ODOMETRY_TIMEOUT_S:
+        twist = _shown(belief, event, silence_s, reading) or reading
+        # A reading that is not filled goes on as the poses show.
+        return Interval(twist, reading if reading.v or reading.omega else twist)
+    v = max(abs(before.v), abs(reading.v), motion.UNKNOWN_SPEED)
+    omega = max(abs(before.omega), abs(reading.omega), motion.UNKNOWN_RATE)
+    shown = _shown(belief, event, silence_s, reading._replace(v=v, omega=omega))
+    return shown and Interval(shown, reading)
 
 
 def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist) -> Twist | None:
@@ -74,33 +67,6 @@ def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist)
     return _twist(turn, ahead, seconds, fastest)
 
 
-def _going_on(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> Twist:
-    """The twist after an interval: the reading, or, where that is not filled, what the poses show:
-    little of it in messages stamped almost together.
-    """
-    if whole is reading or reading.v or reading.omega:
-        return reading
-    before, new = belief.twist, -math.expm1(-seconds / ODOMETRY_TIMEOUT_S)
-    v, omega = whole.v - before.v, whole.omega - before.omega
-    return whole._replace(v=before.v + new * v, omega=before.omega + new * omega)
-
-
-def _remaining(belief: Belief, event: OdometryEvent, whole: Twist) -> Twist:
-    """The mean twist by the odometry's poses since the belief: images have claimed the begin of the
-    interval, and were fused where the last twist led.
-    """
-    if whole is event.twist or belief.odometry_pose is None or event.pose is None:
-        return whole
-    coasted_s = (belief.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
-    left_s = (event.stamp_ns - belief.stamp_ns) * 1e-9
-    if coasted_s <= 0 or left_s <= 0:
-        return whole
-    x, y, yaw = belief.odometry_pose
-    way = motion.arc(yaw, belief.twist.v, belief.twist.omega, coasted_s)
-    turn, ahead, _ = _moved((x + way.dx, y + way.dy, yaw + way.dyaw), event.pose)
-    return _twist(turn, ahead, left_s, whole)
-
-
 def _moved(before: Pose, after: Pose) -> tuple[float, float, float]:
     """How far a pose turned, and lies ahead and to the left, by the mean of both headings."""
     turn = motion.wrap(after[2] - before[2])
@@ -114,33 +80,6 @@ def _twist(turn: float, chord: float, seconds: float, reading: Twist) -> Twist:
     half = turn / 2
     arc = chord * (half / math.sin(half) if half else 1.0)
     return reading._replace(v=arc / seconds, omega=turn / seconds)
-
-
-def _over_gap(belief: Belief, event: OdometryEvent, seconds: float) -> tuple[Twist, bool]:
-    """The mean motion over a gap, and whether the odometry's own poses show it.
-
-    Else nothing but both ends of it is known. The variance of a uniform distribution between them
-    is their difference squared over 12; that of the mean of the random walk that joins them,
-    CTRV's, is a twelfth of the walk's.
-    """
-    a, b = belief.twist, event.twist
-    variances = max(a.v_variance, b.v_variance), max(a.omega_variance, b.omega_variance)
-    mean = Twist((a.v + b.v) / 2, (a.omega + b.omega) / 2, *variances)
-    v = max(abs(a.v), abs(b.v), motion.UNKNOWN_SPEED)
-    omega = max(abs(a.omega), abs(b.omega), motion.UNKNOWN_RATE)
-    shown = _shown(belief, event, seconds, Twist(v, omega, *variances))
-    if shown is not None:
-        # What the readings do not expect may be a reset of the pose.
-        surprise = (shown.v - mean.v) / 2, (shown.omega - mean.omega) / 2
-        return _wider(shown, surprise[0] ** 2, surprise[1] ** 2), True
-    v_variance = (a.v - b.v) ** 2 + motion.ACCELERATION**2 * seconds
-    omega_variance = (a.omega - b.omega) ** 2 + motion.ACCELERATION**2 * seconds
-    return _wider(mean, v_variance / 12, omega_variance / 12), False
-
-
-def _wider(twist: Twist, v_variance: float, omega_variance: float) -> Twist:
-    return twist._replace(v_variance=twist.v_variance + v_variance,
-                          omega_variance=twist.omega_variance + omega_variance)  # fmt: skip
 
 
 def stalled(before: Belief, after: Belief, taken_ns: int, stamp_ns: int) -> bool:

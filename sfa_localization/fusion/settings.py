@@ -34,7 +34,7 @@ class FilterConfig(Settings):
     slip_per_metre: float = setting(
         0.03, 'position error by wheel slip', unit='m per sqrt(m)', low=0.0, high=10.0, live=True)
     yaw_per_radian: float = setting(
-        0.02, 'heading error that grows with turning', unit='rad per sqrt(rad)',
+        0.04, 'heading error that grows with turning', unit='rad per sqrt(rad)',
         low=0.0, high=10.0, live=True)
     measurement_factor: float = setting(
         1.0, 'factor on the variances of the poses from images', low=1e-3, high=1e4, live=True)

@@ -14,11 +14,9 @@ ODOMETRY, POSE, MEASUREMENT = range(3)
 """Kinds of events, in the order in which those of one stamp follow each other."""
 HISTORY_NS = 5_000_000_000
 """How late a measurement may come: many times what any camera, network and model take."""
-JUMP_NS = 60_000_000_000
-"""A stamp this far ahead needs FEW_AHEAD like it: one alone is a damaged message."""
 FEW_AHEAD, FEW_BEHIND = 3, 5
-"""So many messages in a row that lie ahead, or are too late, are no accident: the clock is another
-one, or has gone back."""
+"""So many images in a row that lie ahead, and messages in a row that are too late, are no accident:
+the odometry has ended, and the clock has gone back."""
 _AGAIN_NS = 300_000_000
 """Time that odometry has to cover once more until the clock is taken to have gone back."""
 
@@ -41,12 +39,15 @@ class Timeline:
     """Feed it the stamps of all messages; it says which can be used."""
 
     def __init__(self) -> None:
-        self._behind, self._beyond = 0, 0
-        self._ahead = self._apart = (0, 0)
+        self._behind = self._ahead = 0
+        self._apart = 0, 0
         self._again = _Again()
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
-        """Raises DataError for a stamp that cannot be used, and ClockWentBack."""
+        """Raises DataError for a stamp that cannot be used, and ClockWentBack.
+
+        Odometry keeps the time: an image of a clock ahead would make all that follows too old.
+        """
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
         newest_ns, odometry_ns = history.newest_ns, history.newest.odometry_ns
@@ -54,11 +55,13 @@ class Timeline:
             return
         ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
         if kind == MEASUREMENT:
-            beyond = abs(ahead_ns) > HISTORY_NS
-            self._apart = (self._apart[0] + 1, ahead_ns) if beyond else (0, 0)
-        self._require_near(stamp_ns, ahead_ns, keeps_time)
+            apart = abs(ahead_ns) > HISTORY_NS
+            self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
+        self._ahead = 0 if keeps_time else self._ahead + (ahead_ns > HISTORY_NS)
         reason = ''
-        if ahead_ns <= 0 and not history.reaches(stamp_ns):
+        if not keeps_time and ahead_ns > HISTORY_NS and self._ahead < FEW_AHEAD:
+            reason = 'stamp ahead of the odometry'
+        elif ahead_ns <= 0 and not history.reaches(stamp_ns):
             reason = 'too old'
         elif ahead_ns <= 0 and history.holds((stamp_ns, kind)):
             reason = 'duplicate stamp'
@@ -69,7 +72,6 @@ class Timeline:
         if reason:
             raise DataError(reason)
         if kind == ODOMETRY:
-            self._beyond = 0
             self._notice_again(stamp_ns, odometry_ns, history)
 
     @property
@@ -82,23 +84,6 @@ class Timeline:
             return []
         where = f'{abs(apart_ns) * 1e-9:.0f} s {"ahead of" if apart_ns > 0 else "behind"}'
         return [f'images are stamped {where} the odometry: are the clocks synchronized?']
-
-    def _require_near(self, stamp_ns: int, ahead_ns: int, keeps_time: bool) -> None:
-        """One stamp far ahead is an error; several in a row that agree are a pause. An image of
-        another clock would make all odometry that follows too old, so that some in a row are used
-        where no odometry comes between them, which then has ended.
-        """
-        if ahead_ns > JUMP_NS:
-            last_ns, count = self._ahead
-            self._ahead = (stamp_ns, count + 1 if abs(stamp_ns - last_ns) <= JUMP_NS else 1)
-            if self._ahead[1] < FEW_AHEAD:
-                raise DataError('stamp far ahead')
-        if keeps_time or ahead_ns > JUMP_NS:
-            self._ahead = (0, 0)
-        if not keeps_time and ahead_ns > HISTORY_NS:
-            self._beyond += 1
-            if self._beyond < FEW_AHEAD:
-                raise DataError('stamp ahead of the odometry')
 
     def _notice_again(
         self, stamp_ns: int, newest_ns: int | None, history: History[Event, Belief]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import wrap_angle
 
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
