@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from sfa_localization.fusion.relocation import CAPACITY, relocate, remembered
-from sfa_localization.fusion.track import Image
+from sfa_localization.fusion.relocation import relocate
+from sfa_localization.fusion.track import CAPACITY, SPACING_M, Image, remembered
 
 STD_M, STD_RAD = 0.1, 0.05
 
@@ -49,11 +49,13 @@ def test_errors_are_as_large_as_claimed_and_neighbors_that_err_alike_count_as_fe
     assert np.allclose(alike.covariance, white.covariance * 41 / (1 + 8.0 / 2.0))
 
 
-def test_what_is_remembered_is_bounded_and_its_newer_half_complete():
+def test_of_what_is_remembered_the_newer_half_is_complete_and_the_older_reaches_far():
     kept = ()
-    for image in along(500, step_m=0.001):
+    for image in along(900, step_m=0.02):
         kept = remembered(kept, image)
         assert len(kept) <= CAPACITY
-    assert [image.stamp_ns for image in kept[-30:]] == list(range(470, 500))
+    assert [image.stamp_ns for image in kept[-30:]] == list(range(870, 900))
+    older = [image.traveled_m for image in kept[:-30] if image.is_new]
+    assert len(older) >= 20 and np.allclose(np.diff(older), SPACING_M)
     far = along(2, step_m=100.0)
     assert remembered(remembered((), far[0]), far[1]) == (far[1],)

@@ -6,10 +6,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import State, Twist
 from sfa_localization.fusion.track import Image, Pose, Track
+
+ENOUGH_IMAGES = 5
+"""Images in a row that overrule an established estimate: half a second to a second of a camera."""
+DOUBT_STDS = 2.0
+"""While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
 
 
 class OdometryEvent(NamedTuple):
@@ -101,5 +108,13 @@ class Belief(NamedTuple):
 
     @property
     def state(self) -> State | None:
-        """The estimate, if there is any."""
-        return State(self.stamp_ns, self.mean, symmetric(self.covariance)) if self.located else None
+        """The estimate, if there is any. While images in a row were rejected, it is as uncertain as
+        the last differs from it; the gate is not: wrong images must not open it.
+        """
+        if not self.located:
+            return None
+        covariance, update = symmetric(self.covariance), self.memory.update
+        if self.memory.rejected >= ENOUGH_IMAGES and update and update.innovation is not None:
+            x, y, *yaw = (update.innovation / DOUBT_STDS).tolist()
+            covariance[:3, :3] += np.diag([x * x + y * y] * 2 + [sum(turn**2 for turn in yaw)])
+        return State(self.stamp_ns, self.mean, covariance)

@@ -230,15 +230,19 @@ def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
 
 
 def coast(mean: Array, twist: Twist, dt: float, noise: MotionNoise) -> Step:
-    """Move on without new odometry: v and omega stay, and become less certain (CTRV).
+    """Move on without new odometry: v and omega stay, and become less certain (CTRV); what a random
+    walk of theirs moves the pose by has a third of its variance, and half in common with it.
 
     `twist` is the last reading, whose noise still counts.
     """
     v, omega = float(mean[V]), float(mean[OMEGA])
     standing = v == 0.0 and omega == 0.0
     step = _stand(mean) if standing else _advance(mean, v, omega, twist, dt, noise)
-    step.noise[V, V] += ACCELERATION**2 * dt
-    step.noise[OMEGA, OMEGA] += ACCELERATION**2 * dt
+    twists, gain, walk = slice(V, OMEGA + 1), step.jacobian[:3, V : OMEGA + 1], ACCELERATION**2 * dt
+    step.noise[:3, :3] += walk / 3 * gain.dot(gain.T)
+    step.noise[:3, twists] += walk / 2 * gain
+    step.noise[twists, :3] += walk / 2 * gain.T
+    step.noise[[V, OMEGA], [V, OMEGA]] += walk
     return step
 
 

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.fusion.belief import Belief
+from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief
 from sfa_localization.fusion.motion import YAW, wrap
 from sfa_localization.fusion.track import Columns, Image
 
-FEW_IMAGES, ENOUGH_IMAGES = 3, 5
-"""Agreement that is no coincidence: two images always agree on some motion, the third checks. So
-many in a row overrule an established estimate: half a second to a second of a camera."""
+FEW_IMAGES = 3
+"""Agreement that is no coincidence: two images always agree on some motion, the third checks."""
 AGREEING_M = 2.0
 """Distance over which images must agree: beyond it the errors that neighbors share differ."""
 AGREEING_STDS = 3.0

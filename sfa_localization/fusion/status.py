@@ -9,11 +9,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sfa_localization.fusion.belief import Belief
+from sfa_localization.fusion.belief import ENOUGH_IMAGES, Belief
 from sfa_localization.fusion.health import Health
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.odometry import ODOMETRY_TIMEOUT_S
-from sfa_localization.fusion.relocation import ENOUGH_IMAGES, FEW_IMAGES
+from sfa_localization.fusion.relocation import FEW_IMAGES
 from sfa_localization.fusion.settings import FilterConfig
 
 LEAST_SILENCE_S, MOST_SILENCE_S, PERIODS = 1.4, 3.0, 1.25
