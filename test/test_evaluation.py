@@ -3,6 +3,7 @@
 """evaluate and tune look at a drive as the nodes do, by the same parameter file."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 
@@ -25,6 +26,8 @@ from sfa_localization.fusion.health import health_of
 from sfa_localization.fusion.track import Track
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
+
+TRUSTED = Track(since_m=-math.inf)
 
 
 @pytest.fixture(scope='module')
@@ -121,7 +124,7 @@ def test_seconds_in_which_the_filter_was_sure_and_wrong_are_counted(
     assert 'an error of more than a meter' not in capsys.readouterr().out
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: Torn()))
     # Driving would notice it.
-    monkeypatch.setattr(pose_filter, 'health_of', lambda track: health_of(Track().trusted()))
+    monkeypatch.setattr(pose_filter, 'health_of', lambda *_: health_of(TRUSTED, ()))
     counts = evaluated(bag, tmp_path)['counts']
     wrong, localised = counts['false_localised_s'], counts['states_s']['LOCALISED']
     assert 0.5 * localised < wrong <= localised

@@ -39,8 +39,8 @@ class FilterConfig(Settings):
     measurement_factor: float = setting(
         1.0, 'factor on the variances of the poses from images', low=1e-3, high=1e4, live=True)
     degraded_std: float = setting(
-        0.5, 'standard deviation of the position, or of all single images, above which the state '
-        'is DEGRADED', unit='m', low=1e-3, high=1e6, live=True)
+        0.5, 'standard deviation of the position above which the state is DEGRADED', unit='m',
+        low=1e-3, high=1e6, live=True)
     lost_std: float = setting(
         2.0, 'standard deviation of the position above which the state is LOST', unit='m',
         low=1e-3, high=100.0, live=True)
