@@ -11,18 +11,11 @@ from sfa_localization.data import errors
 
 PACKAGE = Path(errors.__file__).parents[1]
 REASONS = {
-    'fusion/status.py': (
-        'status_of',
-        '_known_to',
-        '_rejections',
-        '_missing',
-        '_contradictions',
-        '_silences',
-    ),
+    'fusion/status.py': ('status_of', '_known_to', '_missing', '_silences'),
     'fusion/health.py': ('problems', '_told'),
-    'fusion/timeline.py': ('problems', 'require_place', '_require_others_ahead'),
-    'fusion/pose_filter.py': ('status', '_require_place'),
-    'fusion/ekf.py': ('_fused', '_gated', '_rejected', '_started'),
+    'fusion/timeline.py': ('problems', 'require_place'),
+    'fusion/pose_filter.py': ('status',),
+    'fusion/ekf.py': ('_found', '_gated'),
     'camera/watch.py': ('judge', 'judge_novelty'),
     'localizer.py': ('_observation',),
     'nodes/discovery.py': ('_tell',),
