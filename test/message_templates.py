@@ -14,7 +14,7 @@ REASONS = {
     'fusion/status.py': ('status_of', '_known_to', '_missing', '_silences'),
     'fusion/health.py': ('problems', '_told'),
     'fusion/timeline.py': ('problems', 'require_place'),
-    'fusion/pose_filter.py': ('status',),
+    'fusion/pose_filter.py': ('status', '_require_place'),
     'fusion/ekf.py': ('_found', '_gated'),
     'camera/watch.py': ('judge', 'judge_novelty'),
     'localizer.py': ('_observation',),
