@@ -289,7 +289,7 @@ class _Survey:
         return report
 
     def _problems(self, stream: Stream, report: TopicReport) -> Iterator[str]:
-        for reason, number in stream.tally.count.skipped.items():
+        for reason, number in stream.skipped.items():
             yield f'{number} of {report.recorded} messages: {reason}'
         if report.recorded == 0:
             yield 'no messages'

@@ -91,7 +91,7 @@ def test_every_format_is_read_exactly(name: str, tmp_path: Path, messages: list[
     assert snapshot(tmp_path) == before
 
 
-ORDERED = ['mcap', 'sqlite3', 'ROS 1 bz2']
+ORDERED = ['sqlite3', 'ROS 1 bz2']
 
 
 @pytest.mark.parametrize('name', ORDERED)
@@ -352,7 +352,7 @@ def test_messages_that_are_left_in_a_log_are_told_of(
     path = write_database(tmp_path / 'bag.db3', messages)
     (tmp_path / 'bag.db3-wal').write_bytes(b'some')
     with Bag(path) as bag:
-        assert 'bag.db3-wal: holds messages that are not read' in bag.problems[0]
+        assert 'bag.db3-wal: holds more messages' in bag.problems[0]
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'bag/b.mcap'])

@@ -107,7 +107,7 @@ EXPECTED = np.array([pose(i) for i in range(COUNT)])
 def test_true_poses_come_in_any_type(make_message: Callable[..., Any], tmp_path: Path) -> None:
     path = record(tmp_path / 'bag', poses_of(make_message, '/truth'))
     with Bag(path, strict=True) as bag:
-        truth = bag.trajectory('/truth')
+        truth = bag.trajectory('/truth:base_link' if make_message is tf else '/truth')
     assert truth.stamps_ns.tolist() == [stamp(i) for i in range(COUNT)]
     np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
 
@@ -120,7 +120,7 @@ def test_poses_serve_as_odometry_when_named(
     with Bag(path, strict=True) as bag:
         with pytest.raises(BagError, match='has no odometry'):
             bag.find('odometry')
-        read = bag.odometry('/tf')
+        read = bag.odometry('/tf:base_link' if make_message is tf else '/tf')
     np.testing.assert_allclose(read.poses, EXPECTED, atol=1e-12)
     np.testing.assert_allclose(read.twists[:, 1], 0.02 * 1e9 / PERIOD, atol=1e-6)
     speed = math.hypot(0.5, 0.25) * 1e9 / PERIOD
@@ -140,7 +140,7 @@ def test_one_transform_of_several_is_named_by_its_frame(tmp_path: Path) -> None:
     entries.append(('/tf', stamp(COUNT), tf(stamp(COUNT), 0, 0, 0)))
     entries[-1][2].transforms = [wheel]
     with Bag(record(tmp_path / 'bag', entries), strict=True) as bag:
-        with pytest.raises(BagError, match='base_link, wheel; choose one as /tf:FRAME'):
+        with pytest.raises(BagError, match=r'base_link, wheel, .* choose one as /tf:FRAME'):
             bag.trajectory('/tf')
         truth = bag.trajectory('/tf:base_link')
         assert bag.counts['/tf'].skipped == {'transforms of other frames': 1}
@@ -283,7 +283,11 @@ HOUR = 3600 * 10**9
             {'stamp out of order': 1},
         ),
         ([*TIMES[:4], TIMES[4] + HOUR, *TIMES[5:]], TIMES[:4] + TIMES[5:], {'stamp jumps': 1}),
-        ([*TIMES[:4], TIMES[4] - HOUR, *TIMES[5:]], TIMES[:4] + TIMES[5:], {'stamp jumps': 1}),
+        (
+            [*TIMES[:4], TIMES[4] - HOUR, *TIMES[5:]],
+            TIMES[:4] + TIMES[5:],
+            {'clock was set back': 1},
+        ),
         ([TIMES[0] + HOUR, *TIMES[1:]], TIMES[1:], {'stamp jumps': 1}),
         ([*TIMES[:9], TIMES[9] + HOUR], TIMES[:9], {'stamp jumps': 1}),
         # A clock that was set forward stays so: what follows is as good as what came before.

@@ -130,14 +130,13 @@ def test_damaged_bags(tmp_path):
 
 
 def test_damaged_messages(tmp_path):
-    decode = decoding.Decoder()
     reads = {decoding.IMAGE: decoding.image_of, decoding.ODOMETRY: decoding.odometry_of}
     messages = [m for m in drive(tmp_path) if m.kind in reads]
 
     def use(random: Random) -> bool:
         _, kind, _, data = messages[random.integers(len(messages))]
         topic = Topic('/a', kind, 'cdr', (), 1)
-        return is_read(lambda: reads[kind](decode(damaged(data, random), topic)))
+        return is_read(lambda: reads[kind](decoding.decode(damaged(data, random), topic)))
 
     check(use)
 

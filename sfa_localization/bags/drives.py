@@ -65,7 +65,7 @@ def as_live(recipe: R, panorama: PanoramaConfig) -> R:
 def image_cache(output: Path) -> AbstractContextManager[Path]:
     """The folder of `output`, for decoded images: files without a name, gone with their process.
 
-    Raises ModelError when it cannot be made, or `output` not be written in the end.
+    Raises ModelError where `output` could not be written in the end.
     """
     try:
         replaced_mode(output)
@@ -139,20 +139,23 @@ def read_drive(
     """
     recipe = recipe or ReadingRecipe()
     with Bag(path, strict=strict, config=recipe.bag) as bag:
-        stored = _Images(Path(cache), recipe)
-        streams = {'images': bag.stream(bag.find('image', recipe.topics.image), stored.panorama)}
-        streams |= _other_streams(bag, recipe.topics, want_truth)
+        name = bag.find('image', recipe.topics.image)
         try:
+            stored = _Images(Path(cache), recipe)
+            streams = {'images': bag.stream(name, stored.panorama)}
+            streams |= _other_streams(bag, recipe.topics, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
+            stamps_ns = np.array(stored.stamps, np.int64)
             near_ns = int(recipe.odometry_tolerance_s * 1e9)
-            covered = odometry.trajectory.covers(stored.stamps_ns, near_ns)
-            panoramas = stored.finish(_used(bag, streams['images'], covered, near_ns))
+            covered = odometry.trajectory.covers(stamps_ns, near_ns)
+            _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
+            panoramas = stored.finish(stamps_ns, covered)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         for problem in bag.problems:
             logger.warning('%s: %s', path, problem)
-    counts = {use: stream.tally.count for use, stream in streams.items()}
+    counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
     return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, counts)
@@ -166,13 +169,8 @@ class _Images:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - as long as the run
         self._unwrap = Unwrapper(recipe.camera, recipe.panorama)
         self._watch = FrozenWatch() if recipe.distinct else None
-        self._stamps: list[int] = []
+        self.stamps: list[int] = []
         self._shape: tuple[int, ...] = ()
-
-    @property
-    def stamps_ns(self) -> Stamps:
-        """Stamps of the images so far."""
-        return np.array(self._stamps, np.int64)
 
     def panorama(self, message: Any) -> Image:
         """The panorama of a message. Raises LocalizationError."""
@@ -190,9 +188,9 @@ class _Images:
     def add(self, stamp_ns: int, image: Image) -> None:
         """Append a panorama."""
         self._file.write(np.ascontiguousarray(image).data)
-        self._stamps.append(stamp_ns)
+        self.stamps.append(stamp_ns)
 
-    def finish(self, keep: NDArray[np.bool_]) -> PanoramaArray:
+    def finish(self, stamps_ns: Stamps, keep: NDArray[np.bool_]) -> PanoramaArray:
         """The panoramas marked in `keep` (N,), moved to the beginning of the file."""
         self._file.flush()
         images = np.memmap(self._file, np.uint8, 'r+', shape=(len(keep), *self._shape))
@@ -200,29 +198,24 @@ class _Images:
         for target, source in enumerate(kept):
             if target != source:
                 images[target] = images[source]
-        return PanoramaArray(self.stamps_ns[kept], images[: len(kept)], self._file)
+        return PanoramaArray(stamps_ns[kept], images[: len(kept)], self._file)
 
 
 def _other_streams(bag: Bag, topics: TopicNames, want_truth: bool) -> dict[str, Stream]:
     """The topics beside the images that make a run, by their use."""
-    streams = {'odometry': bag.odometry_stream(topics.odometry)}
-    if topics.imu or _has_imu(bag):
+    name = bag.find('odometry', topics.odometry)
+    streams = {'odometry': bag.stream(name, decoding.odometry_of)}
+    gyroscopes = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
+    if topics.imu or any(topic.count for topic in gyroscopes):
         streams['imu'] = bag.stream(bag.find('imu', topics.imu), read_yaw_rate)
         streams['imu'].required = bool(topics.imu)
+    elif gyroscopes:
+        names = ', '.join(topic.name for topic in gyroscopes)
+        logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
         streams['ground_truth'] = bag.stream(name, decoding.pose_of)
     return streams
-
-
-def _has_imu(bag: Bag) -> bool:
-    """Whether a gyroscope was recorded; topics that are all empty are only warned of."""
-    found = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
-    if found and not any(topic.count for topic in found):
-        names = ', '.join(topic.name for topic in found)
-        logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
-        return False
-    return bool(found)
 
 
 def _read(
@@ -242,15 +235,18 @@ def _read(
     return values
 
 
-def _used(bag: Bag, images: Stream, covered: NDArray[np.bool_], near_ns: int) -> NDArray[np.bool_]:
-    """The images with odometry, of which the others are counted. Raises BagError without any."""
+def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) -> None:
+    """Count the images without odometry. Raises BagError where none has some."""
     lost = int(np.count_nonzero(~covered))
-    near = f'within {near_ns * 1e-9:g} s' if near_ns else 'before and after'
-    images.tally.withdraw(f'no odometry {near}', lost)
+    near = f'within {near_s:g} s' if near_s else 'before and after'
+    if lost:
+        images.skipped.add(f'no odometry {near}', lost)
+    images.used -= lost
     if not covered.any():
-        raise BagError(f'{bag.path}: none of {lost} images of {images.topic} has odometry {near}; '
-                       'are both stamped by one clock (stamp_source: receive)?')  # fmt: skip
-    return covered
+        raise BagError(
+            f'{images.bag}: none of {lost} images of {images.topic} has odometry {near}; '
+            'are both stamped by one clock (stamp_source: receive)?'
+        )
 
 
 def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> dict[int, Image]:
@@ -258,13 +254,10 @@ def images_at(bag: Path, stamps_ns: Collection[int], recipe: ReadingRecipe) -> d
 
     Those that are not within SAME_IMAGE_NS of an image are left out. Raises BagError.
     """
-    wanted = sorted(stamps_ns)
     found: dict[int, Image] = {}
-    if not wanted:
-        return {}
     with Bag(bag, config=recipe.bag) as opened:
-        for stamp_ns, image in opened.images(recipe.topics.image):
-            found |= {at: image for at in wanted if abs(at - stamp_ns) <= SAME_IMAGE_NS}
-            if len(found) == len(wanted):
+        for stamp_ns, image in opened.images(recipe.topics.image) if stamps_ns else ():
+            found |= {at: image for at in stamps_ns if abs(at - stamp_ns) <= SAME_IMAGE_NS}
+            if len(found) == len(stamps_ns):
                 break
     return found

@@ -8,21 +8,20 @@ its end. Files are never written to.
 
 from __future__ import annotations
 
+import itertools
 import os
 import sqlite3
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import quote
 
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
+from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.interfaces import ConnectionExtRosbag2, Qos
 from rosbags.rosbag1 import Reader as Ros1Reader
@@ -39,8 +38,6 @@ LARGEST = 1 << 28
 """Bytes of a chunk or a message: one image of the largest camera, and room for others."""
 LATEST = 1 << 63
 """The end of the times that ROS has."""
-MOST_PROBLEMS = 50
-"""Problems that are described; more are mentioned."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,23 +53,6 @@ class Topic:
 
 Record = tuple[Topic, int, bytes]
 """A message: its topic, its reception in nanoseconds, its serialized bytes."""
-Folder = TemporaryDirectory[str] | None
-_reception = itemgetter(1)
-_RECOVER = '`sqlite3 FILE .recover`'
-
-
-class StoredFile(Protocol):
-    """One file of a bag, open; `start_ns` is the first reception."""
-
-    topics: dict[int, Topic]
-    start_ns: int
-    problems: list[str]
-
-    def messages(self, names: Collection[str], start_ns: int) -> Iterator[Record]:
-        """Messages of the named topics received at or after `start_ns`, by reception."""
-
-    def close(self) -> None:
-        """Release the file."""
 
 
 def make_topic(name: Any, kind: Any, serialization: Any, qos: Any, count: Any) -> Topic:
@@ -86,14 +66,14 @@ def make_topic(name: Any, kind: Any, serialization: Any, qos: Any, count: Any) -
     with suppress(Exception):  # a bag is not rejected because of its QoS
         found = load_yaml(qos) if isinstance(qos, str) else qos
         profiles = [p for q in found or () for p in ([q] if isinstance(q, Qos) else parse_qos([q]))]
-    name, serialization = short_line(str(name)), short_line(str(serialization))
-    return Topic(name, full, serialization, tuple(profiles), int(count))
+    texts = short_line(str(name)), full, short_line(str(serialization))
+    return Topic(*texts, tuple(profiles), int(count))
 
 
 def add_problem(problems: list[str], text: str) -> None:
-    """Describe a problem, once, among at most MOST_PROBLEMS."""
-    if len(problems) <= MOST_PROBLEMS and text not in problems:
-        problems.append(text if len(problems) < MOST_PROBLEMS else 'there are more problems')
+    """Describe a problem once."""
+    if text not in problems:
+        problems.append(text)
 
 
 def describe(error: Exception) -> str:
@@ -102,13 +82,14 @@ def describe(error: Exception) -> str:
 
 
 class McapFile:
-    """One .mcap file, chunk by chunk. Raises BagError where it holds no message."""
+    """One .mcap file, chunk by chunk; `start_ns` is the first reception.
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._file = path, path.open('rb')
-        self.problems, self.start_ns = list[str](), LATEST
-        self.topics: dict[int, Topic] = {}
-        self._chunks: list[ChunkIndex] = []
+    Raises BagError where it holds no message.
+    """
+
+    def __init__(self, path: Path, problems: list[str]) -> None:
+        self._path, self._problems, self._file = path, problems, path.open('rb')
+        self.start_ns, self.topics = LATEST, dict[int, Topic]()
         damage = self._read_index()
         if not self.topics:
             self._scan()
@@ -116,37 +97,30 @@ class McapFile:
             self.close()
             raise BagError(f'{path}: holds no readable message ({damage}); try `mcap recover`')
         if damage:
-            self.problems.append(f'{path.name}: has no index, recording cut off? ({damage}); '
-                                 'read to the cut; `mcap recover` repairs it')  # fmt: skip
+            problems.append(f'{path.name}: has no index, recording cut off? ({damage}); '
+                            'read to the cut; `mcap recover` repairs it')  # fmt: skip
 
     def close(self) -> None:
         """Release the file."""
         self._file.close()
 
     def messages(self, names: Collection[str], start_ns: int) -> Iterator[Record]:
-        """Messages by reception; of a file without an index chunk by chunk."""
+        """Messages in the order of the file: recorders write them as they receive them."""
         wanted = {key: topic for key, topic in self.topics.items() if topic.name in names}
-        pending: list[Record] = []
-        for start, records in self._parts(start_ns):
-            ready = bisect_left(pending, start, key=_reception)
-            yield from pending[:ready]
-            pending = pending[ready:] + [
-                (wanted[record.channel_id], record.log_time, record.data)
-                for record in records
-                if type(record) is Message and record.channel_id in wanted
-                and start_ns <= record.log_time < LATEST
-            ]  # fmt: skip
-            pending.sort(key=_reception)
-        yield from pending
+        for records in self._parts(start_ns):
+            for record in records:
+                if type(record) is not Message or record.channel_id not in wanted:
+                    continue
+                if start_ns <= record.log_time < LATEST:
+                    yield wanted[record.channel_id], record.log_time, record.data
 
     def _read_index(self) -> str:
-        """Take topics and chunks from the end of the file; return its damage in words."""
+        """Take the topics from the end of the file; return its damage in words."""
         try:
             summary = SeekingReader(self._file, record_size_limit=LARGEST).get_summary()
         except Exception as error:  # a parser of foreign bytes fails in many ways
             return describe(error)
         if summary is not None and summary.statistics is not None:
-            self._chunks = sorted(summary.chunk_indexes, key=lambda entry: entry.message_start_time)
             self.start_ns = summary.statistics.message_start_time
             counts = summary.statistics.channel_message_counts
             self._define(summary.channels, summary.schemas, counts)
@@ -156,15 +130,14 @@ class McapFile:
         """Count the messages of a file without an index."""
         channels, schemas = dict[int, Channel](), dict[int, Schema]()
         counts: Counter[int] = Counter()
-        for _, records in self._parts(0):
-            for record in records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    counts[record.channel_id] += 1
-                    self.start_ns = min(self.start_ns, record.log_time)
+        for record in itertools.chain.from_iterable(self._parts(0)):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                counts[record.channel_id] += 1
+                self.start_ns = min(self.start_ns, record.log_time)
         self._define(channels, schemas, counts)
 
     def _define(
@@ -176,57 +149,66 @@ class McapFile:
             fields = channel.topic, kind, channel.message_encoding, qos
             self.topics[key] = make_topic(*fields, counts.get(key, 0))
 
-    def _parts(self, start_ns: int) -> Iterator[tuple[int, list[Any]]]:
-        """First reception and records of each chunk that ends at or after `start_ns`, and of each
-        record outside of chunks. Damaged chunks are skipped.
+    def _parts(self, start_ns: int) -> Iterator[list[Any]]:
+        """The records of each chunk that ends at or after `start_ns`, and each one outside of
+        chunks, up to where they make no sense. Damaged chunks are skipped.
         """
-        for record in self._indexed(start_ns) if self._chunks else self._streamed(0):
-            if not isinstance(record, Chunk):
-                yield getattr(record, 'log_time', 0), [record]
-            elif record.message_end_time >= start_ns:
-                try:
-                    records = breakup_chunk(record, validate_crc=True)
-                except Exception as error:  # as above
-                    text = f'a damaged chunk is skipped ({describe(error)})'
-                    add_problem(self.problems, f'{self._path.name}: {text}')
-                else:
-                    yield record.message_start_time, records
-
-    def _indexed(self, start_ns: int) -> Iterator[Any]:
-        """The chunks that end at or after `start_ns`, by their first reception."""
-        for entry in self._chunks:
-            if entry.message_end_time >= start_ns:
-                yield next(self._streamed(entry.chunk_start_offset), None)
-
-    def _streamed(self, offset: int) -> Iterator[Any]:
-        """The records from here on, up to where they make no sense."""
-        self._file.seek(offset)
+        self._file.seek(0)
+        reader = StreamReader(self._file, emit_chunks=True, record_size_limit=LARGEST)
         with suppress(Exception):  # as above
-            yield from StreamReader(
-                self._file, offset > 0, emit_chunks=True, record_size_limit=LARGEST
-            ).records
+            for record in reader.records:
+                if not isinstance(record, Chunk):
+                    yield [record]
+                elif record.message_end_time >= start_ns:
+                    try:
+                        yield breakup_chunk(record, validate_crc=True)
+                    except Exception as error:  # as above
+                        text = f'a damaged chunk is skipped ({describe(error)})'
+                        add_problem(self._problems, f'{self._path.name}: {text}')
 
 
 class RosbagsFile:
-    """One file of sqlite3 or ROS 1 that is open in rosbags."""
+    """One file of sqlite3 or ROS 1, which rosbags reads; a damaged one of sqlite3 from a copy."""
 
     def __init__(
-        self, path: Path, reader: Sqlite3Reader | Ros1Reader, start_ns: int, folder: Folder = None
+        self, path: Path, problems: list[str], reader: Sqlite3Reader | Ros1Reader, start_ns: int
     ) -> None:
-        self._path, self._reader, self._folder = path, reader, folder
-        self.start_ns, self.problems = start_ns, list[str]()
-        self.topics: dict[int, Topic] = {}
+        self._path, self._problems, self._reader = path, problems, reader
+        self.start_ns, self.topics = start_ns, dict[int, Topic]()
         for key, name, kind, _, _, count, ext, _ in reader.connections:
             form, qos = 'ros1', list[Qos]()
             if isinstance(ext, ConnectionExtRosbag2):
                 form, qos = ext.serialization_format, ext.offered_qos_profiles
             self.topics[key] = make_topic(name, kind, form, qos, count)
 
+    @classmethod
+    def ros1(cls, path: Path, problems: list[str]) -> RosbagsFile:
+        """Open a .bag file. Raises BagError."""
+        reader = Ros1Reader(path)
+        try:
+            reader.open()
+            return cls(path, problems, reader, reader.start_time)
+        except Exception as error:  # as above
+            raise BagError(f'{path}: no readable bag ({describe(error)}); '
+                           'try `rosbag reindex`') from None  # fmt: skip
+
+    @classmethod
+    def sqlite(cls, path: Path, problems: list[str]) -> RosbagsFile:
+        """Open a .db3 file; of a damaged one what is before the damage. Raises BagError."""
+        try:
+            reader = _sqlite_reader(path)
+        except Exception as error:  # as above
+            reader = _salvaging_reader(path)
+            text = f'{path.name}: damaged database ({describe(error)}); read up to the damage'
+            problems.append(f'{text}; `sqlite3 FILE .recover` repairs it')
+        log = Path(f'{path}-wal')
+        if log.is_file() and log.stat().st_size:
+            problems.append(f'{log.name}: holds more messages; `sqlite3 FILE .recover` adds them')
+        return cls(path, problems, reader, reader.metadata.start_time)
+
     def close(self) -> None:
-        """Release the file, and remove its copy."""
+        """Release the file."""
         self._reader.close()
-        if self._folder is not None:
-            self._folder.cleanup()
 
     def messages(self, names: Collection[str], start_ns: int) -> Iterator[Record]:
         """Messages by reception."""
@@ -238,44 +220,7 @@ class RosbagsFile:
                 yield topics[connection.id], stamp, data
         except Exception as error:  # as above
             text = f'damaged ({describe(error)}); read up to the damage'
-            add_problem(self.problems, f'{self._path.name}: {text}')
-
-
-def open_ros1(path: Path) -> RosbagsFile:
-    """A .bag file of ROS 1. Raises BagError."""
-    reader = Ros1Reader(path)
-    try:
-        reader.open()
-        return RosbagsFile(path, reader, reader.start_time)
-    except Exception as error:  # as above
-        raise BagError(f'{path}: no readable bag ({describe(error)}); '
-                       'try `rosbag reindex`') from None  # fmt: skip
-
-
-def open_sqlite(path: Path) -> RosbagsFile:
-    """A .db3 file; of a damaged one what is before the damage, in a copy. Raises BagError."""
-    log = Path(f'{path}-wal')
-    try:
-        reader = _sqlite_reader(path)
-        file = RosbagsFile(path, reader, reader.metadata.start_time)
-    except Exception as error:  # as above
-        damage = f'damaged database ({describe(error)})'
-        file = _salvaged(path)
-        file.problems.append(f'{path.name}: {damage}; read up to the damage; {_RECOVER} repairs it')
-    if log.is_file() and log.stat().st_size:
-        file.problems.append(f'{log.name}: holds messages that are not read; {_RECOVER} adds them')
-    return file
-
-
-def _salvaged(path: Path) -> RosbagsFile:
-    folder = TemporaryDirectory(prefix='bag-')
-    try:
-        reader = _sqlite_reader(_intact_rows(path, Path(folder.name) / 'copy.db3'))
-        return RosbagsFile(path, reader, reader.metadata.start_time, folder)
-    except Exception as error:  # as above
-        folder.cleanup()
-        raise BagError(f'{path}: no readable bag database ({describe(error)}); '
-                       'try `sqlite3 FILE .recover`') from None  # fmt: skip
+            add_problem(self._problems, f'{self._path.name}: {text}')
 
 
 def _sqlite_reader(path: Path) -> Sqlite3Reader:
@@ -284,29 +229,40 @@ def _sqlite_reader(path: Path) -> Sqlite3Reader:
     return reader
 
 
+def _salvaging_reader(path: Path) -> Sqlite3Reader:
+    """A reader of a copy of the topics, and of the messages up to the damage. Raises BagError."""
+    # The reader keeps the copy, which loses its name here, until it is closed.
+    with TemporaryDirectory(prefix='bag-') as folder:
+        try:
+            return _sqlite_reader(_intact_rows(path, Path(folder) / 'copy.db3'))
+        except Exception as error:  # as above
+            raise BagError(f'{path}: no readable bag database ({describe(error)}); '
+                           'try `sqlite3 FILE .recover`') from None  # fmt: skip
+
+
 def _intact_rows(path: Path, copy: Path) -> Path:
-    """A copy of the topics, and of the messages up to the damage. Raises sqlite3.Error."""
     address = f'file:{quote(os.fsencode(path))}?immutable=1'
-    query = 'SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id'
     with closing(sqlite3.connect(address, uri=True)) as old, closing(sqlite3.connect(copy)) as new:
         old.execute('PRAGMA writable_schema=ON')  # else a cut-off file is not read at all
-        topics = old.execute('SELECT id, name, type, serialization_format FROM topics').fetchall()
         new.execute('CREATE TABLE topics(id, name, type, serialization_format)')
         new.execute('CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)')
+        topics = old.execute('SELECT id, name, type, serialization_format FROM topics').fetchall()
         new.executemany('INSERT INTO topics VALUES(?, ?, ?, ?)', topics)
+        rows = old.execute('SELECT id, topic_id, timestamp, data FROM messages ORDER BY id')
         with suppress(sqlite3.DatabaseError):
-            for row in old.execute(query):
+            for row in rows:
                 new.execute('INSERT INTO messages VALUES(?, ?, ?, ?)', row)
         new.commit()
     return copy
 
 
-READERS: dict[bytes, Callable[[Path], StoredFile]] = {
-    b'SQLite format 3\0': open_sqlite,
+StoredFile = McapFile | RosbagsFile
+READERS: dict[bytes, Callable[[Path, list[str]], StoredFile]] = {
+    b'SQLite format 3\0': RosbagsFile.sqlite,
     b'\x89MCAP0\r\n': McapFile,
-    b'#ROSBAG V': open_ros1,
+    b'#ROSBAG V': RosbagsFile.ros1,
 }
-"""By the first bytes of a file, what opens it."""
+"""By the first bytes of a file, what opens it, with a list for its problems."""
 
 
 def inflate_message(data: bytes) -> bytes:

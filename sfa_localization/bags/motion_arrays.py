@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,8 @@ def to_yaw_rate(values: StampedValues) -> YawRate:
     return YawRate(_stamps(values), rates[:, 0], rates[:, 1])
 
 
-def to_odometry(values: StampedValues) -> tuple[Odometry, int]:
-    """Odometry, and how many resets in it were joined.
+def to_odometry(values: StampedValues) -> tuple[Odometry, int, str]:
+    """Odometry, how many resets in it were joined, and what is odd about it, in words.
 
     The values are a pose, with v, omega and their variances, or with None where the messages hold
     poses only: then twists are the differences of the poses.
@@ -56,20 +57,19 @@ def to_odometry(values: StampedValues) -> tuple[Odometry, int]:
     poses = np.array([pose for _, (pose, _) in values], float).reshape(-1, 3)
     if not values or values[0][1][1] is None:
         twists = differences(stamps, poses)
-        return Odometry(stamps, poses, twists, np.zeros_like(twists)), 0
-    motion = np.array([twist for _, (_, twist) in values], float).reshape(-1, 4)
-    poses, resets = _joined(stamps, poses, motion[:, :2])
-    return Odometry(stamps, poses, motion[:, :2], motion[:, 2:]), resets
+        odometry, resets = Odometry(stamps, poses, twists, np.zeros_like(twists)), 0
+    else:
+        motion = np.array([twist for _, (_, twist) in values], float).reshape(-1, 4)
+        poses, resets = _joined(stamps, poses, motion[:, :2])
+        odometry = Odometry(stamps, poses, motion[:, :2], motion[:, 2:])
+    speeds = np.abs(odometry.twists[:, 0])
+    if len(stamps) > 1 and not np.ptp(poses, axis=0).any() and speeds.max() > _DRIVING_MPS:
+        integrated = replace(odometry, poses=integrate(stamps, odometry.twists))
+        return integrated, resets, 'the pose is constant; the twist is integrated instead'
+    return odometry, resets, (_disagreement(odometry) or _sideways(odometry)) if values else ''
 
 
-def is_pose_constant(odometry: Odometry) -> bool:
-    """Whether all poses are equal although by the twists the robot drives."""
-    if len(odometry.stamps_ns) < 2 or np.ptp(odometry.poses, axis=0).any():
-        return False
-    return bool(np.abs(odometry.twists[:, 0]).max() > _DRIVING_MPS)
-
-
-def disagreement(odometry: Odometry) -> str:
+def _disagreement(odometry: Odometry) -> str:
     """How poses and twists drive or turn another way in sum, in words; '' where they agree.
 
     Twists may lag, and average over any time; one that is always 0 claims nothing.
@@ -85,7 +85,8 @@ def disagreement(odometry: Odometry) -> str:
         by_pose, by_twist = steps[:, even & (steps > _COUNTED).any(axis=0)].sum(axis=1).tolist()
         least, most = sorted([by_pose, by_twist])
         if by_twist > 0 and most > _ENOUGH and most > _UNEQUAL * least:
-            return f'poses {verb} {by_pose:.3g} {unit}, twists {by_twist:.3g} {unit}'
+            differ = f'poses {verb} {by_pose:.3g} {unit}, twists {by_twist:.3g} {unit}'
+            return f'{differ}: are both in meters, radians and seconds?'
     return ''
 
 
@@ -95,7 +96,7 @@ def _by_second(odometry: Odometry) -> tuple[Array, NDArray[np.int64]]:
     return seconds, np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
 
 
-def sideways(odometry: Odometry) -> str:
+def _sideways(odometry: Odometry) -> str:
     """How far poses drive sideways, in words; '' where they drive ahead or back, as wheels do."""
     _, at = _by_second(odometry)
     step = relative(odometry.poses[at[:-1]], odometry.poses[at[1:]])
@@ -105,7 +106,8 @@ def sideways(odometry: Odometry) -> str:
     moved = (chord * np.exp(-1j * half))[counted]
     ahead, aside = np.abs(moved.real).sum(), np.abs(moved.imag).sum()
     if aside > _ENOUGH and aside > _ASIDE * ahead:
-        return f'poses drive {aside:.3g} m sideways and {ahead:.3g} m ahead'
+        driven = f'poses drive {aside:.3g} m sideways and {ahead:.3g} m ahead'
+        return f'{driven}: only motion ahead is used; is the heading right?'
     return ''
 
 

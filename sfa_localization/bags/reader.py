@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +20,12 @@ from sfa_localization.bags.files import ZSTD_MAGIC, Record, Topic, add_problem, 
 from sfa_localization.bags.motion_arrays import StampedValues
 from sfa_localization.bags.recording import Recording
 from sfa_localization.bags.settings import BagConfig
-from sfa_localization.bags.topic_stream import Item, Stream, Tally
+from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.data.errors import BagError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
 from sfa_localization.data.rejections import listed
-from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate, integrate
+from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate
 
-SERIALIZATIONS = ('cdr', 'ros1')
 OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 """What omnicam_node, sfa_node and ekf_node publish is no input where others are recorded too."""
 REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
@@ -39,9 +37,8 @@ along, as with different units; single restarts of an odometry node stay far bel
 
 
 class Kind(NamedTuple):
-    """The use of a topic: its title in errors, its command line flag, the types that can serve.
-
-    `found` are the types by which it is found, `named` those accepted when it is named.
+    """The use of a topic: its title in errors, its command line flag, the types by which it is
+    found, and those accepted when it is named.
     """
 
     title: str
@@ -62,7 +59,8 @@ KINDS = {
 class Bag:
     """Context manager over one bag: a folder, or a single .db3, .mcap or .bag file.
 
-    `strict` raises for damaged bags and messages instead of counting the losses. Raises BagError.
+    `strict` raises for damaged bags and messages instead of counting the losses. An open bag has
+    all `topics` by name, and the `problems` found so far. Raises BagError.
     """
 
     def __init__(
@@ -70,40 +68,21 @@ class Bag:
     ) -> None:
         self.path, self.strict = Path(path), strict
         self._by_header = (config or BagConfig()).stamp_source == 'header'
-        self._decode = decoding.Decoder()
-        self._tallies: dict[str, Tally] = {}
-        self._recording: Recording | None = None
+        self._streams: dict[str, Stream] = {}
 
     def __enter__(self) -> Bag:
-        self._recording = Recording(self.path)
+        self.recording = Recording(self.path)
+        self.topics, self.problems = self.recording.topics, self.recording.problems
         self._raise_problems()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.recording.close()
-        self._recording = None
-
-    @property
-    def recording(self) -> Recording:
-        """The open files. Raises BagError outside the `with` block."""
-        if self._recording is None:
-            raise BagError(f'{self.path}: is not open; use it in a with statement')
-        return self._recording
-
-    @property
-    def topics(self) -> dict[str, Topic]:
-        """All topics by name."""
-        return self.recording.topics
 
     @property
     def counts(self) -> dict[str, Count]:
         """Used and rejected messages of each topic read so far."""
-        return {topic: tally.count for topic, tally in self._tallies.items()}
-
-    @property
-    def problems(self) -> list[str]:
-        """Damage and losses found so far."""
-        return self.recording.all_problems()
+        return {topic: stream.count for topic, stream in self._streams.items()}
 
     def find(self, kind: str, topic: str = '') -> str:
         """Name of the topic that serves as `kind` (a key of KINDS): the named, or the only one.
@@ -114,18 +93,16 @@ class Bag:
         if topic:
             return self._named(wanted, topic)
         found = [t for t in self.topics.values() if t.kind in wanted.found and t.count]
-        if len(found) > 1:
-            found = [t for t in found if not OWN_TOPICS.search(t.name)] or found
-        if len(found) == 1:
-            return self._readable(found[0])
+        found = [t for t in found if not OWN_TOPICS.search(t.name)] or found
         if not found:
             kinds = _short(wanted.found, ' or ')
-            raise BagError(
-                f'{self.path}: has no {wanted.title} ({kinds}); {self._contents(wanted)}'
-            )
-        names = ', '.join(sorted(topic.name for topic in found))
-        raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
-                       f'choose one with {wanted.flag}')  # fmt: skip
+            has = self._contents(wanted)
+            raise BagError(f'{self.path}: has no {wanted.title} ({kinds}); {has}')
+        if len(found) > 1:
+            names = ', '.join(sorted(topic.name for topic in found))
+            raise BagError(f'{self.path}: several topics have {wanted.title}: {names}; '
+                           f'choose one with {wanted.flag}')  # fmt: skip
+        return self._readable(found[0])
 
     def _named(self, wanted: Kind, name: str) -> str:
         plain, colon, child_frame = name.lstrip('/').partition(':')
@@ -141,7 +118,7 @@ class Bag:
         return self._readable(topic) + (colon + child_frame if child_frame else '')
 
     def _readable(self, topic: Topic) -> str:
-        if topic.serialization in SERIALIZATIONS:
+        if topic.serialization in decoding.SERIALIZATIONS:
             return topic.name
         raise BagError(f'{self.path}: {topic.name} is serialized as {topic.serialization!r}; '
                        'only cdr can be read: record it so')  # fmt: skip
@@ -149,9 +126,8 @@ class Bag:
     def _contents(self, wanted: Kind) -> str:
         """The topics that the bag has, and the remedy."""
         kinds = sorted(f'{t.name} ({_short([t.kind])}, {t.count})' for t in self.topics.values())
-        shown = kinds[:MOST_TOPICS] + ['...'] * (len(kinds) > MOST_TOPICS)
-        known = ', '.join(shown) or 'no topics'
-        return f'it has {known}: record one, or name one with {wanted.flag}'
+        shown = ', '.join(kinds[:MOST_TOPICS] + ['...'] * (len(kinds) > MOST_TOPICS)) or 'no topics'
+        return f'it has {shown}: record one, or name one with {wanted.flag}'
 
     def images(self, topic: str = '') -> Iterator[tuple[int, Image]]:
         """Stamps and images (H, W, 3) BGR, one at a time."""
@@ -159,7 +135,7 @@ class Bag:
 
     def odometry(self, topic: str = '') -> Odometry:
         """All odometry; of a topic with poses only, twists are their differences."""
-        stream = self.odometry_stream(topic)
+        stream = self.stream(self.find('odometry', topic), decoding.odometry_of)
         return self.to_odometry(stream, list(self._values(stream)))
 
     def yaw_rate(self, topic: str = '') -> YawRate:
@@ -176,52 +152,36 @@ class Bag:
         return ((stamp_ns, value) for _, stamp_ns, value in self.read([stream]))
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """Odometry of a stream's values; a reset is joined, and noted as a problem."""
-        odometry, resets = motion.to_odometry(values)
+        """Odometry of a stream's values; what is odd about it is noted as a problem."""
+        odometry, resets, oddity = motion.to_odometry(values)
         if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
             raise BagError(
                 f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
                 f'{len(values)} messages: are both in meters, radians and seconds?'
             )
-        texts = []
-        if motion.is_pose_constant(odometry):
-            texts.append('the pose is constant; the twist is integrated instead')
-            poses = integrate(odometry.stamps_ns, odometry.twists)
-            odometry = replace(odometry, poses=poses)
-        elif differing := motion.disagreement(odometry):
-            texts.append(f'{differing}: are both in meters, radians and seconds?')
-        elif aside := motion.sideways(odometry):
-            texts.append(f'{aside}: only motion ahead is used; is the heading right?')
+        problems = self.problems
+        problems += [f'{stream.topic}: {oddity}'] if oddity else []
         if resets:
-            texts.append(f'odometry was reset {resets} times; joined by its twist')
-        self.recording.problems += [f'{stream.topic}: {text}' for text in texts]
-        if resets:
+            problems.append(
+                f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
+            )
             self._raise_problems()
         return odometry
 
-    def odometry_stream(self, topic: str = '') -> Stream:
-        """Stream of (pose, twist and its variances; None of a type without twists)."""
-        return self.stream(self.find('odometry', topic), decoding.odometry_of)
-
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:
-        """A topic to be read; a name '/tf:FRAME' takes only that transform of each message."""
-        topic, _, child_frame = name.partition(':')
-        chooser = decoding.TransformChooser(topic, child_frame)
-        is_tf = self.topics[topic].kind == decoding.TF
-        return self._stream(topic, chooser if is_tf else _itself, convert)
+        """A topic to be read; of a TFMessage, '/tf:FRAME' names the transform that is wanted."""
+        topic, _, frame = name.partition(':')
+        self._streams[topic] = Stream(self.path, topic, convert, self.strict)
+        if self.topics[topic].kind == decoding.TF:
+            self._streams[topic].frame = frame
+        return self._streams[topic]
 
     def any_stream(self, topic: str, convert: Callable[[Any], Any]) -> Stream:
         """A topic of any type, which may be empty; unknown types have the value None."""
-        stream = self._stream(topic, _itself, convert)
-        stream.opaque = not self._decode.can_decode(self.topics[topic])
+        stream = self._streams[topic] = Stream(self.path, topic, convert, self.strict)
+        stream.opaque = not decoding.can_decode(self.topics[topic])
         stream.required = False
         return stream
-
-    def _stream(
-        self, topic: str, select: Callable[[Any], Any], convert: Callable[[Any], Any]
-    ) -> Stream:
-        self._tallies[topic] = tally = Tally(f'{self.path}: {topic}', self.strict)
-        return Stream(topic, select, convert, tally)
 
     def read(self, streams: Iterable[Stream]) -> Iterator[tuple[Stream, int, Any]]:
         """Read the streams' topics in one pass: stream, stamp in ns, value.
@@ -235,13 +195,9 @@ class Bag:
             for stream in by_topic[record[0].name]:
                 stream.received += 1
                 item = self._item(stream, *record)
-                for ready in stream.stamps.push(item) if item is not None else ():
-                    stream.tally.use()
-                    yield stream, ready.stamp_ns, ready.value
+                yield from _used(stream, stream.push(item) if item is not None else ())
         for stream in itertools.chain(*by_topic.values()):
-            for ready in stream.stamps.flush():
-                stream.tally.use()
-                yield stream, ready.stamp_ns, ready.value
+            yield from _used(stream, stream.flush())
             self._check_complete(stream)
 
     def _item(self, stream: Stream, topic: Topic, receive_ns: int, data: bytes) -> Item | None:
@@ -249,20 +205,22 @@ class Bag:
         if stream.opaque:
             return Item(receive_ns, receive_ns, None)
         try:
-            part = stream.select(self._decode(data, topic))
+            part = decoding.decode(data, topic)
+            if stream.frame is not None:
+                part = decoding.transform_to(stream.frame, part, topic.name)
             if part is None:
-                stream.tally.leave_out('transforms of other frames')
+                stream.skipped.add('transforms of other frames')
                 return None
             stamp_ns = decoding.header_stamp(part) if self._by_header else None
             return Item(stamp_ns or receive_ns, receive_ns, stream.convert(part))
         except BagError:
             raise
         except LocalizationError as error:
-            stream.tally.skip(str(error))
+            stream.skip(str(error))
             return None
 
     def messages(self, topics: Iterable[str], start_ns: int = 0) -> Iterator[Record]:
-        """Topic, reception in ns and serialized bytes, as recorded, in order of reception."""
+        """Topic, reception in ns and serialized bytes, as recorded, and in its order."""
         for record in self.recording.messages(set(topics), start_ns):
             if record[2][:4] != ZSTD_MAGIC:
                 yield record
@@ -270,18 +228,18 @@ class Bag:
             try:
                 yield record[0], record[1], inflate_message(record[2])
             except MessageError as error:
-                add_problem(self.recording.problems, f'{record[0].name}: {error}')
+                add_problem(self.problems, f'{record[0].name}: {error}')
 
     def _check_complete(self, stream: Stream) -> None:
         """Compare the messages read with the bag's own count; no usable message is an error."""
         expected = self.topics[stream.topic].count
         if stream.received < expected:
             lost = f'{stream.received} of {expected} messages read; {REMEDY}'
-            add_problem(self.recording.problems, f'{stream.topic}: {lost}')
-            stream.tally.leave_out('lost in a damaged bag', expected - stream.received)
+            add_problem(self.problems, f'{stream.topic}: {lost}')
+            stream.skipped.add('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
-        if stream.required and stream.tally.count.used == 0:
-            reasons = listed(stream.tally.count.skipped) or 'none recorded'
+        if stream.required and stream.used == 0:
+            reasons = listed(stream.skipped) or 'none recorded'
             remedy = f'; {REMEDY}' if stream.received < expected else ''
             if NO_STAMP in reasons:
                 remedy = '; try the time of reception (stamp_source: receive)'
@@ -292,9 +250,10 @@ class Bag:
             raise BagError(f'{self.path}: {self.problems[0]}; read without --strict to salvage it')
 
 
-def _itself(message: Any) -> Any:
-    """The whole of a message."""
-    return message
+def _used(stream: Stream, items: Iterable[Item]) -> Iterator[tuple[Stream, int, Any]]:
+    for item in items:
+        stream.used += 1
+        yield stream, item.stamp_ns, item.value
 
 
 def _short(kinds: Iterable[str], between: str = '') -> str:

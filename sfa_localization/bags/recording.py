@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag on disk: its files, its metadata, and the message counts of both.
 
-Not the directory reader of rosbags (0.11.9), because it rejects a bag when one of its files is
-missing or its metadata is damaged or newer, opens no compressed file without metadata, and reads
-0 of 145 messages, without an error, when metadata and file spell a type differently
-(test_bag.py::test_silence_of_a_library_is_an_error).
+Not the directory reader of rosbags (0.11.9), which rejects a bag for a missing file or for newer
+metadata, and reads 0 of 145 messages, without an error, where metadata and file spell a type
+differently (test_bag.py::test_silence_of_a_library_is_an_error).
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from sfa_localization.bags.files import (
     Record,
     StoredFile,
     Topic,
-    add_problem,
     describe,
     inflate_file,
     make_topic,
@@ -85,10 +83,6 @@ class Recording:
         """Release all files."""
         self._open.close()
 
-    def all_problems(self) -> list[str]:
-        """Problems of the bag and of its files, so far."""
-        return self.problems + [text for file in self._files for text in file.problems]
-
     def messages(self, names: Collection[str], start_ns: int = 0) -> Iterator[Record]:
         """Messages of the topics received at or after `start_ns`, file after file."""
         for file in self._files:
@@ -106,6 +100,11 @@ class Recording:
         try:
             found = _bag_files(self.path)
             names, topics = parse_metadata(read_regular(file, LONGEST).decode(errors='replace'))
+            self.problems += [
+                f'{name} is in the folder, but not in {METADATA}: it is not read'
+                for name in sorted(set(found) - set(names))
+            ]
+            return names, topics
         except FileNotFoundError:
             self.notes.append(f'no {METADATA}; rebuilt from the files')
         except OSError as error:
@@ -113,18 +112,13 @@ class Recording:
         except ValueError as error:
             self.problems.append(f'{METADATA} is damaged ({error}); rebuilt from the files, as '
                                  '`ros2 bag reindex` does for good')  # fmt: skip
-        else:
-            for name in sorted(set(found) - set(names)):
-                text = f'{name} is in the folder, but not in {METADATA}: it is not read'
-                add_problem(self.problems, text)
-            return names, topics
         if not found:
             raise BagError(f'{self.path}: no bag: neither {METADATA} nor .db3, .mcap, .bag')
         return found, []
 
     def _open_files(self, names: list[str]) -> None:
         """Open each file once. Raises BagError when none can be read."""
-        failures = ['it has no files']
+        failures = []
         for name in dict.fromkeys(names):
             path = self.path / name if self.path.is_dir() else self.path
             try:
@@ -138,9 +132,8 @@ class Recording:
             except BagError as error:
                 failures.append(str(error))
         if not self._files:
-            raise BagError(failures[:2][-1])
-        for failure in failures[1:]:
-            add_problem(self.problems, failure)
+            raise BagError(next(iter(failures), f'{self.path}: its {METADATA} names no file'))
+        self.problems += failures
 
     def _open_file(self, path: Path) -> StoredFile:
         """Open one file, or a decompressed copy, by its first bytes. Raises OSError or BagError."""
@@ -152,13 +145,13 @@ class Recording:
             plain = Path(folder) / path.stem
             if damage := inflate_file(path, plain):
                 self.problems.append(f'{path.name}: {damage}')
-        start = start_of(plain, max(map(len, READERS)))
+        start = start_of(plain, 16)
         if not start:
             raise BagError(f'{path}: holds nothing ({damage or "0 bytes"}); record it again')
         for magic, reader in READERS.items():
             if start.startswith(magic):
                 try:
-                    return reader(plain)
+                    return reader(plain, self.problems)
                 except BagError as error:
                     raise BagError(str(error).replace(str(plain), str(path))) from None
         raise BagError(f'{path}: is no bag file: its first bytes are not of sqlite3, mcap or ROS 1')

@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from sfa_localization.data.errors import BagError
@@ -16,38 +17,6 @@ from sfa_localization.data.run import Count
 CLOCK_JUMP_NS = 10_000_000_000
 """A stamp that moved this much (10 s) more or less than the time of reception is a jump of the
 sender's clock: queues and networks delay a message by less."""
-
-
-class Tally:
-    """Counts used messages, and rejected ones by reason; in strict reading these are errors."""
-
-    def __init__(self, where: str, strict: bool) -> None:
-        self._where, self._strict = where, strict
-        self._used = 0
-        self._skipped = RejectionCounter()
-
-    def use(self, number: int = 1) -> None:
-        self._used += number
-
-    def skip(self, reason: str, number: int = 1) -> None:
-        """Count messages that are faulty."""
-        if self._strict:
-            raise BagError(f'{self._where}: {reason}; read without --strict to skip such messages')
-        self._skipped.add(reason, number)
-
-    def leave_out(self, reason: str, number: int = 1) -> None:
-        """Count messages that are left out although nothing is wrong with them."""
-        if number:
-            self._skipped.add(reason, number)
-
-    def withdraw(self, reason: str, number: int) -> None:
-        """Count messages, used so far, as left out."""
-        self._used -= number
-        self.leave_out(reason, number)
-
-    @property
-    def count(self) -> Count:
-        return Count(self._used, dict(self._skipped))
 
 
 class Item(NamedTuple):
@@ -62,87 +31,77 @@ class Item(NamedTuple):
         if before is None:
             return False
         moved, received = self.stamp_ns - before.stamp_ns, self.receive_ns - before.receive_ns
-        return -CLOCK_JUMP_NS <= moved - received <= CLOCK_JUMP_NS
+        return abs(moved - received) <= CLOCK_JUMP_NS
 
 
-class StampFilter:
-    """Passes messages in strictly increasing order of stamp, and detects a clock that was set.
+@dataclass(eq=False)
+class Stream:
+    """One topic being read: the `bag` and its name, the used messages, the others by reason.
 
-    A stamp that moved by CLOCK_JUMP_NS more or less than the time of reception is a jump. It is
-    accepted only when the next message continues from it: a single one is skipped, a lasting one
-    is a clock that was set; after a clock was set back, messages are skipped until it has caught
-    up. One message may be held back, so call `flush` at the end.
+    `convert` makes a value of a message, or of its transform to the `frame`, where that is not
+    None. Messages of an opaque stream are not decoded: their value is None. In `strict` reading a
+    faulty message is an error, and without a usable one a `required` stream always is.
+
+    Messages pass in strictly increasing order of stamp. A jump ahead is accepted only when the next
+    message continues from it: a single one is skipped, a lasting one is a clock that was set. After
+    a clock was set back, messages are skipped until it has caught up.
     """
 
-    def __init__(self, tally: Tally) -> None:
-        self._tally = tally
-        self._last: Item | None = None
-        self._suspect: Item | None = None
-        self._behind: Item | None = None
+    bag: Path
+    topic: str
+    convert: Callable[[Any], Any]
+    strict: bool
+    frame: str | None = None
+    required: bool = True
+    opaque: bool = False
+    received: int = 0
+    used: int = 0
+    skipped: RejectionCounter = field(default_factory=RejectionCounter)
+    _last: Item | None = None
+    _suspect: Item | None = None
+
+    @property
+    def count(self) -> Count:
+        return Count(self.used, dict(self.skipped))
+
+    def skip(self, reason: str) -> None:
+        """Count a message that is faulty. Raises BagError in strict reading."""
+        if self.strict:
+            raise BagError(f'{self.bag}: {self.topic}: {reason}; '
+                           'read without --strict to skip such messages')  # fmt: skip
+        self.skipped.add(reason)
 
     def push(self, item: Item) -> list[Item]:
-        """Messages that can be used now."""
+        """Messages that can be used now; one may be held back, so call `flush` at the end."""
         if item.stamp_ns <= 0:
-            self._tally.skip(NO_STAMP)
+            self.skip(NO_STAMP)
             return []
         suspect, self._suspect = self._suspect, None
-        if item.continues(self._last):
-            self._drop(suspect)
+        sound, last = item.continues(self._last), self._last
+        if suspect is not None and not sound and item.continues(suspect):
+            self._last = suspect
+            return [suspect, *self._in_order(item)]
+        if suspect is not None:
+            self.skip('stamp jumps')
+        if sound or (last is not None and item.stamp_ns <= last.stamp_ns):
             return self._in_order(item)
-        if item.continues(self._behind) and not self._ahead(item):
-            self._behind = item
-            self._tally.skip('clock was set back')
-            return []
-        if suspect is not None and item.continues(suspect):
-            if self._ahead(suspect):
-                return [*self._in_order(suspect), *self._in_order(item)]
-            self._behind = item
-            self._tally.skip('clock was set back', 2)
-            return []
-        self._drop(suspect)
         self._suspect = item
         return []
 
     def flush(self) -> list[Item]:
         """The message held back; it is used only when nothing came before it."""
-        suspect, self._suspect = self._suspect, None
-        if suspect is not None and self._last is None:
-            return self._in_order(suspect)
-        self._drop(suspect)
+        if self._suspect is None:
+            return []
+        if self._last is None:
+            return self._in_order(self._suspect)
+        self.skip('stamp jumps')
         return []
-
-    def _ahead(self, item: Item) -> bool:
-        return self._last is None or item.stamp_ns > self._last.stamp_ns
-
-    def _drop(self, suspect: Item | None) -> None:
-        if suspect is not None:
-            self._tally.skip('stamp jumps')
 
     def _in_order(self, item: Item) -> list[Item]:
-        if self._ahead(item):
+        if self._last is None or item.stamp_ns > self._last.stamp_ns:
             self._last = item
             return [item]
-        same = self._last is not None and item.stamp_ns == self._last.stamp_ns
-        self._tally.skip('duplicate stamp' if same else 'stamp out of order')
+        same, sound = item.stamp_ns == self._last.stamp_ns, item.continues(self._last)
+        other = 'stamp out of order' if sound else 'clock was set back'
+        self.skip('duplicate stamp' if same else other)
         return []
-
-
-@dataclass(eq=False)
-class Stream:
-    """One topic being read.
-
-    `select` picks the part of a message that matters, or None, and `convert` turns that part into
-    a value. Messages of an opaque stream are not decoded: their value is None. Without a usable
-    message a `required` one is an error.
-    """
-
-    topic: str
-    select: Callable[[Any], Any]
-    convert: Callable[[Any], Any]
-    tally: Tally
-    received: int = 0
-    required: bool = True
-    opaque: bool = False
-
-    def __post_init__(self) -> None:
-        self.stamps = StampFilter(self.tally)

@@ -4,23 +4,14 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import (
-    Connection,
-    Nodetype,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Connection, Nodetype
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores
 from rosbags.typesys.store import Typestore
@@ -32,18 +23,6 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
 STORAGES = ('mcap', 'sqlite3')
-FOREVER = QosTime(9223372036, 854775807)
-RELIABLE = Qos(
-    history=QosHistory.KEEP_LAST,
-    depth=10,
-    reliability=QosReliability.RELIABLE,
-    durability=QosDurability.VOLATILE,
-    deadline=FOREVER,
-    lifespan=FOREVER,
-    liveliness=QosLiveliness.AUTOMATIC,
-    liveliness_lease_duration=FOREVER,
-    avoid_ros_namespace_conventions=False,
-)
 
 
 class BagWriter:
@@ -64,41 +43,30 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         if self.path.exists():
             raise BagError(f'{self.path}: already exists; name another bag or remove it')
-        try:
+        with self._named(), ExitStack() as stack:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = Path(tempfile.mkdtemp(prefix='.bag-', dir=self.path.parent))
-        except OSError as error:
-            raise self._unwritable(error) from None
-        try:
-            self._writer = _open_writer(self._folder / self.path.name, self._storage)
-        except BaseException as error:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            if isinstance(error, Exception):
-                raise self._unwritable(error) from None
-            raise
+            folder = TemporaryDirectory(prefix='.bag-', dir=self.path.parent)
+            self._part = Path(stack.enter_context(folder)) / self.path.name
+            self._writer = _open_writer(self._part, self._storage)
+            self._folder = stack.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            self._writer.__exit__(kind, error, trace)
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
+        # The error that ended the block is the cause; a failed write only follows from it.
+        with self._folder, suppress(Exception) if kind else self._named():
+            self._writer.__exit__(kind, *error)
             if kind is None:
-                (self._folder / self.path.name).rename(self.path)
-        except Exception as failure:
-            # The error that ended the block is the cause; a failed write only follows from it.
-            if kind is None:
-                raise self._unwritable(failure) from None
-        finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
+                self._part.rename(self.path)
 
-    def _unwritable(self, error: Exception) -> BagError:
-        """The error to raise instead of one of the file system or of the database."""
-        why = error.strerror if isinstance(error, OSError) else str(error)
-        return BagError(f'{self.path}: cannot be written: {why or type(error).__name__}')
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Raise errors of the file system and of the database as one that names the bag."""
+        try:
+            yield
+        except Exception as error:
+            why = error.strerror if isinstance(error, OSError) else str(error)
+            why = why or type(error).__name__
+            raise BagError(f'{self.path}: cannot be written: {why}') from None
 
     def image(
         self,
@@ -122,28 +90,19 @@ class BagWriter:
         self.message(topic, stamp_ns, message)
 
     def odometry(
-        self,
-        topic: str,
-        stamp_ns: int,
-        pose: Array,
-        twist: Array,
-        twist_variance: Array,
-        frame_id: str = 'odom',
-        child_frame_id: str = 'base_link',
+        self, topic: str, stamp_ns: int, pose: Array, twist: Array, twist_variance: Array
     ) -> None:
         """Write odometry: `pose` x m, y m, yaw rad; `twist` v m/s, omega rad/s; their variances."""
-        message = self._stamped('nav_msgs/msg/Odometry', stamp_ns, frame_id)
-        message.child_frame_id = child_frame_id
+        message = self._stamped('nav_msgs/msg/Odometry', stamp_ns, 'odom')
+        message.child_frame_id = 'base_link'
         _place(message.pose.pose, pose)
         message.twist.twist.linear.x, message.twist.twist.angular.z = map(float, twist)
         message.twist.covariance[[0, 35]] = twist_variance
         self.message(topic, stamp_ns, message)
 
-    def imu(
-        self, topic: str, stamp_ns: int, omega: float, variance: float, frame_id: str = 'base_link'
-    ) -> None:
+    def imu(self, topic: str, stamp_ns: int, omega: float, variance: float) -> None:
         """Write a gyroscope's yaw rate (rad/s); orientation and acceleration are marked unknown."""
-        message = self._stamped('sensor_msgs/msg/Imu', stamp_ns, frame_id)
+        message = self._stamped('sensor_msgs/msg/Imu', stamp_ns, 'base_link')
         message.orientation.w = 1.0
         message.angular_velocity.z = float(omega)
         message.angular_velocity_covariance[8] = variance
@@ -161,17 +120,13 @@ class BagWriter:
         kind = message.__msgtype__
         connection = self._connections.get(topic)
         if connection is None:
-            connection = self._writer.add_connection(
-                topic, kind, typestore=self._types, offered_qos_profiles=[RELIABLE]
-            )
+            connection = self._writer.add_connection(topic, kind, typestore=self._types)
             self._connections[topic] = connection
         if connection.msgtype != kind:
             raise BagError(f'{self.path}: topic {topic} is {connection.msgtype}, not {kind}')
         data = self._types.serialize_cdr(message, kind)
-        try:
+        with self._named():
             self._writer.write(connection, stamp_ns, data)
-        except Exception as error:
-            raise self._unwritable(error) from None
 
     def _stamped(self, kind: str, stamp_ns: int, frame_id: str) -> Any:
         """A message of zeros with a header."""
