@@ -137,18 +137,14 @@ def evaluate(
     Raises BagError or DataError, also without ground truth.
     """
     recipe = as_live(recipe or Recipe(), model.panorama)
-    trained = [
-        _driven(one, Localizer(model, config, watch), _present(one, recipe), progress)
-        for one in align_bags
-    ]
+    given = [(one, Localizer(model, config, watch), _present(one, recipe)) for one in align_bags]
+    trained = [_driven(*one, progress) for one in given]
     kind = Smoother if smooth else PoseFilter
     drive = _driven(bag, Localizer(model, config, watch, kind), recipe, progress)
-    aligned_on = ', '.join(map(str, align_bags or [bag]))
-    aligned_on = 'an earlier evaluation' if transform else aligned_on
-    pairs = [(one.truth, one.images) for one in trained or [drive]]
-    transform = transform or fit_transform(*pairs)
-    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
-    estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
+    earlier, bags = 'an earlier evaluation', ', '.join(map(str, align_bags or [bag]))
+    aligned_on = earlier if transform else bags
+    transform = transform or fit_transform(*((one.truth, one.images) for one in trained or [drive]))
+    estimates = _in_truth(drive, transform)
     if trained:
         estimates['supervised'] = _supervised(model, trained, drive)
     return Evaluation(
@@ -160,6 +156,12 @@ def evaluate(
         aligned_on,
         transform,
     )
+
+
+def _in_truth(drive: _Drive, transform: RigidTransform) -> dict[str, Trajectory]:
+    """All estimates in the frame of the truth."""
+    own = {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
+    return {'odometry': odometry_from_start(drive.truth, drive.run), **own}
 
 
 def _scores(

@@ -26,11 +26,9 @@ from sfa_localization.bags.drives import image_cache, read_drives
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
-from sfa_localization.features import mdp_engine
 from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.image_features import features_of_runs
 from sfa_localization.features.network import Network
-from sfa_localization.features.network_training import train_network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.drives import learn_map
@@ -43,15 +41,10 @@ from sfa_localization.metric.learning import (
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.refinement import refined
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import Span
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe
-from sfa_localization.training_input import TrainingInput, compared
-
-COARSE_POINTS = 700
-"""Inducing points of a map that is refined: with more, the refined map and the heading are no
-better, and the model file is larger."""
+from sfa_localization.training_input import TrainingInput, compared, train_hierarchy
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,30 +91,12 @@ def train(
             checkpoint.remove()
         with one_core():
             given = TrainingInput.of(runs, recipe, progress)  # step 2
-        network = _train_hierarchy(given, checkpoint)  # step 3
+        network = train_hierarchy(given, checkpoint)  # step 3
         with one_core():
             trained = _learn(network, given, strict)  # steps 4 to 9
         trained.model.save(output)
         checkpoint.remove()
     return replace(trained, checks=checks)
-
-
-def _train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
-    """Step 3, from the checkpoint where there is one."""
-    architecture, sequences = given.architecture, given.sequences
-    start, seed = checkpoint.read(architecture), given.recipe.network.seed
-    passes, done = 2 * len(architecture.layers), start.stages if start else 0
-    with given.bar(3, f'learn slow features in {passes} passes', passes, done) as bar:
-        if given.recipe.network.engine == 'mdp':
-            return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
-        return train_network(
-            architecture,
-            sequences,
-            seed,
-            start=start,
-            on_stage=checkpoint.write,
-            on_shard=bar.update,
-        )
 
 
 def learn_place(
@@ -140,8 +115,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     with given.bar(4, 'compute the slow features of all images') as bar:
         images = features_of_runs(network, given.runs, layers, bar.update)
     given.say(6, 'cut the odometry, and learn the map')  # steps 5 and 6
-    span = Span(COARSE_POINTS)
-    segments, first = learn_map(given.drives, images.slow, config, seed, span, strict)
+    segments, first = learn_map(given.drives, images.slow, config, seed, strict)
     given.say(7, 'learn the heading')
     heading = learn_heading(images, segments, first)
     given.say(8, 'refine the map')
@@ -155,9 +129,9 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     result = replace(result, forecast=result.forecast.improved(known.improvement))
     delays = [drive.delay_s for drive in given.drives.items]
     quality: dict[str, Any] = {'features_used': first.map.features, 'refined': finer is not None}
-    quality |= {'camera_delay_s': delays, 'pictures': len(images.slow), **images.variance_shares}
+    quality['camera_delay_s'] = delays
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
-    quality |= {**segments.quality, **result.quality, **known.quality}
+    quality |= {**images.quality, **segments.quality, **result.quality, **known.quality}
     model = PlaceModel(
         network,
         first.map,

@@ -15,9 +15,11 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
+from sfa_localization.features import mdp_engine
+from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.closures import Views, find_closures, views_of
-from sfa_localization.features.network import Architecture, standard_architecture
-from sfa_localization.features.network_training import ImageSequence
+from sfa_localization.features.network import Architecture, Network, standard_architecture
+from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import camera_clock
@@ -100,6 +102,24 @@ class TrainingInput:
         images = sum(len(one.panoramas) for one in self.runs)
         return progress_bar(
             titled(step, text), images * passes, initial=images * done, shown=self.progress
+        )
+
+
+def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
+    """Step 3, section 2 of the paper; from the checkpoint where there is one."""
+    architecture, sequences = given.architecture, given.sequences
+    start, seed = checkpoint.read(architecture), given.recipe.network.seed
+    passes, done = 2 * len(architecture.layers), start.stages if start else 0
+    with given.bar(3, f'learn slow features in {passes} passes', passes, done) as bar:
+        if given.recipe.network.engine == 'mdp':
+            return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
+        return train_network(
+            architecture,
+            sequences,
+            seed,
+            start=start,
+            on_stage=checkpoint.write,
+            on_shard=bar.update,
         )
 
 

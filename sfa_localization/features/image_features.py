@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,11 @@ class ImageFeatures:
     """(N, H, J) of the layer that refines positions; None in a network without it."""
     variance_shares: dict[str, list[float]]
     """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
+
+    @property
+    def quality(self) -> dict[str, Any]:
+        """Figures that are stored in the model."""
+        return {'pictures': len(self.slow), **self.variance_shares}
 
 
 def sample(total: int) -> NDArray[np.int64]:

@@ -30,6 +30,9 @@ from sfa_localization.metric.turn_loss import Shown, way_of
 
 logger = logging.getLogger(__name__)
 
+COARSE_POINTS = 700
+"""Images that span the map: with more, positions and headings are no better, and the model file is
+larger."""
 _LOSS_ROUNDS = 2
 """The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
 
@@ -117,7 +120,6 @@ def learn_map(
     features: Array,
     config: MetricConfig,
     seed: int = 0,
-    span: Span | None = None,
     strict: bool = False,
 ) -> tuple[Segments, MetricResult]:
     """Segments, and the certified map from features (N, K) of all images to them: section 3.
@@ -125,7 +127,7 @@ def learn_map(
     Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
     DataError; `strict` also for a single route, of which else a warning says so.
     """
-    segments = drives.cut()
+    segments, span = drives.cut(), Span(COARSE_POINTS)
     result = learn_metric(features, segments, config, seed, span)
     for _ in range(_LOSS_ROUNDS if config.solver == 'certified' else 0):
         ways = drives.ways(segments, result)

@@ -3,7 +3,7 @@
 """Fit a map for one basis: alternate between the global solution and the noise of its residuals.
 
     expand      slow features to phi(s)                          basis.py
-    eliminate   the map's weights from equation 1                quadratic_form.py
+    eliminate   the map's weights from eq. 1                quadratic_form.py
     solve       directions, origins and biases, certified        quadratic_form.py, phases.py
     noise       variance and correlation of the residuals        here
     links       variances of odometry's links                    link_noise.py

@@ -1,9 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's own solver: momentum descent on equations 1 to 8, kept as the reference.
+"""The paper's own solver: momentum descent on eq. 1 to eq. 8, kept as the reference.
 
-Equation 6 lacks the case of the last line, which has only its second term; here it has that. The
-cosine of equation 5 is the same for a turn and its mirror image; signed turns decide afterwards.
+Eq. 6 lacks the case of the last line, which has only its second term; here it has that. The
+cosine of eq. 5 is the same for a turn and its mirror image; signed turns decide afterwards.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ PAPER_FEATURES = 8
 ITERATIONS = 1000
 """Section 4: the descent ends at about 1000 iterations."""
 LEARNING_RATE = 1e-5
-"""beta of equation 7, section 4."""
+"""beta of eq. 7, section 4."""
 MOMENTUM = 0.95
-"""gamma of equation 7, section 4."""
+"""gamma of eq. 7, section 4."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """theta of equation 1: alpha (N,) rad, origins o (N, 2) m, weights W (J, 2)."""
+    """theta of eq. 1: alpha (N,) rad, origins o (N, 2) m, weights W (J, 2)."""
 
     alpha: Array
     origins: Array
@@ -61,14 +61,14 @@ class Lines:
     """(N - 1,) rad, NaN where unknown; empty for the cost C without turns."""
 
     def cost(self, theta: Parameters) -> float:
-        """C of equation 1, or C' of equation 5 when there are turns."""
+        """C of eq. 1, or C' of eq. 5 when there are turns."""
         cost = 0.5 * float((self._misfit(theta) ** 2).sum())
         if len(self.turns):
             cost += 0.5 * float(np.nansum(self._turn_misfit(theta) ** 2))
         return cost
 
     def gradient(self, theta: Parameters) -> Parameters:
-        """By alpha: equation 2, or equation 6 with turns; by o: equation 3; by W: equation 4."""
+        """By alpha: eq. 2, or eq. 6 with turns; by o: eq. 3; by W: eq. 4."""
         lines = len(theta.alpha)
         misfit = self._misfit(theta)
         predicted = self.regressors @ theta.weights - theta.origins[self.line]
@@ -82,17 +82,17 @@ class Lines:
         return Parameters(alpha, origins, -self.regressors.T @ misfit)
 
     def _misfit(self, theta: Parameters) -> Array:
-        """The vectors inside the norm of equation 1, (M, 2)."""
+        """The vectors inside the norm of eq. 1, (M, 2)."""
         direction = np.column_stack([np.cos(theta.alpha), np.sin(theta.alpha)])[self.line]
         placed = theta.origins[self.line] + self.distances[:, None] * direction
         return np.asarray(placed - self.regressors @ theta.weights)
 
     def _turn_misfit(self, theta: Parameters) -> Array:
-        """The terms inside the second square of equation 5, (N - 1,)."""
+        """The terms inside the second square of eq. 5, (N - 1,)."""
         return np.asarray(np.cos(theta.alpha[:-1] - theta.alpha[1:]) - np.cos(self.turns))
 
     def _turn_gradient(self, theta: Parameters) -> Array:
-        """What equation 6 adds to equation 2, (N,)."""
+        """What eq. 6 adds to eq. 2, (N,)."""
         step = theta.alpha[:-1] - theta.alpha[1:]
         pull = np.nan_to_num(np.sin(step) * -self._turn_misfit(theta))
         gradient = np.zeros(len(theta.alpha))
@@ -110,7 +110,7 @@ def descend(
 ) -> tuple[Parameters, Array]:
     """Momentum descent.
 
-    Equation 7, v_t = gamma v_{t-1} + beta dC/dtheta; equation 8, theta_t = theta_{t-1} - v_t.
+    By eq. 7, v_t = gamma v_{t-1} + beta dC/dtheta, and eq. 8, theta_t = theta_{t-1} - v_t.
 
     Returns the parameters and the cost (I,) before each iteration and after the last. Raises
     DataError when the descent diverges.

@@ -3,8 +3,8 @@
 """Phase synchronization: minimize z^H H z / 2 over unit phases, and prove the minimum global.
 
 H (N, N) is Hermitian and positive semidefinite; z (N,) has |z_n| = 1. Unsupervised metric
-learning (equations 1 and 5 of the paper) is this problem once the map and the segments' origins are
-eliminated; the paper descends on the angles instead, equations 2 and 6 to 8.
+learning (eq. 1 and eq. 5 of the paper) is this problem once the map and the segments' origins are
+eliminated; the paper descends on the angles instead, eq. 2 and eq. 6 to eq. 8.
 """
 
 from __future__ import annotations

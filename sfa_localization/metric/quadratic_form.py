@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unsupervised metric learning as a quadratic form in the directions of the segments.
 
-With p = x + i y in meters and z_n = exp(i alpha_n), equation 1 of the paper reads
+With p = x + i y in meters and z_n = exp(i alpha_n), eq. 1 of the paper reads
 
     2 C = sum_n sum_m |o_n + z_n q_nm - phi(s_nm)^T w|^2,
 
@@ -13,13 +13,13 @@ yaw-rate bias b of each period, q_nm - b drift_nm. `QuadraticForm` adds what odo
 one segment to the next, each square weighted by `variance`, that of an image's position, over its
 own:
 
-    |z_{n+1} - exp(i turn_n) z_n|^2               signed turns: the second sum of equation 5, which
+    |z_{n+1} - exp(i turn_n) z_n|^2               signed turns: the second sum of eq. 5, which
                                                   has only cosines, the same for left and right
     |o_{n+1} - o_n - z_n displacement_n|^2        displacements: not in the paper
     b^2                                           prior of the biases: not in the paper
 
 `schur` minimizes over the origins o. What remains is z^H H z with |z_n| = 1, see phases.py. Where
-equations 2 to 4 are zero, w and o are those of `Elimination.weights` and `schur`.
+eq. 2 to eq. 4 are zero, w and o are those of `Elimination.weights` and `schur`.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ _MEASURED = (
 
 @dataclass(frozen=True, slots=True)
 class Elimination:
-    """Equation 1 minimized over the map's weights: what remains of the features.
+    """Eq. 1 minimized over the map's weights: what remains of the features.
 
     `gram` (3N, 3N) is the quadratic form in [o, z, -b z]; the weights are
     w = F^-1 cross [o, z, -b z] with F = factor factor^T.

@@ -57,12 +57,12 @@ from sfa_localization.metric.compass_training import (
     _solve,
     compass_layers,
 )
+from sfa_localization.metric.drives import COARSE_POINTS
 from sfa_localization.metric.lower_factor import lower_root
 from sfa_localization.metric.refinement import DIMENSIONS, Projection, Refinement, turned_back
 from sfa_localization.metric.saved_map import MetricMap, Weights
 from sfa_localization.metric.selection import INDUCING_POINTS
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import COARSE_POINTS
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
