@@ -238,7 +238,7 @@ def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
         tracks['smoothed'] = _Track.of(localizer.filter.smoothed())
     sure = np.array([level is Level.LOCALISED for _, level in fused], bool)
     assert run.ground_truth is not None
-    features = np.array([one.estimate.slow_features for one in usable])
+    features = np.array([one.slow_features for one in usable])
     return _Drive(run, run.ground_truth, tracks, features, sure, counts)
 
 
@@ -273,9 +273,8 @@ def _images(usable: list[Observation], clock: CameraClock) -> _Track:
     The map is judged where images were taken, by `clock`; the filter has to find out by itself.
     """
     stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
-    estimates = [one.estimate for one in usable]
-    poses = np.array([np.append(e.position, e.yaw) for e in estimates])
-    return _Track(Trajectory(stamps, poses), np.array([e.covariance for e in estimates]))
+    poses = np.array([[*one.position, one.yaw] for one in usable])
+    return _Track(Trajectory(stamps, poses), np.array([one.covariance for one in usable]))
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:

@@ -10,8 +10,9 @@ on the topics between the nodes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,39 +24,18 @@ from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
+from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, distance
+from sfa_localization.features.observation import Observation as Observation
 from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
-from sfa_localization.place_model import Estimate, PlaceModel, SlowPose, require_panorama
+from sfa_localization.place_model import PlaceModel, require_panorama
 
 UNKNOWN_VARIANCE = LARGEST_VARIANCE
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
-
-
-# The distance of slow features from keyframes is averaged over about ten images, outliers cut.
+# The distance of slow features from keyframes, 1 on average where both variances are right, is
+# averaged over about ten images, outliers cut.
 _LATELY, _FARTHEST = 0.1, 100.0
-# Where both variances are right, this is 1 on average; above it, one of both is wrong.
-_CONTRADICTORY = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """One panorama's measurement of the robot's pose: `pose` and `covariance` reach the filter.
-
-    `pose` (3,) is [x m, y m, yaw rad] in the map, yaw 0 where the model has no compass;
-    `covariance` (3, 3) in the same order. `problem` is why the image is unusable, '' when it is
-    usable; the covariance of an unusable one means that nothing is known. `estimate` is the
-    model's own. `turned` is the heading (rad, from any start) that the shifts between the images
-    add up to, NaN for an unusable image: it needs no map, and shows the camera's delay.
-    """
-
-    stamp_ns: int
-    pose: Array
-    covariance: Array
-    problem: str
-    estimate: Estimate
-    turned: float = np.nan
 
 
 class Observer:
@@ -79,20 +59,20 @@ class Observer:
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""
-        self._require_size(panorama)
-        problem, turned = self._judge(panorama)
-        (slow,) = self.model.slow_poses(panorama[None])
-        return self._observation(stamp_ns, self._estimate(panorama, slow), problem, turned)
+        require_panorama(panorama)
+        return self.observe_all(np.array([stamp_ns]), panorama[None])[0]
 
     def observe_all(self, stamps_ns: Stamps, panoramas: Image) -> list[Observation]:
         """The same for panoramas (T, H, W, 3) with stamps (T,), quicker."""
-        for panorama in panoramas[:1]:
-            self._require_size(panorama)
-        judged = [self._judge(panorama) for panorama in panoramas]
-        estimates = list(map(self._estimate, panoramas, self.model.slow_poses(panoramas)))
+        if len(panoramas):
+            self._require_size(panoramas[0])
+        judged = list(map(self._judge, panoramas))
+        located = map(self._locate, panoramas, self.model.slow_poses(panoramas))
         return [
-            self._observation(int(stamp_ns), estimate, *verdict)
-            for stamp_ns, estimate, verdict in zip(stamps_ns, estimates, judged, strict=True)
+            self._usable(replace(found, stamp_ns=stamp_ns, problem=problem, turned=turned))
+            for stamp_ns, (problem, turned), found in zip(
+                stamps_ns.tolist(), judged, located, strict=True
+            )
         ]
 
     def observe_run(self, run: Run) -> Iterator[Observation]:
@@ -102,26 +82,36 @@ class Observer:
             yield from self.observe_all(run.panoramas.stamps_ns[at : at + len(batch)], batch)
             at += len(batch)
 
-    def _estimate(self, panorama: Image, slow: SlowPose) -> Estimate:
-        """Slow features and keyframes together. Where they have lately been farther apart than
-        their covariances allow, the light is another one, and slow features lose their weight,
-        all of it where they contradict keyframes that know the place.
-        """
-        view = self.model.view(panorama, slow, self._light.pattern)
-        if view.known:
-            self._light.add(view.match, view.noise)
-        view = view.in_light(self._light.unlike)
-        contradicted = view.known and self._apart > _CONTRADICTORY
-        trusted = view.by_keyframes if contradicted else view
-        estimate = trusted.estimate(max(self._apart, 1.0))
-        if np.isfinite(view.distance):
-            self._apart += _LATELY * (min(view.distance, _FARTHEST) - self._apart)
-        return estimate
-
     def _judge(self, panorama: Image) -> tuple[str, float]:
         """The problem of the next image, and how far the images have turned."""
         problem = self.watch.judge(panorama)
-        return problem, np.nan if problem else self._gyro.add(panorama)
+        return problem, math.nan if problem else self._gyro.add(panorama)
+
+    def _locate(self, panorama: Image, slow: Observation) -> Observation:
+        """Slow features and keyframes together. Where they have lately been farther apart than
+        their covariances allow, the light is another one, and slow features lose their weight.
+        """
+        noise = self.model.keyframes.noise
+        match = self.model.match(panorama, slow, self._light.pattern)
+        if match.known:
+            self._light.add(match, noise)
+        light = self._light.unlike
+        found = self.model.combined(slow, match, light, max(self._apart, 1.0))
+        apart = distance(slow, match, noise, light)
+        if np.isfinite(apart):
+            self._apart += _LATELY * (min(apart, _FARTHEST) - self._apart)
+        return found
+
+    def _usable(self, found: Observation) -> Observation:
+        """What reaches the filter: of an unusable image, that nothing is known."""
+        problem, finite = found.problem, found.finite
+        if not problem and not finite:
+            problem = 'the model gives no finite estimate for this image'
+        problem = problem or self.watch.judge_novelty(found.novelty)
+        if not problem:
+            return found
+        pose = found.pose if finite else np.zeros(3)
+        return replace(found, pose=pose, covariance=unusable_covariance(), problem=problem)
 
     def _require_size(self, panorama: Image) -> None:
         size = self.model.panorama
@@ -133,30 +123,10 @@ class Observer:
                 f'{size.width}x{size.height}: set width and height of omnicam_node'
             )
 
-    def _observation(
-        self, stamp_ns: int, estimate: Estimate, problem: str, turned: float
-    ) -> Observation:
-        if not _is_finite(estimate):
-            problem = problem or 'the model gives no finite estimate for this image'
-            nothing = unusable_covariance()
-            return Observation(stamp_ns, np.zeros(3), nothing, problem, estimate, turned)
-        problem = problem or self.watch.judge_novelty(estimate.novelty)
-        yaw = estimate.yaw if np.isfinite(estimate.yaw) else 0.0
-        covariance = unusable_covariance() if problem else estimate.covariance
-        return Observation(
-            stamp_ns, np.append(estimate.position, yaw), covariance, problem, estimate, turned
-        )
-
 
 def unusable_covariance() -> Array:
     """Covariance (3, 3) of [x, y, yaw] of an unusable image."""
     return np.diag([UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_YAW_VARIANCE])
-
-
-def _is_finite(estimate: Estimate) -> bool:
-    """Whether slow features, position and covariance are finite; the yaw may be missing."""
-    known = (estimate.slow_features, estimate.position, estimate.covariance)
-    return all(bool(np.all(np.isfinite(part))) for part in known)
 
 
 class Localizer:

@@ -7,9 +7,9 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ from sfa_localization.features.image_features import (
     slow_features,
     spectrum,
 )
-from sfa_localization.features.keyframes import Keyframes, Match, MatchNoise
-from sfa_localization.features.local_regression import Spectra
+from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.features.network import (
     Architecture,
     Layer,
@@ -36,9 +35,16 @@ from sfa_localization.features.network import (
     Node,
     check_weights,
 )
+from sfa_localization.features.observation import (
+    UNKNOWN_YAW_VARIANCE,
+    Match,
+    Observation,
+    Spectra,
+    combine,
+)
 from sfa_localization.features.rotation import Map
 from sfa_localization.features.rotation_spread import Agreement, disagreement
-from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE, Compass
+from sfa_localization.metric.compass import Compass
 from sfa_localization.metric.refinement import Refinement
 from sfa_localization.metric.saved_map import MetricMap
 
@@ -51,91 +57,6 @@ SCALE_STD = 0.01
 """Of the scale of a map: its meters are those of wheels, seldom known better."""
 _LONGEST_DELAY_S = 10.0
 """Of a camera: training finds delays of up to half a second."""
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """The estimate from one panorama.
-
-    `slow_features` (K,); `position` (2,) m and `yaw` rad (NaN without a compass) in the map frame;
-    `covariance` (3, 3) of [x, y, yaw], with pi^2 / 3 where yaw is unknown; `novelty` at most 1 for
-    a familiar image. Where the model gives no finite estimate, position and covariance are NaN.
-    """
-
-    slow_features: Array
-    position: Array
-    yaw: float
-    covariance: Array
-    novelty: float
-
-
-class SlowPose(NamedTuple):
-    """What slow features say of an image: themselves (K,), `position` (2,) m, `yaw` rad, NaN
-    without a compass, and `covariance` (3, 3).
-    """
-
-    slow_features: Array
-    position: Array
-    yaw: float
-    covariance: Array
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """What slow features say of an image, `position` (2,), `yaw` and `covariance` (3, 3) as in
-    `Estimate`, and the `match` of the keyframes, which have `noise`. Of both together the scale
-    of the map is uncertain, about its `center` (2,), and how far beyond the keyframes they are.
-    """
-
-    slow_features: Array
-    position: Array
-    yaw: float
-    covariance: Array
-    match: Match
-    noise: MatchNoise
-    center: Array
-
-    @property
-    def known(self) -> bool:
-        """Whether the keyframes know the place."""
-        return self.match.score >= self.noise.lowest
-
-    def in_light(self, light: float) -> View:
-        """The same where the light is known to make images so unlike, see `OtherLight`."""
-        return replace(self, match=self.match.in_light(light, self.noise))
-
-    @property
-    def by_keyframes(self) -> View:
-        """The same without what slow features say of the pose."""
-        return replace(self, position=np.full(2, np.nan))
-
-    @property
-    def distance(self) -> float:
-        """How far both are apart, see `Match.distance`; NaN where one of them is unknown."""
-        if not self.known:
-            return np.nan
-        covariance = self.match.widened(self.covariance, self.noise)
-        try:
-            return self.match.distance(self.position, covariance[:2, :2])
-        except np.linalg.LinAlgError:
-            return np.nan
-
-    def estimate(self, factor: float = 1.0) -> Estimate:
-        """Both together, with a `factor` on the variances of slow features."""
-        novelty = self.noise.novelty(self.match.score)
-        claimed = self.match.widened(self.covariance * factor, self.noise)
-        try:
-            position, yaw, covariance = self.match.combined(
-                self.position, float(self.yaw), claimed, self.noise
-            )
-        except np.linalg.LinAlgError:
-            nothing = np.full(2, np.nan), np.full((3, 3), np.nan)
-            return Estimate(self.slow_features, nothing[0], np.nan, nothing[1], novelty)
-        covariance = covariance * max(novelty, 1.0) ** 2
-        by_scale = SCALE_STD * (position - self.center)
-        covariance[:2, :2] += np.outer(by_scale, by_scale) + self.match.beyond**2 * np.eye(2)
-        covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        return Estimate(self.slow_features, position, yaw, covariance, novelty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +86,7 @@ class PlaceModel:
         known = [delay for delay in self.quality.get('camera_delay_s', ()) if delay is not None]
         return float(np.median(known)) if known else 0.0
 
-    def locate(self, panorama: Image) -> Estimate:
+    def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
 
         Raises ModelError when it is none, or its size is not `self.panorama`'s.
@@ -173,45 +94,63 @@ class PlaceModel:
         require_panorama(panorama)
         return self.locate_all(panorama[None])[0]
 
-    def locate_all(self, panoramas: Image) -> list[Estimate]:
-        """Estimates of panoramas (T, H, W, 3)."""
-        return [view.estimate() for view in self.views(panoramas)]
+    def locate_all(self, panoramas: Image) -> list[Observation]:
+        """What panoramas (T, H, W, 3) show."""
+        slow = self.slow_poses(panoramas)
+        return [
+            self.combined(one, self.match(panorama, one))
+            for one, panorama in zip(slow, panoramas, strict=True)
+        ]
 
-    def views(self, panoramas: Image) -> list[View]:
-        """The estimates from panoramas (T, H, W, 3) by slow features and by keyframes."""
-        return list(map(self.view, panoramas, self.slow_poses(panoramas)))
-
-    def view(self, panorama: Image, slow: SlowPose, pattern: Spectra | None = None) -> View:
-        """The estimates from a panorama (H, W, 3) by slow features, and by keyframes without the
-        `pattern` that the light adds, see `OtherLight`.
-        """
-        guess = slow.position if np.isfinite(slow.position).all() else None
-        match = self.keyframes.match(panorama, guess, pattern)
-        return View(*slow, match, self.keyframes.noise, self.keyframes.poses[:, :2].mean(0))
-
-    def slow_poses(self, panoramas: Image) -> list[SlowPose]:
-        """The estimates from panoramas (T, H, W, 3) by slow features alone."""
+    def slow_poses(self, panoramas: Image) -> list[Observation]:
+        """What panoramas (T, H, W, 3) show by slow features alone."""
         maps = self.network.maps(panoramas)
         slow = slow_features(maps)
         spread = disagreement(maps[-1])
-        positions, covariances = self.metric.predict(slow)
-        covariances = covariances * self.agreement.factor(spread)[:, None, None]
+        positions, own = self.metric.predict(slow)
         yaw, yaw_variance = self.headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
+        own = own * self.agreement.factor(spread)[:, None, None]
         if self.refinement is not None:
-            positions, covariances = self.refinement.refine(
-                spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, covariances)
+            positions, own = self.refinement.refine(
+                spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, own)
             )
-        joined = _joined(covariances, yaw_variance)
-        return [SlowPose(slow[t], positions[t], float(yaw[t]), joined[t]) for t in range(len(slow))]
+        covariances = np.zeros((len(slow), 3, 3))
+        covariances[:, :2, :2] = own
+        covariances[:, 2, 2] = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
+        poses = np.column_stack([positions, yaw])
+        return list(map(Observation, poses, covariances, slow))
+
+    def match(self, panorama: Image, slow: Observation, pattern: Spectra | None = None) -> Match:
+        """What keyframes show of a panorama (H, W, 3) without the `pattern` that the light adds,
+        see `OtherLight`; they are looked for also where its slow features put it.
+        """
+        guess = slow.position if np.isfinite(slow.position).all() else None
+        return self.keyframes.match(panorama, guess, pattern)
+
+    def combined(
+        self, slow: Observation, match: Match, light: float = 0.0, doubt: float = 1.0
+    ) -> Observation:
+        """Both together, see `combine`, with what is uncertain of both alike: the scale of the map
+        about its center, how far beyond the keyframes they are, and what no image has shown yet.
+        """
+        noise, center = self.keyframes.noise, self.keyframes.poses[:, :2].mean(0)
+        pose, covariance = combine(slow, match, noise, light, doubt)
+        novelty = noise.novelty(match.score)
+        by_scale = SCALE_STD * (pose[:2] - center)
+        covariance = covariance * max(novelty, 1.0) ** 2
+        covariance[:2, :2] += np.outer(by_scale, by_scale)
+        covariance[:2, :2] += noise.beyond(match, light) ** 2 * np.eye(2)
+        covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
+        return Observation(pose, covariance, slow.slow_features, novelty)
 
     def headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
-        """Yaw (T,) rad in the map, NaN without a compass, and its variance (T,), from the maps of
-        all layers and the slow features (T, K).
+        """Yaw (T,) rad in the map and its variance (T,), from the maps of all layers and the slow
+        features (T, K); without a compass it is 0 and unknown.
         """
         if self.compass is None:
-            return np.full(len(slow), np.nan), np.full(len(slow), UNKNOWN_YAW_VARIANCE)
+            return np.zeros(len(slow)), np.full(len(slow), UNKNOWN_YAW_VARIANCE)
         return self.compass.predict(slow, layer_harmonics(maps, self.heading_layers))
 
     def save(self, path: Path) -> None:
@@ -249,9 +188,7 @@ class PlaceModel:
         with np.errstate(all='ignore'):
             estimates = self.locate_all(np.concatenate([noise, np.zeros_like(noise)]))
         for estimate in estimates:
-            known: list[Any] = [estimate.covariance, estimate.position, estimate.novelty]
-            known += [estimate.yaw] if self.compass is not None else []
-            if not all(np.isfinite(value).all() for value in known):
+            if not (estimate.finite and np.isfinite(estimate.novelty)):
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
                 raise ModelError('its covariances are not positive')
@@ -339,14 +276,6 @@ def network_from(arrays: Arrays, header: Mapping[str, Any]) -> Network:
         nodes.append(Node(**part))
     ranks = tuple((int(a), int(b)) for a, b in header['ranks'])
     return Network(architecture, tuple(nodes), tuple(deltas), ranks)
-
-
-def _joined(covariances: Array, yaw_variance: Array) -> Array:
-    """Covariances (T, 3, 3) of positions (T, 2, 2) and yaw (T,)."""
-    joined = np.zeros((len(covariances), 3, 3))
-    joined[:, :2, :2] = covariances
-    joined[:, 2, 2] = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
-    return joined
 
 
 def _prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:

@@ -140,7 +140,7 @@ def new_views(
     assert isinstance(localizer.filter, Smoother)
     poses, certain = _smoothed(localizer.filter, model, run)
     known = model.keyframes.noise.novelty(familiar_score(model))
-    novel = np.array([not one.problem and one.estimate.novelty > known for one in seen], bool)
+    novel = np.array([not one.problem and one.novelty > known for one in seen], bool)
     agree = np.array([_agrees(one, pose) for one, pose in zip(seen, poses, strict=True)], bool)
     chosen = np.flatnonzero(np.array(sure, bool) & certain & novel & agree)
     chosen = chosen[_spread(poses[chosen])]

@@ -4,6 +4,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 from filter_drives import Drive
@@ -12,7 +13,8 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
-from sfa_localization.place_model import Estimate
+from sfa_localization.features.keyframes import Match, MatchNoise
+from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observation
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05
@@ -31,19 +33,23 @@ def panorama(pose=(0.0, 0.0, 0.0), seed=0, novelty=0.5, level=120, spread=40):
     return image
 
 
-class InTwoSteps:
-    """Slow features before keyframes, as a model has them, of one that has only `views`."""
+class WithoutKeyframes:
+    """A stand-in for a model that has only `locate`: no keyframe knows any place."""
+
+    keyframes = SimpleNamespace(noise=MatchNoise())
 
     def slow_poses(self, images):
-        return [None] * len(images)
+        return [self.locate(image) for image in images]
 
-    def view(self, image, slow, pattern=None):
-        (view,) = self.views(image[None])
-        return view
+    def match(self, image, slow, pattern=None):
+        return Match(np.zeros(3), 0.0, 0.0, 0.0)
+
+    def combined(self, slow, match, light=0.0, doubt=1.0):
+        return slow
 
 
 @dataclasses.dataclass
-class PictureReader(InTwoSteps):
+class PictureReader(WithoutKeyframes):
     """Reads what `panorama` wrote; positions are positive."""
 
     panorama: PanoramaConfig = SIZE
@@ -57,26 +63,9 @@ class PictureReader(InTwoSteps):
         yaw = math.remainder((b[1] + 256 * b[2]) / 65535 * 2 * math.pi, 2 * math.pi)
         # As a model does, it is less sure of pictures that are somewhat new.
         spread = np.diag([0.02, 0.03, 0.002]) * max(novelty[0] / 10, 1.0) ** 2
-        yaw = yaw if self.heading else math.nan
-        return Estimate(np.append(position, yaw), position, yaw, spread, novelty[0] / 10)
-
-    def views(self, images):
-        return [AsLocated(self.locate(image)) for image in images]
-
-
-@dataclasses.dataclass
-class AsLocated:
-    """A view that slow features and keyframes agree on."""
-
-    located: Estimate
-    distance: float = math.nan
-    known: bool = False
-
-    def in_light(self, light):
-        return self
-
-    def estimate(self, factor=1.0):
-        return self.located
+        pose = np.append(position, yaw if self.heading else 0.0)
+        spread[2, 2] = spread[2, 2] if self.heading else UNKNOWN_YAW_VARIANCE
+        return Observation(pose, spread, pose, novelty[0] / 10)
 
 
 class Recording:

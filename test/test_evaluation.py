@@ -113,8 +113,8 @@ class Torn(PictureReader):
 
     def locate(self, image):
         found = super().locate(image)
-        shift = np.array([10.0 if found.position[0] > 7 else 0.0, 0.0])
-        return replace(found, position=found.position + shift)
+        shift = np.array([10.0 if found.position[0] > 7 else 0.0, 0.0, 0.0])
+        return replace(found, pose=found.pose + shift)
 
 
 def test_seconds_in_which_the_filter_was_sure_and_wrong_are_counted(

@@ -11,9 +11,9 @@ from cylinder_worlds import place, visit
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.features.image_features import harmonics
+from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric import compass_training
 from sfa_localization.metric.compass import (
-    UNKNOWN_YAW_VARIANCE,
     Compass,
     kernel_between,
     prior_variance,

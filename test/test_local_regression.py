@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sfa_localization.features.keyframes import normalized, spectrum
-from sfa_localization.features.local_regression import Nearby, averaged, place_among, turned
+from sfa_localization.features.local_regression import averaged, place_among, turned
+from sfa_localization.features.observation import Match
 
 ROWS = 8
 SIZES = pytest.mark.parametrize('columns', [60, 61])
@@ -42,8 +43,8 @@ def test_a_place_between_keyframes_is_found(columns, place):
     seen, places, _ = scene(columns)
     keyframes = np.stack([seen(p) for p in places])
     found = place_among(seen(place), keyframes, places, columns)
-    assert np.allclose(found.place, place, atol=0.01)
-    assert abs(found.angle) < 5e-3 and 0 <= found.unlike < 1e-3
+    assert np.allclose(found.pose[:2], place, atol=0.01)
+    assert abs(found.pose[2]) < 5e-3 and 0 <= found.unlike < 1e-3
 
 
 @SIZES
@@ -53,8 +54,8 @@ def test_a_rest_of_angle_is_seen_and_is_no_matter_of_the_place(columns, angle):
     keyframes = np.stack([seen(p) for p in places])
     image = turned(seen((0.1, 0.2))[None], np.array([-angle]))[0]
     found = place_among(image, keyframes, places, columns)
-    assert found.angle == pytest.approx(angle, rel=0.1)
-    assert np.allclose(found.place, (0.1, 0.2), atol=0.02)
+    assert found.pose[2] == pytest.approx(angle, rel=0.1)
+    assert np.allclose(found.pose[:2], (0.1, 0.2), atol=0.02)
 
 
 @pytest.mark.parametrize('share', [0.5, 1.0])
@@ -63,7 +64,7 @@ def test_what_no_place_explains_is_unlike_and_moves_little(share):
     keyframes = np.stack([seen(p) for p in places])
     found = place_among(seen((0.2, 0.1), share * strange), keyframes, places, 60)
     assert found.unlike == pytest.approx(share**2, rel=0.3)
-    assert np.allclose(found.place, (0.2, 0.1), atol=0.1)
+    assert np.allclose(found.pose[:2], (0.2, 0.1), atol=0.1)
 
 
 def test_keyframes_in_another_light_have_little_weight():
@@ -71,7 +72,7 @@ def test_keyframes_in_another_light_have_little_weight():
     keyframes = np.stack([seen(p, i % 2 * strange) for i, p in enumerate(places)])
     wrong = np.where(np.arange(64)[:, None] % 2, places + 0.5, places)
     found = place_among(seen((0.2, 0.1)), keyframes, wrong, 60)
-    assert np.allclose(found.place, (0.2, 0.1), atol=0.03)
+    assert np.allclose(found.pose[:2], (0.2, 0.1), atol=0.03)
 
 
 def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
@@ -82,9 +83,9 @@ def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
     everywhere, place = np.concatenate([places, line]), (0.2, 0.3)
     drives = np.repeat([0, 1], [64, 12]).astype(np.int32)
     alone = place_among(seen(place, strange), keyframes[64:], line, 60)
-    assert abs(alone.place[1]) < 0.01
+    assert abs(alone.pose[1]) < 0.01
     found = place_among(seen(place, strange), keyframes, everywhere, 60, drives=drives)
-    assert np.hypot(*(found.place - place)) < 0.15
+    assert np.hypot(*(found.pose[:2] - place)) < 0.15
 
 
 @pytest.mark.parametrize('texture', [np.zeros((ROWS, 60)), np.ones((ROWS, 60))])
@@ -92,8 +93,8 @@ def test_textures_that_are_all_the_same_give_a_finite_place(texture):
     _, places, _ = scene(60)
     keyframes = np.repeat(spectrum(texture.astype(np.float32))[None], 64, axis=0)
     found = place_among(keyframes[0], keyframes, places, 60)
-    assert np.isfinite(found.place).all() and np.isfinite([found.angle, found.unlike]).all()
-    assert np.abs(found.place).max() <= 0.5
+    assert np.isfinite(found.pose).all() and np.isfinite(found.unlike)
+    assert np.abs(found.pose[:2]).max() <= 0.5
 
 
 def doubled(spoil):
@@ -111,7 +112,7 @@ def doubled(spoil):
 
 def test_channels_that_are_as_good_change_nothing():
     place, plain, found = doubled(lambda spectra: spectra)
-    assert np.allclose(plain.place, place, atol=0.01) and np.allclose(found.place, place, atol=0.01)
+    assert np.allclose([plain.pose[:2], found.pose[:2]], place, atol=0.01)
 
 
 def noisy(spectra):
@@ -122,7 +123,7 @@ def noisy(spectra):
 @pytest.mark.parametrize('spoil', [np.negative, np.zeros_like, noisy])
 def test_a_channel_that_shows_something_else_counts_little(spoil):
     place, plain, found = doubled(spoil)
-    assert np.hypot(*(found.place - place)) < 0.03
+    assert np.hypot(*(found.pose[:2] - place)) < 0.03
     assert found.unlike < 0.3 * plain.unlike
 
 
@@ -142,7 +143,7 @@ def test_the_noise_is_what_light_moves_the_place_by(columns, share):
         place_among(seen(place, lit(rng, columns, share)), keyframes, places, columns)
         for _ in range(300)
     ]
-    errors = np.array([one.place - place for one in found])
+    errors = np.array([one.pose[:2] - place for one in found])
     noise = np.mean([one.noise for one in found], axis=0)
     assert np.allclose(noise, noise.T) and np.linalg.eigvalsh(noise)[0] > 0
     true = errors.T @ errors / len(errors)
@@ -177,9 +178,9 @@ def test_drives_that_put_an_image_apart_make_its_place_uncertain(apart):
     """Along the axis on which they differ, and less where one of them is known to be poor."""
     left = np.zeros((ROWS, 6), np.complex64)
     noise = np.diag([0.01, 0.02])
-    parts = [Nearby(np.array([x, 1.0]), 0.0, 0.2, noise, 0.1, 0.0, left) for x in (0.0, apart)]
+    parts = [Match(np.array([x, 1.0, 0.0]), 0.2, 0.1, 0.0, noise, left=left) for x in (0.0, apart)]
     alike = averaged(parts, [2.0, 2.0])
-    assert np.allclose(alike.place, [apart / 2, 1.0])
+    assert np.allclose(alike.pose[:2], [apart / 2, 1.0])
     assert np.allclose(alike.apart, np.diag([(apart / 2) ** 2, 0.0]))
     mostly = averaged(parts, [99.0, 1.0])
     assert np.allclose(mostly.apart, np.diag([0.0099 * apart**2, 0.0]))

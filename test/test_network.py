@@ -184,9 +184,8 @@ class TestPreparing:
     def test_gain_does_not_matter(self, gain):
         bright = cv2.GaussianBlur(pictures(SIZE, 1)[0], (0, 0), 2)[None]
         dark = (bright * gain).round().astype(np.uint8)
-        for normalization, tolerance in (('panorama', 0.1), ('brightness', 0.1), ('log', 0.2)):
-            a, b = (input_map(i, self.architecture(normalization)) for i in (bright, dark))
-            assert np.abs(a - b).max() < tolerance * np.abs(a).max(), normalization
+        a, b = (input_map(i, self.architecture('panorama')) for i in (bright, dark))
+        assert np.abs(a - b).max() < 0.1 * np.abs(a).max()
         a, b = (input_map(i, self.architecture('none')) for i in (bright, dark))
         assert np.abs(a - b).max() > 0.1
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which images are used, and what the filter gets of those that are not."""
 
-import dataclasses
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +14,16 @@ from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
-from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.local_regression import Nearby
+from sfa_localization.features.observation import (
+    Match,
+    MatchNoise,
+    Observation,
+    combine,
+    distance,
+)
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.localizer import Localizer, Observer, unusable_covariance
-from sfa_localization.place_model import View
-
-NEARBY = Nearby(np.zeros(2), 0.0, 0.1, np.zeros((2, 2)), 0.1, 0.0)
+from sfa_localization.place_model import PlaceModel
 
 
 def test_a_good_picture_is_believed():
@@ -63,16 +66,13 @@ def test_a_believed_picture_gives_the_models_pose_and_covariance():
 
 
 def test_without_a_compass_the_yaw_is_zero_as_on_the_topic():
-    reader = PictureReader(heading=False)
-    reader.locate = lambda image: dataclasses.replace(PictureReader().locate(image), yaw=math.nan)
-    assert Observer(reader).observe(7, panorama((3.0, 4.0, 1.0))).pose.tolist() == [3.0, 4.0, 0.0]
+    seen = Observer(PictureReader(heading=False)).observe(7, panorama((3.0, 4.0, 1.0)))
+    assert seen.pose.tolist() == [3.0, 4.0, 0.0] and math.isnan(seen.yaw)
 
 
 def test_an_estimate_that_is_not_finite_says_that_nothing_is_known():
     reader = PictureReader()
-    reader.locate = lambda image: dataclasses.replace(
-        PictureReader().locate(image), position=np.array([math.nan, 1.0])
-    )
+    reader.locate = lambda image: replace(PictureReader().locate(image), pose=np.full(3, np.nan))
     seen = Observer(reader).observe(7, panorama())
     assert 'no finite estimate' in seen.problem
     assert np.array_equal(seen.pose, np.zeros(3))
@@ -137,108 +137,130 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
     assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3
 
 
-def test_a_view_without_a_finite_estimate_is_no_error():
-    """Two estimates that are certain beyond all numbers have no mean."""
-    match = Match(np.zeros(3), np.zeros((3, 3)), 0.9, 0.0, NEARBY, 0.0, 0.0)
-    view = View(np.zeros(2), np.ones(2), 0.0, np.zeros((3, 3)), match, MatchNoise(), np.zeros(2))
-    assert math.isnan(view.distance)
-    estimate = view.estimate()
-    assert np.isnan(estimate.position).all() and np.isnan(estimate.covariance).all()
+def slow_at(x: float, std_m: float, yaw: float = 0.0, yaw_std: float = 0.1) -> Observation:
+    """Slow features put an image on the x axis."""
+    spread = np.diag([std_m**2, std_m**2, yaw_std**2])
+    return Observation(np.array([x, 0.0, yaw]), spread, np.zeros(2))
+
+
+def match_at(std_m: float, **more) -> Match:
+    """Keyframes put it at the origin, by what is left of the image."""
+    return Match(**{**MATCHED, 'noise': std_m**2 * np.eye(2), **more})
+
+
+MATCHED = {
+    'pose': np.zeros(3), 'unlike': 0.0, 'variation': 0.05, 'aside': 0.0,
+    'score': 0.9, 'known': True,
+}  # fmt: skip
+EXACT = MatchNoise(floor_m=1e-6, yaw_std=0.1)
+
+
+def test_two_that_agree_are_weighted_by_their_information():
+    pose, covariance = combine(slow_at(0.2, 0.1, yaw=0.1), match_at(0.2), EXACT)
+    assert pose == pytest.approx([0.16, 0.0, 0.05], abs=1e-6)
+    assert np.diag(covariance) == pytest.approx([0.2**2 * 0.1**2 / 0.05] * 2 + [0.005], rel=1e-3)
+    behind = match_at(0.1, pose=np.array([0.0, 0.0, -3.14]))
+    opposite, _ = combine(slow_at(0.0, 0.1, yaw=3.14), behind, EXACT)
+    assert abs(opposite[2]) == pytest.approx(math.pi)
+
+
+def test_the_farther_apart_the_less_sure_and_where_they_contradict_keyframes_count():
+    near, far = (combine(slow_at(x, 0.1), match_at(0.1), EXACT)[1][0, 0] for x in (0.0, 0.4))
+    assert far == pytest.approx(near * 0.4**2 / 0.02 / 2, rel=1e-3)
+    for slow, match, doubt in (
+        (slow_at(0.6, 0.1), match_at(0.1), 1.0),
+        (slow_at(0.1, 0.1), match_at(0.1, support=-5.0), 1.0),
+        (slow_at(0.1, 0.1), match_at(0.1), 1.1),
+        (slow_at(math.nan, 0.1), match_at(0.1), 1.0),
+    ):
+        pose, covariance = combine(slow, match, EXACT, doubt=doubt)
+        assert np.array_equal(pose, match.pose)
+        assert np.array_equal(covariance, EXACT.covariance(match))
+    turned = combine(slow_at(0.0, 0.1, yaw=2.0), match_at(0.1), EXACT)
+    assert turned[0][2] == 0.0 and turned[1][2, 2] == pytest.approx(0.1**2)
+
+
+def test_an_unknown_place_is_left_to_slow_features():
+    slow = slow_at(3.0, 0.1)
+    pose, covariance = combine(slow, match_at(0.1, known=False), EXACT, doubt=4.0)
+    assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(4.0 * slow.covariance)
+    assert math.isnan(distance(slow, match_at(0.1, known=False), EXACT))
+
+
+def test_an_unknown_yaw_is_that_of_the_keyframes():
+    slow = slow_at(0.0, 0.1, yaw=1.0, yaw_std=np.pi / np.sqrt(3))
+    pose, covariance = combine(slow, match_at(0.1), EXACT)
+    assert pose[2] == 0.0 and covariance[2, 2] == pytest.approx(0.1**2)
+
+
+def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
+    """Beside the trained area both extrapolate; in another light, where keyframes are near, not."""
+    noise, match = MatchNoise(floor_m=0.02, slope_m=1.4), match_at(0.0, unlike=0.6, score=0.75)
+    slow = slow_at(0.3, 0.1)
+    outside, in_light = combine(slow, match, noise), combine(slow, match, noise, 0.58)
+    by_place_m = 1.4 * noise.by_place(match)
+    assert np.sqrt(outside[1][0, 0]) == pytest.approx(0.45 * by_place_m, rel=0.1)
+    assert np.sqrt(in_light[1][0, 0]) < 0.1
+    assert outside[0][0] < 0.9 * 0.3
+
+
+class Matched(PictureReader):
+    """A model whose slow features and keyframes are given."""
+
+    def __init__(self, slow: Observation, match: Match, noise: MatchNoise, center=(0.0, 0.0)):
+        super().__init__()
+        self.slow, self.found = slow, match
+        self.keyframes = SimpleNamespace(noise=noise, poses=np.array([[*center, 0.0]]))
+
+    def slow_poses(self, images):
+        return [self.slow] * len(images)
+
+    def match(self, image, slow, pattern=None):
+        return self.found
+
+    combined = PlaceModel.combined
+
+    def told(self, light: float = 0.0) -> np.ndarray:
+        return self.combined(self.slow, self.found, light).covariance
 
 
 def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
-    center, place = np.array([1.0, 2.0]), np.array([11.0, 2.0])
-    own = np.diag([0.01, 0.01, 0.001])
-    match = Match(np.append(place, 0.0), own, 0.9, 0.0, NEARBY, 0.0, 0.0)
-    noise = MatchNoise()
-    at_border = View(np.zeros(2), place, 0.0, own, match, noise, center).estimate()
-    at_center = View(np.zeros(2), place, 0.0, own, match, noise, place).estimate()
-    more = at_border.covariance - at_center.covariance
+    slow, match = slow_at(0.0, 0.1), match_at(0.1)
+    more = Matched(slow, match, EXACT, (10.0, 0.0)).told() - Matched(slow, match, EXACT).told()
     assert np.allclose(more, np.diag([0.1**2, 0.0, 0.0]))
 
 
 def test_beyond_the_keyframes_both_estimates_are_wrong_together_and_light_is_no_distance():
-    noise = MatchNoise(away_m=0.8)
-    nearby = Nearby(np.zeros(2), 0.0, 1.0, 1e-4 * np.eye(2), 0.05, 0.7)
-    own = np.diag([0.1**2, 0.1**2, 0.01])
-    match = Match(np.zeros(3), own, 0.7, 0.0, nearby, 0.0, noise.beyond(nearby))
-    view = View(np.zeros(2), np.zeros(2), 0.0, own, match, noise, np.zeros(2))
-    assert noise.beyond(replace(nearby, aside=0.2)) == 0.0
-    expected = (0.8 * np.log(2.0)) ** 2
-    more = (
-        view.estimate().covariance
-        - replace(view, match=replace(match, beyond=0.0)).estimate().covariance
-    )
-    assert np.diag(more)[:2] == pytest.approx(expected)
-    assert view.in_light(1.0).match.beyond == 0.0
-    assert 0 < view.in_light(0.5).match.beyond < view.match.beyond
+    noise, slow = MatchNoise(away_m=0.8), slow_at(0.0, 0.1)
+    among, border = (match_at(0.1, unlike=1.0, score=0.7, aside=aside) for aside in (0.2, 0.7))
+    more = Matched(slow, border, noise).told() - Matched(slow, among, noise).told()
+    assert np.diag(more)[:2] == pytest.approx((0.8 * np.log(2.0)) ** 2)
+    assert noise.beyond(among) == noise.beyond(border, 1.0) == 0.0
+    assert 0 < noise.beyond(border, 0.5) < noise.beyond(border)
 
 
-class InOtherLight(PictureReader):
+def in_other_light() -> Matched:
     """Keyframes alone know the place; all images are unlike by their light."""
-
-    def views(self, images):
-        nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05, 0.0)
-        noise = MatchNoise(floor_m=0.02, slope_m=0.4)
-        own = np.diag([noise.variance(0.6) + 1e-4] * 2 + [0.01])
-        match = Match(np.zeros(3), own, 0.7, 0.0, nearby, noise.by_place(0.6), 0.0)
-        unknown = np.diag([1e4, 1e4, 3.0])
-        return [View(np.zeros(2), np.zeros(2), 0.0, unknown, match, noise, np.zeros(2))] * len(
-            images
-        )
+    noise, match = MatchNoise(floor_m=0.02, slope_m=0.4), match_at(0.01, unlike=0.6, score=0.7)
+    return Matched(slow_at(0.0, 100.0, yaw_std=2.0), match, noise)
 
 
 def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
-    observer = Observer(InOtherLight())
+    observer = Observer(in_other_light())
     seen = [observer.observe(k, panorama(seed=k)) for k in range(1, 200)]
     std = np.array([np.sqrt(one.covariance[0, 0]) for one in seen])
     assert std[0] == pytest.approx(np.hypot(0.24, 0.0224), rel=0.02)
     assert np.all(np.diff(std) < 1e-6) and 0.02 < std[-1] < 0.3 * std[0]
     assert 0.4 < observer.other_light < 0.6
-
-
-def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
-    """Beside the trained area both extrapolate; in another light, where keyframes are near, not."""
-    noise = MatchNoise(floor_m=0.02, slope_m=1.4)
-    nearby = Nearby(np.zeros(2), 0.0, 0.6, 1e-4 * np.eye(2), 0.05, 0.0)
-    own = np.diag([noise.variance(noise.by_place(0.6))] * 2 + [0.01])
-    match = Match(np.zeros(3), own, 0.75, 0.0, nearby, noise.by_place(0.6), 0.0)
-    sure, beside = np.diag([0.1**2, 0.1**2, 0.01]), np.array([0.3, 0.0])
-    view = View(np.zeros(2), beside, 0.0, sure, match, noise, np.zeros(2))
-    outside, in_light = view.estimate(), view.in_light(0.58).estimate()
-    by_place_m = 1.4 * noise.by_place(0.6)
-    assert np.sqrt(outside.covariance[0, 0]) == pytest.approx(0.45 * by_place_m, rel=0.1)
-    assert np.sqrt(in_light.covariance[0, 0]) < 0.1
-    assert np.hypot(*outside.position) < 0.9 * np.hypot(*beside)
-
-
-class Contradicted(PictureReader):
-    """Slow features are sure of a place 0.4 m from that of keyframes, which are as sure of it."""
-
-    def __init__(self, score: float) -> None:
-        super().__init__()
-        self.score = score
-
-    def views(self, images):
-        own = np.diag([0.1**2, 0.1**2, 0.01])
-        match = Match(np.zeros(3), own, self.score, 0.0, NEARBY, 0.0, 0.0)
-        apart = np.array([0.4, 0.0])
-        view = View(np.zeros(2), apart, 0.0, own, match, MatchNoise(), np.zeros(2))
-        return [view] * len(images)
+    observer.use(PictureReader())
+    assert observer.other_light == 0.0, 'another model may know the light'
 
 
 @pytest.mark.parametrize('known', [True, False])
 def test_slow_features_that_contradict_known_places_for_long_do_not_count(known):
-    observer = Observer(Contradicted(0.7 if known else 0.3))
-    seen = [observer.observe(k, panorama(seed=k)).estimate.position[0] for k in range(1, 50)]
+    """Both are as sure of places 0.4 m apart."""
+    match = match_at(0.1, score=0.7 if known else 0.3, known=known)
+    observer = Observer(Matched(slow_at(0.4, 0.1), match, EXACT))
+    seen = [observer.observe(k, panorama(seed=k)).position[0] for k in range(1, 50)]
     assert seen[0] == pytest.approx(0.2 if known else 0.4, abs=0.02)
     assert seen[-1] == (0.0 if known else 0.4)
-
-
-def test_another_model_may_know_the_light():
-    observer = Observer(InOtherLight())
-    for k in range(1, 100):
-        observer.observe(k, panorama(seed=k))
-    assert observer.other_light > 0.3
-    observer.use(PictureReader())
-    assert observer.other_light == 0.0

@@ -7,8 +7,7 @@ import pytest
 from cylinder_worlds import Spheres
 from test_keyframes import CONFIG, COUNTER, holds, learnt, unseen
 
-from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.local_regression import Nearby
+from sfa_localization.features.observation import Match, MatchNoise
 from sfa_localization.features.other_light import OtherLight
 
 NOISE = MatchNoise(by_variation=5.0)
@@ -23,18 +22,14 @@ def images(light: float, number: int, seed: int = 0, scatter: float = 0.3):
         yield seen(float(unlike), float(variation))
 
 
-def seen(unlike: float, variation: float, aside: float = 0.2) -> Nearby:
-    return Nearby(np.zeros(2), 0.0, unlike, np.zeros((2, 2)), variation, aside)
+def seen(unlike: float, variation: float, aside: float = 0.2, x: float = 0.0, left=None) -> Match:
+    return Match(np.array([x, 0.0, 0.0]), unlike, variation, aside, left=left)
 
 
-def matched(nearby: Nearby, left: np.ndarray | None = None, x: float = 0.0) -> Match:
-    return Match(np.array([x, 0.0, 0.0]), np.eye(3), 0.8, 0.0, nearby, 0.0, 0.0, left)
-
-
-def after(nearby) -> float:
+def after(matches) -> float:
     light = OtherLight()
-    for one in nearby:
-        light.add(matched(one), NOISE)
+    for one in matches:
+        light.add(one, NOISE)
     return light.unlike
 
 
@@ -73,14 +68,15 @@ def test_in_another_light_ellipses_are_small_and_hold():
         match = keyframes.match(image)
         light.add(match, keyframes.noise)
         plain.append(match)
-        known.append(match.in_light(light.unlike, keyframes.noise))
+        known.append(keyframes.noise.covariance(match, light.unlike))
     late = slice(50, None)
-    sizes = [
-        np.median([np.trace(m.covariance[:2, :2]) for m in found[late]]) for found in (plain, known)
-    ]
+    first = [keyframes.noise.covariance(match) for match in plain]
+    spreads = np.array([first[late], known[late]])[:, :, :2, :2]
+    sizes = np.median(np.trace(spreads, axis1=2, axis2=3), axis=1)
     assert light.unlike > 0.1
     assert sizes[1] < 0.7 * sizes[0]
-    assert np.mean([holds(m, p) for m, p in zip(known[late], poses[late], strict=True)]) > 0.9
+    late_ones = zip(plain[late], poses[late], known[late], strict=True)
+    assert np.mean([holds(m, p, c) for m, p, c in late_ones]) > 0.9
 
 
 def far_away(world: Spheres, share: float) -> Spheres:
@@ -116,19 +112,20 @@ def test_what_the_light_adds_everywhere_moves_no_place(config):
 
 def test_the_pattern_is_a_mean_over_places():
     """What is unusual about one place, as a visitor there, is none of the others' business."""
-    left, rng = np.ones((3, 4), np.complex64), np.random.default_rng(0)
-    light, near = OtherLight(), seen(0.1, 0.05)
-    light.add(matched(near, left), NOISE)
+    share, rng = np.ones((3, 4), np.complex64), np.random.default_rng(0)
+    light = OtherLight()
+    light.add(seen(0.1, 0.05, left=share), NOISE)
     once = light.pattern.copy()
     for _ in range(100):
-        light.add(matched(near, left, 0.1), NOISE)
+        light.add(seen(0.1, 0.05, x=0.1, left=share), NOISE)
     assert np.array_equal(light.pattern, once), 'a robot that stands learns nothing'
-    light.add(matched(near, left, 0.4), NOISE)
+    light.add(seen(0.1, 0.05, x=0.4, left=share), NOISE)
     assert np.all(light.pattern.real > once.real)
-    light, near = OtherLight(), seen(0.0, 0.3)
+    light = OtherLight()
     for k in range(300):
-        known = light.pattern if light.pattern is not None else 0 * left
-        shown = left + rng.normal(0, 1.0, left.shape)
-        light.add(matched(near, (shown - known).astype(np.complex64), 0.3 * k), NOISE)
+        known = light.pattern if light.pattern is not None else 0 * share
+        shown = share + rng.normal(0, 1.0, share.shape)
+        left = (shown - known).astype(np.complex64)
+        light.add(seen(0.0, 0.3, x=0.3 * k, left=left), NOISE)
     assert np.abs(light.pattern.mean() - 1) < 0.15
     assert np.std(light.pattern) < 0.3

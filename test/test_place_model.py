@@ -15,8 +15,8 @@ from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.localizer import Localizer
-from sfa_localization.metric.compass import UNKNOWN_YAW_VARIANCE
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
 
@@ -67,7 +67,7 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
         assert abs(wrap_angle(other.yaw - one.yaw - turn)) < np.radians(2)
         assert np.abs(other.position - one.position).max() < 0.1
         assert other.novelty == pytest.approx(one.novelty, abs=0.1)
-        slow, turned = model.views(np.stack([picture, np.roll(picture, columns, axis=1)]))
+        slow, turned = model.slow_poses(np.stack([picture, np.roll(picture, columns, axis=1)]))
         assert abs(wrap_angle(turned.yaw - slow.yaw - turn)) < 1e-4
         assert np.abs(turned.position - slow.position).max() < 1e-4
         assert np.allclose(turned.covariance, slow.covariance, rtol=1e-2)
@@ -101,11 +101,10 @@ def test_covariance_of_strange_pictures_is_larger(model, pictures):
 
 def test_without_a_compass_the_keyframes_show_the_yaw(model, pictures):
     blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
-    (view,) = blind.views(pictures[:1])
-    assert np.isnan(view.yaw)
-    assert view.covariance[2, 2] == pytest.approx(UNKNOWN_YAW_VARIANCE)
-    (unrefined,) = replace(model, refinement=None).views(pictures[:1])
-    assert np.allclose(view.position, unrefined.position, atol=1e-9)
+    (slow,) = blind.slow_poses(pictures[:1])
+    assert np.isnan(slow.yaw) and slow.covariance[2, 2] == UNKNOWN_YAW_VARIANCE
+    (unrefined,) = replace(model, refinement=None).slow_poses(pictures[:1])
+    assert np.allclose(slow.position, unrefined.position, atol=1e-9)
     estimate = blind.locate(pictures[0])
     assert abs(wrap_angle(estimate.yaw - model.locate(pictures[0]).yaw)) < np.radians(5)
     assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=0.05)
@@ -113,8 +112,8 @@ def test_without_a_compass_the_keyframes_show_the_yaw(model, pictures):
 
 def test_turned_maps_refine_what_slow_features_find(model, pictures):
     truth = visit().odometry.poses[:, :2]
-    coarse = replace(model, refinement=None).views(pictures)
-    finer = model.views(pictures)
+    coarse = replace(model, refinement=None).slow_poses(pictures)
+    finer = model.slow_poses(pictures)
     errors = [
         np.median(np.hypot(*(np.array([v.position for v in views]) - truth).T))
         for views in (coarse, finer)

@@ -13,13 +13,14 @@ import threading
 
 import numpy as np
 import pytest
-from picture_readers import AsLocated, InTwoSteps
+from picture_readers import WithoutKeyframes
 from robustness.readme import TABLE, robustness_table
 from ros_domains import free_domain
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.place_model import Estimate, PlaceModel
+from sfa_localization.localizer import Observation
+from sfa_localization.place_model import PlaceModel
 
 DOMAIN = free_domain()
 
@@ -70,7 +71,7 @@ NODES = {
 
 
 @dataclasses.dataclass
-class ReadsPixels(InTwoSteps):
+class ReadsPixels(WithoutKeyframes):
     """A model whose position is the first pixel's blue and green; it can be held up."""
 
     panorama: PanoramaConfig = SIZE
@@ -83,10 +84,7 @@ class ReadsPixels(InTwoSteps):
         self.entered.set()
         assert self.free.wait(DEADLINE_S)
         spread = np.diag([0.04, 0.04, 0.0025])
-        return Estimate(np.arange(1.0, 9.0), image[0, 0, :2].astype(float), 0.25, spread, 0.5)
-
-    def views(self, images):
-        return [AsLocated(self.locate(image)) for image in images]
+        return Observation(np.append(image[0, 0, :2], 0.25), spread, np.arange(1.0, 9.0), 0.5)
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 import pytest
-from picture_readers import AsLocated, InTwoSteps
+from picture_readers import WithoutKeyframes
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import FROZEN_IMAGES, NOVELTY_WARNING
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.localizer import UNKNOWN_VARIANCE
-from sfa_localization.place_model import Estimate, PlaceModel
+from sfa_localization.localizer import UNKNOWN_VARIANCE, Observation
+from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
 
@@ -47,7 +47,7 @@ def panorama(seed=0):
 
 
 @dataclasses.dataclass
-class FakeModel(InTwoSteps):
+class FakeModel(WithoutKeyframes):
     """Says that the position is the first pixel's blue and green; novelty is a thing to set."""
 
     novelty: float = 0.5
@@ -57,12 +57,9 @@ class FakeModel(InTwoSteps):
     camera_delay_s: float = 0.0
 
     def locate(self, image):
-        position = image[0, 0, :2].astype(float) + self.shift
+        pose = np.append(image[0, 0, :2] + self.shift, 0.25)
         spread = np.diag([0.04, 0.09, 0.01])
-        return Estimate(np.arange(1.0, 9.0), position, 0.25, spread, self.novelty)
-
-    def views(self, images):
-        return [AsLocated(self.locate(image)) for image in images]
+        return Observation(pose, spread, np.arange(1.0, 9.0), self.novelty)
 
 
 @pytest.fixture

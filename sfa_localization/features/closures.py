@@ -25,7 +25,7 @@ from sfa_localization.features.keyframes import (
     spectra_of,
     texture,
 )
-from sfa_localization.features.local_regression import Spectra
+from sfa_localization.features.observation import Spectra
 
 Indices = NDArray[np.int64]
 

@@ -14,15 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.keyframes import (
-    LOWEST,
-    LOWEST_SHARE,
-    NEIGHBORS,
-    Keyframes,
-    MatchNoise,
-    correlate,
-)
-from sfa_localization.features.local_regression import Nearby
+from sfa_localization.features.keyframes import NEIGHBORS, Keyframes, correlate
+from sfa_localization.features.observation import LOWEST, Match, MatchNoise
 from sfa_localization.features.rotation_spread import (
     LENGTH_TO_STD,
     MEDIAN_TO_STD,
@@ -39,6 +32,8 @@ _TRIALS = 400
 # A keyframe is matched without those of the same stretch of driving: they are too alike.
 _STRETCH_M = 3.0
 _AT_ONCE = 64  # bounds the memory
+# A place is unknown below this share of what keyframes of other stretches of driving reach.
+_LOWEST_SHARE = 0.5
 _TEMPERATURES = np.geomspace(0.003, 0.1, 12)
 _FLOORS_M = np.geomspace(0.01, 1.0, 15)
 _SLOPES_M = np.geomspace(0.03, 3.0, 13)
@@ -102,7 +97,7 @@ def _of_light(keyframes: Keyframes, rows: NDArray[np.int64], light: int) -> floa
     left = []
     for row in rows[np.linspace(0, len(rows) - 1, min(_COMPARED, len(rows))).astype(int)].tolist():
         match = keyframes.match_among(keyframes.spectra[row], others)
-        if match.score >= LOWEST and match.left is not None and not match.nearby.at_border:
+        if match.score >= LOWEST and match.left is not None and not match.at_border:
             left.append(match.left)
     if len(left) < _FEWEST:
         return 1.0
@@ -130,16 +125,15 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
 
 @dataclass(frozen=True, slots=True)
 class _Trial:
-    """The match of a keyframe that is left out: `squared_error` m^2, `turn` rad, the error of its
-    yaw, its `score`, what is `nearby`, the variance m^2 by keyframes elsewhere at each temperature,
-    and whether another track was `crossed` there: else nothing is left of the place.
+    """The `match` of a keyframe that is left out: `squared_error` m^2, `turn` rad, the error of its
+    yaw, the variance m^2 by keyframes elsewhere at each temperature, and whether another track was
+    `crossed` there: else nothing is left of the place.
     """
 
+    match: Match
     squared_error: float
     turn: float
-    score: float
     crossed: bool
-    nearby: Nearby
     scatters: tuple[float, ...]
 
     @classmethod
@@ -161,7 +155,7 @@ class _Trial:
         squared, turn = float(error[:2] @ error[:2]), abs(float(wrap_angle(error[2])))
         others = keyframes.poses[np.isfinite(scores), :2] - keyframes.poses[row, :2]
         crossed = bool(np.hypot(*others.T).min() < _STRETCH_M / 2)
-        return cls(squared, turn, match.score, crossed, match.nearby, tuple(scatters))
+        return cls(match, squared, turn, crossed, tuple(scatters))
 
 
 def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
@@ -171,8 +165,8 @@ def _noise(keyframes: Keyframes, path_m: Array) -> MatchNoise:
         return MatchNoise()
     noise, variance = _likeliest(trials)
     squared = np.array([trial.squared_error for trial in trials])
-    lowest = max(LOWEST, LOWEST_SHARE * float(np.median([trial.score for trial in trials])))
-    turns = [trial.turn / (1 + trial.nearby.unlike) for trial in trials]
+    lowest = max(LOWEST, _LOWEST_SHARE * float(np.median([trial.match.score for trial in trials])))
+    turns = [trial.turn / (1 + trial.match.unlike) for trial in trials]
     crossings = [trial for trial in trials if trial.crossed]
     return dataclasses.replace(
         _usual(crossings, noise, lowest) if crossings else noise,
@@ -200,8 +194,8 @@ def _away(keyframes: Keyframes, lowest: float) -> float:
         if len(rows) < NEIGHBORS:
             continue
         match = keyframes.match_among(keyframes.spectra[row], rows)
-        if match.score >= lowest and match.nearby.at_border:
-            unlike = max(math.log1p(match.nearby.unlike), _LEAST_UNLIKE)
+        if match.score >= lowest and match.at_border:
+            unlike = max(math.log1p(match.unlike), _LEAST_UNLIKE)
             shown.append(math.dist(match.pose[:2], places[row]) / unlike)
     if len(shown) < NEIGHBORS:
         return keyframes.noise.away_m
@@ -210,9 +204,9 @@ def _away(keyframes: Keyframes, lowest: float) -> float:
 
 def _usual(trials: Sequence[_Trial], noise: MatchNoise, lowest: float) -> MatchNoise:
     """The noise with what is usual at places that were left out where tracks cross."""
-    variation = np.maximum([trial.nearby.variation for trial in trials], 1e-6)
-    ratio = np.array([trial.nearby.unlike for trial in trials]) / variation**2
-    usual = quantile(np.array([trial.score for trial in trials]), _USUAL_SHARE)
+    variation = np.maximum([trial.match.variation for trial in trials], 1e-6)
+    ratio = np.array([trial.match.unlike for trial in trials]) / variation**2
+    usual = quantile(np.array([trial.match.score for trial in trials]), _USUAL_SHARE)
     return dataclasses.replace(
         noise,
         usual=max(usual, lowest + _LEAST_RANGE),
@@ -243,8 +237,8 @@ def _likeliest(trials: Sequence[_Trial]) -> tuple[MatchNoise, Array]:
     it gives them.
     """
     squared = np.array([trial.squared_error for trial in trials])
-    unlike = np.array([trial.nearby.unlike for trial in trials])
-    nearby = np.array([np.trace(trial.nearby.noise) for trial in trials]) / 2
+    unlike = np.array([trial.match.unlike for trial in trials])
+    nearby = np.array([np.trace(trial.match.noise) for trial in trials]) / 2
     scatters = np.array([trial.scatters for trial in trials]).T + nearby
     best, found = np.inf, (MatchNoise(), squared)
     # Of equals the largest temperature, which doubts most.

@@ -13,7 +13,6 @@ colors stay.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,13 +26,8 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.local_regression import (
-    Nearby,
-    Spectra,
-    averaged,
-    place_among,
-    turned,
-)
+from sfa_localization.features.local_regression import averaged, place_among, turned
+from sfa_localization.features.observation import Match, MatchNoise, Spectra, unlikeness
 
 Texture = NDArray[np.float32]
 
@@ -57,163 +51,8 @@ _DRIVES = 3
 _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
 _COARSE, _CANDIDATES = 15, 64
-# Correlations that unknown places do not reach (foreign gardens: 0.35, mirrored ones: 0.35, one
-# image 0.43), and the same as a share of what keyframes of other stretches of driving reach.
-LOWEST, LOWEST_SHARE = 0.42, 0.5
 # Keyframes near the place show headings that differ by no more than this because things are near.
 _PARALLAX_RAD = 0.3
-# Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
-_DOUBT = 4.0
-# Slow features extrapolate from the same image: they lack so much of what its place adds to the
-# standard deviation of a match. (Between keyframes, where it adds little, this changes little.)
-_SLOW_SHARE = 0.5
-# Half a squared Mahalanobis distance in the plane that 1 of 400 right estimates exceeds.
-_APART = 6.0
-
-
-@dataclass(frozen=True, slots=True)
-class MatchNoise:
-    """How well keyframes of other stretches of driving are found, learned by `fit_keyframes`.
-
-    `temperature` is the difference of correlation that matters, `floor_m` the least standard
-    deviation of a position, `slope_m` what it grows by with `Nearby.unlike`, `factor` what the
-    variances of positions lack, `yaw_std` rad the least standard deviation of a heading, which
-    grows by as much when `unlike` grows by 1. `lowest` is the correlation below which a place is
-    unknown, `usual` the one that 19 of 20 images of known places reach. `joint_factor` is what
-    the variances lack of estimates that slow features and keyframes agree on. `by_variation`
-    times the square of `Nearby.variation` is how unlike images in the light of the keyframes are.
-    `away_m` times the logarithm of 1 + `unlike` is how far out along each axis an image is that
-    seems to be at the border of the keyframes: likeness decays exponentially with the distance.
-    """
-
-    temperature: float = 0.02
-    floor_m: float = 0.3
-    slope_m: float = 0.5
-    factor: float = 1.0
-    yaw_std: float = 0.03
-    lowest: float = LOWEST
-    usual: float = 0.6
-    joint_factor: float = 1.0
-    by_variation: float = 10.0
-    away_m: float = 0.8
-
-    def with_map(self, common_m: float, turn_std: float) -> MatchNoise:
-        """With the errors of a map, which keyframes that are left out share: standard deviations
-        along each axis, m, and of its directions, rad.
-        """
-        floor, yaw_std = np.hypot(self.floor_m, common_m), np.hypot(self.yaw_std, turn_std)
-        return replace(self, floor_m=float(floor), yaw_std=float(yaw_std))
-
-    def by_place(self, unlike: float, light: float = 0.0) -> float:
-        """How unlike the place makes an image that is so unlike, and the more so because of its
-        `light`; of one that is less usual than the left-out ones `novelty` says the rest.
-        """
-        return min(max((1 + unlike) / (1 + light) - 1, 0.0), _unlike(self.usual))
-
-    def variance(self, by_place: float) -> float:
-        """Variance m^2 of a position along each axis, where the place makes images so unlike."""
-        return self.floor_m**2 + (self.slope_m * by_place) ** 2
-
-    def beyond(self, nearby: Nearby, light: float = 0.0) -> float:
-        """Standard deviation m along each axis of how far an image, in such a light, is beyond
-        the keyframes; 0 among them.
-        """
-        if not nearby.at_border:
-            return 0.0
-        return self.away_m * max(math.log1p(nearby.unlike) - math.log1p(light), 0.0)
-
-    def expected_unlike(self, variation: float) -> float:
-        """How unlike an image in the light of the keyframes is, among such that vary so much."""
-        return self.by_variation * variation**2
-
-    def novelty(self, score: float) -> float:
-        """1 for a correlation that is just usual, 3 for the lowest of a known place, more below."""
-        exponent = (self.usual - score) / (self.usual - self.lowest)
-        return float(3.0 ** min(exponent, 4.0))
-
-
-@dataclass(frozen=True, slots=True)
-class Match:
-    """The estimate of the keyframes for an image.
-
-    `pose` (3,) [x m, y m, yaw rad] in the map, `covariance` (3, 3); `score` is the correlation
-    with the best keyframe, 1 for the same image; `support` the correlation with the keyframes
-    near a guess minus `score`, in temperatures: 0 where the best is among them; `nearby` is what
-    the keyframes around the best one say, `by_place` how unlike the place makes the image, and
-    `beyond` the standard deviation m of what all estimates from it miss outside the keyframes;
-    `left` is `Nearby.left` as of an image with yaw 0.
-    """
-
-    pose: Array
-    covariance: Array
-    score: float
-    support: float
-    nearby: Nearby
-    by_place: float
-    beyond: float
-    left: Spectra | None = None
-
-    def in_light(self, light: float, noise: MatchNoise) -> Match:
-        """The same where the image is known to be so unlike because of its light, by itself: that
-        moves places less than what is unlike because no keyframe is near.
-        """
-        by_place = noise.by_place(self.nearby.unlike, light)
-        less = noise.variance(by_place) - noise.variance(self.by_place)
-        covariance = self.covariance.copy()
-        covariance[:2, :2] += noise.factor * less * np.eye(2)
-        beyond = noise.beyond(self.nearby, light)
-        return replace(self, covariance=covariance, by_place=by_place, beyond=beyond)
-
-    def widened(self, covariance: Array, noise: MatchNoise) -> Array:
-        """The covariance (3, 3) of slow features, with what they lack where the place makes the
-        image unlike.
-        """
-        wider = covariance.copy()
-        wider[:2, :2] += (_SLOW_SHARE * noise.slope_m * self.by_place) ** 2 * np.eye(2)
-        return wider
-
-    def distance(self, position: Array, covariance: Array) -> float:
-        """Half the squared Mahalanobis distance from another estimate's position (2,) m, with its
-        covariance (2, 2): 1 on average where both variances are right.
-        """
-        apart = position - self.pose[:2]
-        return float(apart @ np.linalg.solve(self.covariance[:2, :2] + covariance, apart)) / 2
-
-    def combined(
-        self, position: Array, yaw: float, covariance: Array, noise: MatchNoise
-    ) -> tuple[Array, float, Array]:
-        """Position (2,) m, yaw rad and covariance (3, 3) from this match and another estimate.
-
-        Of an unknown place the other estimate stays; one that the keyframes contradict is
-        dropped; two that agree are weighted by their information, and their variances grow with
-        their distance.
-        """
-        if self.score < noise.lowest:
-            return position, yaw, covariance
-        if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
-            return self.pose[:2], float(self.pose[2]), self.covariance
-        mine, its = self.covariance[:2, :2], covariance[:2, :2]
-        distance = self.distance(position, its)
-        if self.support < -_DOUBT or distance > _APART:
-            return self.pose[:2], float(self.pose[2]), self.covariance
-        joint = np.zeros((3, 3))
-        gain = mine @ np.linalg.inv(mine + its)
-        rest = np.eye(2) - gain
-        both = gain @ its @ gain.T + rest @ mine @ rest.T
-        joint[:2, :2] = noise.joint_factor * max(1.0, distance) * both
-        found, joint[2, 2] = self._combined_yaw(yaw, float(covariance[2, 2]))
-        return self.pose[:2] + gain @ (position - self.pose[:2]), found, joint
-
-    def _combined_yaw(self, yaw: float, variance: float) -> tuple[float, float]:
-        own = float(self.covariance[2, 2])
-        if not np.isfinite(yaw):
-            return float(self.pose[2]), own
-        apart = float(wrap_angle(yaw - self.pose[2]))
-        spread = max(1.0, apart**2 / (own + variance))
-        if spread > 2 * _APART:
-            return float(self.pose[2]), own
-        gain = own / (own + variance)
-        return float(wrap_angle(self.pose[2] + gain * apart)), gain * variance * spread
 
 
 def texture(panorama: Image) -> Texture:
@@ -444,29 +283,30 @@ class Keyframes:
         turn = -2 * self._sign * np.pi / self._columns
         yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
         reach = self.reach(best)
-        found, yaw = self._regressed(spectrum, scores, yaws, reach, pattern)
+        found = self._regressed(spectrum, scores, yaws, reach, pattern)
+        *place, yaw = found.pose.tolist()
+        elsewhere = np.zeros((3, 3))
         weight = self.likelihood(scores, self.noise.temperature)
-        offset = self.elsewhere(scores, found.place, reach)
-        apart = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
-        apart[(apart < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
-        by_place = self.noise.by_place(found.unlike)
-        variance = self.noise.variance(by_place)
-        scatter = (offset * weight[:, None]).T @ offset
-        covariance = np.zeros((3, 3))
-        covariance[:2, :2] = self.noise.factor * (variance * np.eye(2) + found.noise + scatter)
-        # Left-out keyframes, which teach the factor, are in the light of a drive: it decides there.
-        covariance[:2, :2] += found.apart
-        covariance[2, 2] = (self.noise.yaw_std * (1 + found.unlike)) ** 2 + float(weight @ apart)
-        support = 0.0
-        if guess is not None:
-            near = scores[self.nearest(guess)]
-            near = near[np.isfinite(near)]
-            if len(near):
-                support = float(near.max() - scores[best]) / self.noise.temperature
-        pose = np.array([*found.place, wrap_angle(yaw)])
-        beyond = self.noise.beyond(found)
-        left = None if found.left is None else turned(found.left, self._sign * yaw)
-        return Match(pose, covariance, float(scores[best]), support, found, by_place, beyond, left)
+        offset = self.elsewhere(scores, found.pose[:2], reach)
+        elsewhere[:2, :2] = (offset * weight[:, None]).T @ offset
+        turns = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
+        turns[(turns < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
+        elsewhere[2, 2] = weight @ turns
+        return replace(
+            found,
+            pose=np.array([*place, wrap_angle(yaw)]),
+            elsewhere=elsewhere,
+            left=None if found.left is None else turned(found.left, self._sign * yaw),
+            score=float(scores[best]),
+            known=bool(scores[best] >= self.noise.lowest),
+            support=self._support(scores, guess),
+        )
+
+    def _support(self, scores: NDArray[np.float32], guess: Array | None) -> float:
+        """`Match.support` of a guess (2,) m by the correlations (K,)."""
+        near = scores[self.nearest(guess)] if guess is not None else scores[:0]
+        near = near[np.isfinite(near)]
+        return float(near.max() - scores.max()) / self.noise.temperature if len(near) else 0.0
 
     def _regressed(
         self,
@@ -475,11 +315,11 @@ class Keyframes:
         yaws: Array,
         reach: float,
         pattern: Spectra | None,
-    ) -> tuple[Nearby, float]:
+    ) -> Match:
         """Where the spectrum (rows, F) of an image without the light's `pattern` is among the
-        keyframes around the best one, of those whose correlations (K,) are known, and its yaw rad;
-        `yaws` (K,) rad are what each of them shows, `reach` m how far the place may be from the
-        best. Each drive of the training says so by itself, and counts by how certain it is.
+        keyframes around the best one, of those whose correlations (K,) are known; `yaws` (K,) rad
+        are what each of them shows, `reach` m how far the place may be from the best. Each drive of
+        the training says so by itself, and counts by how certain it is.
         """
         best, known = int(scores.argmax()), np.isfinite(scores)
         start = np.append(self.poses[best, :2], yaws[best])
@@ -488,11 +328,9 @@ class Keyframes:
             for drive in self._likeliest_drives(scores)
         ]
         parts = [one for one in by_drive if one is not None]
-        unlike, none = _unlike(float(scores[best])), np.zeros((2, 2))
-        found = Nearby(start[:2], 0.0, unlike, none, 0.0, 1.0)
-        if parts:
-            found = averaged(parts, [1 / self._variance(one) for one in parts])
-        return found, float(yaws[best]) + self._sign * found.angle
+        if not parts:
+            return Match(start, unlikeness(float(scores[best])), 0.0, 1.0)
+        return averaged(parts, [1 / self._variance(one) for one in parts])
 
     def _among(
         self,
@@ -502,36 +340,44 @@ class Keyframes:
         known: NDArray[np.bool_],
         reach: float,
         pattern: Spectra | None,
-    ) -> Nearby | None:
+    ) -> Match | None:
         """The same among the `known` (K,) keyframes of one drive, from a pose (3,) on; None where
         they are too few.
         """
-        sign, columns, found = self._sign, self._columns, None
-        place, angle, limit = start[:2], 0.0, 2 * np.pi / self._columns
+        found, pose, limit = None, start.copy(), 2 * np.pi / self._columns
         for _ in range(_REPEATED):
-            near = self._around(place, drive)
+            near = self._around(pose[:2], drive)
             near = near[known[near]]
             if len(near) < _FEWEST:
                 break
-            yaw = float(start[2]) + sign * angle
-            around = turned(self.spectra[near], sign * (self.poses[near, 2] - yaw))
-            image = spectrum if pattern is None else spectrum - turned(pattern, -sign * yaw)
+            around = turned(self.spectra[near], self._sign * (self.poses[near, 2] - pose[2]))
+            here = spectrum if pattern is None else spectrum - self._as_seen(pattern, pose[2])
             found = place_among(
-                image, around, self.poses[near, :2], columns, self._channels, self.drives[near]
+                here,
+                around,
+                self.poses[near, :2],
+                self._columns,
+                self._channels,
+                self.drives[near],
             )
-            step = found.place - start[:2]
+            step = found.pose[:2] - start[:2]
             apart = float(np.hypot(*step))
-            place = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
-            angle += float(np.clip(found.angle, -limit, limit))
-            found = replace(found, place=place, angle=angle)
+            pose[:2] = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
+            pose[2] += self._sign * np.clip(found.pose[2], -limit, limit)
+            found = replace(found, pose=pose.copy())
             if apart < _NEARER * reach:
                 break
         return found
 
-    def _variance(self, nearby: Nearby) -> float:
+    def _as_seen(self, pattern: Spectra, yaw: float) -> Spectra:
+        """The spectrum (rows, F) at some yaw rad of one as of an image with yaw 0."""
+        return turned(pattern, -self._sign * yaw)
+
+    def _variance(self, match: Match) -> float:
         """Variance m^2 along each axis of a place by the keyframes of one drive."""
-        by_place, beyond = self.noise.by_place(nearby.unlike), self.noise.beyond(nearby)
-        return self.noise.variance(by_place) + float(np.trace(nearby.noise)) / 2 + beyond**2
+        beyond = self.noise.beyond(match)
+        by_place = self.noise.variance(self.noise.by_place(match))
+        return by_place + float(np.trace(match.noise)) / 2 + beyond**2
 
     def likelihood(self, scores: NDArray[np.float32], temperature: float) -> Array:
         """How likely each of the keyframes (M,) whose correlations (K,) are known is the place, of
@@ -598,8 +444,3 @@ class Keyframes:
             return cls.of(textures, poses, noise, clockwise)
         drives, trained = np.asarray(arrays['drives'], np.int32), int(arrays['trained'])
         return cls.of(textures, poses, noise, clockwise, drives, trained)
-
-
-def _unlike(score: float) -> float:
-    """What an image has beside its correlation with another, as a share of what both have."""
-    return max(score, 0.1) ** -2 - 1

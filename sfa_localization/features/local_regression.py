@@ -11,15 +11,15 @@ little to do with them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.features.observation import Match, Spectra
 
-Spectra = NDArray[np.complex64]
 Vectors = NDArray[np.float32]
 
 # Difference of correlation over which the weight of a keyframe falls by a factor of e.
@@ -29,8 +29,6 @@ _LIKENESS = 0.05
 _RIDGE = 0.005
 # Share of its likeness that an image keeps in any light.
 _LEAST_GAIN = 0.2
-# Above this `Nearby.aside` a place is at the border of the keyframes: a straight one has 0.64.
-_BORDER = 0.6
 # Standard deviation of a place by keyframes in another light, m, for an image that has as much of
 # its own as in common with them; and what it grows by with the distance from them: another light
 # takes part of the differences away that show it.
@@ -47,35 +45,6 @@ def turned(spectra: Spectra, angle: Array | float) -> Spectra:
     """
     phase = np.exp(1j * np.multiply.outer(angle, np.arange(spectra.shape[-1]))).astype(np.complex64)
     return np.asarray(spectra * phase[..., None, :])
-
-
-@dataclass(frozen=True, slots=True)
-class Nearby:
-    """Where an image is among keyframes: `place` (2,) m, the `angle` rad by which `turned` would
-    still turn it to them, and `unlike`, how much of it no place among them explains: 0 for an
-    image between them in their light, 1 for as much as what they have in common.
-
-    `noise` (2, 2) m^2 is the covariance of the place by what is left of the image; `variation`
-    how much the keyframes that are like it differ, in the unit of `unlike`: much where none of
-    them is near, in any light. `aside` is how far the place is from the middle of them, of their
-    mean distance: 0 among them, 0.64 at a straight border of theirs, 1 far beside all. `left`
-    (rows, F) is the spectrum of what no place among them explains of the image; None unknown.
-    `apart` (2, 2) m^2 is how far apart several drives put it: in a map they are shifted.
-    """
-
-    place: Array
-    angle: float
-    unlike: float
-    noise: Array
-    variation: float
-    aside: float
-    left: Spectra | None = None
-    apart: Array = field(default_factory=lambda: np.zeros((2, 2)))
-
-    @property
-    def at_border(self) -> bool:
-        """Whether the place is at the border of the keyframes: it may be farther out."""
-        return self.aside > _BORDER
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,9 +171,10 @@ def place_among(
     columns: int,
     channels: Sequence[slice] = (slice(None),),
     drives: NDArray[np.int32] | None = None,
-) -> Nearby:
+) -> Match:
     """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
-    F) of keyframes at places (N, 2) m, all turned to the heading of the image.
+    F) of keyframes at places (N, 2) m, all turned to the heading of the image. The yaw of the match
+    is the angle rad by which `turned` would still turn the image to them.
 
     `channels` are rows that may be unlike for reasons of their own: each counts by how well the
     keyframes explain it. Keyframes of different `drives` (N,) may differ by their light, so that
@@ -229,31 +199,30 @@ def place_among(
     left = np.concatenate([of_channel for of_channel, _ in remainders])
     offset = places - found.place
     aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
-    noise = moved @ moved.T
-    return Nearby(found.place, found.angle, found.unlike, noise, found.variation, aside, left)
+    pose, noise = np.append(found.place, found.angle), moved @ moved.T
+    return Match(pose, found.unlike, found.variation, aside, noise, left=left)
 
 
-def averaged(parts: Sequence[Nearby], weights: Sequence[float]) -> Nearby:
+def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
     """The mean of what several drives say of one image, all with what is left of it, by weights
-    (N,).
+    (N,); `Match.apart` is how far apart they put it.
     """
     share = np.array(weights) / np.sum(weights)
 
     def mean(values: Sequence[Array | float]) -> Array:
         return np.tensordot(share, np.array(values), 1)
 
-    left = [one.left for one in parts if one.left is not None]
-    place = mean([one.place for one in parts])
-    apart = np.array([one.place - place for one in parts])
-    return Nearby(
-        place,
-        float(mean([one.angle for one in parts])),
+    pose = mean([one.pose for one in parts])
+    apart = np.array([one.pose for one in parts])[:, :2] - pose[:2]
+    left = np.array([one.left for one in parts if one.left is not None])
+    return Match(
+        pose,
         float(mean([one.unlike for one in parts])),
-        mean([one.noise for one in parts]),
         float(mean([one.variation for one in parts])),
         float(mean([one.aside for one in parts])),
-        np.tensordot(share.astype(np.float32), np.array(left), 1),
+        mean([one.noise for one in parts]),
         (apart.T * share) @ apart,
+        left=np.tensordot(share.astype(np.float32), left, 1),
     )
 
 

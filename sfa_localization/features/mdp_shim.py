@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import logging
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,8 +20,6 @@ from types import ModuleType
 import numpy as np
 
 from sfa_localization.data.errors import ConfigError
-
-logger = logging.getLogger(__name__)
 
 
 def import_mdp() -> ModuleType:
@@ -36,11 +33,10 @@ def import_mdp() -> ModuleType:
         raise ConfigError(
             f'the engine mdp is not installed ({error}): pip install "sfa_localization[mdp]"'
         ) from None
-    except (AttributeError, TypeError) as error:
-        logger.info('MDP does not import on NumPy %s: %s', np.__version__, error)
-    _unload()
+    except (AttributeError, TypeError):
+        _unload()
     try:
-        with _with_type_names(), _with_lenient_argspec():
+        with _repaired():
             return importlib.import_module('mdp')
     except (AttributeError, TypeError, ImportError) as error:
         _unload()
@@ -56,44 +52,25 @@ def _unload() -> None:
 
 
 @contextmanager
-def _with_type_names() -> Iterator[None]:
-    """Provide numpy.typeDict, names of scalar types to the types, inside the block."""
-    if 'typeDict' in vars(np):
-        yield
-        return
-    logger.info('repaired for MDP: numpy.typeDict')
-    vars(np)['typeDict'] = {name: np.dtype(name).type for name in _TYPE_NAMES if _known(name)}
-    try:
-        yield
-    finally:
-        del vars(np)['typeDict']
-
-
-_TYPE_NAMES = ('float16', 'float96', 'float128', 'complex192', 'complex256')
-
-
-def _known(name: str) -> bool:
-    try:
-        np.dtype(name)
-    except TypeError:
-        return False
-    return True
-
-
-@contextmanager
-def _with_lenient_argspec() -> Iterator[None]:
-    """Let inspect.getfullargspec answer, inside the block, for functions that it cannot read."""
-    ask = inspect.getfullargspec
+def _repaired() -> Iterator[None]:
+    """Provide numpy.typeDict, and let inspect.getfullargspec answer for any function, inside the
+    block.
+    """
+    ask, lacks = inspect.getfullargspec, 'typeDict' not in vars(np)
 
     def answer(func: object) -> inspect.FullArgSpec:
         try:
             return ask(func)
         except TypeError:
-            logger.info('repaired for MDP: the arguments of %s', getattr(func, '__name__', ''))
             return inspect.FullArgSpec([], None, None, None, [], None, {})
 
     inspect.getfullargspec = answer
+    if lacks:
+        names = ('float16', 'float96', 'float128', 'complex192', 'complex256')
+        vars(np)['typeDict'] = {name: getattr(np, name) for name in names if hasattr(np, name)}
     try:
         yield
     finally:
         inspect.getfullargspec = ask
+        if lacks:
+            del vars(np)['typeDict']

@@ -281,39 +281,15 @@ def _gray(image: Image) -> Map:
 
 def _per_panorama(image: Image) -> Map:
     """Zero mean and unit scale of each channel over the whole image: independent of exposure."""
-    mean, std = _moments(image)
+    mean, std = (np.asarray(part).ravel() for part in cv2.meanStdDev(image))
     gain = 1 / np.maximum(std, 1.0)
     return _affine(image, gain, -mean * gain)
 
-
-def _moments(image: Image) -> tuple[Array, Array]:
-    """Mean and standard deviation of each channel, (C,)."""
-    mean, std = cv2.meanStdDev(image)
-    return np.asarray(mean, np.float64).ravel(), np.asarray(std, np.float64).ravel()
-
-
-def _brightness(image: Image) -> Map:
-    """Zero mean and unit scale of the whole image; colors keep their proportion."""
-    mean, std = _moments(image)
-    variance = float((std**2 + mean**2).mean() - mean.mean() ** 2)
-    gain = np.full(len(mean), 1 / max(np.sqrt(variance), 1.0))
-    return _affine(image, gain, -mean.mean() * gain)
-
-
-def _log(image: Image) -> Map:
-    """Logarithm, zero mean of each channel over the whole image: gains cancel."""
-    logs = _LOGS[image]
-    return np.asarray(logs - logs.mean((0, 1), dtype=np.float32))
-
-
-_LOGS = np.log(np.arange(256, dtype=np.float32) + 16)
 
 _NORMALIZATIONS = {
     'none': _unnormalized,
     'grey': _gray,
     'panorama': _per_panorama,
-    'brightness': _brightness,
-    'log': _log,
 }
 NORMALIZATIONS = tuple(_NORMALIZATIONS)
 

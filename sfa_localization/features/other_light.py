@@ -21,8 +21,7 @@ import math
 import numpy as np
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.local_regression import Spectra
+from sfa_localization.features.observation import Match, MatchNoise, Spectra
 
 # Standard deviations of the logarithm: at the start, of its change from image to image, and of what
 # one image shows of it, which those around it repeat.
@@ -52,18 +51,17 @@ class OtherLight:
 
     @property
     def unlike(self) -> float:
-        """How unlike, see `Nearby`, images at the places of keyframes are now at least, to one
+        """How unlike, see `Match`, images at the places of keyframes are now at least, to one
         standard deviation; never negative.
         """
         return math.expm1(max(self._logarithm - math.sqrt(self._variance), 0.0))
 
     def add(self, match: Match, noise: MatchNoise) -> None:
         """Learn from an image of a known place, matched without the `pattern` known so far."""
-        nearby = match.nearby
-        if nearby.at_border:
+        if match.at_border:
             return
-        by_place = math.log1p(noise.expected_unlike(nearby.variation))
-        shown = min(max(math.log1p(nearby.unlike) - by_place, -_MOST), _MOST)
+        by_place = math.log1p(noise.expected_unlike(match.variation))
+        shown = min(max(math.log1p(match.unlike) - by_place, -_MOST), _MOST)
         self._variance += _CHANGE**2
         error, scatter = shown - self._logarithm, _SHOWN**2 + by_place**2
         doubt = 1 + max(error, 0.0) ** 2 / (_SUDDEN**2 * (self._variance + scatter))

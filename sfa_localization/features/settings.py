@@ -21,9 +21,8 @@ class NetworkConfig(Settings):
     )
     normalization: str = setting(
         'panorama',
-        'what is removed from each image: mean and scale of each channel, of all channels together '
-        '(brightness), gains (log), nothing, or color (grey)',
-        choices=('panorama', 'brightness', 'log', 'none', 'grey'),
+        'what is removed from each image: mean and scale of each channel, nothing, or color (grey)',
+        choices=('panorama', 'none', 'grey'),
     )
     seed: int = setting(
         0,

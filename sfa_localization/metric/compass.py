@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.array_files import packed, unpacked
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric.lower_factor import squares
 
 Complex = NDArray[np.complex128]
-UNKNOWN_YAW_VARIANCE = float(np.pi**2 / 3)
 
 
 @dataclass(frozen=True, slots=True)

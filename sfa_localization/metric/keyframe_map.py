@@ -13,6 +13,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.features.closures import Views
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
+from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observation, combine
 from sfa_localization.features.rotation_spread import Agreement, needed_factor, share_within
 from sfa_localization.metric.learning import MetricResult, headings, positions
 from sfa_localization.metric.segments import Segments, assignment
@@ -93,11 +94,11 @@ def _judged(
     errors, variances, alone, weights = [], [], [], []
     for k, scores, shifts in left_out(keyframes, path_m):
         row, place = rows[k], keyframes.poses[k, :2]
-        guess = place + result.left_out[row]
-        match = keyframes.located(keyframes.spectra[k], scores, shifts, guess)
-        claimed = match.widened(np.diag([variance[row], variance[row], 1.0]), keyframes.noise)
-        found, _, covariance = match.combined(guess, np.nan, claimed, keyframes.noise)
-        errors.append(found - place)
+        spread = np.diag([variance[row], variance[row], UNKNOWN_YAW_VARIANCE])
+        slow = Observation(np.append(place + result.left_out[row], 0.0), spread, np.zeros(0))
+        match = keyframes.located(keyframes.spectra[k], scores, shifts, slow.position)
+        pose, covariance = combine(slow, match, keyframes.noise)
+        errors.append(pose[:2] - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)
         alone.append(result.left_out[row])
         weights.append(result.left_out_weight[row])

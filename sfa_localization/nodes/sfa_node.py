@@ -143,7 +143,7 @@ class SfaNode(LocalizationNode):
 
     def _publish(self, seen: Observation) -> None:
         """An unusable image gets no pose without covariance: it would look like a usable one."""
-        frame, slow, stamp_ns = self._config.map_frame, seen.estimate.slow_features, seen.stamp_ns
+        frame, slow, stamp_ns = self._config.map_frame, seen.slow_features, seen.stamp_ns
         if np.all(np.isfinite(slow)):
             self._features.publish(convert.to_array(slow, 'slow features'))
             self._feature_pose.publish(_feature_pose(slow, stamp_ns))
@@ -156,7 +156,7 @@ class SfaNode(LocalizationNode):
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         assert self._observer is not None
-        novelty = self._last.estimate.novelty if self._last is not None else 0.0
+        novelty = self._last.novelty if self._last is not None else 0.0
         values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
         values['unlike by light'] = f'{100 * self._observer.other_light:.0f} %'
         monitor, topic = self.monitor(self._topic), self.shown(self._topic)

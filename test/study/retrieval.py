@@ -18,7 +18,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.features.keyframes import Texture, normalized, spectrum
-from sfa_localization.features.local_regression import Spectra
+from sfa_localization.features.observation import Spectra
 
 COLUMNS, ROWS = 150, 30
 
