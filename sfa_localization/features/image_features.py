@@ -64,11 +64,6 @@ def spectrum(maps: Map, count: int = HARMONICS) -> Spectrum:
     return np.asarray(parts.transpose(0, 2, 1, 3).reshape(len(maps), len(order), -1))
 
 
-def has_refining_layer(network: Network) -> bool:
-    """Whether there is such a layer below the top, whose own maps hardly show the heading."""
-    return len(network.nodes) > REFINING_LAYER + 1
-
-
 @dataclass(frozen=True, slots=True)
 class ImageFeatures:
     """Network outputs for all N images, run after run, and more for a sample of S of them."""
@@ -119,7 +114,8 @@ def features_of_runs(
         spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
-        if has_refining_layer(network):
+        # The top's own maps hardly show the heading.
+        if len(maps) > REFINING_LAYER + 1:
             spectra.append(spectrum(maps[REFINING_LAYER]))
         start += len(images)
         on_images(len(images))

@@ -93,23 +93,22 @@ def _judged(
     """Errors of both together where both were left out; keyframe k is row `rows[k]` (K,)."""
     errors, variances, alone, weights = [], [], [], []
     for k, scores, shifts in left_out(keyframes, path_m):
-        row, place = rows[k], keyframes.poses[k, :2]
+        row, place, error = rows[k], keyframes.poses[k, :2], result.left_out[rows[k]]
         spread = np.diag([variance[row], variance[row], UNKNOWN_YAW_VARIANCE])
-        slow = Observation(np.append(place + result.left_out[row], 0.0), spread, np.zeros(0))
+        slow = Observation(np.append(place + error, 0.0), spread, np.zeros(0))
         match = keyframes.located(keyframes.spectra[k], scores, shifts, slow.position)
         pose, covariance = combine(slow, match, keyframes.noise)
         errors.append(pose[:2] - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)
-        alone.append(result.left_out[row])
+        alone.append(error)
         weights.append(result.left_out_weight[row])
     if len(errors) < _ENOUGH or not sum(weights) > 0:
         return KeyframeMap(keyframes)
     weight, ratio = np.array(weights), (np.array(errors) ** 2).sum(1) / np.array(variances)
     factor = max(needed_factor(ratio, 2, weight), 1.0)
     joint, single = (np.average(np.hypot(*np.array(e).T), weights=weight) for e in (errors, alone))
-    noise = replace(keyframes.noise, joint_factor=factor)
     return KeyframeMap(
-        replace(keyframes, noise=noise),
+        replace(keyframes, noise=replace(keyframes.noise, joint_factor=factor)),
         float(joint / max(single, 1e-9)),
         share_within(ratio / factor, 2, 0.95, weight),
     )
