@@ -16,7 +16,8 @@ from pathlib import Path
 
 from sfa_localization import __version__
 from sfa_localization.data.errors import LocalizationError, NodeError
-from sfa_localization.nodes.entry import NODES, asks_for_help, node_help
+from sfa_localization.nodes import entry
+from sfa_localization.nodes.entry import NODES
 
 COMMANDS = {
     'simulate': 'Record a bag with a simulated robot in a simulated garden.',
@@ -71,12 +72,8 @@ def _terminable() -> Iterator[None]:
 
 def _run(name: str, words: Sequence[str]) -> int:
     """Run a node, which reads its ROS arguments itself, or a command; the exit code."""
-    if name in NODES and asks_for_help(words[1:]):
-        print(node_help(name), end='')
-        return 0
     if name in NODES:
-        node = importlib.import_module(f'sfa_localization.nodes.{name}')
-        return int(node.main(words))
+        return entry.run(name, words)
     if name not in COMMANDS:
         _overview().parse_args(words)  # prints help, version or error, and exits
         return 2

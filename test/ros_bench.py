@@ -35,6 +35,13 @@ def until(condition, deadline_s=DEADLINE_S):
     return bool(condition())
 
 
+def listeners(node, topic):
+    """How many subscriptions a node's publisher of a topic is connected to."""
+    resolved = node.resolve_topic_name(topic)
+    made = [each for each in node.publishers if each.topic_name == resolved]
+    return sum(each.get_subscription_count() for each in made)
+
+
 def start_process(*words, **options):
     """A process of this interpreter, in the domain of the bench."""
     environment = {

@@ -44,7 +44,7 @@ from filter_drives import Drive  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
-from ros_bench import DEADLINE_S, Bench, until  # noqa: E402
+from ros_bench import DEADLINE_S, Bench, listeners, until  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Empty, String  # noqa: E402
 
@@ -158,7 +158,7 @@ def replay(bench, drive, events, together):
     heard = []
     listener = bench.node.create_subscription(Odometry, 'ekf/odometry', heard.append, 1000)
     assert until(lambda: bench.node.count_publishers('ekf/odometry') == 1)
-    assert until(lambda: node._odometry.get_subscription_count() == 1)
+    assert until(lambda: listeners(node, 'ekf/odometry') == 1)
     counts = node.monitor('odom'), node.monitor(SEEN)
     sent = [0, 0]
     for number, (stamp_ns, kind, index) in enumerate(events, 1):
@@ -170,7 +170,8 @@ def replay(bench, drive, events, together):
     bench.node.destroy_subscription(listener)
     bench.end(node)
     state = node.filter.state
-    bench._publishers.clear()
+    for topic in ('odom', SEEN):
+        bench.forget(topic)
     return state, heard
 
 

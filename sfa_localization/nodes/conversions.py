@@ -108,16 +108,11 @@ def read_info(message: String) -> PanoramaConfig:
 
 def read_odometry(message: Odometry) -> Motion:
     """The planar motion of an odometry message; variances of 0 mean that they are unknown."""
-    v, omega, *variances = messages.read_twist(message)
-    pose = message.pose.pose
-    return Motion(
-        stamp_ns=read_stamp(message.header.stamp),
-        pose=np.array(messages.read_planar(pose.position, pose.orientation)),
-        twist=(v, omega),
-        variances=(variances[0], variances[1]),
-        frame=message.header.frame_id,
-        child_frame=message.child_frame_id,
-    )
+    v, omega, v_variance, omega_variance = messages.read_twist(message)
+    pose = np.array(messages.read_planar(message.pose.pose.position, message.pose.pose.orientation))
+    frames = message.header.frame_id, message.child_frame_id
+    spread = v_variance, omega_variance
+    return Motion(read_stamp(message.header.stamp), pose, (v, omega), spread, *frames)
 
 
 def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:

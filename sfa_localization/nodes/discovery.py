@@ -74,9 +74,10 @@ class Discovery:
             )
             self._take(usable[0])
         else:
-            self._tell(', '.join(f'{name} ({kind})' for name, kind in there))
+            self._tell(there)
 
-    def _tell(self, listed: str) -> None:
+    def _tell(self, there: list[tuple[str, str]]) -> None:
+        listed = ', '.join(f'{name} ({kind})' for name, kind in there)
         choices = ' or '.join(f'{argument}:=NAME' for argument in self._arguments)
         hint = f'nobody publishes on {self._given}; there are {listed}: {choices}'
         before, self.hint = self.hint, hint if listed else ''

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -15,6 +14,7 @@ from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
@@ -28,7 +28,7 @@ from sfa_localization.fusion.status import uncertainty
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.broadcast import Broadcast
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, run_node, sensor_qos
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
 from sfa_localization.nodes.monitor import steady_s
 from sfa_localization.nodes.saved_pose import SAVE_PERIOD_S, SavedPose, load_pose, save_pose
 from sfa_localization.nodes.settings import EkfNodeConfig
@@ -88,9 +88,9 @@ class EkfNode(LocalizationNode):
             (Float64, 'sfa/camera_delay', self._receive_delay),
             (Float64MultiArray, 'sfa/error_correlation', self._receive_correlation),
         ):
-            self.subscribe(kind, topic, receive, latched_qos(), while_inactive=True)
+            self.subscribe(kind, topic, receive, latched_qos())
         for topic in ('initialpose', '~/set_pose'):
-            self.subscribe(pose, topic, self._set_pose, 1)
+            self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
         self.service(Trigger, '~/reset', self._reset)
         self.service(SetBool, '~/pause', self._pause)
         self.every(_WATCH_PERIOD_S, self._publish_state)
@@ -354,8 +354,3 @@ class EkfNode(LocalizationNode):
         if clock.known:
             values['camera delay [s]'] = f'{clock.delay_s:.3f}'
         return _LEVELS[status.level], '; '.join(status.reasons) or status.level.name, values
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(EkfNode, args)

@@ -29,21 +29,19 @@ _NUMBERS = (signal.SIGINT, signal.SIGTERM)
 _left_to_ros = False
 
 
-def run(name: str) -> int:
-    """Run a node; the exit code."""
-    if asks_for_help(sys.argv[1:]):
+def run(name: str, words: Sequence[str] | None = None) -> int:
+    """Run a node, with the words of the command line, or print its help; the exit code."""
+    words = list(sys.argv if words is None else words)
+    if {'-h', '--help'} & set(words[1:]):
         sys.stdout.write(node_help(name))
         return 0
     end_at_once()
-    return int(importlib.import_module(f'sfa_localization.nodes.{name}').main())
+    module = importlib.import_module(f'sfa_localization.nodes.{name}')
+    lifecycle = importlib.import_module('sfa_localization.nodes.lifecycle')
+    return int(lifecycle.run_node(getattr(module, name.title().replace('_', '')), words))
 
 
 omnicam_node, sfa_node, ekf_node = (partial(run, name) for name in NODES)
-
-
-def asks_for_help(words: Sequence[str]) -> bool:
-    """Whether arguments of a node ask for help: before those of ROS, or in their place."""
-    return bool({'-h', '--help'} & set(words))
 
 
 def node_help(name: str) -> str:

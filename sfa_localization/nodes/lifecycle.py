@@ -8,7 +8,6 @@ A node written on it declares its Settings classes, makes its publishers and sub
 
 from __future__ import annotations
 
-import sys
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
@@ -132,21 +131,20 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         kind: Any,
         topic: str,
         callback: Callable[[Any], None],
-        qos: QoSProfile | int,
-        *,
-        while_inactive: bool = False,
+        qos: QoSProfile,
         instead: str = '',
     ) -> None:
         """A subscription whose rejected messages are counted under `topic` and end nothing.
 
-        An inactive node drops messages; not `while_inactive` those that come but once, latched.
-        Messages of the topic `instead`, where it is given, are taken as those of `topic`.
+        An inactive node drops messages; not those that come but once, latched. Messages of the
+        topic `instead`, where it is given, are taken as those of `topic`.
         """
+        latched = qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
         self.require_input(topic, instead)
         made = self.create_subscription(
             kind,
             instead or topic,
-            self.receiver(topic, callback, while_inactive),
+            self.receiver(topic, callback, latched),
             qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
@@ -328,12 +326,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def _publish_health(self) -> None:
         if not self.active:
             return
-        try:
-            level, text, values = self.health()
-        except Exception as error:
-            self.defect('health', error)
-            level, values = DiagnosticStatus.ERROR, {}
-            text = 'the state of the node cannot be determined'
+        level, text, values = self.health()
         problem = self._time_problem()
         if problem:
             self.refuse('/clock', problem)
@@ -352,13 +345,12 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
 
 
-def run_node(make: Callable[[], LocalizationNode], args: Sequence[str] | None = None) -> int:
+def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM, which is exit code 0; or until it dies.
 
     For the main thread of a process that then ends: signals are ignored afterwards.
     """
-    words, node = list(sys.argv if args is None else args), None
-    entry.end_at_once()
+    node = None
     try:
         problem = _initialise(words)
         if problem:

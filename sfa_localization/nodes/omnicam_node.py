@@ -9,7 +9,6 @@ without a subscriber, and of images that come too fast only the newest is used.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, cast
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -227,8 +226,3 @@ def _judge_feed(status: FeedStatus, details: dict[str, str]) -> tuple[int, str]:
     if status.state == 'opening':
         return _WARN, 'opening the camera'
     return _OK, 'at the end of the images' if status.state == 'ended' else ''
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM."""
-    return lifecycle.run_node(OmnicamNode, args)

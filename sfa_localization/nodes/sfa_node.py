@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +22,7 @@ from sfa_localization.data.settings import Settings
 from sfa_localization.localizer import Observation, Observer
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, run_node, sensor_qos
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
 from sfa_localization.nodes.parameters import Current
 from sfa_localization.nodes.settings import SfaNodeConfig
 from sfa_localization.place_model import PlaceModel
@@ -55,7 +54,7 @@ class SfaNode(LocalizationNode):
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
         self._info = self.following('panorama/info')
-        self.subscribe(String, self._info, self._receive_info, latched_qos(), while_inactive=True)
+        self.subscribe(String, self._info, self._receive_info, latched_qos())
         compressed = self._config.image_transport == 'compressed'
         self._topic = self.following('panorama/compressed') if compressed else 'panorama'
         kinds = [CompressedImage, Image] if compressed else [Image, CompressedImage]
@@ -183,8 +182,3 @@ def _feature_pose(slow: Any, stamp_ns: int) -> PoseStamped:
     message = convert.to_pose([x, y, 0.0], stamp_ns, _FEATURE_FRAME)
     message.pose.position.z = z
     return message
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(SfaNode, args)

@@ -10,7 +10,7 @@ import time
 
 import cv2
 import numpy as np
-from ros_bench import Bench, until
+from ros_bench import Bench, listeners, until
 
 from robustness.faults import NODES, Reading, Restart
 from robustness.judged import output
@@ -58,7 +58,7 @@ class Chain:
         for name in NODES:
             self.start(name)
         self.bench.node.create_subscription(Odometry, 'ekf/odometry', self.hear, 1000)
-        assert until(lambda: self.nodes['ekf_node']._odometry.get_subscription_count() == 1)
+        assert until(lambda: listeners(self.nodes['ekf_node'], 'ekf/odometry') == 1)
 
     def hear(self, message):
         self.last = message
@@ -80,9 +80,9 @@ class Chain:
         ekf = self.nodes['ekf_node']
         return (
             self.pictures.get_subscription_count() == self.wheels.get_subscription_count() == 1
-            and self.nodes['omnicam_node']._panoramas.get_subscription_count() == 1
-            and self.nodes['sfa_node']._uncertain.get_subscription_count() == 1
-            and self.nodes['sfa_node']._turned.get_subscription_count() == 1
+            and listeners(self.nodes['omnicam_node'], PANORAMA) == 1
+            and listeners(self.nodes['sfa_node'], SEEN) == 1
+            and listeners(self.nodes['sfa_node'], 'sfa/turned') == 1
             and ekf.monitor('sfa/error_correlation').used > 0
             and ekf.monitor('sfa/camera_delay').used > 0
         )
