@@ -86,6 +86,8 @@ def test_two_robots_side_by_side_locate_themselves_apart(bench, robots):
         )
 
     assert drive(bench, located)
+    limits = {name: nodes[2].get_parameter('lost_std').value for name, nodes in robots.items()}
+    assert limits == {'robot1': 1.5, 'robot2': 1.8}, 'each has its own section of the file'
     for name, place in PLACES.items():
         # The odometry stands at its origin: the transform is the place in the map.
         sent = [pose[:2] for message in [*moved[name]] for _, pose in json.loads(message.data)]
@@ -105,9 +107,3 @@ def test_two_robots_side_by_side_locate_themselves_apart(bench, robots):
 
 def pose_of(message):
     return read_planar(message.pose.pose.position, message.pose.pose.orientation)
-
-
-def test_each_robot_gets_its_own_parameters_of_one_file(robots):
-    values = {name: nodes[2].get_parameter('lost_std').value for name, nodes in robots.items()}
-    assert values == {'robot1': 1.5, 'robot2': 1.8}
-    assert all(nodes[0].get_parameter('width').value == SIZE.width for nodes in robots.values())

@@ -241,10 +241,10 @@ class EkfNode(LocalizationNode):
             saved = SavedPose(state.stamp_ns, frame, state.pose, state.pose_covariance)
             save_pose(FilePath(self._config.pose_file), saved)
 
-    def defect(self, name: str, error: Exception) -> str:
+    def defect(self, name: str, error: Exception) -> None:
         """What failed inside may fail at every message from now on: the filter starts anew."""
+        super().defect(name, error)
         self._forget()
-        return super().defect(name, error)
 
     def _forget(self) -> None:
         self.filter.reset()

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import rclpy
@@ -18,7 +19,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
@@ -179,8 +179,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def require_input(self, topic: str, instead: str = '') -> None:
         """Take a topic as an input. Raises ConfigError where this node itself publishes on it."""
         resolved = self._resolved[topic] = self.resolve_topic_name(instead or topic)
-        outputs = [made for _, made in self._entities if isinstance(made, Publisher)]
-        if any(made.topic_name == resolved for made in outputs):
+        if any(made.topic_name == resolved for made in self.publishers):
             raise ConfigError(
                 f'input {topic} is {resolved}, which this node itself publishes: remap one of both'
             )
@@ -213,9 +212,8 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
     def every(self, period_s: float, callback: Callable[[], None]) -> None:
         """Call at a steady period: simulated time may stop, and wall time may step back."""
         name = f'timer {callback.__name__.strip("_")}'
-        made = self.create_timer(
-            period_s, lambda: self.attempt(name, callback) and None, clock=self._steady
-        )
+        call = partial(self.attempt, name, callback)
+        made = self.create_timer(period_s, call, clock=self._steady)
         self._entities.append((self.destroy_timer, made))
 
     def attempt(self, name: str, callback: Callable[..., None], *given: Any) -> bool:
@@ -240,15 +238,13 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             self.get_logger().warning(f'{self.shown(topic)}: {short_line(reason)} ({count} so far)')
         return count
 
-    def defect(self, name: str, error: Exception) -> str:
-        """Count an error in the program itself, and log where it came from; the reason.
+    def defect(self, name: str, error: Exception) -> None:
+        """Count an error in the program itself, and log where it came from.
 
         After a signal nothing can be published any more, and that is no defect.
         """
-        reason = f'internal error: {type(error).__name__}'
-        if self.context.ok() and self.refuse(name, reason) == 1:
+        if self.context.ok() and self.refuse(name, f'internal error: {type(error).__name__}') == 1:
             self.get_logger().error(traceback.format_exc())
-        return reason
 
     def _guarded(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
         """A callback that counts what it raises: a clock may be negative, a transition may not fit.
