@@ -9,6 +9,7 @@ import os
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from sfa_localization.camera.calibration_files import (
     calibration_of,
@@ -39,135 +40,75 @@ OCAM = """#polynomial coefficients of the direct mapping
 
 480 640
 """
-CAMERA_INFO = """image_width: 848
-image_height: 800
-camera_name: front
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [285.5, 0.0, 424.0, 0.0, 286.5, 400.0, 0.0, 0.0, 1.0]
-distortion_model: {model}
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: {coefficients}
-"""
-ECHOED = """header:
-  frame_id: camera
-height: 800
-width: 848
-distortion_model: equidistant
-d: [0.1, 0.2, 0.3, 0.4]
-k: [285.5, 0.0, 424.0, 0.0, 286.5, 400.0, 0.0, 0.0, 1.0]
-roi:
-  height: 0
-  width: 0
----
-header:
-  frame_id: camera
-"""
-KALIBR = """cam0:
-  camera_model: {model}
-  intrinsics: {intrinsics}
-  distortion_model: {distortion}
-  distortion_coeffs: [0.1, 0.2, 0.3, 0.4]
-  resolution: [848, 800]
-  rostopic: /cam0/image_raw
-cam1:
-  camera_model: ds
-"""
-MEI = """%YAML:1.0
----
-model_type: MEI
-image_width: 848
-image_height: 800
-mirror_parameters:
-   xi: 1.5
-distortion_parameters:
-   k1: 0.1
-   k2: 0.2
-   p1: 0.3
-   p2: 0.4
-projection_parameters:
-   gamma1: 285.5
-   gamma2: 286.5
-   u0: 424.0
-   v0: 400.0
-"""
-BRANDT = """%YAML:1.0
----
-model_type: KANNALA_BRANDT
-image_width: 848
-image_height: 800
-projection_parameters:
-   k2: 0.1
-   k3: 0.2
-   k4: 0.3
-   k5: 0.4
-   mu: 285.5
-   mv: 286.5
-   u0: 424.0
-   v0: 400.0
-"""
-STELLA = """Camera:
-  name: "a fisheye"
-  setup: "monocular"
-  model: "{model}"
-  fx: 285.5
-  fy: 286.5
-  cx: 424.0
-  cy: 400.0
-  k1: 0.1
-  k2: 0.2
-  k3: 0.3
-  k4: 0.4
-  fps: 30.0
-  cols: 848
-  rows: 800
-Feature:
-  scale_factor: 1.2
-"""
-ORB = """%YAML:1.0
-
-#--------------------------------------------------------------------------------------------
-# Camera Parameters. Adjust them!
-#--------------------------------------------------------------------------------------------
-File.version: "1.0"
-Camera.type: "{model}"
-Camera1.fx: 285.5
-Camera1.fy: 286.5
-Camera1.cx: 424.0
-Camera1.cy: 400.0
-Camera1.k1: 0.1
-Camera1.k2: 0.2
-Camera1.k3: 0.3
-Camera1.k4: 0.4
-Camera2.k1: 0.9
-Camera.width: 848
-Camera.height: 800
-"""
+MATRIX = [285.5, 0.0, 424.0, 0.0, 286.5, 400.0, 0.0, 0.0, 1.0]
 FOUR = [0.1, 0.2, 0.3, 0.4, 0.0]
-SLAM_PINHOLE = ORB.format(model='PinHole').replace('k3: 0.3', 'p1: 0.3').replace('k4', 'p2')
+K = {'k1': 0.1, 'k2': 0.2, 'k3': 0.3, 'k4': 0.4}
+LENS = {'fx': 285.5, 'fy': 286.5, 'cx': 424.0, 'cy': 400.0}
+SIZE = {'image_width': 848, 'image_height': 800}
 
 
-def info(model, name='distortion_model'):
+def info(model, name='distortion_model', coefficients=FOUR, matrix=MATRIX):
     """camera_info, or ost.yaml of one of the releases of camera_calibration."""
-    return CAMERA_INFO.format(model=model, coefficients=FOUR).replace('distortion_model', name)
+    parts = {
+        'camera_matrix': {'rows': 3, 'cols': 3, 'data': matrix},
+        'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': coefficients},
+    }
+    return yaml.safe_dump({**SIZE, 'camera_name': 'front', **parts, name: model})
 
 
-def kalibr(model, intrinsics, distortion):
-    return KALIBR.format(model=model, intrinsics=intrinsics, distortion=distortion)
+def echoed():
+    """What `ros2 topic echo` prints."""
+    message = {
+        'header': {'frame_id': 'camera'}, 'height': 800, 'width': 848, 'k': MATRIX, 'd': FOUR,
+        'distortion_model': 'equidistant', 'roi': {'height': 0, 'width': 0},
+    }  # fmt: skip
+    return yaml.safe_dump(message, sort_keys=False) + '---\nheader:\n  frame_id: camera\n'
+
+
+def kalibr(model, intrinsics, distortion, resolution=(848, 800)):
+    camera = {
+        'camera_model': model, 'intrinsics': intrinsics, 'distortion_model': distortion,
+        'distortion_coeffs': FOUR[:4], 'resolution': [*resolution], 'rostopic': '/cam0/image_raw',
+    }  # fmt: skip
+    return yaml.safe_dump({'cam0': camera, 'cam1': {'camera_model': 'ds'}})
+
+
+def storage(content):
+    """camodocal's, and ORB-SLAM3's."""
+    return '%YAML:1.0\n---\n' + yaml.safe_dump(content)
+
+
+MEI = storage({
+    'model_type': 'MEI', **SIZE, 'mirror_parameters': {'xi': 1.5},
+    'distortion_parameters': {'k1': 0.1, 'k2': 0.2, 'p1': 0.3, 'p2': 0.4},
+    'projection_parameters': {'gamma1': 285.5, 'gamma2': 286.5, 'u0': 424.0, 'v0': 400.0},
+})  # fmt: skip
+BRANDT = storage({
+    'model_type': 'KANNALA_BRANDT', **SIZE,
+    'projection_parameters': {'k2': 0.1, 'k3': 0.2, 'k4': 0.3, 'k5': 0.4,
+                              'mu': 285.5, 'mv': 286.5, 'u0': 424.0, 'v0': 400.0},
+})  # fmt: skip
+
+
+def stella(model):
+    camera = {'name': 'a camera', 'model': model, **LENS, **K, 'fps': 30.0, 'cols': 848}
+    return yaml.safe_dump({'Camera': {**camera, 'rows': 800}, 'Feature': {'scale_factor': 1.2}})
+
+
+def orb(model, head, coefficients=K):
+    numbers = {f'{head}.{name}': value for name, value in {**LENS, **coefficients}.items()}
+    size = {'Camera.width': 848, 'Camera.height': 800, 'Camera2.k1': 0.9}
+    return storage({'File.version': '1.0', 'Camera.type': model, **numbers, **size})
 
 
 def opencv(suffix, tmp_path, **more):
     path = tmp_path / f'storage{suffix}'
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    matrix = np.array([[285.5, 0, 424], [0, 286.5, 400], [0, 0, 1]])
-    size = {'image_width': 848, 'image_height': 800}
-    shape = {'camera_matrix': matrix, 'distortion_coefficients': np.array([FOUR])}
-    for name, value in {**size, **shape, **more}.items():
-        storage.write(name, value)
-    storage.release()
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    matrix = np.reshape(MATRIX, (3, 3))
+    lens = {'camera_matrix': matrix, 'distortion_coefficients': np.array([FOUR])}
+    for name, value in {**SIZE, **lens, **more}.items():
+        file.write(name, value)
+    file.release()
     return path.read_text()
 
 
@@ -179,17 +120,17 @@ def read(tmp_path, text, name='camera.yaml'):
 
 def test_one_camera_from_the_files_of_every_program(tmp_path):
     """Focal lengths, center, size and four coefficients are the same in all."""
-    xi, four = np.array([[1.25]]), '[285.5, 286.5, 424, 400]'
+    xi, four = np.array([[1.25]]), [*LENS.values()]
     for text, model, mirror in (
         (info('plumb_bob'), 'mirror', 0.0), (info('plumb_bob', 'camera_model'), 'mirror', 0.0),
         (info('equidistant'), 'fisheye', None), (info('fisheye', 'camera_model'), 'fisheye', None),
-        (ECHOED, 'fisheye', None), (MEI, 'mirror', 1.5), (BRANDT, 'fisheye', None),
-        (kalibr('omni', '[0.8, 285.5, 286.5, 424, 400]', 'radtan'), 'mirror', 0.8),
+        (echoed(), 'fisheye', None), (MEI, 'mirror', 1.5), (BRANDT, 'fisheye', None),
+        (kalibr('omni', [0.8, *four], 'radtan'), 'mirror', 0.8),
         (kalibr('pinhole', four, 'radtan'), 'mirror', 0.0),
         (kalibr('pinhole', four, 'equidistant'), 'fisheye', None),
-        (STELLA.format(model='fisheye'), 'fisheye', None), (SLAM_PINHOLE, 'mirror', 0.0),
-        (ORB.format(model='KannalaBrandt8'), 'fisheye', None),
-        (ORB.format(model='KannalaBrandt8').replace('Camera1.', 'Camera.'), 'fisheye', None),
+        (stella('fisheye'), 'fisheye', None), (orb('KannalaBrandt8', 'Camera1'), 'fisheye', None),
+        (orb('KannalaBrandt8', 'Camera'), 'fisheye', None),
+        (orb('PinHole', 'Camera1', {'k1': 0.1, 'k2': 0.2, 'p1': 0.3, 'p2': 0.4}), 'mirror', 0.0),
         *((opencv(s, tmp_path, xi=xi), 'mirror', 1.25) for s in ('.yml', '.xml')),
         *((opencv(s, tmp_path, fisheye_model=1), 'fisheye', None) for s in ('.yml', '.xml')),
         *((opencv(s, tmp_path, fisheye_model=0), 'mirror', 0.0) for s in ('.yml', '.xml')),
@@ -203,7 +144,7 @@ def test_one_camera_from_the_files_of_every_program(tmp_path):
         if mirror is not None:
             assert lens.xi == mirror, text
             assert (lens.mirrored, lens.axis) == (('auto',) * 2 if mirror else ('no', 'forward'))
-    assert read(tmp_path, STELLA.format(model='equirectangular')).camera_model == 'equirectangular'
+    assert read(tmp_path, stella('equirectangular')).camera_model == 'equirectangular'
 
 
 def test_ocam(tmp_path):
@@ -258,13 +199,13 @@ def test_what_is_written_is_read_again(tmp_path):
         ('', 'no camera calibration'),
         ('a: [1, 2', 'is not YAML'),
         ('a: 1', 'none of fx, gamma1, mu is given; known are'),
-        (CAMERA_INFO.format(model='plumb_bob', coefficients=[1, 2, 3, 4, 5]), 'only 4'),
+        (info('plumb_bob', coefficients=[1, 2, 3, 4, 5]), 'only 4'),
         (info('strange'), "'strange' is not supported; calibrate with another"),
-        (CAMERA_INFO.replace('285.5', '0.0').format(model='', coefficients=[]), 'not calib'),
+        (info('', coefficients=[], matrix=[0.0] * 9), 'not calib'),
         (kalibr('ds', [1, 2, 3, 4, 5, 6], 'none'), "'ds'"),
         (kalibr('omni', [1, 2], 'none'), '2 numbers of'),
         (kalibr('omni', [1] * 5, 'equidistant'), "'equidistant'"),
-        (kalibr('omni', [1] * 5, '').replace('848', 'x'), "'x'"),
+        (kalibr('omni', [1] * 5, '', 'xy'), "'x'"),
         (MEI.replace('MEI', 'SCARAMUZZA'), 'scaramuzza'),
         (MEI.replace('gamma1', 'gamma'), 'gamma1'),
         (MEI.replace('xi', 'psi'), 'none of xi'),
@@ -272,7 +213,7 @@ def test_what_is_written_is_read_again(tmp_path):
         ('camera_model: panorama\nmirored: yes', "did you mean 'mirrored'"),
         ('camera_model: strange', 'strange'),
         ('camera_model: panorama\nimage_width: -1', 'image_width'),
-        (STELLA.format(model='radial_division'), 'radial_division'),
+        (stella('radial_division'), 'radial_division'),
         ('Camera: 3', 'none of fx'),
         ('<opencv_storage><a>', 'is not XML'),
         ('<opencv_storage><camera_matrix/></opencv_storage>', 'none of fx'),

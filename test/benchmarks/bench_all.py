@@ -33,7 +33,6 @@ HEADLINES = {
     'uml_over_supervised': 'error of the unsupervised map over a supervised one',
     'paper_solver_success_share': "share in which the paper's descent ends at the optimum",
     'unwrap_over_remap': 'unwrapping over a bare cv2.remap',
-    'omnicam_latency_over_relay': "the omnicam node's latency beyond a relay's, over a remap",
     'filter_over_filterpy': 'a filter step over bare filterpy',
     'chain_latency_p99_ms': 'ms of the chain, 99th percentile',
     'chain_cpu_share': 'share of one core that the chain takes',
@@ -47,8 +46,7 @@ def benches(folder: Path, quick: bool, model: Path | None) -> Iterator[tuple[str
     yield 'bench_metric', lambda m: m.bench_metric(20 if quick else 1000)
     yield 'bench_filter', lambda m: m.bench_filter()
     yield 'bench_bag', lambda m: m.bench_bag(folder, 3 if quick else 9)
-    yield 'bench_panorama', lambda m: {**m.bench_unwrap(), **m.bench_roundtrip()}
-    yield 'bench_panorama', lambda m: m.bench_omnicam()
+    yield 'bench_panorama', lambda m: m.bench_unwrap()
     if model is not None:
         yield 'bench_chain', lambda m: m.bench_chain(str(model))
 
