@@ -200,7 +200,7 @@ def test_what_is_written_is_read_again(tmp_path):
         ('a: [1, 2', 'is not YAML'),
         ('a: 1', 'none of fx, gamma1, mu is given; known are'),
         (info('plumb_bob', coefficients=[1, 2, 3, 4, 5]), 'only 4'),
-        (info('strange'), "'strange' is not supported; calibrate with another"),
+        (info('strange'), "'strange' is not supported; use another"),
         (info('', coefficients=[], matrix=[0.0] * 9), 'not calib'),
         (kalibr('ds', [1, 2, 3, 4, 5, 6], 'none'), "'ds'"),
         (kalibr('omni', [1, 2], 'none'), '2 numbers of'),

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from bag_formats import FORMATS, drive, write_version
 from cylinder_worlds import place
-from test_calibration_files import CAMERA_INFO, OCAM
+from test_calibration_files import OCAM, echoed
 
 from sfa_localization.bags import decoding
 from sfa_localization.bags.files import Topic
@@ -152,10 +152,9 @@ def test_damaged_models(tmp_path):
 
 def test_damaged_texts(tmp_path):
     """Of parameter files, calibrations and metadata."""
-    info = CAMERA_INFO.format(model='plumb_bob', n=5, coefficients='[0.1, 0, 0, 0, 0]')
     changes = 'sfa_node:\n  ros__parameters:\n    model: a.npz\n    map_frame: map\n'
     metadata = (write_version(tmp_path / 'bag', drive(tmp_path)[:20], 5) / METADATA).read_text()
-    texts, path = [render(), changes, info, OCAM, metadata], tmp_path / 'file.yaml'
+    texts, path = [render(), changes, echoed(), OCAM, metadata], tmp_path / 'file.yaml'
 
     def use(random: Random) -> bool:
         text = spoilt(texts[random.integers(len(texts))], random)

@@ -22,7 +22,7 @@ from sfa_localization.camera.settings import CameraConfig, LensCalibration
 from sfa_localization.data.errors import CameraError, ConfigError
 from sfa_localization.data.files import read_regular
 from sfa_localization.data.plain_yaml import load_yaml
-from sfa_localization.data.rejections import short_line
+from sfa_localization.data.rejections import quoted, short_line
 
 _KNOWN = (
     'known are camera_info, OpenCV, Kalibr, camodocal, stella_vslam and ORB-SLAM3 YAML, OpenCV '
@@ -195,7 +195,7 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
     unknown = kinds - _PINHOLES - (_MIRRORS if has_mirror else _FISHEYES)
     if unknown:
         raise CameraError(
-            f'camera model {" ".join(sorted(unknown))!r} is not supported; calibrate with another: '
+            f'camera model {quoted(" ".join(sorted(unknown)))} is not supported; use another: '
             'omni or MEI, equidistant or KANNALA_BRANDT, or a pinhole with radtan'
         )
     if has_mirror and len(numbers) == 5:
