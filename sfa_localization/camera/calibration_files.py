@@ -10,6 +10,7 @@ KANNALA_BRANDT, stella_vslam, ORB-SLAM3, and OCamCalib's calib_results.txt.
 
 from __future__ import annotations
 
+import itertools
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
@@ -60,7 +61,8 @@ _SIZES = (('image_width', 'width', 'cols'), ('image_height', 'height', 'rows'))
 _KINDS = ('camera_model', 'model_type', 'model', 'type', 'distortion_model')
 _MIRRORS = {'mei', 'omni'}
 _FISHEYES = {'equidistant', 'equi', 'fisheye', 'kannala_brandt', 'kannalabrandt8'}
-_PINHOLES = {'', 'none', 'pinhole', 'perspective', 'plumb_bob', 'radtan', 'rational_polynomial'}
+_PLAIN = {'none', 'pinhole', 'perspective'}
+_PINHOLES = _PLAIN | {'', 'plumb_bob', 'radtan', 'rational_polynomial'}
 
 
 def calibration_of(camera: CameraConfig) -> LensCalibration:
@@ -211,24 +213,26 @@ def _from_others(named: Mapping[str, Any]) -> dict[str, Any]:
     lens = {
         **dict(zip(('fx', 'fy', 'cx', 'cy'), numbers, strict=True)),
         **dict(zip(('image_width', 'image_height'), _size(named), strict=True)),
-        'distortion': _distortion(named, fisheye),
+        'distortion': _distortion(named, kinds, fisheye),
     }
     if fisheye:
         return {'camera_model': 'fisheye', **lens}
     if has_mirror:
-        return {'camera_model': 'mirror', 'xi': (xi or [_required(named, 'xi')])[0], **lens}
+        return {'camera_model': 'mirror', 'xi': _required({'xi': xi}, 'xi'), **lens}
     # A lens without a mirror shows the world as it is, and looks where it is pointed.
     return {'camera_model': 'mirror', 'xi': 0.0, 'mirrored': 'no', 'axis': 'forward', **lens}
 
 
-def _distortion(named: Mapping[str, Any], fisheye: bool) -> tuple[float, ...]:
-    """The four coefficients, none where all are 0."""
-    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2', 'k3')
+def _distortion(named: Mapping[str, Any], kinds: set[str], fisheye: bool) -> tuple[float, ...]:
+    """The four coefficients, none where all are 0. They must be there, but for a plain pinhole."""
+    names = ('k1', 'k2', 'k3', 'k4') if fisheye else ('k1', 'k2', 'p1', 'p2')
     names = ('k2', 'k3', 'k4', 'k5') if fisheye and 'k5' in named else names  # camodocal's
     if set(_COEFFICIENTS) & set(named):
         numbers = _given(named, *_COEFFICIENTS)
+    elif kinds and kinds <= _PLAIN:
+        numbers = [_required({name: 0.0, **named}, name) for name in (*names, 'k3')]
     else:
-        numbers = [(_given(named, name) or [0.0])[0] for name in names]
+        numbers = [_required(named, name) for name in names]
     if any(numbers[4:]):
         raise CameraError(f'{len(numbers)} coefficients of distortion; only 4 are supported')
     return tuple((numbers + [0.0] * 4)[:4]) if any(numbers) else ()
@@ -236,8 +240,10 @@ def _distortion(named: Mapping[str, Any], fisheye: bool) -> tuple[float, ...]:
 
 def _size(named: Mapping[str, Any]) -> list[int]:
     """Columns and rows, 0 where they are not given."""
-    both = _given(named, 'resolution') or [(_given(named, *n) or [0.0])[0] for n in _SIZES]
-    return [int(number) for number in both]
+    both = _given(named, 'resolution')
+    if not both and set(itertools.chain(*_SIZES)) & set(named):
+        both = [_required(named, *names) for names in _SIZES]
+    return [int(number) for number in both or (0, 0)]
 
 
 def _given(named: Mapping[str, Any], *names: str) -> list[float]:
@@ -247,8 +253,8 @@ def _given(named: Mapping[str, Any], *names: str) -> list[float]:
 
 def _required(named: Mapping[str, Any], *names: str) -> float:
     numbers = _given(named, *names)
-    if not numbers:
-        raise CameraError(f'none of {", ".join(names)} is given; {_KNOWN}')
+    if len(numbers) != 1:
+        raise CameraError(f'no number {" or ".join(names)} is given; {_KNOWN}')
     return numbers[0]
 
 
