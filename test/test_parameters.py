@@ -258,7 +258,6 @@ def test_parameters_of_cameras_nodes_and_commands_are_set_in_their_tests():
 
 
 @pytest.mark.parametrize(('given', 'message'), [
-    ({'pose_file': 'x' * 10_000}, 'pose_file: a text of 10000 characters'),
     ({'odom_frame': 'map'}, 'three different frames'),
     ({'map_frame': 'base_link'}, 'three different frames'),
 ])  # fmt: skip

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -16,62 +15,39 @@ LOG_PERIOD_S = 10.0
 T = TypeVar('T')
 
 
-class LogLines:
-    """Counts work, and writes how much of it is done each LOG_PERIOD_S; short work writes nothing.
+class _Log:
+    """Standard error as tqdm writes to it, but a line for each state of the bar."""
 
-    With the few methods of tqdm's bars that are used here.
-    """
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            sys.stderr.write(f'{line}\n')
 
-    def __init__(self, desc: str, total: int | None, unit: str, initial: int = 0) -> None:
-        self.desc, self.total, self.unit, self.n = desc, total, unit, initial
-        self._first, self._start_s = initial, time.monotonic()
-        self._next_s = self._start_s + LOG_PERIOD_S
+    def flush(self) -> None:
+        sys.stderr.flush()
 
-    def __enter__(self) -> LogLines:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def update(self, n: int = 1) -> None:
-        """So much more is done."""
-        self.n += n
-        now_s = time.monotonic()
-        if now_s >= self._next_s:
-            self._next_s = now_s + LOG_PERIOD_S
-            announce(self.line(now_s - self._start_s), shown=True)
-
-    def over(self, items: Iterable[T]) -> Iterator[T]:
-        """The items; each that has been dealt with counts."""
-        for item in items:
-            yield item
-            self.update()
-
-    def line(self, seconds: float) -> str:
-        """What is done after so many seconds, and how long the rest takes at this pace."""
-        if not self.total:
-            return f'{self.desc}: {self.n} {self.unit}'
-        left_s = seconds * (self.total - self.n) / max(self.n - self._first, 1)
-        share = self.n / self.total
-        return f'{self.desc}: {share:.0%} of {self.total} {self.unit}, {left_s:.0f} s left'
+def _bar(items: Iterable[T] | None, desc: str, total: int | None, unit: str, **options: Any) -> Any:
+    if not options.get('disable') and not sys.stderr.isatty():
+        done = (
+            '{percentage:.0f}% of {total_fmt}{unit}, {remaining} left' if total else '{n_fmt}{unit}'
+        )
+        options |= {'file': _Log(), 'bar_format': f'{{desc}}: {done}', 'leave': False}
+        options |= {'mininterval': LOG_PERIOD_S, 'delay': LOG_PERIOD_S, 'miniters': 1}
+    return tqdm(items, desc, total, unit=f' {unit}', **options)
 
 
 def progress_bar(
     desc: str, total: int | None = None, unit: str = 'images', initial: int = 0, *, shown: bool
 ) -> Any:
     """A context manager with `update(n)`, `n` and `total`; not `shown`, it counts silently."""
-    if shown and not sys.stderr.isatty():
-        return LogLines(desc, total, unit, initial)
-    return tqdm(desc=desc, total=total, unit=f' {unit}', initial=initial, disable=not shown)
+    return _bar(None, desc, total, unit, initial=initial, disable=not shown)
 
 
 def progress_over(
     items: Iterable[T], desc: str, total: int | None = None, unit: str = 'images', *, shown: bool
 ) -> Iterator[T]:
     """The items, with the progress through them."""
-    if shown and not sys.stderr.isatty():
-        return LogLines(desc, total, unit).over(items)
-    return iter(tqdm(items, desc, total, unit=f' {unit}', disable=not shown))
+    return iter(_bar(items, desc, total, unit, disable=not shown))
 
 
 def announce(text: str, *, shown: bool) -> None:

@@ -118,15 +118,15 @@ class Count:
 
 
 class Panoramas(Protocol):
-    """The images of a run, streamed: never all in memory at once."""
+    """The images of a run, streamed, never all in memory: stamps (N,), and the rows, columns and
+    channels (BGR, uint8) of each.
+    """
 
     @property
-    def stamps_ns(self) -> Stamps:
-        """Stamps (N,)."""
+    def stamps_ns(self) -> Stamps: ...
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Rows, columns, channels (BGR, uint8) of each panorama."""
+    def shape(self) -> tuple[int, int, int]: ...
 
     def __len__(self) -> int: ...
 

@@ -12,6 +12,7 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,10 +20,6 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.rejections import quoted
 
 S = TypeVar('S', bound='Settings')
-_LONGEST_NAME = 100
-"""Characters of a wrong name that are compared with those of the parameters."""
-_MOST_ENTRIES, _LONGEST_TEXT = 100, 4096
-"""Of a value: no list of sectors and no path is longer, and longer ones would block a node."""
 
 
 def setting(
@@ -51,7 +48,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
-            value = _checked(item, getattr(self, item.name))
+            value = _converted(item.name, item.default, getattr(self, item.name))
+            for number in value if isinstance(value, tuple) else (value,):
+                _check_bounds(item.name, item.metadata, number)
             object.__setattr__(self, item.name, value)
 
     @classmethod
@@ -75,45 +74,26 @@ class Settings:
 
 def nearest(name: str, known: Collection[str]) -> str:
     """The end of a message about an unknown name: the most similar known one, or ''."""
-    close = difflib.get_close_matches(name[:_LONGEST_NAME], sorted(known), n=1)
+    close = difflib.get_close_matches(name[:100], sorted(known), n=1)
     return f'; did you mean {close[0]!r}?' if close else ''
-
-
-def _checked(item: dataclasses.Field[Any], value: Any) -> Any:
-    """Return the value in the type of the default, or raise ConfigError."""
-    where = item.name
-    value = _converted(where, item.default, value)
-    numbers = value if isinstance(value, tuple) else (value,)
-    for number in numbers:
-        _check_bounds(where, item.metadata, number)
-    return value
 
 
 def _converted(where: str, default: Any, value: Any) -> Any:
     """Accept an int for a float and a list for a tuple; otherwise require the same type."""
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
-        if len(value) > _MOST_ENTRIES:
-            raise ConfigError(f'{where}: {len(value)} entries are more than {_MOST_ENTRIES}')
         kind = default[0] if default else 0.0
         return tuple(_converted(where, kind, entry) for entry in value)
     if isinstance(default, bool) or isinstance(value, bool):
         matches = isinstance(default, bool) and isinstance(value, bool)
     elif isinstance(default, float) and isinstance(value, (int, float)):
-        return _float(where, value)
+        with suppress(OverflowError):  # of an integer beyond all floats
+            return float(value)
+        matches = False
     else:
         matches = isinstance(value, type(default))
-    if isinstance(value, str) and len(value) > _LONGEST_TEXT:
-        raise ConfigError(f'{where}: a text of {len(value)} characters, more than {_LONGEST_TEXT}')
     if not matches:
         raise ConfigError(f'{where}: {quoted(value)} is not of type {type(default).__name__}')
     return value
-
-
-def _float(where: str, value: float) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        raise ConfigError(f'{where}: {quoted(value)} is too large') from None
 
 
 def _check_bounds(where: str, metadata: Mapping[str, Any], value: Any) -> None:
