@@ -24,8 +24,8 @@ def test_a_log_gets_a_line_each_ten_seconds(monkeypatch, capsys):
             now[0] += 0.5
             bar.update()
     assert capsys.readouterr().err.splitlines() == [
-        'read: 20% of 100 images, 00:40 left',
-        'read: 40% of 100 images, 00:30 left',
+        'read: 20% of 100 images, 40 s left',
+        'read: 40% of 100 images, 30 s left',
     ]
     for _ in progress.progress_over(range(3), 'read', shown=True):
         now[0] += 11.0

@@ -29,7 +29,9 @@ class _Log:
 def _bar(items: Iterable[T] | None, desc: str, total: int | None, unit: str, **options: Any) -> Any:
     if not options.get('disable') and not sys.stderr.isatty():
         done = (
-            '{percentage:.0f}% of {total_fmt}{unit}, {remaining} left' if total else '{n_fmt}{unit}'
+            '{percentage:.0f}% of {total_fmt}{unit}, {remaining_s:.0f} s left'
+            if total
+            else '{n_fmt}{unit}'
         )
         options |= {'file': _Log(), 'bar_format': f'{{desc}}: {done}', 'leave': False}
         options |= {'mininterval': LOG_PERIOD_S, 'delay': LOG_PERIOD_S, 'miniters': 1}
