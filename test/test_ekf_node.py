@@ -271,19 +271,6 @@ def test_a_parameter_of_an_unknown_type_is_refused_and_ends_nothing(bench):
         assert any(result.successful for result in answer.results) == understood
 
 
-def test_what_senders_write_does_not_fill_the_diagnostics(bench):
-    node = bench.run(EkfNode)
-    told = bench.listen(DiagnosticArray, '/diagnostics')
-    for number in range(200):
-        message = to_pose_with_covariance([1, 1, 0], SPREAD, 5, f'frame_{number}' + 'x' * 2000)
-        bench.publish(IMAGE_POSE, message)
-        assert until(lambda n=number: refused(node, IMAGE_POSE) > n)
-    told.clear()
-    assert until(lambda: told)
-    values = told[-1].status[0].values
-    assert len(values) < 100 and max(len(value.key) for value in values) < 320
-
-
 TWIST, TURNED, PLACED = 'twist.twist', 'pose.pose.orientation', 'pose.pose.position'
 MALFORMED = [
     ('odom', f'{TWIST}.linear.x', math.nan), ('odom', f'{TWIST}.angular.z', math.inf),

@@ -139,41 +139,23 @@ def test_a_start_script_ends_at_ctrl_c_before_its_slow_imports(start):
 
 
 WRONG = [
-    ('sfa_node', ['model:=/nowhere/model.npz'], '/nowhere/model.npz'),
-    ('sfa_node', ['novelty_limit:=-1.0'], 'novelty_limit'),
-    ('ekf_node', ['speed_std:=.nan'], 'speed_std'),
-    ('ekf_node', ['degraded_std:=50.0'], 'degraded_std'),
+    ('sfa_node', ['-p', 'model:=/nowhere/model.npz'], '/nowhere/model.npz'),
+    ('ekf_node', ['-p', 'speed_std:=.nan'], 'speed_std'),
+    ('ekf_node', ['-p', 'degraded_std:=50.0'], 'degraded_std'),
+    ('ekf_node', ['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
+    ('ekf_node', ['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML"),
+    ('ekf_node', ['--lost_std', '2'], "ROS cannot use its arguments: ['--lost_std', '2']"),
+    ('ekf_node', ['--', '--lost_std', '2'], 'unknown arguments --lost_std 2: give parameters as'),
 ]
 
 
-def test_a_wrong_parameter_ends_the_node_with_its_name(start):
-    started = [(start(node, '-p', *words), why) for node, words, why in WRONG]
-    for process, why in started:
-        code, text = ended(process)
-        assert code == CANNOT_START and why in text and 'Traceback' not in text, (why, text)
-
-
-FILES = {
-    'indented.yaml': 'ekf_node:\n ros__parameters:\n   speed_std: 1.0\n  gate: 2.0\n',
-    'keyless.yaml': 'ekf_node:\n  speed_std: 1.0\n',
-}
-UNREADABLE = [
-    (['--params-file', 'indented.yaml'], 'near line 4'),
-    (['--params-file', 'keyless.yaml'], 'before ros__parameters at line 2'),
-    (['--params-file', 'missing.yaml'], "missing.yaml'. Error: Error opening YAML file"),
-    (['-r', 'odom'], "remap rule: '-r odom'"),
-    (['--lost_std', '2'], "ROS cannot use its arguments: ['--lost_std', '2']"),
-    (['--', '--lost_std', '2'], 'unknown arguments --lost_std 2: give parameters as --ros-args -p'),
-]
-
-
-def test_what_ros_cannot_read_ends_the_node_with_its_reason(start, tmp_path):
-    for name, text in FILES.items():
-        (tmp_path / name).write_text(text)
+def test_a_wrong_parameter_ends_the_node_with_its_name(start, tmp_path):
+    """And a file or argument that ROS cannot read with the reason."""
+    (tmp_path / 'keyless.yaml').write_text('ekf_node:\n  speed_std: 1.0\n')
     started = []
-    for words, why in UNREADABLE:
+    for node, words, why in WRONG:
         words = [f'{tmp_path}/{word}' if word.endswith('.yaml') else word for word in words]
-        started.append((start('ekf_node', *words), why))
+        started.append((start(node, *words), why))
     for process, why in started:
         code, text = ended(process)
         assert code == CANNOT_START and why in text and 'Traceback' not in text, (why, text)
@@ -186,25 +168,12 @@ def test_a_node_that_dies_later_has_another_exit_code_than_one_that_cannot_start
     assert code == DIED and 'ZeroDivisionError' in text
 
 
-SECTIONS = {
-    '/robot2/ekf_node': True, '/**/ekf_node': False, 'robot1': False, '/**/efk_node': True,
-    'ekf_filter_node': False,
-}  # fmt: skip
-"""Whether the node `/robot1/ekf_node` warns of this section of its file."""
-
-
-def test_a_section_for_another_namespace_or_a_misspelt_one_is_warned_of(start, tmp_path):
-    started = []
-    for k, (key, ignored) in enumerate(SECTIONS.items()):
-        path, section = tmp_path / f'{k}.yaml', {'ros__parameters': {'autostart': False}}
-        path.write_text(
-            yaml.safe_dump({key: {'ekf_node': section} if key == 'robot1' else section})
-        )
-        words = ['--params-file', str(path), '-r', '__ns:=/robot1']
-        before = SEND.format('SIGINT') + MOMENTS['made']
-        started.append((path, key, ignored, start('ekf_node', *words, before=before)))
-    for path, key, ignored, process in started:
-        code, text = ended(process)
-        assert code == 0, text
-        warned = f'{path}: nothing of {key} is used: this node is /robot1/ekf_node'
-        assert (warned in text) == ignored and ('/**/ekf_node:' in text) == ignored
+@pytest.mark.parametrize(('key', 'ignored'), [('/**/efk_node', True), ('/**/ekf_node', False)])
+def test_a_misspelt_section_is_warned_of(start, tmp_path, key, ignored):
+    """Which sections are: test_config_file.py."""
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(yaml.safe_dump({key: {'ros__parameters': {'autostart': False}}}))
+    words = ['--params-file', str(path), '-r', '__ns:=/robot1']
+    code, text = ended(start('ekf_node', *words, before=SEND.format('SIGINT') + MOMENTS['made']))
+    warned = f'{path}: nothing of {key} is used: this node is /robot1/ekf_node; write /**/ekf_node:'
+    assert code == 0 and (warned in text) == ignored, text

@@ -241,17 +241,14 @@ def test_the_replay_of_the_readme_becomes_localised(bench, start, model):
     interrupted(chain)
 
 
-def test_a_launch_with_a_missing_parameter_file_fails(start):
-    chain = launch(start, 'model:=none', 'config:=/none.yaml')
-    assert chain.wait(COMMAND_S) != 0
-    assert 'there is no such parameter file' in chain.log.read_text()
-
-
-def test_a_launch_with_a_model_that_cannot_be_loaded_ends_with_1(start, tmp_path):
-    chain = launch(start, f'model:={tmp_path / "none.npz"}')
+@pytest.mark.parametrize(('argument', 'reasons'), [
+    ('config:=/none.yaml', ['there is no such parameter file']),
+    ('image_transport:=raw', ['none.npz: no such file', 'cannot start']),
+])  # fmt: skip
+def test_a_launch_without_its_parameter_file_or_model_ends_with_1(start, argument, reasons):
+    chain = launch(start, 'model:=/none.npz', argument)
     assert chain.wait(COMMAND_S) == 1
-    told = chain.log.read_text()
-    assert 'none.npz' in told and 'cannot start' in told
+    assert all(reason in chain.log.read_text() for reason in reasons)
 
 
 @pytest.mark.parametrize('respawn', ['true', 'false'])
