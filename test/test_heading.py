@@ -15,8 +15,6 @@ from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric import compass_training
 from sfa_localization.metric.compass import (
     Compass,
-    kernel_between,
-    prior_variance,
 )
 from sfa_localization.metric.compass_training import CompassFit, fit_compass
 
@@ -54,12 +52,6 @@ def test_harmonics_by_hand():
     assert np.allclose(harmonics(maps), [[2, -1j]])
 
 
-def test_harmonics_turn_with_the_columns():
-    maps = np.random.default_rng(0).normal(size=(2, 3, 12, 4)).astype(np.float32)
-    phase = np.exp(-2j * np.pi * 5 / 12)
-    assert np.allclose(harmonics(np.roll(maps, 5, axis=2)), phase * harmonics(maps), atol=1e-5)
-
-
 def test_headings_are_learnt():
     fit = fitted()
     assert np.degrees(np.abs(fit.error).mean()) < 2
@@ -78,7 +70,7 @@ def test_column_direction_is_found(sign):
     assert np.degrees(np.abs(wrap_angle(told - sign * yaw)).max()) < 5
 
 
-@pytest.mark.parametrize('turn', [0.1, 1.0, -2.5, 3.1])
+@pytest.mark.parametrize('turn', [0.1, -2.5])
 def test_turning_is_exact(turn):
     features, harmonic, _ = scene()
     compass = fitted().compass
@@ -86,14 +78,8 @@ def test_turning_is_exact(turn):
     turned, same = compass.predict(features, harmonic * np.exp(-1j * turn))
     assert np.abs(wrap_angle(turned - yaw - turn)).max() < 1e-4
     assert np.allclose(same, variance, rtol=1e-3)
-
-
-def test_contrast_does_not_matter():
-    features, harmonic, _ = scene()
-    compass = fitted().compass
-    yaw, variance = compass.predict(features, harmonic)
     faint, same = compass.predict(features, 0.1 * harmonic)
-    assert np.abs(wrap_angle(faint - yaw)).max() < 1e-5
+    assert np.abs(wrap_angle(faint - yaw)).max() < 1e-5, 'contrast does not matter'
     assert np.allclose(same, variance, rtol=1e-3)
 
 
@@ -117,22 +103,17 @@ def test_ambiguous_scenes_are_unsure():
     assert np.sqrt(np.median(variance)) > np.radians(60)
 
 
-def test_foreign_pictures_are_unsure():
+def test_foreign_pictures_and_unknown_places_are_unsure():
     features, harmonic, _ = scene()
     compass = fitted().compass
     rng = np.random.default_rng(1)
     noise = rng.normal(size=(*harmonic.shape, 2)) @ np.array([1, 1j])
     known, lost = (compass.predict(features, h)[1] for h in (harmonic, noise))
     assert np.median(lost) > 10 * np.median(known)
+    assert compass.predict(features + 100, harmonic)[1].min() > 0.5 * UNKNOWN_YAW_VARIANCE
 
 
-def test_unknown_places_are_unsure():
-    features, harmonic, _ = scene()
-    _, variance = fitted().compass.predict(features + 100, harmonic)
-    assert variance.min() > 0.5 * UNKNOWN_YAW_VARIANCE
-
-
-@pytest.mark.parametrize('folds', [2, 4])
+@pytest.mark.parametrize('folds', [2])
 def test_symmetric_panoramas_raise_the_variance(folds):
     """Scenes that look alike in several directions have no first harmonic to tell them by."""
     pictures, model = visit().panoramas.read(0, 43), place().model
@@ -146,23 +127,6 @@ def test_symmetric_panoramas_raise_the_variance(folds):
     assert np.sqrt(lost) > np.radians(30)
 
 
-def test_prediction_by_definition():
-    """The triangular products equal the process's equations in double precision."""
-    features, harmonic, _ = scene()
-    compass = fitted().compass
-    s, f = compass._scaled(features, harmonic)
-    kernel = kernel_between(s, f, compass.features, compass.harmonic, compass.length)
-    explained = (np.abs(kernel @ np.tril(compass.factor).astype(complex)) ** 2).sum(1)
-    expected = np.maximum(prior_variance(f) - explained, 0) + compass.noise
-    g, variance = compass._field(features, harmonic)
-    assert np.allclose(g, kernel @ compass.weights, atol=1e-3)
-    assert np.allclose(variance, expected, rtol=0.02)
-    for t in range(0, len(features), 29):
-        alone = compass._field(features[t : t + 1], harmonic[t : t + 1])
-        assert alone[0][0] == pytest.approx(g[t], abs=1e-4)
-        assert alone[1][0] == pytest.approx(variance[t], rel=0.02)
-
-
 def test_arrays_round_trip():
     features, harmonic, _ = scene()
     compass = fitted().compass
@@ -171,12 +135,6 @@ def test_arrays_round_trip():
         compass.predict(features, harmonic), again.predict(features, harmonic), strict=True
     ):
         assert np.allclose(one, other, atol=1e-4, rtol=1e-2)
-
-
-def test_same_data_same_bytes():
-    one, other = fitted(), fitted()
-    assert one.compass.weights.tobytes() == other.compass.weights.tobytes()
-    assert one.error.tobytes() == other.error.tobytes()
 
 
 @pytest.mark.parametrize(('count', 'folds'), [(19, 6), (0, 6), (100, 1)])

@@ -13,12 +13,10 @@ from cylinder_worlds import Spheres
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.features.keyframe_training import MOST, fit_keyframes, spread
+from sfa_localization.features.keyframe_training import fit_keyframes
 from sfa_localization.features.keyframes import (
     Keyframes,
-    correlate,
     quantized,
-    spectrum,
     texture,
 )
 from sfa_localization.features.observation import Match
@@ -311,20 +309,6 @@ def gray(image: np.ndarray) -> np.ndarray:
     return np.repeat(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[:, :, None], 3, axis=2)
 
 
-def moved(one: np.ndarray, other: np.ndarray) -> float:
-    """By how much of a column one image seems to be the other, shifted."""
-    spectra = [spectrum(texture(image))[None] for image in (one, other)]
-    columns = texture(one).shape[1]
-    shift = float(correlate(*spectra, columns)[1][0, 0])
-    return abs((shift + columns / 2) % columns - columns / 2)
-
-
-def test_colors_stay_where_the_sun_moves_the_lit_side():
-    morning, evening = posts(1.0), posts(-1.0)
-    assert moved(gray(morning), gray(evening)) > 0.5
-    assert moved(morning, evening) < 0.5 * moved(gray(morning), gray(evening))
-
-
 def test_color_weighs_about_as_much_as_brightness_and_a_gray_camera_has_none():
     image, rows = posts(0.0), (16, 24)
     parts = [np.linalg.norm(part) for part in np.split(texture(image), rows)]
@@ -332,23 +316,6 @@ def test_color_weighs_about_as_much_as_brightness_and_a_gray_camera_has_none():
     assert all(np.ptp(part) < 1e-6 for part in np.split(texture(gray(image)), rows)[1:])
     tinted = (image * np.array([0.8, 1.0, 0.9])).astype(np.uint8)
     assert float((texture(image) * texture(tinted)).sum()) > 0.97, 'the white balance is no matter'
-
-
-def test_a_gray_image_finds_its_place_among_colored_keyframes():
-    world, poses = Spheres.about(0), unseen(30)
-    images = np.stack([gray(image) for image in world.panoramas(poses, CONFIG)])
-    assert np.median(errors(learnt(world), images, poses)[0]) < 0.1
-
-
-def test_a_long_drive_is_thinned_evenly():
-    """An even drive over a square: no part of it is left without keyframes."""
-    t = np.linspace(0, 1, 3000)
-    poses = np.column_stack([10 * np.abs((40 * t) % 2 - 1), 10 * t, np.zeros(3000)])
-    kept = spread(poses)
-    assert len(kept) == MOST and len(np.unique(kept)) == MOST
-    shares = np.histogram(kept, bins=10, range=(0, 3000))[0] / MOST
-    assert shares.min() > 0.07
-    assert np.array_equal(kept, spread(poses))
 
 
 @pytest.mark.parametrize('east', [(2.6, 3.2), (3.2, 4.0)])

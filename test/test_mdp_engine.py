@@ -48,26 +48,12 @@ def test_the_network_is_the_flow():
     assert np.allclose(flow.execute(flat).reshape(2, 1, 12, 4), network.maps(images)[-1], atol=2e-3)
 
 
-def test_several_drives():
-    drives = [drive(10), drive(12, seed=3)]
-    images = drives[0].panoramas.read(0, 10)
-    ours = hierarchy.train_network(ARCHITECTURE, drives, **PLAIN).maps(images)
-    theirs = mdp_engine.train_network(ARCHITECTURE, drives, **PLAIN).maps(images)
-    assert correlations(ours[-1], theirs[-1]).min() > 0.9999
-
-
 @pytest.mark.parametrize('receptive', ARCHITECTURE.fields)
 def test_switchboards_show_what_fields_see(receptive):
     maps = np.random.default_rng(0).normal(size=(1, 5, 12, 3)).astype(np.float32)
     wires = mdp_engine.connections((5, 12, 3), receptive)
     seen = unfold(maps, receptive)
     assert np.array_equal(maps.ravel()[wires], seen.reshape(-1, seen.shape[-1]))
-
-
-def test_progress_counts_every_picture_in_every_pass():
-    told = []
-    mdp_engine.train_network(ARCHITECTURE, [drive(6)], **PLAIN, on_shard=told.append)
-    assert sum(told) == 6 * 6
 
 
 def test_blank_pictures_are_refused():

@@ -36,9 +36,11 @@ def saved(model, tmp_path) -> Path:
     return tmp_path / 'model.npz'
 
 
-def test_images_are_located(model, pictures):
-    truth = visit().odometry.poses
-    estimates = model.locate_all(pictures)
+@pytest.mark.parametrize('clockwise', [True, False])
+def test_images_are_located(clockwise):
+    """Yaw by REP-103, whichever way the columns go: checked against the true headings."""
+    truth = visit(clockwise).odometry.poses
+    estimates = place(clockwise).model.locate_all(visit(clockwise).panoramas.read(0, 43))
     error = np.array([e.position for e in estimates]) - truth[:, :2]
     yaw_error = wrap_angle(np.array([e.yaw for e in estimates]) - truth[:, 2])
     assert np.median(np.hypot(*error.T)) < 0.3
@@ -56,13 +58,13 @@ def test_one_by_one_equals_all_together(model, pictures):
 
 
 @pytest.mark.parametrize('clockwise', [True, False])
-@pytest.mark.parametrize('steps', [1, 5, -7, 9, 17])
+@pytest.mark.parametrize('steps', [1, -7])
 def test_rolled_columns_turn_the_robot(clockwise, steps):
     """k columns are 2 pi k / W of yaw, its sign that of the column direction, and no way at all."""
     model, columns = place(clockwise).model, steps * COLUMN_STEP
     # A robot that turned left sees everything farther right: at larger columns when clockwise.
     turn = (1 if clockwise else -1) * 2 * np.pi * columns / PLACE_SIZE[1]
-    for picture in visit(clockwise).panoramas.read(0, 20):
+    for picture in visit(clockwise).panoramas.read(0, 10):
         one, other = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
         assert abs(wrap_angle(other.yaw - one.yaw - turn)) < np.radians(2)
         assert np.abs(other.position - one.position).max() < 0.1
@@ -73,25 +75,12 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
         assert np.allclose(turned.covariance, slow.covariance, rtol=1e-2)
 
 
-@pytest.mark.parametrize('clockwise', [True, False])
-def test_yaw_is_counterclockwise_from_the_maps_x(clockwise):
-    """REP-103, whichever way the columns go: checked against the true headings."""
-    truth = visit(clockwise).odometry.poses
-    estimates = place(clockwise).model.locate_all(visit(clockwise).panoramas.read(0, 43))
-    error = wrap_angle(np.array([e.yaw for e in estimates]) - truth[:, 2])
-    assert np.degrees(np.median(np.abs(error))) < 3
-
-
 def test_covariances_are_positive_definite(model, pictures):
     strange = np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8)
     for estimate in model.locate_all(np.concatenate([pictures, strange])):
         assert np.allclose(estimate.covariance, estimate.covariance.T)
         assert np.linalg.eigvalsh(estimate.covariance).min() > 0
         assert 0 < estimate.covariance[2, 2] <= UNKNOWN_YAW_VARIANCE
-
-
-def test_covariance_of_strange_pictures_is_larger(model, pictures):
-    strange = np.random.default_rng(0).integers(0, 256, pictures.shape, np.uint8)
     familiar, foreign = (
         np.median([np.trace(e.covariance[:2, :2]) for e in model.locate_all(p)])
         for p in (pictures, strange)
@@ -137,116 +126,87 @@ def test_other_pictures_are_refused(model, picture):
         model.locate(picture)
 
 
-class TestFile:
-    """Saving and loading."""
+def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path):
+    again = PlaceModel.load(saved)
+    for one, other in zip(model.locate_all(pictures), again.locate_all(pictures), strict=True):
+        assert np.array_equal(one.position, other.position)
+        assert np.allclose(one.covariance, other.covariance, rtol=1e-2)
+        assert one.yaw == pytest.approx(other.yaw, abs=1e-5)
+        assert one.novelty == other.novelty
+    assert again.quality == json.loads(json.dumps(model.quality))
+    assert (again.panorama, again.network.ranks) == (model.panorama, model.network.ranks)
+    assert again.error_correlation == model.error_correlation != ErrorCorrelation()
+    assert Localizer(again).filter.correlation.share == pytest.approx(again.error_correlation.share)
+    model.save(tmp_path / 'again.npz')
+    again.save(tmp_path / 'loaded.npz')
+    assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
+    assert (tmp_path / 'loaded.npz').read_bytes() == saved.read_bytes()
+    blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
+    blind.save(tmp_path / 'blind.npz')
+    again = PlaceModel.load(tmp_path / 'blind.npz')
+    assert again.compass is None and again.locate(pictures[0]).yaw == blind.locate(pictures[0]).yaw
 
-    def test_round_trip(self, model, saved, pictures):
-        again = PlaceModel.load(saved)
-        for one, other in zip(model.locate_all(pictures), again.locate_all(pictures), strict=True):
-            assert np.array_equal(one.position, other.position)
-            assert np.allclose(one.covariance, other.covariance, rtol=1e-2)
-            assert one.yaw == pytest.approx(other.yaw, abs=1e-5)
-            assert one.novelty == other.novelty
-        assert again.quality == json.loads(json.dumps(model.quality))
-        assert again.panorama == model.panorama
-        assert again.network.ranks == model.network.ranks
 
-    def test_same_model_same_bytes(self, model, saved, tmp_path):
-        model.save(tmp_path / 'again.npz')
-        PlaceModel.load(saved).save(tmp_path / 'loaded.npz')
-        assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
-        assert (tmp_path / 'loaded.npz').read_bytes() == saved.read_bytes()
+def test_a_failed_write_leaves_the_old_model_and_nothing_else(model, saved, monkeypatch):
+    before = saved.read_bytes()
 
-    def test_without_heading(self, model, tmp_path, pictures):
-        blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
-        blind.save(tmp_path / 'blind.npz')
-        again = PlaceModel.load(tmp_path / 'blind.npz')
-        assert again.compass is None and model.compass is not None
-        assert again.locate(pictures[0]).yaw == blind.locate(pictures[0]).yaw
+    def full(file, **arrays):
+        file.write(b'half')
+        raise OSError(28, 'No space left on device')
 
-    def test_nothing_but_the_model_is_left(self, saved):
-        assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
+    monkeypatch.setattr(np, 'savez', full)
+    with pytest.raises(ModelError, match='No space left'):
+        model.save(saved)
+    assert saved.read_bytes() == before
+    assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
+    (saved.parent / 'file').write_text('')
+    with pytest.raises(ModelError, match='cannot be written'):
+        model.save(saved.parent / 'file' / 'model.npz')
 
-    def test_a_folder_that_cannot_be(self, model, tmp_path):
-        (tmp_path / 'file').write_text('')
-        with pytest.raises(ModelError, match='cannot be written'):
-            model.save(tmp_path / 'file' / 'model.npz')
 
-    def test_a_failed_write_leaves_the_old_model(self, model, saved, monkeypatch):
-        before = saved.read_bytes()
+def test_what_is_no_model_is_refused_with_the_remedy(tmp_path):
+    os.mkfifo(tmp_path / 'pipe.npz')
+    np.savez(tmp_path / 'other.npz', a=np.zeros(3))
+    (tmp_path / 'empty.npz').write_bytes(b'')
+    (tmp_path / 'broken.npz').write_bytes(b'PK\x03\x04 broken')
+    for name, told in (
+        ('none.npz', 'no such file: train it'),
+        ('pipe.npz', 'is no regular file'),
+        ('.', 'is a folder'),
+        ('other.npz', 'not a sfa_localization place model'),
+        ('empty.npz', 'not a sfa_localization place model'),
+        ('broken.npz', 'not a sfa_localization place model'),
+    ):
+        refused(tmp_path / name, told)
 
-        def full(file, **arrays):
-            file.write(b'half')
-            raise OSError(28, 'No space left on device')
 
-        monkeypatch.setattr(np, 'savez', full)
-        with pytest.raises(ModelError, match='No space left'):
-            model.save(saved)
-        assert saved.read_bytes() == before
-        assert [path.name for path in saved.parent.iterdir()] == ['model.npz']
-
-    def test_missing(self, tmp_path):
-        with pytest.raises(ModelError, match=r'none\.npz: no such file: train it'):
-            PlaceModel.load(tmp_path / 'none.npz')
-
-    def test_what_is_no_file_is_named(self, tmp_path):
-        os.mkfifo(tmp_path / 'pipe.npz')
-        for name, what in (('pipe.npz', 'is no regular file'), ('.', 'is a folder')):
-            with pytest.raises(ModelError, match=what):
-                PlaceModel.load(tmp_path / name)
-
-    @pytest.mark.parametrize('content', [b'', b'no zip', b'PK\x03\x04 broken'])
-    def test_no_model(self, tmp_path, content):
-        (tmp_path / 'x.npz').write_bytes(content)
-        refused(tmp_path / 'x.npz', 'not a sfa_localization place model')
-
-    def test_other_arrays(self, tmp_path):
-        np.savez(tmp_path / 'x.npz', a=np.zeros(3))
-        refused(tmp_path / 'x.npz', 'not a sfa_localization place model')
-
-    def test_another_kind(self, saved):
-        rewrite(saved, format='something else')
-        refused(saved, 'a something else, not a')
-
-    def test_another_version(self, saved):
-        rewrite(saved, version=VERSION + 1)
-        refused(saved, f'version {VERSION + 1}, this software reads {VERSION}: train it')
-
-    @pytest.mark.parametrize('cut', [0.1, 0.5, 0.99])
-    def test_cut_off(self, saved, cut):
-        data = saved.read_bytes()
-        saved.write_bytes(data[: int(len(data) * cut)])
+def test_a_damaged_model_is_refused_with_the_remedy(saved):
+    whole = saved.read_bytes()
+    for cut in (0.1, 0.99):
+        saved.write_bytes(whole[: int(len(whole) * cut)])
         refused(saved, 'not a sfa_localization place model')
-
-    @pytest.mark.parametrize('part', [0.01, 0.5, 0.9])
-    def test_a_bit_is_wrong(self, saved, part):
-        data = bytearray(saved.read_bytes())
+    for part in (0.01, 0.5, 0.9):
+        data = bytearray(whole)
         data[int(len(data) * part)] ^= 16
         saved.write_bytes(data)
         refused(saved, 'damaged.*: copy it again, or train it')
-
-    @pytest.mark.parametrize(
-        'name',
-        [
-            'network/1/slow',
-            'metric/linear',
-            'keyframes/noise',
-            'compass/weights',
-            'refinement/axes',
-        ],
-    )
-    def test_an_array_is_missing(self, saved, name):
+    names = ('network/1/slow', 'metric/linear', 'keyframes/noise', 'compass/weights')
+    for name in (*names, 'refinement/axes'):
+        saved.write_bytes(whole)
         rewrite(saved, without=name)
         refused(saved, 'train')
-
-    def test_a_header_without_panorama(self, saved):
-        rewrite(saved, panorama={'nonsense': 1})
-        refused(saved, 'damaged.*train it again')
-
-    def test_no_pickle_is_read(self, saved):
-        arrays = read_arrays(saved, FORMAT, VERSION, '')
-        np.savez(saved, **{**arrays, 'evil': np.array([object()], dtype=object)})
-        refused(saved, 'not a sfa_localization place model')
+    for header, told in (
+        ({'format': 'something else'}, 'a something else, not a'),
+        ({'version': VERSION + 1}, f'version {VERSION + 1}, this software reads {VERSION}: train'),
+        ({'panorama': {'nonsense': 1}}, 'damaged.*train it again'),
+    ):
+        saved.write_bytes(whole)
+        rewrite(saved, **header)
+        refused(saved, told)
+    saved.write_bytes(whole)
+    arrays = read_arrays(saved, FORMAT, VERSION, '')
+    np.savez(saved, **{**arrays, 'evil': np.array([object()], dtype=object)})
+    refused(saved, 'not a sfa_localization place model')
 
 
 def rewrite(path: Path, without: str = '', **header) -> None:
@@ -261,14 +221,3 @@ def refused(path: Path, told: str) -> None:
         PlaceModel.load(path)
     assert str(path) in str(error.value)
     assert 'train' in str(error.value) and '\n' not in str(error.value)
-
-
-def test_what_is_known_of_the_errors_travels_with_the_model(model, tmp_path):
-    known = replace(model, error_correlation=ErrorCorrelation(0.35, 2.5))
-    known.save(tmp_path / 'known.npz')
-    assert PlaceModel.load(tmp_path / 'known.npz').error_correlation == ErrorCorrelation(0.35, 2.5)
-
-
-def test_the_trainer_fills_it_in_from_what_it_left_out(model):
-    assert model.error_correlation != ErrorCorrelation()
-    assert Localizer(model).filter.correlation.share == pytest.approx(model.error_correlation.share)

@@ -11,8 +11,6 @@ from sfa_localization.features.rotation import (
     Field,
     FieldStatistics,
     SampleStatistics,
-    shifted,
-    strips,
     unfold,
 )
 from sfa_localization.features.sfa import Statistics
@@ -69,11 +67,6 @@ def brute_force(signals: np.ndarray, rotations: int, joined: np.ndarray) -> Stat
         counted / rotations,
         sums[1] / rotations,
     )
-
-
-def added(one: Statistics, other: Statistics) -> Statistics:
-    """Statistics of both signals, with a break between them."""
-    return Statistics(*(getattr(one, name) + getattr(other, name) for name in Statistics.__slots__))
 
 
 def assert_equal(ours: Statistics, theirs: Statistics, tolerance: float = 1e-5) -> None:
@@ -139,14 +132,6 @@ def test_without_rotation_only_images_at_the_same_view_are_compared(joined):
         assert np.allclose(ours.second, flat.T @ flat, rtol=1e-5)
 
 
-def test_paper_sized_field_equals_brute_force():
-    """60 rotations, fields of 14 columns."""
-    of, field, joined = maps(3, 2, 3, 60, 4), Field(2, 14, 1), np.ones(1, bool)
-    assert_equal(
-        field_statistics(of, field, joined), brute_force(views(sequence(of), field), 60, joined)
-    )
-
-
 @given(batch=st.integers(1, 9), broken=st.integers(0, 7), seed=st.integers(0, 50))
 @settings(max_examples=25, deadline=None)
 def test_batches_equal_the_whole(batch, broken, seed):
@@ -154,14 +139,6 @@ def test_batches_equal_the_whole(batch, broken, seed):
     joined = np.arange(8) != broken
     assert_equal(field_statistics(of, field, joined, batch), field_statistics(of, field, joined))
     assert_equal(sample_statistics(of, joined, batch), sample_statistics(of, joined))
-
-
-def test_a_break_equals_two_drives():
-    of, field = maps(4, 9), FIELDS[0]
-    halves = [
-        field_statistics(part, field, np.ones(len(part) - 1, bool)) for part in (of[:4], of[4:])
-    ]
-    assert_equal(field_statistics(of, field, np.arange(8) != 3), added(*halves))
 
 
 def test_merging_with_a_lead_equals_the_whole():
@@ -198,15 +175,3 @@ def test_a_single_picture_turns_but_does_not_move():
 def test_unfold_shows_what_nodes_see(field):
     of = maps(6, 3)
     assert np.array_equal(unfold(of, field), views(of, field).astype(np.float32))
-
-
-def test_turning_shifts_the_views():
-    of, field = maps(7, 2), FIELDS[1]
-    turned = unfold(np.roll(of, -5, axis=2), field)
-    assert np.array_equal(turned, np.roll(unfold(of, field), -5, axis=2))
-
-
-def test_strips_and_shifts_by_hand():
-    of = np.arange(12, dtype=np.float32).reshape(1, 3, 4, 1)
-    assert strips(of, Field(2, 1, 1))[0, 1].tolist() == [[4, 8], [5, 9], [6, 10], [7, 11]]
-    assert shifted(of, [1, -1])[0, 0].tolist() == [[1, 3], [2, 0], [3, 1], [0, 2]]

@@ -9,7 +9,6 @@ takes fewer pictures; `--model FILE` measures inference of a trained model, not 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import re
 import subprocess
@@ -41,14 +40,12 @@ from sfa_localization.features.keyframe_training import MOST
 from sfa_localization.features.keyframes import Keyframes, MatchNoise, quantized, texture
 from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
-    RELATIVE_CUT,
     ImageSequence,
     cores,
     shards_of,
     train_network,
 )
 from sfa_localization.features.rotation_spread import Agreement
-from sfa_localization.features.sfa import Statistics, solve
 from sfa_localization.metric.basis import Process, expand
 from sfa_localization.metric.compass import Compass, kernel_between
 from sfa_localization.metric.compass_training import (
@@ -383,30 +380,6 @@ def peak(path: Path, count: int) -> float:
     return float(re.search(r'VmHWM:\s+(\d+) kB', status).group(1)) / 1024
 
 
-def statistics(x: np.ndarray) -> Statistics:
-    """The sums over a signal (N, D)."""
-    dx = np.diff(x, axis=0)
-    return Statistics(len(x), x.sum(0), x.T @ x, len(dx), dx.T @ dx)
-
-
-def bench_sklearn_sfa(rounds: int = 3) -> dict[str, float]:
-    """Our solver against sklearn-sfa's on one node's signal; nothing where it is not installed."""
-    if importlib.util.find_spec('sksfa') is None:
-        return {}
-    from sksfa import SFA
-
-    rng = np.random.default_rng(0)
-    signal = rng.normal(size=(20_000, 300)).cumsum(0) @ rng.normal(size=(300, 300))
-    theirs, ours = in_turns(
-        [
-            lambda: SFA(n_components=32).fit(signal),
-            lambda: solve(statistics(signal), 32, RELATIVE_CUT),
-        ],
-        rounds,
-    )
-    return {'sfa_speedup_vs_sklearn_sfa': float(np.median(theirs) / np.median(ours))}
-
-
 def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> dict[str, float]:
     """All figures, by name."""
     if model is None:
@@ -415,7 +388,6 @@ def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> d
     else:
         located = PlaceModel.load(model)
     figures = bench_locate(located, 300 if quick else 2000)
-    figures |= bench_sklearn_sfa()
     figures |= bench_memory(folder, quick)
     figures |= bench_training(folder, quick)
     try:
