@@ -21,7 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.lenses import CameraModel, make_camera
+from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.settings import LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
@@ -260,13 +260,12 @@ def simulate(
     config: SimulationConfig,
     out: Path,
     panorama: PanoramaConfig | None = None,
-    camera: CameraModel | None = None,
     progress: bool = False,
 ) -> Drive:
     """Drive through the garden of `config` and `record` it. Returns what was recorded."""
     garden = Garden(config.world, config)
     driven = drive(garden, config)
-    record(driven, garden, config, out, panorama, camera, progress)
+    record(driven, garden, config, out, panorama, progress)
     return driven
 
 
@@ -276,7 +275,6 @@ def record(
     config: SimulationConfig,
     out: Path,
     panorama: PanoramaConfig | None = None,
-    camera: CameraModel | None = None,
     progress: bool = False,
 ) -> None:
     """Record a drive to the bag `out`; `progress` shows a bar.
@@ -287,7 +285,7 @@ def record(
     if config.images == 'panorama':
         view = panorama_view(panorama or PanoramaConfig())
     else:
-        camera = camera or make_camera(LensCalibration(), RAW_SIZE)
+        camera = make_camera(LensCalibration(), RAW_SIZE)
         view = raw_view(camera.unproject, camera.size)
     with BagWriter(out, config.storage) as bag:
         noisy = render_images(garden, driven, config, view)
