@@ -73,20 +73,19 @@ def test_images_without_a_mirror_are_rejected():
             find_circles([picture])
 
 
-@pytest.mark.parametrize('side', [480, 1440, 2880])
 @pytest.mark.parametrize('soft', [0.03, 0.1])
-def test_a_soft_rim_is_found_at_any_resolution(side, soft):
+def test_a_soft_rim_is_found_at_any_resolution(soft):
     center, radius = (240.7, 239.0), 245.8  # the border cuts it off by 2 %
     rows, columns = np.mgrid[:480, :480]
     off = np.hypot(columns - center[0], rows - center[1]) / radius - 1
     texture = np.random.default_rng(0).uniform(40, 230, (24, 24, 3)).astype(np.float32)
     light = 1 / (1 + np.exp(np.clip(4 * off / soft, -50, 50)))
     picture = cv2.resize(texture, (480, 480), interpolation=cv2.INTER_CUBIC) * light[..., None]
-    shown = cv2.resize(np.clip(picture, 0, 255).astype(np.uint8), (side, side))
-    rim = find_circles([shown]).rim
-    scale = side / 480
-    found = rim.column / scale, rim.row / scale, rim.radius / scale
-    np.testing.assert_allclose(found, (*center, radius), atol=0.015 * radius)
+    for side in (480, 1440, 2880):
+        shown = cv2.resize(np.clip(picture, 0, 255).astype(np.uint8), (side, side))
+        rim, scale = find_circles([shown]).rim, side / 480
+        found = rim.column / scale, rim.row / scale, rim.radius / scale
+        np.testing.assert_allclose(found, (*center, radius), atol=0.015 * radius)
 
 
 @pytest.mark.parametrize('turns', ['mirror', 'picture'])
@@ -190,44 +189,22 @@ def test_from_a_calibration_file(tmp_path):
     assert 'mount_rpy: [0.0, 0.0, 90.0]' in output.read_text()
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        ([], 'give images'),
-        (['missing.png'], 'missing.png'),
-        (['notes.txt'], 'notes.txt'),
-        (['raw.png', 'small.png'], 'image 2 differs in size'),
-        (['raw.png', '--center', '3'], '--radii'),
-        (['--calibration', 'missing.yaml'], 'missing.yaml'),
-        (['filled.png'], 'inner circle'),
-        (['raw.png', '--angle-min', '120', '--angle-max', '80'], 'angle'),
-        (['raw.png', '--calibration', 'other.yaml'], 'add the columns and rows cut off'),
-    ],
-)
-def test_bad_input_is_one_line_and_nothing_written(picture, capsys, arguments, words):
+def test_bad_input_is_one_line_and_nothing_written(picture, capsys):
     cv2.imwrite('small.png', scene(1)[:100])
     cv2.imwrite('filled.png', scene(1, radii=(0.0, 200.0)))
     Path('notes.txt').write_text('no picture')
     Path('other.yaml').write_text(KALIBR.replace('752', '480'))
-    assert cli.main(['calibrate', *arguments, '--output', 'camera.yaml']) == 1
-    printed, error = capsys.readouterr()
-    assert words in error and printed == ''
-    assert '\n' not in error.strip()
-    assert not Path('camera.yaml').exists()
-
-
-@pytest.mark.parametrize('option', ['--output', '--check'])
-def test_what_is_read_is_not_replaced(picture, capsys, option):
-    before = Path(picture).read_bytes()
-    assert cli.main(['calibrate', picture, option, picture]) == 1
-    assert 'would be replaced' in capsys.readouterr().err and Path(picture).read_bytes() == before
-    assert cli.main(['calibrate', picture, '--output', 'a', '--check', './a']) == 1
-    assert 'a: named for two outputs: give each its own' in capsys.readouterr().err
-    assert cli.main(['calibrate', picture, '--output', 'camera.yaml']) == 0
-    before = Path('camera.yaml').read_bytes()
-    known = ['--calibration', 'camera.yaml', '--mount-rpy', '0x0x90']
-    assert cli.main(['calibrate', *known, '--output', './camera.yaml']) == 1
-    assert Path('camera.yaml').read_bytes() == before
+    for arguments, words in {
+        '': 'give images', 'missing.png': 'missing.png', 'notes.txt': 'notes.txt',
+        'raw.png small.png': 'image 2 differs in size', 'raw.png --center 3': '--radii',
+        '--calibration missing.yaml': 'missing.yaml', 'filled.png': 'inner circle',
+        'raw.png --angle-min 120 --angle-max 80': 'angle_min',
+        'raw.png --calibration other.yaml': 'add the columns and rows cut off',
+    }.items():  # fmt: skip
+        assert cli.main(['calibrate', *arguments.split(), '--output', 'camera.yaml']) == 1
+        printed, error = capsys.readouterr()
+        assert words in error and printed == '' and '\n' not in error.strip()
+        assert not Path('camera.yaml').exists()
 
 
 def test_the_check_image_marks_the_directions():

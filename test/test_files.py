@@ -190,6 +190,8 @@ REFUSED = {
         'evaluate model.npz other --align bag --json bag/sample.mcap',
         'evaluate model.npz bag --config a.yaml --json a.yaml',
         'train bag --output bag/sample.mcap', 'train bag --update model.npz --output link/a.mcap',
+        'calibrate picture.png --check picture.png',
+        'calibrate --calibration a.yaml --output ./a.yaml',
     ], 'would be replaced by an output'),
     **dict.fromkeys([
         'inspect bag --json diary.txt', 'evaluate model.npz bag --json diary.txt',
@@ -212,6 +214,7 @@ REFUSED = {
         'train bag --output=new --report=./new',
         'train bag --output=new/training.md --report=new',
         'train bag --output=new --report=new/report',
+        'calibrate picture.png --output=new --check=./new',
     ], 'named for two outputs: give each its own'),
     'config --output loop.yaml': 'loop.yaml: ',
 }  # fmt: skip
