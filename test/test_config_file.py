@@ -56,14 +56,6 @@ def test_every_parameter_is_explained_and_has_the_type_that_ros_needs():
             assert type(values[item.name]) is type(default), item.name
 
 
-def test_changes_are_written_and_the_rest_stays(tmp_path):
-    path = tmp_path / 'c.yaml'
-    write_config(path, {'ekf_node': {'slip_per_metre': 1.5e-7}, 'omnicam_node': {'width': 300}})
-    assert load_settings(path, 'ekf_node', FilterConfig) == FilterConfig(slip_per_metre=1.5e-7)
-    assert load_settings(path, 'omnicam_node', PanoramaConfig).width == 300
-    assert config_file.load_changes(path)['ekf_node']['slip_per_metre'] == 1.5e-7
-
-
 def test_parameters_of_ros_are_kept(tmp_path):
     """A file that is read and written again keeps the parameters of ROS, and all others."""
     path = saved(tmp_path, '/**:\n  ros__parameters:\n    use_sim_time: true\n    width: 300\n'
@@ -173,24 +165,19 @@ def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path):
         assert str(path) in str(raised.value) and '\n' not in str(raised.value), text
 
 
-def test_a_missing_file_and_an_unwritable_one_are_named(tmp_path):
-    with pytest.raises(ConfigError, match='cannot be read'):
-        load_settings(tmp_path / 'none.yaml', 'ekf_node', FilterConfig)
-    (tmp_path / 'file').touch()
-    with pytest.raises(ConfigError, match='cannot be written'):
-        write_config(tmp_path / 'file' / 'c.yaml')
-
-
 def test_a_pipe_is_no_parameter_file(tmp_path, capsys):
     """It would be waited for; and one that a shell fills can be read once, but has sections."""
     os.mkfifo(tmp_path / 'pipe')
     reading, writing = os.pipe()
     os.write(writing, b'ekf_node: {ros__parameters: {lost_std: 3.0}}\n')
     os.close(writing)
-    for path in (tmp_path / 'pipe', f'/dev/fd/{reading}'):
+    for path, why in {
+        tmp_path / 'pipe': 'it is no regular file', f'/dev/fd/{reading}': 'it is no regular file',
+        tmp_path / 'none.yaml': 'No such file',
+    }.items():  # fmt: skip
         words = ['train', 'no_bag', '--output', str(tmp_path / 'a.npz'), '--config', str(path)]
         assert main(words) == 1
-        assert f'{path}: cannot be read: it is no regular file' in capsys.readouterr().err
+        assert f'{path}: cannot be read: {why}' in capsys.readouterr().err
     os.close(reading)
 
 
@@ -199,3 +186,5 @@ def test_the_command_prints_and_writes(tmp_path, capsys):
     assert capsys.readouterr().out == render()
     assert main(['config', '--output', str(tmp_path / 'c.yaml')]) == 0
     assert (tmp_path / 'c.yaml').read_text() == render()
+    assert main(['config', '--output', str(tmp_path / 'c.yaml' / 'd.yaml')]) == 1
+    assert 'c.yaml/d.yaml: cannot be written' in capsys.readouterr().err
