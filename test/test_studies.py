@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from study import __main__ as studies
-from study import comparisons, light, light_report, paper, results, year, year_report
+from study import comparisons, light, paper, results, year
 from study.comparisons import BASELINES, VARIANTS
 from study.half_real import given_drive
-from study.paper_report import PAPER, comparison_table, paper_table
+from study.paper_report import PAPER, paper_table
 from study.results import Results
 from study.retrieval import ImageRetrieval
 from study.signatures import FourierSignature, TurnedComponents
@@ -58,31 +58,25 @@ def made(tmp_path_factory, gardens, small_network):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', ['simulator', 'robot'])
-def test_an_experiment_judges_every_recipe(made, name):
-    (cell,) = cells(made / 'all' / f'{name}.json')
-    assert cell['images'][0] == {'simulator': 150, 'robot': 260}[name]
-    assert cell['odometry'] == pytest.approx(0.31, abs=0.03)
-    columns = {'paper', 'certified', 'ours'} | ({'random', 'random_long'} & set(cell['columns']))
-    assert set(cell['columns']) == columns and ('random' in columns) == (name == 'simulator')
-    ours = cell['columns']['ours']
-    assert ours['training_supervised'] <= ours['training'] < 1 and ours['ekf'] < 1
-    assert 0 < ours['test'] < 2 and ours['scaled'] < 1.02 * ours['image'] != ours['test']
-    figures = {'simulator': (4, 5, 6), 'robot': (7, 8, 9)}[name]
-    for number in figures:
-        assert cv2.imread(str(made / 'all' / f'figure_{number}.png')).std() > 5
+def test_an_experiment_judges_every_recipe(made):
+    for name, images, figures in (('simulator', 150, (4, 5, 6)), ('robot', 260, (7, 8, 9))):
+        (cell,) = cells(made / 'all' / f'{name}.json')
+        assert cell['images'][0] == images and cell['odometry'] == pytest.approx(0.31, abs=0.03)
+        assert set(cell['columns']) >= {'paper', 'certified', 'ours'}
+        assert ('random' in cell['columns']) == (name == 'simulator')
+        ours = cell['columns']['ours']
+        assert ours['training_supervised'] <= ours['training'] < 1 and ours['ekf'] < 1
+        assert 0 < ours['test'] < 2 and ours['scaled'] < 1.02 * ours['image'] != ours['test']
+        for number in figures:
+            assert cv2.imread(str(made / 'all' / f'figure_{number}.png')).std() > 5
 
 
 @pytest.mark.slow
-def test_baselines_are_judged_alike(made):
+def test_baselines_and_ablations_are_judged_alike(made):
     found = {cell['features']: cell for cell in cells(made / 'all' / 'baselines.json')}
     assert all(0 < found[name]['test'] < 6 for name in BASELINES)
     assert found['slow features, first pass']['test'] < 1.5
     assert found[comparisons.RETRIEVAL]['test_supervised'] < 1
-
-
-@pytest.mark.slow
-def test_ablations_leave_out_what_they_name(made):
     found = {cell['variant']: cell for cell in cells(made / 'all' / 'ablations.json')}
     whole, bare = found['everything'], found['no keyframes']
     assert bare['slow'] == whole['slow'] == bare['sfa'] != whole['sfa']
@@ -90,22 +84,14 @@ def test_ablations_leave_out_what_they_name(made):
 
 
 @pytest.mark.slow
-def test_lights_are_tested_by_models_of_some_lights(made):
+def test_lights_and_months_are_judged_before_anything_is_learned(made):
     found = cells(made / 'all' / 'light' / 'matrix.json')
     assert [cell['trained'] for cell in found] == ['day'] * 2 + ['day + overcast'] * 2
-    *_, last = light.trainings(light.FULL)
-    assert last.trained == light.ALL_BUT and {test[0] for test in last.tests}.isdisjoint(
-        last.lights
-    )
     for cell in found:
         assert 0 <= cell['localized'] <= 1 and 0 < cell['sfa']['mean_m'] < 6
         assert cell['slow']['mean_m'] > 0 and ('paper' in cell) == (cell['trained'] == 'day')
     assert found[0]['retrieval']['mean_m'] < 1
     assert cv2.imread(str(made / 'all' / 'light' / 'matrix.png')).std() > 5
-
-
-@pytest.mark.slow
-def test_a_year_judges_before_anything_is_learned(made):
     found = {(cell['month'], cell['model']): cell for cell in cells(made / 'year' / 'year.json')}
     assert found['July', 'frozen']['ekf_m'] == found['July', 'updated']['ekf_m']
     assert {model for month, model in found if month == 'August'} == {
@@ -164,17 +150,6 @@ def test_the_table_has_the_papers_numbers_and_mean_and_spread_of_ours():
     assert table['test, unsupervised map'] == ['0.14', '-', '0.150 ± 0.071']
     assert table['EKF against odometry'] == ['-65 %', '-', '-80 ± 0 %']
     assert round(1 - PAPER['robot']['ekf'] / PAPER['robot']['odometry'], 2) == 0.65
-
-
-def test_tables_have_a_dash_where_there_is_no_result():
-    worlds = [{'world': 'a', 'features': 'slow', 'test': 0.12345},
-              {'world': 'b', 'features': 'slow', 'problem': 'too few'}]  # fmt: skip
-    assert rows(comparison_table(worlds, 'features', {'test': 'm'}))['slow'] == ['0.123', '-']
-    blind = {'light': 'evening', 'season': 'winter', 'problem': 'dark'}
-    line = rows(light_report.table([{'trained': 'day', **blind}]))['day']
-    assert set(line[1:]) == {'-'}
-    line = rows(year_report.table([{'model': 'frozen', 'month': 'May', **blind}]))['May']
-    assert set(line[1:]) == {'-'}
 
 
 # Other features
