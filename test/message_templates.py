@@ -17,7 +17,7 @@ REASONS = {
     'fusion/pose_filter.py': ('status', '_require_place'),
     'fusion/ekf.py': ('_found', '_gated'),
     'camera/watch.py': ('judge', 'judge_novelty'),
-    'localizer.py': ('_observation',),
+    'localizer.py': ('_usable',),
     'nodes/discovery.py': ('_tell',),
     'nodes/lifecycle.py': ('_time_problem',),
     'nodes/ekf_node.py': ('status', '_receive_pose'),

@@ -206,8 +206,7 @@ def combine(
 
     The yaw is combined in the same way by itself (n = 1, j = 1). Slow features count alone at a
     place that the keyframes do not know; keyframes alone where slow features give no position,
-    contradict them (d^2 > 12, or the keyframes near p_s are unlike), or have lately done so:
-    `doubt` above 1.
+    contradict them (d^2 > 12, or the keyframes near p_s are unlike), or lately did (`doubt` > 1).
     """
     mine, its = noise.covariance(match, light), _slow_covariance(slow, match, noise, light, doubt)
     if not match.known:
@@ -251,7 +250,7 @@ def _slow_covariance(
 
 
 def _weighted(apart: Array, mine: Array, its: Array) -> tuple[Array, Array] | None:
-    """The step (n,) towards another estimate that is `apart` (n,), and the covariance (n, n) of
+    """The step (n,) toward another estimate that is `apart` (n,), and the covariance (n, n) of
     both together, see `combine`; None where they contradict each other.
     """
     squared = _squared(apart, mine + its)
