@@ -26,7 +26,7 @@ from sfa_localization.fusion.belief import (
     PoseEvent,
     Update,
 )
-from sfa_localization.fusion.inputs import symmetric
+from sfa_localization.fusion.inputs import root, symmetric
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
 from sfa_localization.fusion.odometry import COAST_S, Interval, interval
 from sfa_localization.fusion.relocation import Relocation, relocate
@@ -54,10 +54,11 @@ def measurement_event(
     """A position (2,) or pose (3,), its covariance split into what neighboring images share.
 
     z = value + sqrt(share) L ERROR + white, with L L^T the covariance and (1 - share) of it white.
+    Raises DataError for a covariance that is not positive.
     """
     size = len(value)
     jacobian = _OBSERVED[:size].copy()
-    jacobian[:, ERROR : ERROR + size] = math.sqrt(share) * np.linalg.cholesky(covariance)
+    jacobian[:, ERROR : ERROR + size] = math.sqrt(share) * root(covariance)
     return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
 
 
@@ -319,6 +320,6 @@ def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Be
     mean[YAW] = wrap(float(mean[YAW]))
     full, kept = np.eye(SIZE), slice(V, ERROR)
     full[:3, :3], full[kept, kept] = covariance, belief.covariance[kept, kept]
-    shared = -math.sqrt(share) * np.linalg.cholesky(covariance)
+    shared = -math.sqrt(share) * root(covariance)
     full[:3, ERROR:], full[ERROR:, :3] = shared, shared.T
     return belief._replace(mean=mean, covariance=full, located=True)

@@ -31,6 +31,7 @@ _LEAST_TWIST_STDS, _LEAST_STDS = (0.01, 0.005), (0.05, 0.05, 0.02)
 _COMMANDS, _REPEATED = 200, 0.5
 _LARGEST_M, _LARGEST_TWIST = 1e9, 100.0  # m; m/s and rad/s: beyond, nothing is a robot's
 _SKEW = 1e-6  # of the largest entry: rounding
+_NO_COVARIANCE = 'covariance is not symmetric positive'
 
 
 class OpenLoop:
@@ -96,9 +97,9 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
         pose, matrix = pose[:2], matrix[:2, :2]
     if not matrix.any():
         matrix = np.diag(np.square(_UNKNOWN_STDS[: pose.size]))
-    require_covariance(matrix)
+    require_symmetric(matrix)
     variances = matrix.diagonal()
-    if max(variances[:2]) >= LARGEST_VARIANCE:
+    if max(variances[:2].tolist()) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
     noise = factor * symmetric(matrix)
     np.fill_diagonal(noise, np.maximum(factor * variances, np.square(_LEAST_STDS[: pose.size])))
@@ -112,18 +113,27 @@ def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
     if matrix.shape != (3, 3):
         raise DataError('covariance of the initial pose is not (3, 3)')
-    require_covariance(matrix)
+    require_symmetric(matrix)
+    root(matrix)
     return value, symmetric(matrix)
 
 
-def require_covariance(matrix: Array) -> None:
-    """Raise DataError for a matrix that is not finite, symmetric and positive."""
+def require_symmetric(matrix: Array) -> None:
+    """Raise DataError for a matrix (N, N) that is not symmetric, or has no positive diagonal."""
+    rows = matrix.tolist()  # arrays of two or three cost more than what is done with them
+    pairs = [(rows[i][j], rows[j][i]) for i in range(len(rows)) for j in range(i)]
+    largest, least = max(map(max, rows)), min(row[i] for i, row in enumerate(rows))
+    skewed = max(abs(a - b) for a, b in pairs) > _SKEW * largest
+    if skewed or not (math.isfinite(sum(map(sum, rows))) and least > 0):
+        raise DataError(_NO_COVARIANCE)
+
+
+def root(covariance: Array) -> Array:
+    """The lower triangular root (Cholesky). Raises DataError where there is none."""
     try:
-        fits = np.isfinite(np.linalg.cholesky(matrix)).all()
+        return np.asarray(np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:
-        fits = False
-    if not fits or np.abs(matrix - matrix.T).max() > _SKEW * matrix.max():
-        raise DataError('covariance is not symmetric positive')
+        raise DataError(_NO_COVARIANCE) from None
 
 
 def symmetric(matrix: Array) -> Array:

@@ -165,11 +165,11 @@ class PoseFilter:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
             taken_ns = self._taken(stamp_ns)
             self._require_place(taken_ns, MEASUREMENT)
+            noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
+            event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
-        noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
-        event = measurement_event(taken_ns, fused, noise, self.correlation.share)
         update = self._history.add((taken_ns, MEASUREMENT), event).memory.update
         assert update is not None
         self.counts[f'measurement: {update.reason}'] += 1

@@ -11,8 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import wrap_angle
-
 Pose = tuple[float, float, float]
 """x m, y m, yaw rad."""
 Knot = tuple[int, float, float, float]
@@ -66,7 +64,7 @@ def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
 
 
 def _moved(last: Image, image: Image) -> bool:
-    turn = float(wrap_angle(image.dead_reckoned[2] - last.dead_reckoned[2]))
+    turn = math.remainder(image.dead_reckoned[2] - last.dead_reckoned[2], 2 * math.pi)
     return image.traveled_m - last.traveled_m >= SPACING_M or abs(turn) >= SPACING_RAD
 
 
