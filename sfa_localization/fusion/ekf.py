@@ -148,7 +148,10 @@ class Ekf:
             )
         held, reading = interval(belief, event), event.twist
         if held is None:
-            belief, held = self.coast(belief, event.stamp_ns), Interval(reading, reading)
+            belief, held = (
+                self.coast(belief, event.stamp_ns),
+                Interval(reading, reading, reading.omega),
+            )
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         step = motion.drive(belief.mean, held.twist, dt, self._noise, held.now)
         return self._moved(belief, event.stamp_ns, step, event, held)
@@ -198,7 +201,7 @@ class Ekf:
             belief.memory,
             event.pose if event else belief.odometry_pose,
             belief.track.driven(stamp_ns, reckoned, oldest_ns),
-            held.twist.omega if held else belief.omega,
+            held.omega if held else belief.omega,
         )
 
     # Update.

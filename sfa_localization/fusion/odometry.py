@@ -29,10 +29,13 @@ _JUMP = 0.05
 
 
 class Interval(NamedTuple):
-    """The mean `twist` since the message before, and the twist to go on with, `now`."""
+    """The mean `twist` since the belief, the twist to go on with, `now`, and the mean turn rate
+    `omega` since the message before.
+    """
 
     twist: Twist
     now: Twist
+    omega: float
 
 
 def interval(belief: Belief, event: OdometryEvent) -> Interval | None:
@@ -40,13 +43,13 @@ def interval(belief: Belief, event: OdometryEvent) -> Interval | None:
     reading, before = event.twist, belief.twist
     silence_s = (event.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
     if belief.odometry_ns is None or silence_s <= ODOMETRY_TIMEOUT_S:
-        twist = _shown(belief, event, silence_s, reading) or reading
-        # A reading that is not filled goes on as the poses show.
-        return Interval(twist, reading if reading.v or reading.omega else twist)
+        whole = _shown(belief, event, silence_s, reading) or reading
+        now = _going_on(belief, whole, reading, silence_s)
+        return Interval(_remaining(belief, event, whole), now, whole.omega)
     v = max(abs(before.v), abs(reading.v), motion.UNKNOWN_SPEED)
     omega = max(abs(before.omega), abs(reading.omega), motion.UNKNOWN_RATE)
     shown = _shown(belief, event, silence_s, reading._replace(v=v, omega=omega))
-    return shown and Interval(shown, reading)
+    return shown and Interval(shown, reading, reading.omega)
 
 
 def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist) -> Twist | None:
@@ -65,6 +68,33 @@ def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist)
     if seconds <= ODOMETRY_TIMEOUT_S and drives and abs(aside) > max(abs(ahead), _ROUNDED_M):
         return None
     return _twist(turn, ahead, seconds, fastest)
+
+
+def _going_on(belief: Belief, whole: Twist, reading: Twist, seconds: float) -> Twist:
+    """The twist after an interval: the reading, or, where that is not filled, what the poses show:
+    little of it in messages stamped almost together.
+    """
+    if whole is reading or reading.v or reading.omega:
+        return reading
+    before, new = belief.twist, -math.expm1(-seconds / ODOMETRY_TIMEOUT_S)
+    v, omega = whole.v - before.v, whole.omega - before.omega
+    return whole._replace(v=before.v + new * v, omega=before.omega + new * omega)
+
+
+def _remaining(belief: Belief, event: OdometryEvent, whole: Twist) -> Twist:
+    """The mean twist by the odometry's poses since the belief: images have claimed the begin of the
+    interval, and were fused where the last twist led.
+    """
+    if whole is event.twist or belief.odometry_pose is None or event.pose is None:
+        return whole
+    coasted_s = (belief.stamp_ns - (belief.odometry_ns or belief.stamp_ns)) * 1e-9
+    left_s = (event.stamp_ns - belief.stamp_ns) * 1e-9
+    if coasted_s <= 0 or left_s <= 0:
+        return whole
+    x, y, yaw = belief.odometry_pose
+    way = motion.arc(yaw, belief.twist.v, belief.twist.omega, coasted_s)
+    turn, ahead, _ = _moved((x + way.dx, y + way.dy, yaw + way.dyaw), event.pose)
+    return _twist(turn, ahead, left_s, whole)
 
 
 def _moved(before: Pose, after: Pose) -> tuple[float, float, float]:
