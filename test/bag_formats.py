@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""One small drive written as every kind of bag, by hand or by rosbags, for the tests."""
+"""One small drive written as every kind of bag, for the tests."""
 
 import sqlite3
 from collections import Counter
@@ -254,13 +254,6 @@ def write_ros1(
 # Whole bags.
 
 
-def compress_files(folder: Path) -> None:
-    """Compress every storage file of a folder as `ros2 bag record --compression-mode file`."""
-    for file in [*folder.glob('*.db3'), *folder.glob('*.mcap')]:
-        file.with_name(f'{file.name}.zstd').write_bytes(zstandard.compress(file.read_bytes()))
-        file.unlink()
-
-
 def write_split(path: Path, messages: Sequence[Message]) -> Path:
     """Write a bag in twelve files, so that names in order are not files in order."""
     size = -(-len(messages) // 12)
@@ -284,10 +277,11 @@ def _packed(path: Path, messages: Sequence[Message], storage: str, mode: str) ->
     if mode == 'MESSAGE':
         messages = [m._replace(data=zstandard.compress(m.data)) for m in messages]
     write, name = (write_mcap, 'bag_0.mcap') if storage == 'mcap' else (write_database, 'bag_0.db3')
-    write(path / name, messages)
+    file = write(path / name, messages)
     if mode == 'FILE':
-        compress_files(path)
         name += '.zstd'
+        (path / name).write_bytes(zstandard.compress(file.read_bytes()))
+        file.unlink()
     text = metadata(6, [name], messages, storage=storage, compression=mode)
     (path / 'metadata.yaml').write_text(text)
     return path

@@ -145,7 +145,7 @@ def test_memory_does_not_grow_with_a_bag(
     assert peak(30_000) < 1.1 * peak(6_000) + 100_000
 
 
-@pytest.mark.parametrize('name', ['mcap', 'sqlite3', 'ROS 1', 'split mcap'])
+@pytest.mark.parametrize('name', ['mcap', 'sqlite3', 'ROS 1'])
 def test_reading_can_start_later(name: str, tmp_path: Path, messages: list[Message]) -> None:
     path, middle = FORMATS[name](tmp_path / 'bag', messages), stamp(IMAGES / 2)
     receptions = [at for at, _, _ in received(path, middle)]

@@ -1,16 +1,10 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading bags against bare rosbags: speed, and what is read of damaged bags.
-
-Each ratio compares two ways through the same bag, measured in turns, in one run: `python
-bench_bag.py`. The counts of `salvage` are the reason why damaged files are not left to rosbags.
-"""
+"""Speed of reading bags against bare rosbags, the same bag in turns: `python bench_bag.py`."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import statistics
 import sys
 import tempfile
@@ -118,45 +112,7 @@ def bench_bag(folder: Path, rounds: int = 9) -> dict[str, float]:
     return {'bag_over_rosbags': iteration, **result}
 
 
-def cut_off(path: Path) -> None:
-    """Cut a file at 60 %, as a crash or a full disk does."""
-    os.truncate(path, int(path.stat().st_size * 0.6))
-
-
-def damage_middle(path: Path) -> None:
-    """Overwrite 4096 bytes in the middle: a page of a database, the start of an mcap chunk."""
-    data = bytearray(path.read_bytes())
-    middle = len(data) // 2 // 4096 * 4096
-    start = data.index(b'\x28\xb5\x2f\xfd', middle) if path.suffix == '.mcap' else middle
-    data[start : start + 4096] = b'\xff' * 4096
-    path.write_bytes(data)
-
-
-def read_alone(read: Counter, path: Path) -> int | str:
-    """Messages read, or the class of the error."""
-    try:
-        return read(path)[0]
-    except Exception as error:
-        return type(error).__name__
-
-
-def salvage(folder: Path) -> dict[str, dict[str, int | str]]:
-    """Messages that rosbags and this package read of damaged bags."""
-    result: dict[str, dict[str, int | str]] = {}
-    for storage in STORAGES:
-        whole = write_drive(folder / f'whole_{storage}', storage)
-        for damage in (cut_off, damage_middle):
-            path = Path(shutil.copytree(whole, folder / f'{storage}_{damage.__name__}'))
-            damage(next(file for file in path.iterdir() if file.suffix != '.yaml'))
-            result[path.name] = {
-                'written': our_raw(whole)[0],
-                'rosbags': read_alone(bare_raw, path),
-                'here': read_alone(our_raw, path),
-            }
-    return result
-
-
 if __name__ == '__main__':
     with tempfile.TemporaryDirectory() as temporary:
-        found = {**bench_bag(Path(temporary)), 'salvage': salvage(Path(temporary))}
+        found = bench_bag(Path(temporary))
         sys.stdout.write(json.dumps(found, indent=2) + '\n')
