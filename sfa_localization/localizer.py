@@ -105,8 +105,8 @@ class Observer:
     def _usable(self, found: Observation) -> Observation:
         """What reaches the filter: of an unusable image, that nothing is known."""
         problem, finite = found.problem, found.finite
-        if not problem and not finite:
-            problem = 'the model gives no finite estimate for this image'
+        if not finite:
+            problem = problem or 'the model gives no finite estimate for this image'
         problem = problem or self.watch.judge_novelty(found.novelty)
         if not problem:
             return found

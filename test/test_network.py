@@ -5,7 +5,7 @@
 import cv2
 import numpy as np
 import pytest
-from cylinder_worlds import ARCHITECTURE, LAYERS, SIZE
+from cylinder_worlds import ARCHITECTURE, SIZE
 from test_rotation import views
 
 from sfa_localization.data.errors import ConfigError, ModelError
@@ -176,21 +176,10 @@ class TestPreparing:
             input_map(np.zeros((1, 12, 50, 3), np.uint8), ARCHITECTURE)
 
 
-@pytest.mark.parametrize(
-    ('grid', 'reason'),
-    [
-        ((30, 302), 'use a width of 300 or 305'),
-        ((31, 300), r'layer 1: fields of 10 rows, stride 4, do not fill 31 rows: use 30 or 34'),
-        ((26, 300), r'layer 3'),
-        ((5, 300), r'do not fill 5 rows: use 10 or 14'),
-        ((30, 50), 'wider than the 10 columns'),
-    ],
-)
-def test_odd_grids_are_rejected_with_those_that_fit(grid, reason):
+@pytest.mark.parametrize(('grid', 'reason'), [
+    ((30, 302), 'do not hold whole strides of 5'), ((31, 300), 'layer 1: .* do not fill 31 rows'),
+    ((26, 300), 'layer 3'), ((30, 50), 'wider than the 10 columns'), ((30, 0), 'above 0'),
+])  # fmt: skip
+def test_odd_grids_are_rejected(grid, reason):
     with pytest.raises(ConfigError, match=reason):
         Architecture((60, 600), grid, 'panorama', STANDARD[30, 300])
-
-
-def test_fields_hold_whole_strides():
-    with pytest.raises(ConfigError, match='no multiple of the stride 4: use 8 or 12'):
-        Architecture(SIZE, SIZE, 'none', (Layer((4, 10), (4, 4), 6, 5), *LAYERS[1:]))

@@ -61,10 +61,7 @@ class Architecture:
     layers: tuple[Layer, ...]
 
     def __post_init__(self) -> None:
-        _check_numbers(self)
-        _check_columns(self)
-        for depth, rows in enumerate(self.map_rows[:-1]):
-            _check_rows(depth, rows, self.layers[depth])
+        _check(self)
 
     @property
     def rotations(self) -> int:
@@ -102,62 +99,34 @@ class Architecture:
         return self.layers[-1].outputs
 
 
-LARGEST_NUMBER = 1 << 16
-"""Of pixels, strides and features: more than any panorama has columns."""
-LARGEST_SIGNAL = 1 << 28
-"""Bytes of one layer's signals of one image: hundreds of times those of the standard networks."""
-
-
-def _check_numbers(architecture: Architecture) -> None:
-    """All sizes must be whole and positive, and the limit of the signals too."""
+def _check(architecture: Architecture) -> None:
+    """Fields must fill their maps in whole strides. Raises ConfigError."""
     numbers: list[object] = [*architecture.size, *architecture.grid]
     for layer in architecture.layers:
         numbers += [*layer.field, *layer.stride, layer.linear, layer.outputs]
-    whole = all(isinstance(n, int) and 1 <= n <= LARGEST_NUMBER for n in numbers)
-    if not architecture.layers or not whole:
-        raise ConfigError(f'a network has layers whose sizes are from 1 to {LARGEST_NUMBER}')
-    if not all(0.0 < layer.clip < math.inf for layer in architecture.layers):
-        raise ConfigError('the limit (clip) of a layer must be positive and finite')
+    whole = all(isinstance(n, int) and n >= 1 for n in numbers)
+    if not (architecture.layers and whole and all(layer.clip > 0 for layer in architecture.layers)):
+        raise ConfigError('a network has layers, whose sizes are whole numbers above 0')
     if architecture.normalization not in _NORMALIZATIONS:
         raise ConfigError(f'unknown normalization: use {", ".join(NORMALIZATIONS)}')
-
-
-def _check_columns(architecture: Architecture) -> None:
-    """Fields must cover whole strides, and strides the resampled image."""
     first, columns = architecture.layers[0], architecture.grid[1]
-    stride = first.stride[1]
-    if first.field[1] % stride:
+    if first.field[1] % first.stride[1] or columns % first.stride[1]:
         raise ConfigError(
-            f'layer 1: a field {first.field[1]} wide is no multiple of the stride {stride}: '
-            f'use {_multiples(first.field[1], stride)}'
+            f'a grid {columns} wide and fields {first.field[1]} wide do not hold whole strides of '
+            f'{first.stride[1]} pixels'
         )
-    if columns % stride:
-        raise ConfigError(
-            f'a grid {columns} wide does not hold whole strides of {stride} pixels: use a width of '
-            f'{_multiples(columns, stride)}'
-        )
-    for depth, receptive in enumerate(architecture.fields):
+    levels = zip(architecture.fields, architecture.map_rows[:-1], strict=True)
+    for depth, (receptive, rows) in enumerate(levels, 1):
         if receptive.columns * receptive.spacing > architecture.rotations + receptive.spacing - 1:
             raise ConfigError(
-                f'layer {depth + 1}: a field of {receptive.columns} columns, {receptive.spacing} '
+                f'layer {depth}: a field of {receptive.columns} columns, {receptive.spacing} '
                 f'apart, is wider than the {architecture.rotations} columns of its map'
             )
-
-
-def _multiples(size: int, unit: int) -> str:
-    """The multiples of `unit` on both sides of a size that is none."""
-    below = size // unit * unit
-    return f'{below} or {below + unit}' if below else f'{unit}'
-
-
-def _check_rows(depth: int, rows: int, layer: Layer) -> None:
-    height, stride = layer.field[0], layer.stride[0]
-    if rows < height or (rows - height) % stride:
-        below = height + max(0, (rows - height) // stride) * stride
-        raise ConfigError(
-            f'layer {depth + 1}: fields of {height} rows, stride {stride}, do not fill {rows} '
-            f'rows: use {below} or {below + stride}'
-        )
+        if rows < receptive.rows or (rows - receptive.rows) % receptive.row_stride:
+            raise ConfigError(
+                f'layer {depth}: fields of {receptive.rows} rows, stride {receptive.row_stride}, '
+                f'do not fill {rows} rows'
+            )
 
 
 # 600 x 60 color panoramas, the paper's size; layers found best on path-traced gardens.
@@ -347,26 +316,17 @@ class Network:
 
 
 def check_weights(network: Network) -> None:
-    """Require weights of the sizes that the architecture has, and signals that fit into memory.
-
-    Raises ModelError.
-    """
+    """Require weights of the sizes that the architecture has. Raises ModelError."""
     architecture = network.architecture
-    if math.prod(architecture.size) * 3 * np.dtype(np.float32).itemsize > LARGEST_SIGNAL:
-        raise ModelError(f'a panorama of its size exceeds {LARGEST_SIGNAL} bytes')
     levels = zip(
         network.nodes,
         architecture.layers,
         architecture.fields,
         architecture.channels,
-        architecture.map_rows[1:],
         strict=True,
     )
-    for depth, (node, layer, receptive, channels, rows) in enumerate(levels):
+    for depth, (node, layer, receptive, channels) in enumerate(levels, 1):
         inputs = receptive.rows * receptive.columns * channels
         linear, slow = (inputs, layer.linear), (layer.expanded, layer.outputs)
         if (node.linear.shape, node.slow.shape) != (linear, slow):
-            raise ModelError(f'the weights of layer {depth + 1} do not fit its sizes')
-        wide = max(inputs, layer.expanded, layer.outputs)
-        if rows * architecture.rotations * wide * node.linear.itemsize > LARGEST_SIGNAL:
-            raise ModelError(f'the signals of layer {depth + 1} exceed {LARGEST_SIGNAL} bytes')
+            raise ModelError(f'the weights of layer {depth} do not fit its sizes')

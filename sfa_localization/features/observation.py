@@ -219,9 +219,8 @@ def combine(
     found = _weighted(apart[:2], mine[:2, :2], its[:2, :2])
     if found is None:
         return pose, mine
-    covariance = np.zeros((3, 3))
-    pose[:2] += found[0]
-    covariance[:2, :2], covariance[2, 2] = noise.joint_factor * found[1], mine[2, 2]
+    covariance = np.diag([0.0, 0.0, mine[2, 2]])
+    pose[:2], covariance[:2, :2] = pose[:2] + found[0], noise.joint_factor * found[1]
     turn = _weighted(apart[2:], mine[2:, 2:], its[2:, 2:]) if np.isfinite(slow.yaw) else None
     if turn is not None:
         pose[2], covariance[2, 2] = wrap_angle(pose[2] + turn[0][0]), turn[1][0, 0]
