@@ -4,7 +4,6 @@
 
 import json
 import math
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +11,9 @@ import pytest
 from picture_readers import PictureReader, Recording
 from scipy import signal
 
-from sfa_localization import evaluation, tuning
+from sfa_localization import evaluation
 from sfa_localization.bags.settings import TopicNames
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
@@ -65,21 +63,6 @@ def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, caps
     watch = {'novelty_limit': 1.5}
     found = evaluated(bag, tmp_path, sfa_node=watch)['counts']['observations']['skipped']
     assert found['image is unlike any of training'] == 4 + 3
-
-
-def test_unusable_pictures_are_not_scored(bag, tmp_path):
-    figures = evaluated(bag, tmp_path)
-    assert figures['sfa']['n'] == figures['counts']['observations']['used']
-    assert figures['sfa']['p95'] < 0.6
-
-
-def test_tune_leaves_out_the_same_pictures(bag):
-    drives = [
-        tuning.read_drive(bag, PictureReader(), Recipe(), watch, False)
-        for watch in (None, WatchConfig(novelty_limit=1.5))
-    ]
-    counts = [len(drive.poses) for drive in drives]
-    assert counts == [102, 102 - 3]
 
 
 @pytest.mark.parametrize('command', ['evaluate', 'tune'])
@@ -201,20 +184,6 @@ def test_the_map_is_laid_on_the_truth_by_all_training_drives():
         drives.append((truth, Trajectory(estimate.stamps_ns, np.column_stack([places, places]))))
     one, both = evaluation.fit_transform(drives[0]), evaluation.fit_transform(*drives)
     assert one.x_m == pytest.approx(0.0, abs=0.01) and both.x_m == pytest.approx(-0.1, abs=0.03)
-
-
-def test_each_aligning_drive_is_named_and_the_reference_is_fitted_on_all(
-    bag, tmp_path, capsys, monkeypatch
-):
-    def supervised(_model, trained, drive):
-        assert len(trained) == 2 and len(trained[0].features) == len(drive.features)
-        return drive.images
-
-    monkeypatch.setattr(evaluation, '_supervised', supervised)
-    shutil.copytree(bag, tmp_path / 'second')
-    aligning = '--align', str(bag), '--align', str(tmp_path / 'second')
-    assert main(['evaluate', 'reader.npz', str(bag), *aligning]) == 0
-    assert f'aligned on {bag}, {tmp_path / "second"}' in capsys.readouterr().out
 
 
 def test_topics_are_named_for_the_aligning_drive_only_where_it_has_them(tmp_path):

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import metric_worlds as worlds
@@ -19,7 +19,6 @@ from sfa_localization.metric.learning import MetricResult
 from sfa_localization.metric.refinement import (
     LearnedRefinement,
     Projection,
-    Refinement,
     learn_refinement,
     turned_back,
 )
@@ -148,12 +147,6 @@ def replace_yaw(poses, yaw):
     return np.column_stack([poses[:, :2], yaw])
 
 
-def test_turning_keeps_the_norm_and_all_harmonics_keep_that_of_the_map():
-    maps = np.random.default_rng(2).standard_normal((4, 2, 25, 3)).astype(np.float32)
-    vectors = turned_back(spectrum(maps, 13), np.array([0.0, 0.1, 2.0, -1.0]), 1.0)
-    np.testing.assert_allclose((vectors**2).sum(1), (maps**2).sum((1, 2, 3)), rtol=1e-5)
-
-
 def test_principal_components_hold_what_the_vectors_span():
     rng = np.random.default_rng(3)
     spanned = rng.standard_normal((300, 4)) @ rng.standard_normal((4, 60))
@@ -179,15 +172,6 @@ def test_unseen_places_are_found_better_than_by_the_slow_features():
     assert share_inside(refined, poses[:, :2]) >= 0.85
 
 
-def test_the_finer_map_lies_in_the_coarse_ones_frame():
-    ours = world()
-    (_, yaw), (_, finer) = (
-        learning.headings(result, ours.segments) for result in (ours.coarse, ours.fitted.metric)
-    )
-    assert abs(np.angle(np.exp(1j * (yaw - finer)).mean())) < 1e-6
-    assert ours.fitted.metric.certificate.certified
-
-
 def test_two_estimates_that_differ_inflate_the_covariance():
     poses = unseen(40)
     _, (places, agreed) = agreeing(poses)
@@ -199,60 +183,8 @@ def test_two_estimates_that_differ_inflate_the_covariance():
     assert share_inside((kept, inflated), away) == 1.0
 
 
-@pytest.mark.parametrize('wrong_deg', [20.0, 90.0, 180.0])
-def test_a_wrong_heading_gives_no_sure_wrong_position(wrong_deg):
-    poses = unseen()
-    _, refined = estimates(poses, yaw_error=np.deg2rad(wrong_deg))
-    assert share_inside(refined, poses[:, :2]) >= 0.8
-
-
-@pytest.mark.parametrize('wrong_deg', [90.0, 180.0])
-def test_at_a_wrong_heading_a_sure_coarse_estimate_counts(wrong_deg):
-    poses, yaw_error = unseen(), np.deg2rad(wrong_deg)
-    spectra = spectrum(maps_at(poses, seed=7))
-    finer = world().fitted.refinement.predict(spectra, poses[:, 2] + yaw_error, np.ones(200))
-    near = poses[:, :2] + np.random.default_rng(8).normal(0, 0.1, (200, 2))
-    coarse = near, np.tile(0.1**2 * np.eye(2), (200, 1, 1))
-    _, refined = estimates(poses, yaw_error=yaw_error, coarse=coarse)
-    assert share_inside(finer, poses[:, :2]) < 0.5
-    assert share_inside(refined, poses[:, :2]) >= 0.9
-    assert mean_error(refined[0], poses) < 0.5 * mean_error(finer[0], poses)
-
-
-def test_an_uncertain_heading_is_part_of_the_covariance():
-    poses = unseen(40)
-    _, (_, sure) = agreeing(poses, yaw_variance=1e-6)
-    _, (_, unsure) = agreeing(poses, yaw_variance=np.deg2rad(2.0) ** 2)
-    growth = np.linalg.eigvalsh(unsure - sure)
-    assert growth.min() > -1e-12
-    assert np.median(growth[:, 1]) > 1e-5
-
-
 @pytest.mark.parametrize('yaw_error, yaw_variance', [(np.nan, 1e-4), (0.0, np.pi**2 / 3)])
 def test_without_a_heading_the_coarse_estimate_stays(yaw_error, yaw_variance):
     coarse, refined = estimates(unseen(20), yaw_error=yaw_error, yaw_variance=yaw_variance)
     for kept, first in zip(refined, coarse, strict=True):
         np.testing.assert_array_equal(kept, first)
-
-
-def test_the_same_drive_gives_the_same_bytes(monkeypatch):
-    monkeypatch.setattr(selection, 'INDUCING_POINTS', 150)
-    ours = world()
-    again = fitted_of(ours.segments, ours.coarse, ours.spectra, ours.views)
-    arrays = ours.fitted.refinement.to_arrays()
-    for name, array in again.refinement.to_arrays().items():
-        assert array.tobytes() == arrays[name].tobytes(), name
-
-
-def test_a_saved_refinement_gives_the_same_estimates():
-    ours = world().fitted.refinement
-    loaded = Refinement.from_arrays(ours.to_arrays())
-    assert replace(loaded).usual == ours.usual
-    poses = unseen(10)
-    spectra, views = spectrum(maps_at(poses)), np.ones(10)
-    for one, other in zip(
-        ours.predict(spectra, poses[:, 2], views),
-        loaded.predict(spectra, poses[:, 2], views),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)

@@ -82,14 +82,6 @@ def test_standing_still_is_left_out_and_does_not_break_the_line():
     assert all(s.linked for s in segments.items[:-1])
 
 
-def test_reversing_makes_the_distance_shrink():
-    odometry, stamps = drive_of(straight(4.0), straight(-3.0))
-    (segment,) = cut(odometry, stamps, STRAIGHT)
-    assert segment.path.real.max() == pytest.approx(4.0, abs=0.21)
-    assert segment.path[-1] == pytest.approx(1.0, abs=0.21)
-    assert np.all(segment.path.imag == 0)
-
-
 def test_an_odometry_reset_breaks_the_drive():
     run = drive(straight(12.0))
     poses = run.odometry.poses.copy()
@@ -167,16 +159,6 @@ def test_what_a_yaw_rate_bias_does_is_known_to_first_order():
         assert np.allclose(s.headings - bias * s.times_s, np.unwrap(local[:, 2]), atol=1e-9)
 
 
-def test_a_stretch_without_pictures_splits_but_keeps_the_link():
-    run = drive(straight(12.0))
-    keep = np.abs(run.poses[:, 0] - 6.0) > 1.0
-    stamps = run.stamps_ns[keep]
-    segments = cut(run.odometry, stamps, STRAIGHT)
-    assert len(segments) == 2
-    assert segments[0].displacement == pytest.approx(7.0, abs=0.21)
-    check_segments(segments, run.poses[keep])
-
-
 def test_message_variances_rule_over_the_configured_noise(monkeypatch):
     monkeypatch.setattr(segments_module, 'PIECE_STD_M', 10.0)
     run = drive(straight(12.0))
@@ -200,18 +182,6 @@ def test_joined_runs_keep_their_pictures_apart():
     owner = assignment(both, 2 * len(run.stamps_ns))
     assert np.array_equal(np.flatnonzero(owner == 4), one[0].images + len(run.stamps_ns))
     assert (owner == -1).sum() == 2 * len(run.stamps_ns) - both.images.used
-
-
-def test_joined_runs_have_periods_of_their_own(monkeypatch):
-    """Each with a yaw-rate bias; none of them without a segment."""
-    monkeypatch.setattr(segments_module, 'BIAS_PERIOD_S', 20.0)
-    run = drive(np.vstack([straight(12.0), stand(50.0), straight(12.0)]))
-    one = cut(run.odometry, run.stamps_ns, ANY)
-    both = join([one, one], [0, len(run.stamps_ns)])
-    starts = [run.stamps_ns[s.images[0]] * 1e-9 - 1.0 for s in one]
-    own = [0 if start < 20.0 else 1 for start in starts]
-    assert {0, 1} == set(own)
-    assert [s.period for s in both] == own + [2 + period for period in own]
 
 
 @pytest.mark.parametrize(

@@ -12,20 +12,18 @@ import pytest
 from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, panorama_config, recipe, run_in, wander
 
 from sfa_localization import training
-from sfa_localization.bags.drives import read_drive, read_drives
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
 from sfa_localization.features import checkpoint as checkpoints
 from sfa_localization.features import image_features
 from sfa_localization.features.network_training import ImageSequence, train_network
-from sfa_localization.metric import compass_training, refinement
+from sfa_localization.metric import refinement
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
-from sfa_localization.training import Recipe, learn_place, train
+from sfa_localization.training import learn_place, train
 
 PICTURES = 160
 ARCHITECTURE = replace(
@@ -105,16 +103,6 @@ def test_it_says_what_error_to_expect_and_where_it_is_worst(bag, tmp_path):
     assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
 
 
-@pytest.mark.parametrize(('panorama', 'said'), [
-    (PanoramaConfig(), False), (PanoramaConfig(width=600, height=30), True),
-])  # fmt: skip
-def test_a_size_that_recorded_panoramas_do_not_have_is_named(bag, tmp_path, caplog, panorama, said):
-    recipe = replace(RECIPE, panorama=panorama)
-    runs = read_drives([bag], tmp_path, recipe)
-    assert ('width and height (600x30) are for images of a camera' in caplog.text) is said
-    assert runs[0].panoramas.shape[:2] != (30, 600)
-
-
 def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(image_features, 'SAMPLES', 15)
     trained = train([bag], tmp_path / 'model.npz', RECIPE)
@@ -150,27 +138,6 @@ def test_two_layers_have_none_to_refine_with(bag, tmp_path):
     assert trained.model.compass is not None and trained.model.refinement is None
 
 
-def test_monomials_are_not_refined(bag, tmp_path):
-    metric = replace(RECIPE.metric, metric_map='monomials')
-    trained = train([bag], tmp_path / 'model.npz', replace(RECIPE, metric=metric))
-    assert trained.model.refinement is None
-
-
-def test_a_heading_from_some_of_the_images_only(bag, tmp_path, monkeypatch):
-    monkeypatch.setattr(image_features, 'SAMPLES', 97)
-
-    def of_the_first_half(images, *rest):
-        half = images.sampled < PICTURES / 2
-        return compass_training.learn_heading(
-            replace(images, sampled=images.sampled[half], harmonic=images.harmonic[half]), *rest
-        )
-
-    monkeypatch.setattr(training, 'learn_heading', of_the_first_half)
-    trained = train([bag], tmp_path / 'model.npz', RECIPE)
-    assert trained.heading.images.max() < PICTURES / 2
-    assert 0.0 < trained.model.quality['expected_yaw_error_deg'] < 180.0
-
-
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
@@ -198,31 +165,6 @@ def test_resuming_gives_the_same_bytes(bag, whole, tmp_path, stages, error):
     train([bag], output, RECIPE, resume=True)
     assert output.read_bytes() == whole
     assert names(tmp_path) == ['model.npz']
-
-
-def test_resuming_leaves_out_finished_stages(bag, tmp_path, monkeypatch):
-    cut_off(bag, tmp_path / 'model.npz', 4, Cut())
-    stages = []
-    monkeypatch.setattr(
-        checkpoints.Checkpoint, 'write', lambda self, partial: stages.append(partial)
-    )
-    train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
-    assert len(stages) == 2
-
-
-def test_without_resume_it_starts_anew(bag, tmp_path, monkeypatch):
-    cut_off(bag, tmp_path / 'model.npz', 4, Cut())
-    stages = []
-    monkeypatch.setattr(
-        checkpoints.Checkpoint, 'write', lambda self, partial: stages.append(partial)
-    )
-    train([bag], tmp_path / 'model.npz', RECIPE)
-    assert len(stages) == 6
-
-
-def test_resuming_without_a_checkpoint_starts_anew(bag, whole, tmp_path):
-    train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
-    assert (tmp_path / 'model.npz').read_bytes() == whole
 
 
 @pytest.mark.parametrize('other', ['recipe', 'bag'])
@@ -258,14 +200,6 @@ def _fail(*args, **kwargs):
     raise DataError('the drive cannot fix a map')
 
 
-def test_an_old_model_survives_an_error(bag, tmp_path, monkeypatch):
-    (tmp_path / 'model.npz').write_bytes(b'old')
-    monkeypatch.setattr(training, 'learn_map', _fail)
-    with pytest.raises(DataError):
-        train([bag], tmp_path / 'model.npz', RECIPE)
-    assert (tmp_path / 'model.npz').read_bytes() == b'old'
-
-
 def test_bags_of_other_sizes_are_refused(bag, tmp_path):
     other = write_bag(tmp_path / 'other', size=(12, 96))
     with pytest.raises(DataError, match=r'different sizes \(drive: 72x12, other: 96x12\)'):
@@ -292,40 +226,6 @@ def test_a_drive_given_twice_is_refused(bag, tmp_path):
     with pytest.raises(DataError, match=r'the same drive as .*: name each drive once'):
         train([bag, bag], tmp_path / 'm.npz', RECIPE)
     assert not (tmp_path / 'm.npz').exists()
-
-
-def test_two_bags_are_two_drives(bag, tmp_path):
-    other = write_bag(tmp_path / 'other', seed=5)
-    trained = train([bag, other], tmp_path / 'model.npz', RECIPE)
-    assert len(trained.runs) == 2 and len(trained.features) == 2 * PICTURES
-
-
-class TestNeighbors:
-    """Which images are neighbors."""
-
-    def run(self, x_m: list[float], seconds: list[float]) -> Run:
-        stamps = (np.array(seconds) * 1e9).astype(np.int64)
-        poses = np.zeros((len(stamps), 3))
-        poses[:, 0] = x_m
-        images = np.zeros((len(stamps), 12, 72, 3), np.uint8)
-        odometry = Odometry(stamps, poses, np.zeros((len(stamps), 2)), np.zeros((len(stamps), 2)))
-        return Run('run', PanoramaArray(stamps, images), odometry, counts={'images': Count()})
-
-    def joined(self, run: Run) -> list[bool]:
-        return ImageSequence.of(run).joined.tolist()
-
-    def test_close_images_are_neighbors(self):
-        assert self.joined(self.run([0, 0.1, 0.4, 0.5], [0, 1, 2, 3])) == [True] * 3
-
-    def test_pauses_and_jumps_are_breaks(self):
-        run = self.run([0, 0.1, 0.2, 3.0, 3.1], [0, 1, 9, 10, 11])
-        assert self.joined(run) == [True, False, False, True]
-
-
-def test_a_drive_is_streamed_from_the_cache(bag, tmp_path):
-    run = read_drive(bag, tmp_path, Recipe(panorama=RECIPE.panorama))
-    assert isinstance(run.panoramas.images, np.memmap)
-    assert list(tmp_path.iterdir()) == [], 'its file has no name'
 
 
 def straight_route(speed):
@@ -360,3 +260,12 @@ def test_one_straight_route_gives_a_model_and_one_sentence(speed, caplog):
     assert least > 10 * surest
     with pytest.raises(DataError, match='no track crosses another'):
         learn_place(network, [run], recipe(), strict=True)
+
+
+def test_pauses_and_jumps_of_a_drive_are_breaks_between_its_images():
+    seconds, x_m = np.array([0, 1, 2, 9, 10, 11]), np.array([0, 0.1, 0.4, 0.5, 3.0, 3.1])
+    stamps, none = (seconds * 1e9).astype(np.int64), np.zeros((6, 2))
+    images = PanoramaArray(stamps, np.zeros((6, 12, 72, 3), np.uint8))
+    odometry = Odometry(stamps, np.column_stack([x_m, none]), none, none)
+    run = Run('run', images, odometry, counts={'images': Count()})
+    assert ImageSequence.of(run).joined.tolist() == [True, True, False, False, True]
