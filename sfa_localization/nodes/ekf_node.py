@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from sfa_localization.data.errors import DataError, MessageError
+from sfa_localization.data.errors import MessageError
 from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
@@ -76,7 +76,7 @@ class EkfNode(LocalizationNode):
 
     def setup(self) -> None:
         self._begin()
-        self._restore_pose()
+        self.attempt('pose_file', self._restore_pose)
         self._make_publishers()
         self._subscribe_odometry()
         self.discovery = Discovery(self, _ODOM, [Odometry], ['odom'], self._subscribe_odometry)
@@ -220,14 +220,8 @@ class EkfNode(LocalizationNode):
 
     def _restore_pose(self) -> None:
         """Begin at the pose of before the restart: a hypothesis, which images confirm or not."""
-        path = self._config.pose_file
-        if not path or self.settings(FilterConfig).initial_pose:
-            return
-        try:
-            saved = load_pose(FilePath(path), self._config.map_frame)
-        except DataError as error:
-            self.get_logger().warning(f'{error}: waiting for images that show where')
-            return
+        path, given = self._config.pose_file, self.settings(FilterConfig).initial_pose
+        saved = load_pose(FilePath(path), self._config.map_frame) if path and not given else None
         if saved is not None:
             self.filter.set_pose(saved.stamp_ns, saved.pose, saved.moved())
             x, y, yaw = saved.pose
