@@ -10,7 +10,7 @@ first keyframes stay.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -41,8 +41,6 @@ MOST_OF_DRIVE = MOST_ADDED // 4
 CERTAIN_M, CERTAIN_RAD = 0.15, 0.03
 """Largest standard deviations of a smoothed pose that a keyframe may have: those of the error of
 one image in a trained place, so that an added keyframe is about as well placed as a first one."""
-_REMEMBERED = 1000
-"""Updates whose bags a model names: more than its keyframes come from, and few beside its size."""
 _APART_M, _COARSER = 0.2, 1.2
 """Two images of one drive in a cell of so many meters show the same; where there are too many, by
 this factor larger cells are tried."""
@@ -128,10 +126,11 @@ def new_views(
     localizer = Localizer(model, config, watch, Smoother)
     seen, sure = [], []
     with progress_bar(f'replay {run.name}', len(run.panoramas), shown=progress) as bar:
-        for observation, localized in _replayed(localizer, run):
-            seen.append(observation)
-            sure.append(localized)
-            bar.update()
+        for _, observation, _ in localizer.replay(run):
+            if observation is not None:
+                seen.append(observation)
+                sure.append(localizer.status.level is Level.LOCALISED)
+                bar.update()
     if not any(sure):
         raise DataError(
             f'{run.name}: the robot is never LOCALISED on this drive, so that the places of its '
@@ -145,13 +144,6 @@ def new_views(
     chosen = np.flatnonzero(np.array(sure, bool) & certain & novel & agree)
     chosen = chosen[_spread(poses[chosen])]
     return Additions(_textures(run, chosen, model.keyframes), poses[chosen])
-
-
-def _replayed(localizer: Localizer, run: Run) -> Iterator[tuple[Observation, bool]]:
-    """Each image of a run, and whether the robot was LOCALISED with it."""
-    for _, observation, _ in localizer.replay(run):
-        if observation is not None:
-            yield observation, localizer.status.level is Level.LOCALISED
 
 
 def familiar_score(model: PlaceModel) -> float:
@@ -228,7 +220,7 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
         old.trained,
     )
     updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': count}]
-    quality = {**model.quality, 'updates': updates[-_REMEMBERED:]}
+    quality = {**model.quality, 'updates': updates}
     return replace(model, keyframes=keyframes, quality=quality)
 
 
