@@ -106,13 +106,12 @@ def draw(figure, path, shots, k):
     angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
     below.add_patch(Ellipse(shot.pose[:2], width, height, angle=angle, fill=False, color=BLUE))
     error = math.hypot(*(shot.pose - shot.true)[:2])
-    words = {'transform': below.transAxes}
-    below.text(0.01, 0.95, shot.level, color=COLORS[shot.level], size='x-large', **words)
-    below.text(0.01, 0.90, f'error {error:.2f} m', color=GRAY, **words)
+    figure.text(0.02, 0.77, shot.level, color=COLORS[shot.level], size='x-large')
+    figure.text(0.02, 0.72, f'error {error:.2f} m', color=GRAY)
     legend = 'gray: true robot   blue: estimate, 95 %   rendered, 2 x real time'
-    below.text(0.01, 0.01, legend, color=GRAY, **words)
+    figure.text(0.02, 0.02, legend, color=GRAY)
     if 0 <= shot.second - FROM_S < CARRIED_SHOWN_S:
-        below.text(0.8, 0.95, 'kidnapped!', color=COLORS['LOST'], size='x-large', **words)
+        figure.text(0.8, 0.77, 'kidnapped!', color=COLORS['LOST'], size='x-large')
 
 
 def film(output, path, shots):
