@@ -82,17 +82,13 @@ def test_the_mirror_model_by_hand():
     camera = make_camera(LensCalibration(radius_min=0.0), SIZE)
     expected = [[319.5, 319.5 - 150 / 0.9], [319.5 + 150 / 0.9, 319.5], [319.5, 319.5]]
     np.testing.assert_allclose(camera.project(np.array([FORWARD, LEFT, -UP])), expected)
+    angle = np.array([0.2, 0.9, 1.5, 2.0])  # a paraboloid maps it to the radius tan(angle / 2)
+    pixels = lens_of(xi=1.0, fx=100.0, fy=100.0).project(unit(*angle))
+    np.testing.assert_allclose(pixels[:, 0], 100 * np.tan(angle / 2))
     slanted = np.array([[np.cos(0.3), 0.0, np.sin(0.3)]])
     radius = 150 * np.cos(0.3) / (0.9 - np.sin(0.3))
     np.testing.assert_allclose(camera.project(slanted), [[319.5, 319.5 - radius]])
     assert np.isnan(camera.project(np.array([UP, [np.nan, 0, 0], [0, 0, 0]]))).all()
-
-
-def test_a_parabolic_mirror_obeys_its_reflection_law():
-    """A paraboloid (focal parameter p) maps the angle a from its axis to radius p tan(a / 2)."""
-    angle = np.array([0.2, 0.9, 1.5, 2.0])
-    pixels = lens_of(xi=1.0, fx=100.0, fy=100.0).project(unit(*angle))
-    np.testing.assert_allclose(pixels[:, 0], 100 * np.tan(angle / 2))
 
 
 def test_a_hyperbolic_mirror_obeys_its_reflection_law():
