@@ -31,7 +31,7 @@ from sfa_localization.features.image_features import features_of_runs
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
-from sfa_localization.metric.drives import learn_map
+from sfa_localization.metric.drives import compare_with_map, learn_map
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
@@ -94,6 +94,7 @@ def train(
         network = train_hierarchy(given, checkpoint)  # step 3
         with one_core():
             trained = _learn(network, given, strict)  # steps 4 to 9
+            compare_with_map(checks, given.drives, trained.segments, trained.metric)
         trained.model.save(output)
         checkpoint.remove()
     return replace(trained, checks=checks)

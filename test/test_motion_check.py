@@ -21,7 +21,15 @@ from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, YawRate, integrate
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 from sfa_localization.metric.motion_check import check_drives, check_motion, without_jumps
-from sfa_localization.metric.motion_sources import GYRO, IMAGES, POSE, TWIST, Source, compare
+from sfa_localization.metric.motion_sources import (
+    GYRO,
+    IMAGES,
+    POSE,
+    TWIST,
+    Source,
+    compare,
+    compare_map,
+)
 from sfa_localization.training import train
 
 ENOUGH = InspectionConfig(min_pictures=100)
@@ -292,6 +300,17 @@ def test_turns_of_another_robot_are_not_alike():
     one, other = (drive(*DRIVES['wandering'][:1], seed=1), drive(meander(120.0, seed=8)[0]))
     check = check_motion(one.odometry, None, other.gyro)
     assert check.pair(POSE, GYRO).correlation < 0.6 and check.gyro is None
+
+
+def test_a_map_is_compared_with_its_odometry_over_ten_meters():
+    run = drive(*DRIVES['straight legs'][:1], yaw_noise=0.1, speed_noise=0.1, seed=1)
+    shown = run.poses + 0.3 * np.random.default_rng(0).normal(size=run.poses.shape) * [1, 1, 0]
+    right = compare_map(run.odometry, run.stamps_ns, shown)
+    assert not right.differs('alike') and right.scale == pytest.approx(1.0, abs=0.1)
+    collapsed = compare_map(run.odometry, run.stamps_ns, shown * [0.4, 0.4, 1.0])
+    assert collapsed.differs('scale') and collapsed.scale == pytest.approx(0.4, abs=0.04)
+    elsewhere = compare_map(run.odometry, run.stamps_ns, shown[::-1])
+    assert elsewhere.differs('alike')
 
 
 def test_a_drive_that_hardly_turns_says_nothing():

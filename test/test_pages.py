@@ -116,12 +116,14 @@ def with_quality(trained, **values):
 
 def test_the_answer_about_a_map_follows_its_figures(trained):
     good = {'expected_error_m': 0.1, 'certified': True, 'left_out_within_95': 0.95}
+    good['explained'] = 0.99
     for change, level in (
         ({}, page.GOOD),
         ({'expected_error_m': 0.6}, page.WEAK),
         ({'certified': False}, page.WEAK),
         ({'left_out_within_95': 0.7}, page.WEAK),
         ({'expected_error_m': 2.1}, page.BAD),
+        ({'explained': 0.3}, page.BAD),
     ):
         assert training.judgment(with_quality(trained, **{**good, **change}))[0] == level
     found = with_quality(trained, certified=False)

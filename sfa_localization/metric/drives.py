@@ -21,6 +21,8 @@ from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
+from sfa_localization.metric.motion_check import MotionCheck
+from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.selection import Span
@@ -113,6 +115,19 @@ class Drives:
             found.append(way_of(track, Shown(time_s, shown[own], yaw[own]), segments.ways[k]))
         scales = [way.scale for way in found if way]
         return [way and way._replace(scale=float(np.mean(scales))) for way in found]
+
+
+def compare_with_map(
+    checks: Sequence[MotionCheck], drives: Drives, segments: Segments, result: MetricResult
+) -> None:
+    """Add to what the sources of each drive's motion tell how far the images moved by the map."""
+    images, places = positions(result, segments)
+    poses = np.column_stack([places - result.residuals, headings(result, segments)[1]])
+    for check, drive, start in zip(checks, drives.items, drives.starts, strict=True):
+        rows = images - start
+        own = (rows >= 0) & (rows < len(drive.stamps_ns))
+        pair = compare_map(drive.run.odometry, drive.stamps_ns[rows[own]], poses[own])
+        check.pairs += [pair] if pair else []
 
 
 def learn_map(

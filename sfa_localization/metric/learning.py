@@ -28,11 +28,16 @@ from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import Span, choose, leave_out, part_of
+from sfa_localization.metric.selection import LeftOut, Span, choose, leave_out, part_of
 from sfa_localization.metric.settings import MetricConfig
 
 Indices = NDArray[np.int64]
 
+LITTLE, OVERFIT = 0.9, 4.0
+"""Where features explain less than this share of the places of images left out, whose variance is
+so many times that of the others, a map follows noise: it leaves no residuals, and would bend the
+drive as it likes. Weighted by what is left out, it leaves the drive the shape that odometry and
+loop closures give it."""
 _LARGEST_SHARE = 0.8
 """Of the error of an image that its neighbors have too."""
 
@@ -66,6 +71,8 @@ class MetricResult:
     left_out_weight: Array
     """(M,) of sum 1: how well each of `left_out` represents paths between the trained ones, by
     the distance to the nearest image that its map was learned from."""
+    explained: float
+    """Share of the spread of the places that the features explain in images left out."""
     forecast: Forecast
     """Errors to expect on paths between the trained ones."""
     diagnostics: Diagnostics
@@ -92,6 +99,7 @@ class MetricResult:
             'expected_error_m': self.forecast.expected_m,
             'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
             'left_out_error_m': self.left_out_error_m,
+            'explained': self.explained,
             'coverage': self.diagnostics.as_dict(),
         }
 
@@ -118,11 +126,17 @@ def learn_metric(
         fit, history = paper_solver.learn(problem)
     else:
         fit = choose(problem, span)
+    left = _Left.of(fit)
+    overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
+    overfits &= config.solver == 'certified' and not diagnose(fit).one_route
+    if overfits:
+        fit = fit.weighted(left.variance, left.images.errors)
+        left = _Left.of(fit)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
     frame = map_frame(fit) if onto is None else _frame_of(onto, fit)
-    return _result(fit, frame, diagnostics, history)
+    return _result(fit, left, overfits, frame, diagnostics, history)
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -152,19 +166,58 @@ def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
     return RigidTransform(x_m, y_m, turn.yaw_rad)
 
 
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """Images left out of a fit, and the forecast by those that are as near to the others as points
+    of the covered ground: their `weight` (M,) of sum 1.
+    """
+
+    images: LeftOut
+    expected: Forecast
+    weight: Array
+    sway: NDArray[np.complex128]
+    sway_variance: float
+    spread: float
+    """Mean square distance (m^2) of the images from their middle."""
+
+    @classmethod
+    def of(cls, fit: MapFit) -> _Left:
+        images, weights_sway, places = leave_out(fit), sway(fit), fit.places
+        variance = (np.abs(fit.expanded @ weights_sway) ** 2).sum(1)
+        expected = forecast(fit, variance, np.random.default_rng(fit.problem.seed))
+        near = nearest_used(plane(places), part_of(fit.stack, fit.problem.seed))
+        spread = float((np.abs(places - places.mean()) ** 2).mean())
+        weight = expected.importance(near)
+        return cls(images, expected, weight, weights_sway, float(variance.mean()), spread)
+
+    @property
+    def variance(self) -> float:
+        """Of the position of an image that was left out, m^2 per axis."""
+        return float(self.weight @ np.abs(self.images.errors) ** 2) / 2
+
+    @property
+    def explained(self) -> float:
+        """Share of the spread of the places that the features explain in images left out."""
+        return 1.0 - 2.0 * self.variance / max(self.spread, 1e-12)
+
+
 def _result(
-    fit: MapFit, frame: RigidTransform, diagnostics: Diagnostics, history: Array
+    fit: MapFit,
+    left: _Left,
+    overfits: bool,
+    frame: RigidTransform,
+    diagnostics: Diagnostics,
+    history: Array,
 ) -> MetricResult:
-    left = leave_out(fit)
-    weights_sway = sway(fit)
-    sway_variance = (np.abs(fit.expanded @ weights_sway) ** 2).sum(1)
-    expected = forecast(fit, sway_variance, np.random.default_rng(fit.problem.seed))
-    part = part_of(fit.stack, fit.problem.seed)
-    weight = expected.importance(nearest_used(plane(fit.places), part))
-    inflation = max(needed_factor(left.ratio, 2, weight), 1.0)
+    inflation = max(needed_factor(left.images.ratio, 2, left.weight), 1.0)
+    expected = left.expected.widened(inflation)
+    if overfits:
+        # Beside an image lies another one that errs alike: stretches that were left out do not.
+        mean = float(left.weight @ np.abs(left.images.errors))
+        expected = expected.improved(max(mean / expected.left_out.mean(), 1.0))
     turn = np.exp(1j * frame.yaw_rad)
     return MetricResult(
-        map=metric_map(fit, weights_sway, frame, inflation),
+        map=metric_map(fit, left.sway, frame, inflation),
         angles=wrap_angle(np.angle(fit.solution.z) + frame.yaw_rad),
         origins=plane(fit.solution.o * turn + frame.x_m + 1j * frame.y_m),
         angle_covariance=angle_covariance(fit),
@@ -173,11 +226,12 @@ def _result(
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
         noise_m=float(np.sqrt(fit.variance)),
-        common_m=float(np.sqrt(inflation * sway_variance.mean() / 2)),
-        left_out=plane(left.errors * turn),
-        left_out_variance=left.variances * inflation,
-        left_out_weight=weight,
-        forecast=expected.widened(inflation).moved(frame),
+        common_m=float(np.sqrt(inflation * left.sway_variance / 2)),
+        left_out=plane(left.images.errors * turn),
+        left_out_variance=left.images.variances * inflation,
+        left_out_weight=left.weight,
+        explained=left.explained,
+        forecast=expected.moved(frame),
         diagnostics=diagnostics,
         history=history,
     )

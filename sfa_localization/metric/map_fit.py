@@ -186,6 +186,23 @@ class MapFit:
         """Variance of a position against which odometry's links are weighted, m^2."""
         return self.variance * self.correlation
 
+    def weighted(self, variance: float, errors: Complex) -> MapFit:
+        """Solved again for this variance m^2 of a position, whose errors (M,) are so correlated,
+        and the links' stated variances: those of this fit may be learned of a bent drive.
+        """
+        problem, stack = self.problem, self.stack
+        correlation = LINK_WEIGHT * _correlation(errors, stack)
+        noise = variance * correlation
+        form = problem.form(self.elimination, self.loops, problem.links, noise, YAW_BIAS_STD)
+        solution = problem._unmirrored(form.solve(None, np.zeros(stack.period[-1] + 1)))
+        weights = self.elimination.weights(solution.coefficients(stack.period))
+        predicted = self.expanded @ weights.real + 1j * (self.expanded @ weights.imag)
+        residuals = np.asarray(solution.places(stack) - predicted)
+        return replace(
+            self, variance=variance, correlation=correlation, links=problem.links,
+            solution=solution, residuals=residuals, map_weights=weights,
+        )  # fmt: skip
+
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
         noise = self.links, self.link_variance

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.motion_sources import (
     EQUAL,
     GYRO,
@@ -45,6 +46,8 @@ FASTEST_MPS = 30.0
 JUMP, ACCELERATION = 0.05, 5.0
 """A pose that moves so much (m, rad) beyond what its motion before and after, and this change of
 speed (m/s^2, rad/s^2), explain has jumped: wheels do not."""
+NOISE = 6.0
+"""Standard deviations of noisy wheels that a jump exceeds, too."""
 OFTEN_PER_MINUTE = 1.0
 """Odometry that jumps more often is corrected by a localization."""
 # s around a step in which its usual speed is measured.
@@ -336,12 +339,13 @@ def _jumps(stamps: Stamps, poses: Array) -> tuple[Mask, Array]:
         sums = np.vstack([np.zeros(4), np.cumsum(kept, axis=0)])
         around = sums[last] - sums[first] - kept
         speed = around[:, :3] / np.maximum(around[:, 3:], period)
-        allowed = JUMP + ACCELERATION * longest[:, 0] ** 2
-        found = (dt < reach) & (around[:, 3] > 0)
-        found &= np.maximum(
+        beyond = np.maximum(
             _beyond(step[:, :2], speed[:, :2], longest) - period * np.hypot(*speed[:, :2].T),
             _beyond(step[:, 2:], speed[:, 2:], longest) - period * np.abs(speed[:, 2]),
-        ) > allowed  # fmt: skip
+        )
+        noise = MEDIAN_TO_STD * float(np.median(np.abs(step - speed * dt[:, None])[:, :2].max(1)))
+        allowed = JUMP + ACCELERATION * longest[:, 0] ** 2 + NOISE * noise
+        found = (dt < reach) & (around[:, 3] > 0) & (beyond > allowed)
     return found, speed * dt[:, None]
 
 

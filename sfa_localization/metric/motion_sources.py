@@ -9,7 +9,7 @@ is mirrored, has another unit, runs by another clock, or shows something else. N
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 Mask = NDArray[np.bool_]
 
 IMAGES, POSE, TWIST, GYRO = 'images', 'odometry pose', 'odometry twist', 'gyroscope'
+MAP = 'map'
 LONGEST_S = 2.5
 """Clocks farther apart are not recognized."""
 ALIKE, UNLIKE = 0.7, 0.3
@@ -47,6 +48,8 @@ _OUTLIER = 3.0
 _WINDOWS = 3000
 # A delay is known where delays that fit about as well spread by less, s (of a quarter of them).
 _STD_MAX_S = 0.06
+# m of way over which a map is compared with odometry: much more than images err in it.
+_STRETCH_M = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,11 @@ class Source:
     stamps_ns: Stamps
     turned: Array | None
     driven: Array | None = None
+
+    @property
+    def period_s(self) -> float:
+        """Between messages, as usual."""
+        return float(np.median(np.diff(self.stamps_ns))) * 1e-9
 
     def sums(self, what: str) -> Array | None:
         return self.turned if what == 'turns' else self.driven
@@ -107,11 +115,14 @@ class Pair:
     delay_s: float
     delay_known: bool
     correlation: float
+    period_s: float
+    """Of the slower one of both, images left out: a mean rate is late by half of it."""
 
     @property
     def late_s(self) -> float:
         """By how much `b` is stamped later; 0 where that is not known, or too little to matter."""
-        return self.delay_s if self.delay_known and abs(self.delay_s) > LATE_S else 0.0
+        least = max(LATE_S, self.period_s)
+        return self.delay_s if self.delay_known and abs(self.delay_s) > least else 0.0
 
     @property
     def independent(self) -> bool:
@@ -167,7 +178,7 @@ def unit(pair: Pair) -> str:
 
 def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
     """Compare two sources; None where they show too little motion at the same time."""
-    slow, fast = sorted((a, b), key=lambda one: -float(np.median(np.diff(one.stamps_ns))))
+    slow, fast = sorted((a, b), key=lambda one: -one.period_s)
     if slow.sums(what) is None or fast.sums(what) is None:
         return None
     for length_s in _SHORTEST_S * 2.0 ** np.arange(5):
@@ -182,7 +193,9 @@ def compare(a: Source, b: Source, what: str = 'turns') -> Pair | None:
     moving = _moved(fast, windows + np.round(delays * 1e9).astype(np.int64), what)
     fixed = np.broadcast_to(fixed, moving.shape)
     x, y = (fixed, moving) if slow is a else (moving, fixed)
-    return _fitted(what, a.name, b.name, x, y)
+    period_s = max(one.period_s for one in (a, b) if one.name != IMAGES)
+    found = _fitted(what, a.name, b.name, x, y)
+    return found and replace(found, period_s=period_s)
 
 
 def _windows(slow: Source, fast: Source, length_s: float) -> Stamps:
@@ -258,7 +271,7 @@ def _fitted(what: str, a: str, b: str, x: Array, y: Array) -> Pair | None:
     inside = 0 < best < len(_GRID) - 1
     known = inside and np.ptp(as_good) / 4 < _STD_MAX_S
     delay_s = float(_GRID[best]) + (_summit(alike[best - 1 : best + 2]) if inside else 0.0)
-    return Pair(what, a, b, scale, delay_s, bool(known), float(alike[best]))
+    return Pair(what, a, b, scale, delay_s, bool(known), float(alike[best]), 0.0)
 
 
 def _cosines(u: Array, v: Array) -> Array:
@@ -282,3 +295,24 @@ def _slope(x: Array, y: Array) -> float:
     order = np.argsort(ratio)
     total = np.cumsum(weight[order])
     return float(ratio[order][np.searchsorted(total, total[-1] / 2)]) if len(ratio) else 0.0
+
+
+def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | None:
+    """The way of the images (M,) of a drive, by the map, with that of the odometry.
+
+    `poses` (M, 3) are their places in the map, m, by the images alone, and their yaw, rad. None for
+    a drive that is too short.
+    """
+    driven = odometry.trajectory.at(stamps_ns)
+    way = summed(np.hypot(*np.diff(driven[:, :2], axis=0).T))
+    last = np.searchsorted(way, way + min(_STRETCH_M, way[-1] / 4))
+    first = np.flatnonzero(last < len(way))
+    if way[-1] < ENOUGH['way'] or not len(first):
+        return None
+    x, y = (
+        np.diff(places[np.stack([first, last[first]])], axis=0)[0] * np.exp(-1j * yaw[first])
+        for places, yaw in ((one[:, 0] + 1j * one[:, 1], one[:, 2]) for one in (driven, poses))
+    )
+    together, power = np.vdot(x, y), float(np.vdot(x, x).real)
+    alike = float(np.abs(together) / np.sqrt(max(power * np.vdot(y, y).real, 1e-12)))
+    return Pair('way', POSE, MAP, float(together.real) / max(power, 1e-12), 0.0, False, alike, 0.0)

@@ -14,6 +14,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.learning import positions
+from sfa_localization.metric.motion_sources import MAP
 from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure
@@ -26,6 +27,9 @@ GOOD_M, USEFUL_M = 0.5, 2.0
 LOST."""
 TRUSTED_SHARE = 0.9
 """Of the left-out images, the regions of 95 % hold at least so many where they can be believed."""
+EXPLAINED = 0.5
+"""Share of the places' spread that features explain in images left out: below, knowing no image is
+nearly as good."""
 FEW_CROSSINGS = 5
 """With fewer crossings one bad stretch of odometry bends the map unnoticed."""
 PARALLEL = 0.3
@@ -87,6 +91,12 @@ def judgment(trained: Trained) -> tuple[str, str]:
     """The color of the page, and its answer in a sentence."""
     quality = trained.model.quality
     expected = quality['expected_error_m']
+    by_map = [pair for check in trained.checks for pair in check.pairs if pair.b == MAP]
+    if any(pair.differs('alike') or pair.differs('scale') for pair in by_map):
+        return page.BAD, 'The map cannot be used: it has another shape than its odometry.'
+    route = trained.metric.diagnostics.one_route
+    if quality['explained'] < EXPLAINED and not route:
+        return page.BAD, 'The map cannot be used: the images hardly show where they were taken.'
     if expected > USEFUL_M or trained.metric.diagnostics.mirror_ambiguous:
         return page.BAD, 'The map cannot be used yet: see what to drive next.'
     sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
