@@ -26,21 +26,11 @@ DELAY = 5_000_000
 IMAGES = 12
 PER_IMAGE = 5
 SHAPE = (6, 40, 3)
-QOS_TEXT = yaml.safe_dump(
-    [
-        {
-            'history': 1,
-            'depth': 7,
-            'reliability': 2,
-            'durability': 1,
-            'deadline': {'sec': 2147483647, 'nsec': 4294967295},
-            'lifespan': {'sec': 2147483647, 'nsec': 4294967295},
-            'liveliness': 1,
-            'liveliness_lease_duration': {'sec': 2147483647, 'nsec': 4294967295},
-            'avoid_ros_namespace_conventions': False,
-        }
-    ]
-)
+_FOREVER = {'sec': 2147483647, 'nsec': 4294967295}
+_QOS = {'history': 1, 'depth': 7, 'reliability': 2, 'durability': 1, 'deadline': _FOREVER,
+        'lifespan': _FOREVER, 'liveliness': 1, 'liveliness_lease_duration': _FOREVER,
+        'avoid_ros_namespace_conventions': False}  # fmt: skip
+QOS_TEXT = yaml.safe_dump([_QOS])
 
 
 class Message(NamedTuple):

@@ -61,7 +61,7 @@ def received(path: Path, start_ns: int = 0) -> list[tuple[int, str, bytes]]:
 
 
 @pytest.mark.parametrize('name', FORMATS)
-def test_every_format_is_read_exactly(name: str, tmp_path: Path, messages: list[Message]) -> None:
+def test_every_format_is_read_exactly(name, tmp_path, messages):
     path = FORMATS[name](tmp_path / 'bag', messages)
     before = snapshot(tmp_path)
     with Bag(path, strict=True) as bag:
@@ -91,20 +91,15 @@ def test_every_format_is_read_exactly(name: str, tmp_path: Path, messages: list[
     assert snapshot(tmp_path) == before
 
 
-ORDERED = ['sqlite3', 'ROS 1 bz2']
-
-
-@pytest.mark.parametrize('name', ORDERED)
-def test_messages_come_in_order_of_reception(
-    name: str, tmp_path: Path, messages: list[Message]
-) -> None:
+@pytest.mark.parametrize('name', ['sqlite3', 'ROS 1 bz2'])
+def test_messages_come_in_order_of_reception(name, tmp_path, messages):
     by_topic = sorted(messages, key=lambda message: message.topic)
     found = received(FORMATS[name](tmp_path / 'bag', by_topic))
     assert sorted(part[:2] for part in found) == sorted((m.receive_ns, m.topic) for m in messages)
     assert [at for at, _, _ in found] == sorted(m.receive_ns for m in messages)
 
 
-def test_ros_1_topics_written_one_after_the_other_are_read_whole(tmp_path: Path) -> None:
+def test_ros_1_topics_written_one_after_the_other_are_read_whole(tmp_path):
     """As tools that filter or merge bags write them: the topics share no chunk."""
     with BagWriter(tmp_path / 'drive', 'sqlite3') as writer:
         for index in range(427):
@@ -127,9 +122,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize('name', WRITERS)
-def test_memory_does_not_grow_with_a_bag(
-    name: str, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
     (picture,) = [m for m in messages if m.topic == '/image_raw'][:1]
 
     def peak(count: int) -> int:
@@ -146,20 +139,20 @@ def test_memory_does_not_grow_with_a_bag(
 
 
 @pytest.mark.parametrize('name', ['mcap', 'sqlite3', 'ROS 1'])
-def test_reading_can_start_later(name: str, tmp_path: Path, messages: list[Message]) -> None:
+def test_reading_can_start_later(name, tmp_path, messages):
     path, middle = FORMATS[name](tmp_path / 'bag', messages), stamp(IMAGES / 2)
     receptions = [at for at, _, _ in received(path, middle)]
     assert receptions == [m.receive_ns for m in messages if m.receive_ns >= middle]
 
 
-def test_stamps_of_reception_can_be_chosen(tmp_path: Path, messages: list[Message]) -> None:
+def test_stamps_of_reception_can_be_chosen(tmp_path, messages):
     path = write_version(tmp_path / 'bag', messages, 5)
     with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         assert [at for at, _ in bag.images()] == [stamp(i) + DELAY for i in range(IMAGES)]
 
 
 @pytest.mark.parametrize('name', ['version 9', 'lone db3', 'lone mcap'])
-def test_quality_of_service_is_kept(name: str, tmp_path: Path, messages: list[Message]) -> None:
+def test_quality_of_service_is_kept(name, tmp_path, messages):
     with Bag(FORMATS[name](tmp_path / 'bag', messages)) as bag:
         (qos,) = bag.topics['/odom'].qos
     found = qos.depth, qos.reliability.name, qos.durability.name
@@ -169,9 +162,7 @@ def test_quality_of_service_is_kept(name: str, tmp_path: Path, messages: list[Me
 # Silence.
 
 
-def test_silence_of_a_library_is_an_error(
-    tmp_path: Path, messages: list[Message], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silence_of_a_library_is_an_error(tmp_path, messages, monkeypatch):
     """As rosbags 0.11 reads nothing where metadata and file spell a type differently."""
     path = FORMATS['other text in the metadata'](tmp_path / 'bag', messages)
     with Bag(path, strict=True) as bag:
@@ -181,27 +172,16 @@ def test_silence_of_a_library_is_an_error(
         read_drive(path, tmp_path / 'cache')
 
 
-@pytest.mark.parametrize('kept', [0, 70])
-def test_fewer_messages_than_declared_are_counted_as_lost(
-    kept: int, tmp_path: Path, messages: list[Message]
-) -> None:
-    path = tmp_path / 'bag'
-    write_database(path / 'bag_0.db3', messages[:kept] or [messages[0]])
+def test_fewer_messages_than_declared_are_counted_as_lost(tmp_path, messages):
+    path, total = tmp_path / 'bag', COUNTS['/odom']
+    write_database(path / 'bag_0.db3', messages[:70])
     (path / 'metadata.yaml').write_text(metadata(5, ['bag_0.db3'], messages))
-    total = COUNTS['/odom']
     with Bag(path) as bag:
-        if not kept:
-            with pytest.raises(BagError, match=f'{total} lost.*mcap recover.*ros2 bag reindex'):
-                bag.odometry()
-            return
         read = len(bag.odometry().stamps_ns)
         assert bag.counts['/odom'].skipped == {'lost in a damaged bag': total - read}
         assert f'/odom: {read} of {total} messages read' in bag.problems[0]
-    with (
-        pytest.raises(BagError, match=f'of {total} .*; read without'),
-        Bag(path, strict=True) as bag,
-    ):
-        bag.odometry()
+    with pytest.raises(BagError, match=f'of {total} .*; read without'), Bag(path, strict=True) as b:
+        b.odometry()
 
 
 # Damage.
@@ -240,9 +220,7 @@ CUT_OFF = {
 
 @pytest.mark.parametrize('share', [0.4, 0.7, 0.95])
 @pytest.mark.parametrize('name', CUT_OFF)
-def test_a_cut_off_file_is_read_up_to_the_cut(
-    name: str, share: float, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_a_cut_off_file_is_read_up_to_the_cut(name, share, tmp_path, messages):
     path = CUT_OFF[name](tmp_path, messages)
     every = received(path)
     os.truncate(path, int(path.stat().st_size * share))
@@ -251,19 +229,8 @@ def test_a_cut_off_file_is_read_up_to_the_cut(
     assert set(found) <= set(every) and found == sorted(found, key=lambda part: part[0])
 
 
-def test_a_cut_off_file_of_ros_1_names_what_repairs_it(
-    tmp_path: Path, messages: list[Message]
-) -> None:
-    path = write_ros1(tmp_path / 'a.bag', messages, chunk_size=2000)
-    os.truncate(path, int(path.stat().st_size * 0.7))
-    with pytest.raises(BagError, match=r'a\.bag: no readable bag .*`rosbag reindex`'), Bag(path):
-        pass
-
-
 @pytest.mark.parametrize('name', ['version 5', 'mcap', 'mcap zstd file'])
-def test_a_cut_off_bag_counts_what_is_lost(
-    name: str, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_a_cut_off_bag_counts_what_is_lost(name, tmp_path, messages):
     noise = [m._replace(topic='/noise') for m in messages if m.topic == '/image_raw']
     path = FORMATS[name](tmp_path / 'bag', [part for m in messages for part in (m, *noise)])
     (file,) = [file for file in path.iterdir() if file.suffix != '.yaml']
@@ -271,7 +238,7 @@ def test_a_cut_off_bag_counts_what_is_lost(
     assert 0 < salvaged(path) < 1
 
 
-def test_a_damaged_part_costs_itself_alone(tmp_path: Path, messages: list[Message]) -> None:
+def test_a_damaged_part_costs_itself_alone(tmp_path, messages):
     path = write_mcap(tmp_path / 'bag.mcap', messages, compression='zstd')
     data = path.read_bytes()
     overwrite(path, data.index(b'\x28\xb5\x2f\xfd', len(data) // 2), 40)
@@ -280,18 +247,14 @@ def test_a_damaged_part_costs_itself_alone(tmp_path: Path, messages: list[Messag
         assert any('a damaged chunk is skipped' in problem for problem in bag.problems)
 
 
-def test_a_damaged_database_is_read_up_to_the_damage(
-    tmp_path: Path, messages: list[Message]
-) -> None:
+def test_a_damaged_database_is_read_up_to_the_damage(tmp_path, messages):
     path = write_database(tmp_path / 'bag.db3', messages)
     overwrite(path, path.stat().st_size // 2 // 4096 * 4096, 4096)
     assert 0.3 < salvaged(path) < 1
 
 
 @pytest.mark.parametrize('data', [b'\x28\xb5\x2f\xfd' + bytes(20), b''])
-def test_a_damaged_message_costs_itself(
-    data: bytes, tmp_path: Path, messages: list[Message]
-) -> None:
+def test_a_damaged_message_costs_itself(data, tmp_path, messages):
     first = next(i for i, m in enumerate(messages) if m.topic == '/odom')
     messages = [*messages[:first], messages[first]._replace(data=data), *messages[first + 1 :]]
     with Bag(write_mcap(tmp_path / 'a.mcap', messages)) as bag:
@@ -299,7 +262,7 @@ def test_a_damaged_message_costs_itself(
         assert sum(bag.counts['/odom'].skipped.values()) == 1
 
 
-def test_a_missing_file_of_several_is_counted(tmp_path: Path, messages: list[Message]) -> None:
+def test_a_missing_file_of_several_is_counted(tmp_path, messages):
     path = write_split(tmp_path / 'bag', messages)
     (path / 'bag_3.mcap').unlink()
     with Bag(path) as bag:
@@ -318,14 +281,12 @@ def test_a_missing_file_of_several_is_counted(tmp_path: Path, messages: list[Mes
         (b'not a bag at all', 'is no bag file'),
         (b'SQLite format 3\x00', 'no readable bag database'),
         (b'\x89MCAP0\r\n', 'holds no readable message'),
-        (b'#ROSBAG V2.0\n', 'no readable bag'),
+        (b'#ROSBAG V2.0\n', 'no readable bag .*`rosbag reindex`'),
         (b'\x28\xb5\x2f\xfd', 'cut-off zstd data'),
         (None, 'neither metadata.yaml nor'),
     ],
 )
-def test_what_holds_no_bag_is_one_error(
-    content: bytes | None, complaint: str, tmp_path: Path
-) -> None:
+def test_what_holds_no_bag_is_one_error(content, complaint, tmp_path):
     path = tmp_path / 'bag.mcap'
     path.mkdir() if content is None else path.write_bytes(content)
     with pytest.raises(BagError, match=rf'bag.*: .*{complaint}') as error, Bag(path):
@@ -336,7 +297,7 @@ def test_what_holds_no_bag_is_one_error(
 @pytest.mark.parametrize(
     'text', ['', 'a: [', '[1, 2]', 'a: 3', 'rosbag2_bagfile_information: {}', '[' * 30_000]
 )
-def test_damaged_metadata_is_rebuilt(text: str, tmp_path: Path, messages: list[Message]) -> None:
+def test_damaged_metadata_is_rebuilt(text, tmp_path, messages):
     path = write_version(tmp_path / 'bag', messages, 5)
     (path / 'metadata.yaml').write_text(text)
     with Bag(path) as bag:
@@ -346,9 +307,7 @@ def test_damaged_metadata_is_rebuilt(text: str, tmp_path: Path, messages: list[M
         pass
 
 
-def test_messages_that_are_left_in_a_log_are_told_of(
-    tmp_path: Path, messages: list[Message]
-) -> None:
+def test_messages_that_are_left_in_a_log_are_told_of(tmp_path, messages):
     path = write_database(tmp_path / 'bag.db3', messages)
     (tmp_path / 'bag.db3-wal').write_bytes(b'some')
     with Bag(path) as bag:
@@ -356,7 +315,7 @@ def test_messages_that_are_left_in_a_log_are_told_of(
 
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'bag/b.mcap'])
-def test_a_pipe_is_no_bag(name: str, tmp_path: Path) -> None:
+def test_a_pipe_is_no_bag(name, tmp_path):
     (tmp_path / 'bag').mkdir()
     os.mkfifo(tmp_path / name)
     path = tmp_path / name.partition('/')[0]
@@ -365,7 +324,7 @@ def test_a_pipe_is_no_bag(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['a?b', 'a#b', 'a%20b', 'ä b', '\udcff'])
-def test_odd_names_are_opened(name: str, tmp_path: Path, messages: list[Message]) -> None:
+def test_odd_names_are_opened(name, tmp_path, messages):
     write_rosbags(tmp_path / 'plain', messages).rename(tmp_path / name)
     with Bag(tmp_path / name, strict=True) as bag:
         assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
@@ -374,9 +333,7 @@ def test_odd_names_are_opened(name: str, tmp_path: Path, messages: list[Message]
 # Runs.
 
 
-def test_images_without_odometry_are_skipped_and_counted(
-    tmp_path: Path, messages: list[Message]
-) -> None:
+def test_images_without_odometry_are_skipped_and_counted(tmp_path, messages):
     late, early = stamp(2), stamp(9)
     kept = [m for m in messages if m.topic != '/odom' or late <= m.receive_ns - DELAY <= early]
     run = read_drive(write_version(tmp_path / 'bag', kept, 5), tmp_path)
@@ -388,9 +345,7 @@ def test_images_without_odometry_are_skipped_and_counted(
 
 
 @pytest.mark.parametrize(('distinct', 'used'), [(False, [0, 1, 2, 3, 4, 5]), (True, [0, 3, 5])])
-def test_learning_leaves_out_images_that_repeat_the_one_before(
-    distinct: bool, used: list[int], tmp_path: Path
-) -> None:
+def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, tmp_path):
     """A driver that was late sends an old image with a new stamp: it shows another place."""
     with BagWriter(tmp_path / 'bag') as bag:
         for index, shown in enumerate((0, 0, 0, 3, 3, 0)):
@@ -402,7 +357,7 @@ def test_learning_leaves_out_images_that_repeat_the_one_before(
     assert run.counts['images'].as_dict() == {'used': len(used), 'skipped': skipped}
 
 
-def test_truth_is_read_only_when_wanted(tmp_path: Path, messages: list[Message]) -> None:
+def test_truth_is_read_only_when_wanted(tmp_path, messages):
     broken = [m._replace(data=b'\xff') if m.topic == '/ground_truth' else m for m in messages]
     path = write_version(tmp_path / 'bag', broken, 5)
     read_drive(path, tmp_path, strict=True)
@@ -415,7 +370,7 @@ def test_truth_is_read_only_when_wanted(tmp_path: Path, messages: list[Message])
     np.testing.assert_array_equal(run.ground_truth.poses, run.odometry.poses)
 
 
-def test_images_are_unwrapped_when_they_are_no_panoramas(tmp_path: Path) -> None:
+def test_images_are_unwrapped_when_they_are_no_panoramas(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         for index in range(3):
             bag.image('/image', stamp(index), np.full((20, 40, 3), index, np.uint8), 'camera')
@@ -425,7 +380,7 @@ def test_images_are_unwrapped_when_they_are_no_panoramas(tmp_path: Path) -> None
     assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == 3
 
 
-def test_nothing_is_left_behind_after_an_error(tmp_path: Path) -> None:
+def test_nothing_is_left_behind_after_an_error(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         for index in range(3):
             bag.image('/image', stamp(index), image(index), 'camera')

@@ -104,9 +104,7 @@ EXPECTED = np.array([pose(i) for i in range(COUNT)])
 @pytest.mark.parametrize(
     'make_message', [pose_stamped, with_covariance, transform_stamped, tf, odometry]
 )
-def test_poses_come_in_any_type_and_serve_as_odometry_when_named(
-    make_message: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_poses_come_in_any_type_and_serve_as_odometry_when_named(make_message, tmp_path):
     path = record(tmp_path / 'bag', poses_of(make_message, '/p'))
     name = '/p:base_link' if make_message is tf else '/p'
     with Bag(path, strict=True) as bag:
@@ -121,13 +119,13 @@ def test_poses_come_in_any_type_and_serve_as_odometry_when_named(
         assert not read.variances.any()
 
 
-def test_driving_backwards_has_a_negative_speed(tmp_path: Path) -> None:
+def test_driving_backwards_has_a_negative_speed(tmp_path):
     entries = [('/p', stamp(i), pose_stamped(stamp(i), -0.1 * i, 0.0, 0.0)) for i in range(4)]
     with Bag(record(tmp_path / 'bag', entries)) as bag:
         np.testing.assert_allclose(bag.odometry('/p').twists, [[-1.0, 0.0]] * 4, atol=1e-9)
 
 
-def test_one_transform_of_several_is_named_by_its_frame(tmp_path: Path) -> None:
+def test_one_transform_of_several_is_named_by_its_frame(tmp_path):
     wheel = transform_stamped(stamp(99), 9.0, 9.0, 0.0, child='wheel')
     entries = [('/tf', stamp(i), tf(stamp(i), *pose(i), wheel)) for i in range(COUNT)]
     entries.append(('/tf', stamp(COUNT), tf(stamp(COUNT), 0, 0, 0)))
@@ -140,11 +138,10 @@ def test_one_transform_of_several_is_named_by_its_frame(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
 
 
-def test_odometry_that_was_reset_is_joined(tmp_path: Path) -> None:
+def test_odometry_that_was_reset_is_joined(tmp_path):
     entries = []
     for index in range(20):
-        x = 0.1 * index if index < 10 else 0.1 * (index - 10)
-        y = 50.0 if index < 10 else 0.0
+        x, y = (0.1 * index, 50.0) if index < 10 else (0.1 * (index - 10), 0.0)
         entries.append(('/odom', stamp(index), odometry(stamp(index), x, y, 0.0)))
     path = record(tmp_path / 'bag', entries)
     with Bag(path) as bag:
@@ -164,7 +161,7 @@ def full(path: Path, *more: Entry) -> Path:
     return record(path, [*entries, *poses_of(odometry, '/odom'), *more])
 
 
-def test_ambiguity_is_an_error_that_lists_the_candidates(tmp_path: Path) -> None:
+def test_ambiguity_is_an_error_that_lists_the_candidates(tmp_path):
     path = full(tmp_path / 'bag', ('/second', stamp(1), picture(stamp(1))))
     with Bag(path) as bag:
         with pytest.raises(
@@ -185,14 +182,12 @@ def test_ambiguity_is_an_error_that_lists_the_candidates(tmp_path: Path) -> None
         ('ground_truth', '', r'has no true poses .* --ground-truth-topic'),
     ],
 )
-def test_a_missing_or_wrong_topic_names_the_remedy(
-    kind: str, name: str, complaint: str, tmp_path: Path
-) -> None:
+def test_a_missing_or_wrong_topic_names_the_remedy(kind, name, complaint, tmp_path):
     with Bag(full(tmp_path / 'bag')) as bag, pytest.raises(BagError, match=complaint):
         bag.find(kind, name)
 
 
-def test_an_unknown_serialization_is_rejected_by_name(tmp_path: Path) -> None:
+def test_an_unknown_serialization_is_rejected_by_name(tmp_path):
     path = record(tmp_path / 'bag', poses_of(odometry, '/odom'), serialization='protobuf')
     with Bag(path) as bag, pytest.raises(BagError, match="/odom is serialized as 'protobuf'"):
         bag.odometry()
@@ -201,7 +196,7 @@ def test_an_unknown_serialization_is_rejected_by_name(tmp_path: Path) -> None:
 # Faulty messages.
 
 
-def test_faulty_messages_are_skipped_and_counted(tmp_path: Path) -> None:
+def test_faulty_messages_are_skipped_and_counted(tmp_path):
     faults = [
         ({'data': np.zeros(239, np.uint8)}, 'data size is not rows times step'),
         ({'step': 30, 'data': np.zeros(120, np.uint8)}, 'step is shorter than a row'),
@@ -268,13 +263,11 @@ HOUR = 3600 * 10**9
         ([*TIMES[:5], *(t - HOUR for t in TIMES[5:])], TIMES[:5], {'clock was set back': 5}),
     ],
 )
-def test_stamps_that_cannot_be(
-    stamps: list[int], used: list[int], skipped: dict[str, int], tmp_path: Path
-) -> None:
+def test_stamps_that_cannot_be(stamps, used, skipped, tmp_path):
     assert used_of(tmp_path / 'bag', stamps) == (used, skipped)
 
 
-def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
+def test_a_bag_without_stamps_names_the_remedy(tmp_path):
     entries = [('/p', stamp(i), pose_stamped(0, *pose(i))) for i in range(COUNT)]
     path = record(tmp_path / 'bag', entries)
     with (
@@ -286,9 +279,7 @@ def test_a_bag_without_stamps_names_the_remedy(tmp_path: Path) -> None:
         np.testing.assert_allclose(bag.trajectory().poses, EXPECTED, atol=1e-12)
 
 
-def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(tmp_path, caplog):
     with Writer(tmp_path / 'bag', version=9) as writer:
         writer.add_connection('/imu', 'sensor_msgs/msg/Imu', typestore=STORE)
         for topic, made in (('/camera', picture), ('/odom', lambda at: odometry(at, 0, 0, 0))):
@@ -305,103 +296,68 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(
         )
 
 
-def drive_bag(path: Path, pose: Callable[[int], Any], twist: Any, count: int = 100) -> Path:
+def drive_bag(path, pose, twist, count=100):
     with BagWriter(path) as bag:
         for k in range(count):
-            bag.image('/image', stamp(k), np.full((8, 32, 3), k, np.uint8), 'camera')
-            bag.odometry('/odom', stamp(k), np.array(pose(k)), np.array(twist), np.zeros(2))
+            bag.odometry('/odom', stamp(k), np.array(pose(k)), np.array(twist(k)), np.zeros(2))
     return path
 
 
-def test_a_pose_and_a_twist_of_different_units_are_rejected(tmp_path: Path) -> None:
-    """A pose in centimeters would else be taken for odometry that is reset at every message."""
+def test_odometry_whose_pose_and_twist_contradict_each_other(tmp_path):
     step = PERIOD * 1e-9
-    meters = drive_bag(tmp_path / 'm', lambda k: (k * step * 10, 0.0, 0.0), (10.0, 0.0))
-    with Bag(meters) as bag:
-        assert len(bag.odometry().poses) == 100 and bag.problems == []
-    centimeters = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), (10.0, 0.0))
-    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* meters')
-    with refusal, Bag(centimeters) as bag:
-        bag.odometry()
-
-
-def test_a_pose_that_is_never_kept_is_summed_up_from_the_twist(tmp_path: Path) -> None:
-    path = drive_bag(tmp_path / 'bag', lambda k: (0.0, 0.0, 0.0), (1.0, 0.0))
-    with Bag(path) as bag:
-        x = bag.odometry().poses[:, 0]
-        assert x == pytest.approx(np.arange(100) * PERIOD * 1e-9)
+    with Bag(drive_bag(tmp_path / '0', lambda k: (0.0, 0.0, 0.0), lambda k: (1.0, 0.0))) as bag:
+        assert bag.odometry().poses[:, 0] == pytest.approx(np.arange(100) * step)
         assert bag.problems == ['/odom: the pose is constant; the twist is integrated instead']
-
-
-@pytest.mark.parametrize(
-    ('askew', 'axle', 'found'),
-    [
-        (0.0, 0.0, ''),
-        (0.0, 0.4, ''),  # a frame that is not on the axle swings in turns
-        (math.pi, 0.0, ''),  # always backward
-        (0.5, 0.0, r'/odom: poses drive 4[0-9.]+ m sideways and 7[0-9.]+ m ahead: only'),
-        (math.pi / 2, 0.0, r'/odom: poses drive 8[0-9.]+ m sideways and [0-9.e-]+ m ahead: only'),
-    ],
-)
-def test_robots_that_drive_sideways_are_named(
-    askew: float, axle: float, found: str, tmp_path: Path
-) -> None:
-    """A circle of 2 m at 1 m/s, headed `askew` off the motion, seen `axle` m ahead of the axle."""
-
-    def pose(k: int) -> tuple[float, float, float]:
-        yaw = 0.5 * k * PERIOD * 1e-9
-        x, y = 2 * math.sin(yaw), 2 * (1 - math.cos(yaw))
-        return x + axle * math.cos(yaw), y + axle * math.sin(yaw), yaw + askew
-
-    path = drive_bag(tmp_path / 'bag', pose, (round(math.cos(askew), 3), 0.5))
-    with Bag(path) as bag:
+    path = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), lambda k: (10.0, 0.0))
+    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* meters')
+    with refusal, Bag(path) as bag:
         bag.odometry()
-        assert len(bag.problems) == bool(found)
-        assert not found or re.match(found, bag.problems[0])
 
 
 @pytest.mark.parametrize(
-    ('twist', 'pose_turns', 'found'),
+    ('twist', 'turns', 'askew', 'axle', 'found'),
     [
-        ((1.0, 0.5), 1.0, ''),
-        ((1.2, 0.4), 1.0, ''),
-        ((0.0, 0.0), 1.0, ''),  # a twist that is never set claims nothing
-        ((1000.0, 0.5), 1.0, r'/odom: poses drive 1[0-9.]+ m, twists 1[.0-9]+e\+04 m: are'),
-        ((1.0, 28.6), 1.0, r'/odom: poses turn 7[0-9.]* rad, twists 4[0-9]+ rad: are both'),
-        ((1.0, 0.5), 0.0, r'/odom: poses turn 0 rad, twists 7[0-9.]* rad: are both in'),
+        ((1.0, 0.5), 1.0, 0.0, 0.0, ''),
+        ((1.2, 0.4), 1.0, 0.0, 0.0, ''),
+        ((0.0, 0.0), 1.0, 0.0, 0.0, ''),  # a twist that is never set claims nothing
+        ((1.0, 0.5), 1.0, 0.0, 0.4, ''),  # a frame that is not on the axle swings in turns
+        ((-1.0, 0.5), 1.0, math.pi, 0.0, ''),  # always backward
+        ((0.9, 0.5), 1.0, 0.5, 0.0, r'drive [0-9.]+ m sideways and [0-9.]+ m ahead: only'),
+        (
+            (0.0, 0.5),
+            1.0,
+            math.pi / 2,
+            0.0,
+            r'drive [0-9.]+ m sideways and [0-9.e-]+ m ahead: only',
+        ),
+        ((1000.0, 0.5), 1.0, 0.0, 0.0, r'drive 1[0-9.]+ m, twists 1[.0-9]+e\+04 m: are'),
+        ((1.0, 28.6), 1.0, 0.0, 0.0, r'turn 7[0-9.]* rad, twists 4[0-9]+ rad: are both'),
+        ((1.0, 0.5), 0.0, 0.0, 0.0, r'turn 0 rad, twists 7[0-9.]* rad: are both in'),
     ],
 )
-def test_poses_and_twists_in_other_units_are_named(
-    twist: tuple[float, float], pose_turns: float, found: str, tmp_path: Path
-) -> None:
-    """The robot drives a circle of 2 m at 1 m/s, and then stands with a flickering twist."""
+def test_other_units_and_motion_aside_are_named(twist, turns, askew, axle, found, tmp_path):
+    """A circle of 2 m at 1 m/s, headed `askew` off the motion, seen `axle` m ahead of the axle;
+    then the robot stands, with a flickering twist.
+    """
 
-    def pose(k: int) -> tuple[float, float, float]:
+    def pose(k):
         yaw = 0.5 * min(k, 150) * PERIOD * 1e-9
-        return 2 * math.sin(yaw), 2 * (1 - math.cos(yaw)), yaw * pose_turns
+        x, y = 2 * math.sin(yaw), 2 * (1 - math.cos(yaw))
+        return x + axle * math.cos(yaw), y + axle * math.sin(yaw), yaw * turns + askew
 
-    with BagWriter(tmp_path / 'bag') as writer:
-        for k in range(300):
-            given = np.array(twist) if k <= 150 else np.array([0.0, 0.04 * any(twist)])
-            writer.odometry('/odom', stamp(k), np.array(pose(k)), given, np.zeros(2))
-    with Bag(tmp_path / 'bag') as bag:
+    def told(k):
+        return twist if k <= 150 else (0.0, 0.04 * any(twist))
+
+    with Bag(drive_bag(tmp_path / 'bag', pose, told, 300)) as bag:
         bag.odometry()
         assert len(bag.problems) == bool(found)
-        assert re.match(found, ''.join(bag.problems))
+        assert re.search(found, ''.join(bag.problems))
 
 
 # The writer.
 
 
-def test_a_bag_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
-    with pytest.raises(KeyError), BagWriter(tmp_path / 'new' / 'bag') as bag:
-        bag.imu('/imu', stamp(0), 0.1, 0.0)
-        assert not (tmp_path / 'new' / 'bag').exists()
-        raise KeyError
-    assert list((tmp_path / 'new').iterdir()) == []
-
-
-def test_an_existing_bag_is_not_overwritten(tmp_path: Path) -> None:
+def test_an_existing_bag_is_not_overwritten(tmp_path):
     (tmp_path / 'bag').mkdir()
     with pytest.raises(BagError, match='bag: already exists'), BagWriter(tmp_path / 'bag'):
         pass
@@ -410,7 +366,7 @@ def test_an_existing_bag_is_not_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_same_calls_write_same_bytes(storage: str, tmp_path: Path) -> None:
+def test_same_calls_write_same_bytes(storage, tmp_path):
     content = []
     for folder in ('one', 'two'):
         with BagWriter(tmp_path / folder / 'bag', storage) as bag:
@@ -422,7 +378,7 @@ def test_same_calls_write_same_bytes(storage: str, tmp_path: Path) -> None:
     assert content[0] == content[1] and len(content[0]) == 2
 
 
-def test_images_are_written_raw_or_compressed(tmp_path: Path) -> None:
+def test_images_are_written_raw_or_compressed(tmp_path):
     smooth = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)
     for kind, error in ((None, 0), ('png', 0), ('jpeg', 12)):
         path = tmp_path / str(kind)
@@ -433,7 +389,7 @@ def test_images_are_written_raw_or_compressed(tmp_path: Path) -> None:
         assert at == stamp(0) and np.abs(read.astype(int) - smooth).max() <= error
 
 
-def test_a_topic_has_one_type(tmp_path: Path) -> None:
+def test_a_topic_has_one_type(tmp_path):
     refusal = pytest.raises(BagError, match=r'/x is sensor_msgs/msg/Imu, not')
     with refusal, BagWriter(tmp_path / 'bag') as bag:
         bag.imu('/x', stamp(0), 0.0, 0.0)

@@ -3,7 +3,6 @@
 """A model file whose parts do not fit each other is one error, when it is loaded."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ CHANGES = {
 }
 
 
-def test_parts_that_do_not_fit_under_a_right_checksum(tmp_path: Path) -> None:
+def test_parts_that_do_not_fit_under_a_right_checksum(tmp_path):
     place().model.save(tmp_path / 'model.npz')
     arrays = read_arrays(tmp_path / 'model.npz', FORMAT, VERSION, '')
     for number, (reason, change) in enumerate(CHANGES.items()):
@@ -47,7 +46,7 @@ def test_parts_that_do_not_fit_under_a_right_checksum(tmp_path: Path) -> None:
         assert text.startswith(f'{path}: ') and 'train it' in text and '\n' not in text
 
 
-def test_other_numbers_than_were_saved(tmp_path: Path) -> None:
+def test_other_numbers_than_were_saved(tmp_path):
     """The zip is whole; only the checksum of the header shows the change."""
     place().model.save(tmp_path / 'model.npz')
     arrays = read_arrays(tmp_path / 'model.npz', FORMAT, VERSION, '')

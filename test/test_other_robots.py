@@ -3,25 +3,21 @@
 """Robots unlike the simulator's: what must not matter does not, over many random drives.
 
 The odometry frame lies anywhere and may start anew, the gyroscope has a bias and gaps, odometry
-comes at any rate and with pauses, images are stamped late, and a second drive starts elsewhere.
+comes at any rate and with pauses, and a second drive starts elsewhere.
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, place, recipe, run_in, visit, wander
 from metric_worlds import criss_cross, drive, garden_features
 
 from sfa_localization.data.geometry import align, compose, wrap_angle
-from sfa_localization.data.run import Odometry, PanoramaArray, YawRate
-from sfa_localization.features.network_training import ImageSequence, train_network
+from sfa_localization.data.run import Odometry, YawRate
 from sfa_localization.metric import learning as metric
 from sfa_localization.metric import selection
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.training import learn_place
 
 QUICK = MetricConfig(metric_map='monomials', slow_features=5)
 CUT = SegmentConfig()
@@ -157,35 +153,3 @@ def test_any_robot_gives_nearly_as_good_a_map(drives):
     plain, other = np.array(plain), np.array(other)
     assert np.all(np.median(other, axis=0) < 1.2 * np.median(plain, axis=0) + [0.02, 0.2])
     assert np.all(other < 2.0 * plain + [0.3, 3.0])
-
-
-@cache
-def placed(delay_s, seed):
-    """Mean error (m) of a place learnt from images stamped so late, after rigid alignment."""
-    config = recipe()
-    world, odometry = Spheres.about(seed), wander(400, seed + 1, hz=4.0)
-    exact = run_in(world, odometry, config.panorama)
-    shifted = PanoramaArray(
-        exact.panoramas.stamps_ns + round(delay_s * 1e9), exact.panoramas.images
-    )
-    run = replace(exact, panoramas=shifted)
-    if delay_s == 0.0 and seed == 1:
-        trained = place()
-    else:
-        network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
-        trained = learn_place(network, [run], config)
-    seen = visit() if seed == 1 else exact
-    estimates = trained.model.locate_all(seen.panoramas.read(0, len(seen.panoramas)))
-    places = np.array([estimate.position for estimate in estimates])
-    truth = seen.odometry.poses[:, :2]
-    return np.hypot(*(align(places, truth).apply(places) - truth).T).mean(), trained
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('delay', [-0.3, 0.3])
-def test_a_late_camera_gives_as_good_a_map(delay):
-    """The delay is found from the turns, stays with the model, and is left out of the map."""
-    in_time, _ = placed(0.0, 1)
-    late, trained = placed(delay, 1)
-    assert trained.model.camera_delay_s == pytest.approx(delay, abs=0.05)
-    assert late < in_time + 0.01

@@ -16,7 +16,7 @@ README = (BAGS / 'README.md').read_text(encoding='utf-8')
 
 
 @pytest.mark.parametrize(('name', 'enough'), [('sample', True), ('sample_test', False)])
-def test_the_sample_holds_what_its_readme_lists(name: str, enough: bool, tmp_path: Path) -> None:
+def test_the_sample_holds_what_its_readme_lists(name, enough, tmp_path):
     row = re.search(rf'^\| `{name}` .*\| (\d+) \| (\d+) each \|$', README, re.MULTILINE)
     assert row
     others = dict.fromkeys(('/odom', '/imu', '/ground_truth'), int(row[2]))

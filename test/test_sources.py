@@ -113,9 +113,6 @@ def test_a_disconnected_camera_is_opened_again(run_feed):
     assert [received.get(timeout=PATIENCE_S) for _ in range(5)] == [1, 2, 3, 4, 5]
     assert script.opened == 3
     assert feed.status().lost == 2
-
-
-def test_the_reason_is_shown_while_a_camera_is_away(run_feed):
     feed, _ = run_feed(Script(CameraError('not there')))
     wait_for(lambda: feed.status().state == 'lost')
     assert feed.status().problem == 'not there'
