@@ -34,6 +34,7 @@ from sfa_localization.features.network import (
     Network,
     Node,
     check_weights,
+    require_size,
 )
 from sfa_localization.features.observation import (
     UNKNOWN_YAW_VARIANCE,
@@ -103,8 +104,10 @@ class PlaceModel:
         ]
 
     def slow_poses(self, panoramas: Image) -> list[Observation]:
-        """What panoramas (T, H, W, 3) show by slow features alone."""
-        maps = self.network.maps(panoramas)
+        """What panoramas (T, H, W, 3) show by slow features alone, leveled by keyframes."""
+        require_size(panoramas, self.network.architecture)
+        level = list(map(self.keyframes.level, panoramas))
+        maps = self.network.maps(np.stack([image.panorama for image in level]))
         slow = slow_features(maps)
         spread = disagreement(maps[-1])
         positions, own = self.metric.predict(slow)
@@ -120,14 +123,20 @@ class PlaceModel:
         covariances[:, :2, :2] = own
         covariances[:, 2, 2] = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
         poses = np.column_stack([positions, yaw])
-        return list(map(Observation, poses, covariances, slow))
+        return [
+            Observation(pose, covariance, features, leveled=image)
+            for pose, covariance, features, image in zip(
+                poses, covariances, slow, level, strict=True
+            )
+        ]
 
     def match(self, panorama: Image, slow: Observation, pattern: Spectra | None = None) -> Match:
         """What keyframes show of a panorama (H, W, 3) without the `pattern` that the light adds,
         see `OtherLight`; they are looked for also where its slow features put it.
         """
         guess = slow.position if np.isfinite(slow.position).all() else None
-        return self.keyframes.match(panorama, guess, pattern)
+        level = slow.leveled or self.keyframes.level(panorama)
+        return self.keyframes.match_level(level, guess, pattern)
 
     def combined(
         self, slow: Observation, match: Match, light: float = 0.0, doubt: float = 1.0
@@ -143,7 +152,7 @@ class PlaceModel:
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         covariance[:2, :2] += noise.beyond(match, light) ** 2 * np.eye(2)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        return Observation(pose, covariance, slow.slow_features, novelty)
+        return Observation(pose, covariance, slow.slow_features, novelty, tilt=match.tilt)
 
     def headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
         """Yaw (T,) rad in the map and its variance (T,), from the maps of all layers and the slow
@@ -229,11 +238,12 @@ class PlaceModel:
         compass, yaw_agreement, refinement = (
             _under(arrays, name) for name in ('compass/', 'yaw_agreement/', 'refinement/')
         )
+        panorama = PanoramaConfig.from_mapping(header['panorama'], 'panorama')
         return cls(
             network_from(arrays, header),
             MetricMap.from_arrays(_under(arrays, 'metric/')),
-            PanoramaConfig.from_mapping(header['panorama'], 'panorama'),
-            Keyframes.from_arrays(_under(arrays, 'keyframes/')),
+            panorama,
+            Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
             Compass.from_arrays(compass) if compass else None,
             Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,

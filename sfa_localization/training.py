@@ -125,7 +125,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     agreement = left_out_agreement(images.disagreement, first)
     result, finest = (finer.metric, finer.refinement.agreement) if finer else (first, agreement)
     known = learn_keyframes(
-        given.views, images.disagreement, segments, result, finest, given.recipe.panorama.clockwise
+        given.views, images.disagreement, segments, result, finest, given.recipe.panorama.sphere
     )
     result = replace(result, forecast=result.forecast.improved(known.improvement))
     delays = [drive.delay_s for drive in given.drives.items]

@@ -215,7 +215,7 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
         np.concatenate([old.textures[rows], new.textures]),
         np.concatenate([old.poses[rows], new.poses]),
         old.noise,
-        old.clockwise,
+        old.sphere,
         np.append(old.drives[rows], np.full(count, old.drives.max() + 1, np.int32)),
         old.trained,
     )

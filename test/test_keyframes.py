@@ -52,7 +52,7 @@ def sunny(images: np.ndarray) -> np.ndarray:
 def learnt(world: Spheres, config: PanoramaConfig = CONFIG) -> Keyframes:
     poses = drive()
     textures = np.stack([texture(image) for image in world.panoramas(poses, config)])
-    return fit_keyframes(quantized(textures), poses, path(poses), config.clockwise)
+    return fit_keyframes(quantized(textures), poses, path(poses), config.sphere)
 
 
 def unseen(number: int = 60) -> np.ndarray:
@@ -179,7 +179,7 @@ def test_they_are_saved_and_read(several):
     if several:
         drives = np.arange(len(keyframes.poses), dtype=np.int32) % 3
         keyframes = replace(keyframes, drives=drives, trained=2)
-    again = Keyframes.from_arrays(keyframes.to_arrays())
+    again = Keyframes.from_arrays(keyframes.to_arrays(), keyframes.sphere)
     assert np.array_equal(again.first, keyframes.first)
     for image in world.panoramas(unseen(5), CONFIG):
         a, b = keyframes.match(image), again.match(image)
@@ -203,12 +203,13 @@ def test_drives_in_one_light_are_one_and_those_in_another_are_not():
             np.concatenate(textures),
             np.concatenate([poses, again, third]),
             np.concatenate([path(poses), 1000 + path(again), 2000 + path(third)]),
-            drives=np.repeat([3, 5, 7], len(poses)).astype(np.int32),
+            CONFIG.sphere,
+            np.repeat([3, 5, 7], len(poses)).astype(np.int32),
         )
         assert keyframes.drives.tolist() == np.repeat(numbers, len(poses)).tolist()
         assert keyframes.first.all() and keyframes.trained == max(numbers) + 1
         if max(numbers) == 0:
-            alone = fit_keyframes(textures[0], poses, path(poses))
+            alone = fit_keyframes(textures[0], poses, path(poses), CONFIG.sphere)
             (off, turned, _), (worse, *_) = (
                 errors(k, images, unseen()) for k in (keyframes, alone)
             )
@@ -224,7 +225,8 @@ def test_drives_that_do_not_meet_are_kept_apart():
         np.concatenate([textures, others]),
         np.concatenate([poses + np.array([step, 0.0, 0.0]) for step in steps]),
         np.concatenate([path(poses) + 1000 * step for step in steps]),
-        drives=np.repeat([0, 1], len(poses)).astype(np.int32),
+        CONFIG.sphere,
+        np.repeat([0, 1], len(poses)).astype(np.int32),
     )
     assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
     off, turned, _ = errors(keyframes, Spheres.about(0).panoramas(unseen(), CONFIG), unseen())
@@ -241,7 +243,7 @@ def test_keyframes_of_a_drive_elsewhere_change_nothing_here(trained):
         np.concatenate([keyframes.textures, textures]),
         np.concatenate([keyframes.poses, poses]),
         keyframes.noise,
-        keyframes.clockwise,
+        keyframes.sphere,
         np.repeat([0, 1], [len(keyframes.poses), 40]).astype(np.int32),
         trained,
     )
@@ -259,11 +261,12 @@ def test_each_drive_of_the_training_shows_the_place_in_its_own_light():
         np.concatenate(textures),
         np.concatenate([poses, again]),
         np.concatenate([path(poses), 1000 + path(again)]),
-        drives=np.repeat([0, 1], len(poses)).astype(np.int32),
+        CONFIG.sphere,
+        np.repeat([0, 1], len(poses)).astype(np.int32),
     )
     alone = (
-        fit_keyframes(textures[0], poses, path(poses)),
-        fit_keyframes(textures[1], again, path(again)),
+        fit_keyframes(textures[0], poses, path(poses), CONFIG.sphere),
+        fit_keyframes(textures[1], again, path(again), CONFIG.sphere),
     )
     for seen, own, other in ((plain[2], *alone), (lit[2], *alone[::-1])):
         joint, best, worst = (errors(k, seen, images)[0].mean() for k in (both, own, other))
@@ -274,7 +277,7 @@ def test_many_images_are_thinned_evenly():
     rng = np.random.default_rng(0)
     poses = np.column_stack([rng.uniform(-5, 5, (4000, 2)), np.zeros(4000)])
     textures = rng.normal(size=(4000, 8, 24)).astype(np.float32)
-    keyframes = fit_keyframes(quantized(textures), poses, np.arange(4000) * 0.1)
+    keyframes = fit_keyframes(quantized(textures), poses, np.arange(4000) * 0.1, CONFIG.sphere)
     assert len(keyframes.poses) == 2000
     counts, _, _ = np.histogram2d(*keyframes.poses[:, :2].T, bins=5)
     assert counts.min() > 50
@@ -282,7 +285,7 @@ def test_many_images_are_thinned_evenly():
 
 def test_too_few_images_are_rejected():
     with pytest.raises(DataError, match='too few'):
-        fit_keyframes(np.zeros((3, 4, 8), np.int8), np.zeros((3, 3)), np.arange(3.0))
+        fit_keyframes(np.zeros((3, 4, 8), np.int8), np.zeros((3, 3)), np.arange(3.0), CONFIG.sphere)
 
 
 @pytest.mark.parametrize('shape', [(4, 16), (8, 60), (60, 600), (128, 1024)])

@@ -36,14 +36,7 @@ def looks_like_panorama(height: int, width: int) -> bool:
 
 def panorama_rays(panorama: PanoramaConfig) -> Array:
     """Unit rays (H, W, 3) of the pixels, in the robot's axes (x forward, y left, z up)."""
-    low, high = np.radians([panorama.elevation_min, panorama.elevation_max])
-    height, width = panorama.height, panorama.width
-    clockwise = (np.arange(width) + 0.5 - width / 2) * 2 * np.pi / width
-    azimuth = -clockwise if panorama.clockwise else clockwise
-    elevation = high - (np.arange(height) + 0.5) * (high - low) / height
-    flat = np.cos(elevation)[:, None]
-    up = np.broadcast_to(np.sin(elevation)[:, None], (height, width))
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], axis=-1)
+    return panorama.sphere.rays(panorama.height, panorama.width)
 
 
 @dataclass(frozen=True, slots=True)

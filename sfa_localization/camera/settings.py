@@ -5,10 +5,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.data.sphere import Sphere
 
 NEEDS_CALIBRATION = ('mirror', 'fisheye', 'ocam', 'polar', 'dual_fisheye')
 """Camera models with parameters of their own, which a calibration finds."""
@@ -37,6 +39,12 @@ class PanoramaConfig(Settings):
         Settings.__post_init__(self)
         if self.elevation_min >= self.elevation_max:
             raise ConfigError('elevation_min of the panorama must be below elevation_max')
+
+    @property
+    def sphere(self) -> Sphere:
+        """The directions of its pixels."""
+        low, high = math.radians(self.elevation_min), math.radians(self.elevation_max)
+        return Sphere(low, high, self.clockwise)
 
     def differences(self, other: PanoramaConfig) -> str:
         """What differs in `other`, as 'height 30 instead of 60'; '' when they are equal."""

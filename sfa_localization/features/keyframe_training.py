@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.keyframes import NEIGHBORS, Keyframes, correlate
 from sfa_localization.features.observation import LOWEST, Match, MatchNoise
 from sfa_localization.features.rotation_spread import (
@@ -58,7 +59,7 @@ def fit_keyframes(
     textures: NDArray[np.int8],
     poses: Array,
     path_m: Array,
-    clockwise: bool = True,
+    sphere: Sphere,
     drives: NDArray[np.int32] | None = None,
 ) -> Keyframes:
     """From textures (N, rows, columns) of training images, their poses (N, 3) in the map, the
@@ -70,7 +71,7 @@ def fit_keyframes(
     kept = spread(poses)
     own = None if drives is None else drives[kept]
     keyframes = Keyframes.of(
-        textures[kept], np.asarray(poses[kept], float), MatchNoise(), clockwise, own
+        textures[kept], np.asarray(poses[kept], float), MatchNoise(), sphere, own
     )
     keyframes = _by_light(keyframes)
     return dataclasses.replace(keyframes, noise=_noise(keyframes, path_m[kept]))

@@ -13,6 +13,7 @@ colors stay.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,8 +27,16 @@ from scipy.spatial import cKDTree
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
+from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.local_regression import averaged, place_among, turned
-from sfa_localization.features.observation import Match, MatchNoise, Spectra, unlikeness
+from sfa_localization.features.observation import (
+    Leveled,
+    Match,
+    MatchNoise,
+    Spectra,
+    unlikeness,
+)
+from sfa_localization.features.tilt import derivatives, find_tilt, leveled
 
 Texture = NDArray[np.float32]
 
@@ -51,6 +60,10 @@ _DRIVES = 3
 _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
 _COARSE, _CANDIDATES = 15, 64
+# The likest keyframes to which an image is leveled: with a tilt the first may be another place.
+_LEVELED = 48
+# Images that are tilted by less are as well as level: what a tilt changes is linear.
+_TILTED_RAD = math.radians(0.7)
 # Keyframes near the place show headings that differ by no more than this because things are near.
 _PARALLAX_RAD = 0.3
 
@@ -162,7 +175,7 @@ class Keyframes:
     textures: NDArray[np.int8]
     poses: Array
     noise: MatchNoise
-    clockwise: bool
+    sphere: Sphere
     drives: NDArray[np.int32]
     trained: int
     spectra: Spectra
@@ -175,7 +188,7 @@ class Keyframes:
         textures: NDArray[np.int8],
         poses: Array,
         noise: MatchNoise,
-        clockwise: bool,
+        sphere: Sphere,
         drives: NDArray[np.int32] | None = None,
         trained: int | None = None,
     ) -> Keyframes:
@@ -189,7 +202,7 @@ class Keyframes:
             raise DataError(f'{first} images are too few for keyframes')
         spectra, tree = spectra_of(textures), cKDTree(poses[:, :2])
         matched = spectra, coarse(spectra), tree
-        return cls(textures, poses, noise, clockwise, drives, trained, *matched)
+        return cls(textures, poses, noise, sphere, drives, trained, *matched)
 
     @property
     def first(self) -> NDArray[np.bool_]:
@@ -206,21 +219,58 @@ class Keyframes:
         The likeliest by a coarse correlation, their best's neighbors and those of the guess are
         correlated in full.
         """
-        image = spectrum(texture(panorama))[None]
-        scores, shifts = self._unmatched()
-        wanted = [self._candidates(image)]
+        return self.match_level(self.level(panorama), guess, pattern)
+
+    def level(self, panorama: Image) -> Leveled:
+        """A panorama (H, W, 3) uint8 BGR without the roll and pitch of the robot that make it
+        likest one of the keyframes that it is likest anyway.
+        """
+        image = texture(panorama)
+        known = Leveled(panorama, panorama, np.zeros(2), spectrum(image), *self._unmatched())
+        self._add(known, self._candidates(known.spectrum[None]))
+        likely = np.argsort(-known.scores, kind='stable')[:_LEVELED]
+        likely = likely[np.isfinite(known.scores[likely])]
+        apart = np.asarray(known.shifts[likely], float) * (2 * np.pi / self._columns)
+        others = fft.irfft(turned(self.spectra[likely], apart), self._columns)
+        tilts, scores = find_tilt(image, others, self._channels, self.sphere)
+        return self._leveled(known, tilts[int(scores.argmax())])
+
+    def _leveled(self, known: Leveled, tilt: Array) -> Leveled:
+        """What is known of an image after a roll and pitch (2,) rad more, if they matter; the
+        same keyframes are correlated.
+        """
+        if np.hypot(*tilt) < _TILTED_RAD:
+            return known
+        whole = known.tilt + tilt
+        panorama = leveled(known.seen, whole, self.sphere)
+        image = spectrum(texture(panorama))
+        new = Leveled(known.seen, panorama, whole, image, *self._unmatched())
+        self._add(new, np.flatnonzero(np.isfinite(known.scores)))
+        return new
+
+    def match_level(
+        self, known: Leveled, guess: Array | None = None, pattern: Spectra | None = None
+    ) -> Match:
+        """The same for a leveled panorama; what is left of its tilt is taken out."""
+        known = replace(known, scores=known.scores.copy(), shifts=known.shifts.copy())
         if guess is not None:
-            wanted.append(self.nearest(guess))
-        self._add(image, np.unique(np.concatenate(wanted)), scores, shifts)
-        best = self.poses[int(scores.argmax()), :2]
-        around = [self._around(best, drive) for drive in self._likeliest_drives(scores)]
-        self._add(image, np.unique(np.concatenate(around)), scores, shifts)
-        return self.located(image[0], scores, shifts, guess, pattern)
+            self._add(known, self.nearest(guess))
+        match = self._match_around(known, guess, pattern)
+        finer = self._leveled(known, match.tilt)
+        if finer is not known:
+            match = self._match_around(finer, guess, pattern)
+        return replace(match, tilt=finer.tilt + match.tilt)
+
+    def _match_around(self, known: Leveled, guess: Array | None, pattern: Spectra | None) -> Match:
+        best = self.poses[int(known.scores.argmax()), :2]
+        around = [self._around(best, drive) for drive in self._likeliest_drives(known.scores)]
+        self._add(known, np.unique(np.concatenate(around)))
+        return self.located(known.spectrum, known.scores, known.shifts, guess, pattern)
 
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
         """Find the spectrum (rows, F) of an image with some keyframes alone."""
         scores, shifts = self._unmatched()
-        self._add(spectrum[None], rows, scores, shifts)
+        scores[rows], shifts[rows] = self._correlated(spectrum, rows)
         return self.located(spectrum, scores, shifts)
 
     def _unmatched(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -228,18 +278,19 @@ class Keyframes:
         count = len(self.poses)
         return np.full(count, -np.inf, np.float32), np.zeros(count, np.float32)
 
-    def _add(
-        self,
-        image: Spectra,
-        wanted: NDArray[np.int64],
-        scores: NDArray[np.float32],
-        shifts: NDArray[np.float32],
-    ) -> None:
+    def _correlated(
+        self, spectrum: Spectra, rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Correlations (M,) of the spectrum (rows, F) of an image with M keyframes, and shifts."""
+        found, shift = correlate(spectrum[None], self.spectra[rows], self._columns)
+        return found[0], shift[0]
+
+    def _add(self, known: Leveled, wanted: NDArray[np.int64]) -> None:
         """Fill in what is still missing of the wanted keyframes' correlations."""
-        wanted = wanted[np.isneginf(scores[wanted])]
+        wanted = wanted[np.isneginf(known.scores[wanted])]
         if len(wanted):
-            found, shift = correlate(image, self.spectra[wanted], self._columns)
-            scores[wanted], shifts[wanted] = found[0], shift[0]
+            found = self._correlated(known.spectrum, wanted)
+            known.scores[wanted], known.shifts[wanted] = found
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
         """The keyframes that are likeliest by the coarse structure of the image."""
@@ -345,6 +396,7 @@ class Keyframes:
         they are too few.
         """
         found, pose, limit = None, start.copy(), 2 * np.pi / self._columns
+        tilts = self._by_tilt(spectrum)
         for _ in range(_REPEATED):
             near = self._around(pose[:2], drive)
             near = near[known[near]]
@@ -353,7 +405,7 @@ class Keyframes:
             around = turned(self.spectra[near], self._sign * (self.poses[near, 2] - pose[2]))
             here = spectrum if pattern is None else spectrum - self._as_seen(pattern, pose[2])
             found = place_among(
-                here,
+                np.concatenate([here[None], tilts]),
                 around,
                 self.poses[near, :2],
                 self._columns,
@@ -368,6 +420,12 @@ class Keyframes:
             if apart < _NEARER * reach:
                 break
         return found
+
+    def _by_tilt(self, image: Spectra) -> Spectra:
+        """Derivatives (2, rows, F) of the spectrum (rows, F) of an image by roll and pitch."""
+        texture = fft.irfft(image, self._columns)
+        parts = [derivatives(texture[rows], self.sphere) for rows in self._channels]
+        return spectrum(np.concatenate(parts, axis=1))
 
     def _as_seen(self, pattern: Spectra, yaw: float) -> Spectra:
         """The spectrum (rows, F) at some yaw rad of one as of an image with yaw 0."""
@@ -402,7 +460,7 @@ class Keyframes:
     @property
     def _sign(self) -> int:
         """Of the angle by which `turned` makes of an image at some yaw that at another."""
-        return 1 if self.clockwise else -1
+        return 1 if self.sphere.clockwise else -1
 
     @property
     def _channels(self) -> tuple[slice, ...]:
@@ -410,7 +468,7 @@ class Keyframes:
         rows = self.textures.shape[1]
         few = min(rows // 3, _COLOR_ROWS)
         light = rows - 2 * few
-        return slice(light), slice(light, light + few), slice(light + few, rows)
+        return slice(0, light), slice(light, light + few), slice(light + few, rows)
 
     def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""
@@ -426,7 +484,6 @@ class Keyframes:
             'textures': self.textures,
             'poses': self.poses,
             'noise': noise,
-            'clockwise': np.array(self.clockwise),
         }
         if self.drives.any():
             arrays['drives'] = self.drives
@@ -434,13 +491,12 @@ class Keyframes:
         return arrays
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Keyframes:
-        """Read the arrays of `to_arrays`."""
+    def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], sphere: Sphere) -> Keyframes:
+        """Read the arrays of `to_arrays`, of panoramas that show so much of the `sphere`."""
         noise = MatchNoise(*np.asarray(arrays['noise'], float).tolist())
         textures = np.asarray(arrays['textures'], np.int8)
         poses = np.asarray(arrays['poses'], float)
-        clockwise = bool(arrays['clockwise'])
         if 'drives' not in arrays:
-            return cls.of(textures, poses, noise, clockwise)
+            return cls.of(textures, poses, noise, sphere)
         drives, trained = np.asarray(arrays['drives'], np.int32), int(arrays['trained'])
-        return cls.of(textures, poses, noise, clockwise, drives, trained)
+        return cls.of(textures, poses, noise, sphere, drives, trained)

@@ -49,13 +49,13 @@ def turned(spectra: Spectra, angle: Array | float) -> Spectra:
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """A regression of an image. `combine` (3, N + 2) makes of the vectors of N keyframes, of their
-    mean's derivative and of the image what is left of the image, and the two vectors along which
-    that moves the place.
+    """A regression of an image. `combine` (3, N + 1 + M) makes of the vectors of N keyframes, of
+    the image and of M changes what is left of the image, and the two vectors along which that moves
+    the place. `changed` (M,) is how much of each change the image has.
     """
 
     place: Array
-    angle: float
+    changed: Array
     unlike: float
     variation: float
     combine: Array
@@ -64,8 +64,9 @@ class _Regression:
 @dataclass(frozen=True, slots=True)
 class _Compared:
     """A channel and a mean of its N keyframes: the derivative of the mean by the angle, `turning`
-    (1, D), the share of its likeness to the mean that the image has kept, `gain`, and the products
-    (N + 2, N + 2) of keyframes, derivative and image, which gets back what it lacks.
+    (D,), the share of its likeness to the mean that the image has kept, `gain`, and the products
+    (N + 2 + T, N + 2 + T) of keyframes, the image and its derivatives, which get back what they
+    lack, and `turning`.
     """
 
     turning: Vectors
@@ -75,8 +76,9 @@ class _Compared:
 
 @dataclass(frozen=True, slots=True)
 class _Channel:
-    """Some rows of N keyframes and an image: their vectors (N + 1, D), the image's last, and the
-    products (N + 1, N + 1) of these, which are correlations; and the `scale` of the vectors.
+    """Some rows of N keyframes, an image, and T derivatives of it by what is no matter of its
+    place: their `vectors` (N + 1 + T, D), in that order, and the products (N + 1 + T, N + 1 + T) of
+    these, which are correlations; and the `scale` of the vectors.
     """
 
     vectors: Vectors
@@ -85,23 +87,23 @@ class _Channel:
 
     @classmethod
     def of(cls, keyframes: Spectra, image: Spectra, scale: Vectors) -> _Channel:
-        """Of spectra (N, rows, F) and (1, rows, F)."""
+        """Of spectra (N, rows, F) and (1 + T, rows, F)."""
         vectors = _vectors(np.concatenate([keyframes, image]), scale)
         return cls(vectors, (vectors @ vectors.T).astype(np.float64), scale)
 
     def about(self, mean: Array) -> _Compared:
         """With a mean by shares (N,) of the keyframes."""
-        turning = _turning(mean.astype(np.float32) @ self.vectors[:-1], len(self.scale))
-        rows = np.append(np.arange(len(mean)), len(mean) + 1)
-        products = np.empty((len(mean) + 2, len(mean) + 2))
-        products[np.ix_(rows, rows)] = self.products
-        products[-2, rows] = products[rows, -2] = self.vectors @ turning[0]
-        products[-2, -2] = turning[0] @ turning[0]
-        kept = float(self.products[-1, :-1] @ mean)
-        whole = float(mean @ self.products[:-1, :-1] @ mean)
+        count = len(mean)
+        turning = _turning(mean.astype(np.float32) @ self.vectors[:count], len(self.scale))
+        products = np.zeros((len(self.vectors) + 1, len(self.vectors) + 1))
+        products[:-1, :-1] = self.products
+        products[-1, :-1] = products[:-1, -1] = self.vectors @ turning
+        products[-1, -1] = turning @ turning
+        kept = float(self.products[count, :count] @ mean)
+        whole = float(mean @ self.products[:count, :count] @ mean)
         gain = max(kept / max(whole, 1e-12), _LEAST_GAIN)
-        products[-1] /= gain
-        products[:, -1] /= gain
+        products[count:-1] /= gain
+        products[:, count:-1] /= gain
         return _Compared(turning, gain, products)
 
     def remainder(
@@ -111,9 +113,9 @@ class _Channel:
         sector of the panorama, (2, sectors): light and what hides the view are alike within one,
         not in all.
         """
-        combine = found.combine.astype(np.float32)
-        own = combine[:, -1:] / np.float32(compared.gain) * self.vectors[-1]
-        vectors = combine[:, :-2] @ self.vectors[:-1] + combine[:, -2:-1] * compared.turning + own
+        combine, changes = found.combine.astype(np.float32), len(found.changed)
+        combine[:, -1 - changes : -1] /= np.float32(compared.gain)
+        vectors = combine[:, :-1] @ self.vectors + combine[:, -1:] * compared.turning
         spectra = vectors.view(np.complex64).reshape(3, -1, len(self.scale)) / self.scale
         left, along_x, along_y = fft.irfft(spectra, columns)
         pull = np.stack([(along_x * left).sum(axis=0), (along_y * left).sum(axis=0)])
@@ -173,16 +175,18 @@ def place_among(
     drives: NDArray[np.int32] | None = None,
 ) -> Match:
     """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
-    F) of keyframes at places (N, 2) m, all turned to the heading of the image. The yaw of the match
-    is the angle rad by which `turned` would still turn the image to them.
+    F) of keyframes at places (N, 2) m, all turned to the heading of the image; it may be followed
+    by its derivatives (1 + 2, rows, F) by roll and pitch, which then are found too. The yaw of the
+    match is the angle rad by which `turned` would still turn the image to them.
 
     `channels` are rows that may be unlike for reasons of their own: each counts by how well the
     keyframes explain it. Keyframes of different `drives` (N,) may differ by their light, so that
     only differences within one show the place; all of one drive by default.
     """
     scale = _scale(image.shape[-1], columns)
-    parts = [_Channel.of(keyframes[:, rows], image[None, rows], scale) for rows in channels]
-    scores = np.sum([part.products[-1, :-1] for part in parts], axis=0)
+    image, count = image if image.ndim == 3 else image[None], len(places)
+    parts = [_Channel.of(keyframes[:, rows], image[:, rows], scale) for rows in channels]
+    scores = np.sum([part.products[count, :count] for part in parts], axis=0)
     drives = np.zeros(len(places), np.int32) if drives is None else drives
     basis = _Basis.of(scores, drives, places)
     compared = [part.about(basis.mean) for part in parts]
@@ -199,8 +203,10 @@ def place_among(
     left = np.concatenate([of_channel for of_channel, _ in remainders])
     offset = places - found.place
     aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
-    pose, noise = np.append(found.place, found.angle), moved @ moved.T
-    return Match(pose, found.unlike, found.variation, aside, noise, left=left)
+    *tilt, turning = found.changed
+    pose, noise = np.append(found.place, -turning), moved @ moved.T
+    made = Match(pose, found.unlike, found.variation, aside, noise, left=left)
+    return replace(made, tilt=np.array(tilt)) if tilt else made
 
 
 def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
@@ -223,6 +229,7 @@ def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
         mean([one.noise for one in parts]),
         (apart.T * share) @ apart,
         left=np.tensordot(share.astype(np.float32), left, 1),
+        tilt=mean([one.tilt for one in parts]),
     )
 
 
@@ -231,7 +238,7 @@ def _trust(compared: Sequence[_Compared], basis: _Basis) -> Array:
     products = np.array([one.products for one in compared])
     gains = np.array([one.gain for one in compared])
     left = _regressed(np.tensordot(np.square(gains), products, 1), basis).combine[0]
-    sizes = [one.turning.shape[1] for one in compared]
+    sizes = [len(one.turning) for one in compared]
     errors = np.einsum('i,cij,j->c', left, products, left) / sizes
     trust = 1 / (errors + errors.min() + 1e-12)
     return np.asarray(trust / trust.max())
@@ -244,32 +251,53 @@ def _found(compared: Sequence[_Compared], trust: Array, basis: _Basis) -> _Regre
 
 
 def _turning(mean: Vectors, frequencies: int) -> Vectors:
-    """The derivative by the angle of a vector (D,), (1, D)."""
+    """The derivative by the angle of a vector (D,), (D,)."""
     by_angle = 1j * np.arange(frequencies, dtype=np.float32)
     spectra = mean.view(np.complex64).reshape(-1, frequencies) * by_angle
-    return spectra.astype(np.complex64).view(np.float32).reshape(1, -1)
+    return spectra.astype(np.complex64).view(np.float32).ravel()
+
+
+@dataclass(frozen=True, slots=True)
+class _Apart:
+    """What N keyframes and an image differ by: the products (N + 1, N + 1) of these differences;
+    what was taken out of them, shares `out` (C, N + 1) of combinations `common` (C, N + 1 + M) of
+    keyframes, the image and M changes; and the `square` of the mean.
+    """
+
+    products: Array
+    out: Array
+    common: Array
+    square: float
+
+    @classmethod
+    def of(cls, products: Array, basis: _Basis) -> _Apart:
+        """Neither the drive, nor likeness to the mean, nor a change is a matter of the place: of
+        the products (N + 1 + M, N + 1 + M) the parts of all vectors along these are taken out.
+        """
+        count, means, drive = len(basis.mean), basis.means, basis.drive
+        common = np.zeros((len(products) - count, len(products)))
+        common[0, :count] = basis.mean
+        common[1:, count + 1 :] = np.eye(len(common) - 1)
+        apart = products[:, : count + 1].copy()
+        apart[:, :-1] -= (apart[:, :-1] @ means.T)[:, drive]
+        both = apart[: count + 1].copy()
+        both[:-1] -= (means @ both[:-1])[drive]
+        within = common @ products @ common.T
+        square = max(float(within[0, 0]), 1e-12)
+        within[np.diag_indices(len(common))] += 1e-9 * within.diagonal() + 1e-12
+        along = common @ apart
+        out = np.asarray(np.linalg.solve(within, along), float)
+        return cls(both - along.T @ out, out, common, square)
 
 
 def _regressed(products: Array, basis: _Basis) -> _Regression:
-    """The regression by the products (N + 2, N + 2) of N keyframes, the derivative of their mean by
-    the angle, and the image.
-
-    Neither likeness to the mean nor a rest of angle is a matter of the place: the parts of all
-    vectors along both, which are orthogonal, are taken out.
+    """The regression by the products (N + 1 + M, N + 1 + M) of N keyframes, the image, and M
+    changes that are no matter of the place.
     """
     count, means, drive = len(basis.mean), basis.means, basis.drive
-    common = np.zeros((2, count + 2))
-    common[0, :-2], common[1, -2] = basis.mean, 1.0
-    apart = np.delete(products, -2, axis=1)
-    apart[:, :-1] -= (apart[:, :-1] @ means.T)[:, drive]
-    both = np.delete(apart, -2, axis=0)
-    both[:-1] -= (means @ both[:-1])[drive]
-    along = common @ apart
-    norms = np.maximum(((common @ products) * common).sum(1), 1e-12)
-    both -= along.T @ (along / norms[:, None])
-    turned_by = float(products[-2, -1])
-    square, root = float(norms[0]), np.sqrt(basis.weight)
-    gram, shown = both[:-1, :-1] * np.outer(root, root), both[:-1, -1]
+    apart = _Apart.of(products, basis)
+    root = np.sqrt(basis.weight)
+    gram, shown = apart.products[:-1, :-1] * np.outer(root, root), apart.products[:-1, -1]
     variation = float(np.trace(gram))
     ridge = max(_RIDGE * variation, 1e-12)
     offsets = basis.places - (means @ basis.places)[drive]
@@ -279,13 +307,14 @@ def _regressed(products: Array, basis: _Basis) -> _Regression:
     sums = np.stack([np.bincount(drive, one, len(means)) for one in share])
     of_image = np.array([1.0, 0.0, 0.0])
     centered = np.column_stack([share, of_image])
-    combine = np.column_stack([share - sums @ means, np.zeros(3), of_image])
-    combine -= (centered @ along.T / norms) @ common
+    combine = np.zeros((3, len(products)))
+    combine[:, : count + 1] = np.column_stack([share - sums @ means, of_image])
+    combine -= (centered @ apart.out.T) @ apart.common
     return _Regression(
         basis.mean @ basis.places - share[0] @ offsets,
-        -turned_by / float(norms[1]),
-        max(float(centered[0] @ both @ centered[0]), 0.0) / square,
-        variation / square,
+        apart.out[1:, -1],
+        max(float(centered[0] @ apart.products @ centered[0]), 0.0) / apart.square,
+        variation / apart.square,
         combine,
     )
 

@@ -198,15 +198,20 @@ def input_map(images: Image, architecture: Architecture) -> Map:
 
     Raises ModelError when the images have another size than the network expects.
     """
+    require_size(images, architecture)
+    normalize = _NORMALIZATIONS[architecture.normalization]
+    maps = np.stack([normalize(resampled(image, architecture.grid)) for image in images])
+    return maps.reshape(len(maps), maps.shape[1], architecture.rotations, -1)
+
+
+def require_size(images: Image, architecture: Architecture) -> None:
+    """Raise ModelError when images are not of the size (T, H, W, C) that the network expects."""
     if images.ndim != 4 or images.shape[1:3] != architecture.size:
         height, width = architecture.size
         raise ModelError(
             f'the model expects panoramas of {width} x {height} pixels, got {images.shape[-2]} x '
             f'{images.shape[-3]}: set the panorama size of the omnicam node, or train again'
         )
-    normalize = _NORMALIZATIONS[architecture.normalization]
-    maps = np.stack([normalize(resampled(image, architecture.grid)) for image in images])
-    return maps.reshape(len(maps), maps.shape[1], architecture.rotations, -1)
 
 
 def resampled(image: Image, grid: tuple[int, int]) -> Image:

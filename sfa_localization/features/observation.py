@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.run import Image
 
 Spectra = NDArray[np.complex64]
 
@@ -51,7 +52,8 @@ class Match:
 
     `score` is the correlation with the best keyframe, 1 for the same image, `known` whether it is
     high enough for a known place, and `support` the correlation with the keyframes near a guess
-    minus `score`, in temperatures: 0 where the best is among them.
+    minus `score`, in temperatures: 0 where the best is among them. `tilt` (2,) rad is the roll and
+    pitch of the robot that the image shows against the keyframes.
     """
 
     pose: Array
@@ -65,6 +67,7 @@ class Match:
     score: float = 0.0
     known: bool = False
     support: float = 0.0
+    tilt: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
     def at_border(self) -> bool:
@@ -151,6 +154,21 @@ def unlikeness(score: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class Leveled:
+    """The `panorama` (H, W, 3) that a `tilt`, roll and pitch (2,) rad, made the one that was
+    `seen`, and what is known of it: the `spectrum` (rows, F) of its texture, the correlations
+    `scores` (K,) with the keyframes, -inf where unknown, and the `shifts` (K,) of the columns.
+    """
+
+    seen: Image
+    panorama: Image
+    tilt: Array
+    spectrum: Spectra
+    scores: NDArray[np.float32]
+    shifts: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
 class Observation:
     """What one image shows: `pose` (3,) [x m, y m, yaw rad] in the map and its `covariance` (3, 3).
 
@@ -158,7 +176,8 @@ class Observation:
     most 1 for a familiar image. `problem` is why the image at `stamp_ns` is unusable, '' where it
     is usable: the covariance then means that nothing is known. `turned` is the heading (rad, from
     any start) that the shifts between the images of a drive add up to, NaN for an unusable one: it
-    needs no map, and shows the camera's delay.
+    needs no map, and shows the camera's delay. `tilt` (2,) rad is the roll and pitch of the robot,
+    against those of the training; `leveled` is the image that slow features see without it.
     """
 
     pose: Array
@@ -168,6 +187,8 @@ class Observation:
     stamp_ns: int = 0
     problem: str = ''
     turned: float = math.nan
+    tilt: Array = field(default_factory=lambda: np.zeros(2))
+    leveled: Leveled | None = None
 
     @property
     def position(self) -> Array:

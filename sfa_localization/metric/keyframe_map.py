@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import Views
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
 from sfa_localization.features.keyframes import Keyframes
@@ -47,7 +48,7 @@ def learn_keyframes(
     segments: Segments,
     result: MetricResult,
     agreement: Agreement,
-    clockwise: bool,
+    sphere: Sphere,
 ) -> KeyframeMap:
     """Keyframes where the certified solution puts the images of `views`; `disagreement` (N,) is
     that of all images' rotated views. Raises DataError for too few.
@@ -57,7 +58,7 @@ def learn_keyframes(
     poses = np.column_stack([places, headings(result, segments)[1]])[row]
     path = _along_tracks(views, segments)[seen]
     drives = views.run[seen].astype(np.int32)
-    own = fit_keyframes(views.textures[seen], poses, path, clockwise, drives)
+    own = fit_keyframes(views.textures[seen], poses, path, sphere, drives)
     turn_std = usual_turn_std(result.angle_covariance)
     keyframes = replace(own, noise=own.noise.with_map(result.common_m, turn_std))
     kept = spread(poses)

@@ -216,7 +216,7 @@ def _keyframes(rng: np.random.Generator) -> Keyframes:
     """As many keyframes as a model holds, of random images at random places."""
     textures = [texture(rng.integers(0, 256, (*SIZE, 3), np.uint8)) for _ in range(MOST)]
     poses = np.column_stack([rng.uniform(0, 16, (MOST, 2)), rng.uniform(-3, 3, MOST)])
-    return Keyframes.of(quantized(np.array(textures)), poses, MatchNoise(), True)
+    return Keyframes.of(quantized(np.array(textures)), poses, MatchNoise(), PanoramaConfig().sphere)
 
 
 def _compass(rng: np.random.Generator, count: int, features: int, width: int) -> Compass:

@@ -1,0 +1,144 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Uneven ground: roll and pitch of the robot are found in the image and change no estimate."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres
+
+from sfa_localization.camera.settings import PanoramaConfig
+from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.sphere import Sphere
+from sfa_localization.features.keyframe_training import fit_keyframes
+from sfa_localization.features.keyframes import Keyframes, quantized, texture
+from sfa_localization.features.tilt import (
+    derivatives,
+    find_tilt,
+    leveled,
+    rotation,
+    tilted,
+)
+
+BOTH = pytest.mark.parametrize('clockwise', [True, False])
+SPHERE = Sphere(-0.6, 0.6)
+
+
+def config(clockwise: bool = True) -> PanoramaConfig:
+    return PanoramaConfig(
+        width=160, height=40, elevation_min=-34.4, elevation_max=34.4, clockwise=clockwise
+    )
+
+
+def smooth(sphere: Sphere, rows: int = 40, columns: int = 160) -> np.ndarray:
+    """A panorama (rows, columns) of random blobs."""
+    rough = np.random.default_rng(3).normal(size=(rows, 3 * columns)).astype(np.float32)
+    rough[:, :columns] = rough[:, -columns:] = rough[:, columns : 2 * columns]
+    return 40 * cv2.GaussianBlur(rough, (0, 0), 3)[:, columns : 2 * columns]
+
+
+@BOTH
+def test_a_robot_that_rolls_to_the_right_sees_the_left_lower_and_nose_down_the_front_higher(
+    clockwise,
+):
+    """Things sink in the image where the camera rises: positive roll lifts the left side."""
+    sphere = Sphere(-0.6, 0.6, clockwise)
+    line = np.zeros((60, 120, 1), np.uint8)
+    line[29:31] = 200
+    left = int(np.argmin(np.abs(sphere.azimuths(120) - np.pi / 2)))
+    down = 0.1 / (1.2 / 60)
+    for tilt, column, expected in (((0.1, 0.0), left, down), ((0.0, 0.1), 60, -down)):
+        image = tilted(line, np.array(tilt), sphere)[:, column, 0].astype(float)
+        moved = (image @ np.arange(60)) / image.sum() - 29.5
+        assert moved == pytest.approx(expected, abs=0.1)
+
+
+@BOTH
+def test_the_derivatives_are_those_of_the_tilted_panorama(clockwise):
+    sphere = Sphere(-0.6, 0.6, clockwise)
+    image = smooth(sphere)
+    for k, one in enumerate(np.eye(2) * 0.004):
+        ahead, behind = (tilted(image[..., None], s * one, sphere)[..., 0] for s in (1, -1))
+        numeric, analytic = (ahead - behind) / 0.008, derivatives(image, sphere)[k]
+        inner = np.s_[3:-3]
+        assert np.corrcoef(numeric[inner].ravel(), analytic[inner].ravel())[0, 1] > 0.99
+        assert np.std(analytic[inner]) == pytest.approx(np.std(numeric[inner]), rel=0.05)
+
+
+def test_leveling_undoes_a_tilt():
+    image, tilt = smooth(SPHERE)[..., None], np.array([0.05, -0.07])
+    assert np.allclose(rotation(tilt) @ rotation(tilt).T, np.eye(3))
+    back = leveled(tilted(image, tilt, SPHERE), tilt, SPHERE)
+    assert np.abs(back - image)[8:-8].mean() < 0.1 * np.abs(image).mean()
+
+
+@pytest.mark.parametrize('degrees', [(0, 0), (3, -2), (-8, 5), (0, 10)])
+def test_the_tilt_between_two_textures_is_found_among_others(degrees):
+    tilt = np.radians(degrees)
+    world, poses = Spheres.about(0), np.array([[0.0, 0, 0], [4, 4, 1], [-4, 3, 2]])
+    images = world.panoramas(poses, config())
+    others = np.stack([texture(image) for image in images])
+    channels = slice(0, 16), slice(16, 24), slice(24, 32)
+    seen = texture(tilted(images[0], tilt, SPHERE))
+    tilts, scores = find_tilt(seen, others, channels, SPHERE)
+    assert scores.argmax() == 0
+    assert np.hypot(*(tilts[0] - tilt)) < 0.7 * 1.2 / 16  # of a row
+
+
+def test_nothing_to_see_is_level():
+    nothing = np.zeros((32, 80), np.float32)
+    channels = slice(0, 16), slice(16, 24), slice(24, 32)
+    tilts, _ = find_tilt(nothing, nothing[None], channels, SPHERE)
+    assert np.array_equal(tilts, np.zeros((1, 2)))
+
+
+def drive(step: float = 0.25) -> np.ndarray:
+    """Poses (N, 3) up and down a square of 4 m."""
+    lanes = np.arange(-2.0, 2.01, step)
+    return np.array([(x, y, 0.0) for y in lanes for x in lanes])
+
+
+@cache
+def learnt(degrees: float) -> Keyframes:
+    """Keyframes of a robot that is tilted at random by so much."""
+    poses, rng = drive(), np.random.default_rng(0)
+    images = Spheres.about(0).panoramas(poses, config())
+    images = [tilted(i, np.radians(degrees) * rng.normal(size=2), SPHERE) for i in images]
+    textures = quantized(np.stack([texture(image) for image in images]))
+    return fit_keyframes(textures, poses, np.arange(len(poses)) * 0.25, config().sphere)
+
+
+def errors(keyframes: Keyframes, degrees: float):
+    """Of 40 unseen images, tilted by so much at random: in m, rad of yaw, and rad of tilt; and
+    their scores.
+    """
+    rng = np.random.default_rng(1)
+    poses = np.column_stack([rng.uniform(-1.5, 1.5, (40, 2)), rng.uniform(-3, 3, 40)])
+    tilts = np.radians(degrees) * rng.normal(size=(40, 2))
+    images = Spheres.about(0).panoramas(poses, config())
+    found = [
+        keyframes.match(tilted(i, tilt, SPHERE)) for i, tilt in zip(images, tilts, strict=True)
+    ]
+    off = np.array([match.pose for match in found]) - poses
+    turned = np.abs(wrap_angle(off[:, 2]))
+    rest = np.hypot(*(np.array([match.tilt for match in found]) - tilts).T)
+    return np.hypot(*off[:, :2].T), turned, rest, np.array([match.score for match in found])
+
+
+@pytest.mark.parametrize('degrees', [2.0, 4.0])
+def test_a_tilted_image_stays_where_it_is_and_is_known(degrees):
+    flat, turned, *_ = errors(learnt(0.0), 0.0)
+    off, swayed, rest, scores = errors(learnt(0.0), degrees)
+    assert off.mean() < 1.5 * flat.mean() + 0.01
+    assert swayed.mean() < turned.mean() + np.radians(0.3)
+    assert np.degrees(np.median(rest)) < 0.5
+    assert scores.min() > learnt(0.0).noise.lowest
+
+
+def test_keyframes_of_a_tilted_robot_show_the_place_too():
+    flat, *_ = errors(learnt(0.0), 0.0)
+    for degrees in (0.0, 2.0):
+        off, *_ = errors(learnt(2.0), degrees)
+        assert off.mean() < 2.0 * flat.mean() + 0.02
