@@ -11,7 +11,6 @@ from filter_drives import START_NS, Drive
 
 from sfa_localization.cli import main
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.errors import DataError
 from sfa_localization.filtering import ODOMETRY, POSITIONS, Table, read_table, run_filter
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -182,24 +181,13 @@ def test_stamps_may_count_from_zero_or_below(shift):
     assert errors(drive, done.stamps_ns, done.poses, shift).max() < 0.6
 
 
-def test_rates_and_gaps_of_all_kinds_are_survived():
-    for rate in (1, 5, 200):
-        drive = Drive(seconds=60, rate_hz=rate, every=max(1, rate // 2), **NOISY)
-        done = run_filter(*tables(drive, 0.04), FilterConfig())
-        assert errors(drive, done.stamps_ns, done.poses)[-rate * 20 :].mean() < 0.3, rate
-    drive = Drive(seconds=90, **NOISY)
-    silent = {0: (30e9, 45e9), 1: (50e9, 70e9)}
-    cut = []
-    for k, table in enumerate(tables(drive)):
-        after = table.stamps_ns - START_NS
-        kept = (after < silent[k][0]) | (after > silent[k][1])
+def test_gaps_and_missing_variances_are_survived():
+    drive, cut = Drive(seconds=90, rate_hz=10, every=5, **NOISY), []
+    for table, (first, last) in zip(tables(drive), ((30e9, 45e9), (50e9, 70e9)), strict=True):
+        kept = abs(table.stamps_ns - START_NS - (first + last) / 2) > (last - first) / 2
         cut.append(Table(table.stamps_ns[kept], table.values[kept]))
     done = run_filter(*cut, FilterConfig())
-    assert errors(drive, done.stamps_ns, done.poses)[-500:].mean() < 0.3
-
-
-def test_missing_variances_are_those_of_a_usual_position():
-    drive = Drive(seconds=300, rate_hz=10, every=5, **NOISY)
+    assert errors(drive, done.stamps_ns, done.poses)[-100:].mean() < 0.3
     done = run_filter(*tables(drive), FilterConfig())
     assert errors(drive, done.stamps_ns, done.poses).mean() < 0.5 * alone(drive)
 
@@ -257,21 +245,6 @@ def test_nothing_that_is_read_is_replaced(tmp_path, capsys, name):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_an_output_that_cannot_be_is_noticed_before_the_work(tmp_path, capsys):
-    absent = [str(tmp_path / name) for name in ('o.csv', 'p.csv')]
-    for output, what in {'.': 'a folder', '': 'a folder', '/dev/null': 'no regular file'}.items():
-        assert main(['filter', *absent, '--output', output]) == 1
-        assert f'cannot be written: it is {what}' in capsys.readouterr().err
-
-
 def test_a_start_is_checked(tmp_path, capsys):
     assert run(tmp_path, Drive(seconds=1), *at(tmp_path, 1e9, 0.0, 0.0))[0] == 1
     assert 'initial_pose: 1000000000.0 is outside' in capsys.readouterr().err
-
-
-def test_an_output_that_cannot_be_written_leaves_nothing(tmp_path):
-    (tmp_path / 'no').touch()
-    with pytest.raises(DataError):
-        read_table(tmp_path / 'no', ODOMETRY)
-    code, _ = run(tmp_path, Drive(seconds=1), '--output', str(tmp_path / 'no' / 'out.tum'))
-    assert code == 1 and not list(tmp_path.glob('*.tum'))
