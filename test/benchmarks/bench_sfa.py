@@ -3,7 +3,7 @@
 """Training and inference against MDP and against bare matrix products: `python bench_sfa.py`.
 
 Ratios compare two ways of doing the same, measured in turns, in one run, on one core. `--quick`
-takes fewer pictures; `--model FILE` measures inference of a trained model, not of a made-up one.
+takes fewer pictures; inference is measured of the trained model that `--model FILE` names.
 """
 
 from __future__ import annotations
@@ -24,20 +24,14 @@ import numpy as np
 import psutil
 from scipy import linalg
 
-from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
 from sfa_localization.features.image_features import (
-    REFINING_LAYER,
     harmonics,
-    layer_harmonics,
     slow_features,
-    spectrum,
 )
-from sfa_localization.features.keyframe_training import MOST
-from sfa_localization.features.keyframes import Keyframes, MatchNoise, quantized, texture
 from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
     ImageSequence,
@@ -45,20 +39,8 @@ from sfa_localization.features.network_training import (
     shards_of,
     train_network,
 )
-from sfa_localization.features.rotation_spread import Agreement
-from sfa_localization.metric.basis import Process, expand
-from sfa_localization.metric.compass import Compass, kernel_between
-from sfa_localization.metric.compass_training import (
-    INDUCING_IMAGES,
-    PLACE_FEATURES,
-    _solve,
-    compass_layers,
-)
-from sfa_localization.metric.drives import COARSE_POINTS
-from sfa_localization.metric.lower_factor import lower_root
-from sfa_localization.metric.refinement import DIMENSIONS, Projection, Refinement, turned_back
-from sfa_localization.metric.saved_map import MetricMap, Weights
-from sfa_localization.metric.selection import INDUCING_POINTS
+from sfa_localization.metric.basis import Process
+from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.place_model import PlaceModel
 
 SIZE = (60, 600)
@@ -110,10 +92,13 @@ def bench_training(folder: Path, quick: bool = False) -> dict[str, float]:
     return {f'{name}_s': wall, f'{name}_cpu_s': cpu, 'cores': float(cores())}
 
 
-def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
+def bench_engines(
+    folder: Path, quick: bool = False, model: PlaceModel | None = None
+) -> dict[str, float]:
     """Seconds of one core per picture and in all, by MDP on the explicit sequence and by ours.
 
-    Each is measured at two sizes, in turns; time is a + b pictures.
+    Each is measured at two sizes, in turns; time is a + b pictures. MDP's execution of a prepared
+    frame is compared with all that a model does to locate a picture.
     """
     sizes, our_sizes = ((2, 4) if quick else (4, 8)), (64, 320)
     drive = panoramas(folder / 'engines.u8', our_sizes[1])
@@ -127,19 +112,27 @@ def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
             seconds['mdp'].append(time.process_time() - start)
             part = _first(drive, our_size)
             start = time.process_time()
-            network = train_network(ARCHITECTURE, [part])
+            train_network(ARCHITECTURE, [part])
             seconds['ours'].append(time.process_time() - start)
     theirs = _extrapolated(sizes, seconds['mdp'])
     ours = _extrapolated(our_sizes, seconds['ours'])
     speedup = float(theirs @ [1, PAPER_PICTURES] / (ours @ [1, PAPER_PICTURES]))
-    return {
+    figures = {
         'train_speedup_vs_mdp': speedup,
         'train_speedup_vs_mdp_per_picture': float(theirs[1] / ours[1]),
         'train_mdp_s_per_picture': float(theirs[1]),
         'train_s_per_picture': float(ours[1]),
         'train_mdp_paper_size_hours': float(theirs @ [1, PAPER_PICTURES]) / 3600,
-        **_execution(flow, network, drive.panoramas.read(0, 1)),
     }
+    if model is not None:
+        image = drive.panoramas.read(0, 1)
+        flat = input_map(image, ARCHITECTURE).reshape(1, -1).astype(float)
+        image = cv2.resize(image[0], model.network.architecture.size[::-1])
+        with one_core():
+            pair = [lambda: flow.execute(flat), lambda: model.locate(image)]
+            executed, located = np.median(in_turns(pair, 30), axis=1)
+        figures['locate_speedup_vs_mdp'] = float(executed / located)
+    return figures
 
 
 def _first(drive: ImageSequence, count: int) -> ImageSequence:
@@ -153,15 +146,6 @@ def _extrapolated(sizes: tuple[int, ...], seconds: list[float]) -> np.ndarray:
     return np.array([max(seconds[0] - slope * sizes[0], 0.0), slope])
 
 
-def _execution(flow, network, image: np.ndarray) -> dict[str, float]:
-    """MDP's execution of a prepared frame over all that locate does with the picture."""
-    model = made_up_model(network)
-    flat = input_map(image, ARCHITECTURE).reshape(1, -1).astype(float)
-    with one_core():
-        theirs, ours = in_turns([lambda: flow.execute(flat), lambda: model.locate(image[0])], 30)
-    return {'locate_speedup_vs_mdp': float(np.median(theirs) / np.median(ours))}
-
-
 def in_turns(functions: list[Callable[[], object]], rounds: int) -> np.ndarray:
     """Seconds (functions, rounds) of each function, called in turns."""
     taken = np.zeros((len(functions), rounds))
@@ -173,73 +157,6 @@ def in_turns(functions: list[Callable[[], object]], rounds: int) -> np.ndarray:
             function()
             row[at] = time.perf_counter() - start
     return taken
-
-
-def made_up_model(network) -> PlaceModel:
-    """A model of the default sizes whose map and compass mean nothing; their cost is real."""
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (40, *SIZE, 3), np.uint8)
-    maps = network.maps(images)
-    layers = compass_layers(len(network.nodes))
-    width = layer_harmonics([m[:1] for m in maps], layers).shape[1]
-    with one_core():
-        compass = _compass(rng, INDUCING_IMAGES, PLACE_FEATURES, width)
-    turned = turned_back(spectrum(maps[REFINING_LAYER]), np.zeros(len(images)), compass.sign)
-    axes = linalg.qr(rng.normal(size=(turned.shape[1], DIMENSIONS)), mode='economic')[0]
-    projection = Projection(turned.mean(0), axes.astype(np.float32))
-    finer = _map(rng, INDUCING_POINTS, DIMENSIONS)
-    return PlaceModel(
-        network,
-        _map(rng, COARSE_POINTS, 16),
-        PanoramaConfig(),
-        _keyframes(rng),
-        agreement=Agreement(1.0, 1.0, 1.0),
-        compass=compass,
-        yaw_agreement=Agreement(1.0, 1.0, 1.0),
-        heading_layers=layers,
-        refinement=Refinement(projection, finer, Agreement(1.0, 1.0, 1.0), compass.sign, 3.0),
-    )
-
-
-def _map(rng: np.random.Generator, count: int, features: int) -> MetricMap:
-    """A map of random inducing points."""
-    points = rng.normal(size=(count, features))
-    basis = Process(np.full(features, 0.3), points * 0.3, 0.01)
-    expanded = expand(basis, points)
-    posterior = linalg.inv(expanded.T @ expanded + np.diag(basis.ridge) + 1e-9 * np.eye(count + 1))
-    spread = linalg.cholesky(0.05**2 * posterior, lower=True)
-    sway = 1e-3 * rng.normal(size=(count + 1, 12, 2))
-    return MetricMap.of(basis, Weights(rng.normal(size=(count + 1, 2)), spread, sway, 0.05), 1.0)
-
-
-def _keyframes(rng: np.random.Generator) -> Keyframes:
-    """As many keyframes as a model holds, of random images at random places."""
-    textures = [texture(rng.integers(0, 256, (*SIZE, 3), np.uint8)) for _ in range(MOST)]
-    poses = np.column_stack([rng.uniform(0, 16, (MOST, 2)), rng.uniform(-3, 3, MOST)])
-    return Keyframes.of(quantized(np.array(textures)), poses, MatchNoise(), PanoramaConfig().sphere)
-
-
-def _compass(rng: np.random.Generator, count: int, features: int, width: int) -> Compass:
-    """A compass of random inducing pictures."""
-    s = rng.normal(size=(count, features))
-    f = rng.normal(size=(count, width, 2)) @ np.array([1, 1j])
-    f /= np.linalg.norm(f, axis=1, keepdims=True)
-    kernel = kernel_between(s, f, s, f, 2.0)
-    moment = kernel.conj().T @ np.exp(1j * rng.uniform(-3, 3, count))
-    solution = _solve(kernel.conj().T @ kernel, moment, kernel, 0.1)
-    scales = np.ones(features), np.ones(width)
-    weights, uncertainty = solution
-    return Compass(
-        s,
-        f,
-        *scales,
-        weights,
-        np.asfortranarray(lower_root(uncertainty), np.complex64),
-        2.0,
-        0.1,
-        -1.0,
-        np.array([1.0, 1e-3]),
-    )
 
 
 def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
@@ -382,16 +299,13 @@ def peak(path: Path, count: int) -> float:
 
 def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> dict[str, float]:
     """All figures, by name."""
-    if model is None:
-        drive = panoramas(folder / 'locate.u8', 96)
-        located = made_up_model(train_network(ARCHITECTURE, [drive]))
-    else:
-        located = PlaceModel.load(model)
-    figures = bench_locate(located, 300 if quick else 2000)
-    figures |= bench_memory(folder, quick)
+    located = None if model is None else PlaceModel.load(model)
+    figures = bench_memory(folder, quick)
+    if located is not None:
+        figures |= bench_locate(located, 300 if quick else 2000)
     figures |= bench_training(folder, quick)
     try:
-        figures |= bench_engines(folder, quick)
+        figures |= bench_engines(folder, quick, located)
     except ConfigError as error:
         sys.stderr.write(f'no comparison with MDP: {error}\n')
     return figures
