@@ -65,10 +65,3 @@ def test_disagreement_is_zero_for_equal_views_and_does_not_depend_on_heading():
     assert disagreement(np.repeat(top[:, :, :1], 12, axis=2)) == pytest.approx(0.0, abs=1e-7)
     assert disagreement(np.roll(top, 4, axis=2)) == pytest.approx(disagreement(top), rel=1e-6)
     assert disagreement(top) == pytest.approx(top[:, 0].std(1).mean(1), rel=1e-5)
-
-
-def test_arrays_bring_the_same_factors_back():
-    fit = Agreement(0.2, 3.0, 1.5)
-    u = np.array([0.1, 0.2, 5.0])
-    assert np.array_equal(Agreement.from_arrays(fit.to_arrays()).factor(u), fit.factor(u))
-    assert fit.factor(u)[1] == pytest.approx(3.0)
