@@ -4,8 +4,6 @@
 
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -42,22 +40,22 @@ class Message(NamedTuple):
     data: bytes
 
 
-def image(index: int) -> np.ndarray:
+def image(index):
     """The index-th picture of the drive, all different."""
     return np.random.default_rng(index).integers(0, 256, SHAPE, np.uint8)
 
 
-def stamp(index: float) -> int:
+def stamp(index):
     """Stamp of the index-th picture; fractions for what comes between."""
     return START + round(index * PERIOD)
 
 
-def pose(index: float) -> tuple[float, float, float]:
+def pose(index):
     """Where the robot is at the index-th picture: 0.5 m on, turning slowly."""
     return (0.5 * index, -0.25 * index, 0.02 * index)
 
 
-def drive(path: Path) -> list[Message]:
+def drive(path):
     """Record the drive with the writer under test; return it as messages received late."""
     with BagWriter(path / 'drive', 'sqlite3') as bag:
         for index in range(IMAGES):
@@ -84,7 +82,7 @@ COUNTS = {
 }
 
 
-def kinds(messages: Sequence[Message]) -> dict[str, str]:
+def kinds(messages):
     """Type of each topic."""
     return {message.topic: message.kind for message in messages}
 
@@ -92,7 +90,7 @@ def kinds(messages: Sequence[Message]) -> dict[str, str]:
 # Files.
 
 
-def write_rosbags(path: Path, messages: Sequence[Message], storage: str = 'sqlite3') -> Path:
+def write_rosbags(path, messages, storage='sqlite3'):
     """Write with the newest metadata, as rosbags does."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with BagWriter(path, storage) as writer:
@@ -101,15 +99,7 @@ def write_rosbags(path: Path, messages: Sequence[Message], storage: str = 'sqlit
     return path
 
 
-def write_database(
-    path: Path,
-    messages: Sequence[Message],
-    *,
-    schema: int = 2,
-    kind: Callable[[str], str] = str,
-    serialization: str = 'cdr',
-    qos: str = QOS_TEXT,
-) -> Path:
+def write_database(path, messages, *, schema=2, kind=str, serialization='cdr', qos=QOS_TEXT):
     """Write a .db3 as the recorders of the time did: schema 1 has no QoS, 2 has; 3 its version."""
     path.parent.mkdir(parents=True, exist_ok=True)
     database = sqlite3.connect(path)
@@ -139,15 +129,7 @@ def write_database(
     return path
 
 
-def metadata(
-    version: int,
-    files: Sequence[str],
-    messages: Sequence[Message],
-    *,
-    storage: str = 'sqlite3',
-    kind: Callable[[str], str] = str,
-    compression: str = '',
-) -> str:
+def metadata(version, files, messages, *, storage='sqlite3', kind=str, compression=''):
     """Text of metadata.yaml as its version has it, of all that is read."""
     qos = yaml.safe_load(QOS_TEXT) if version >= 9 else QOS_TEXT
     told = [
@@ -177,7 +159,7 @@ def metadata(
     return yaml.safe_dump({'rosbag2_bagfile_information': information}, sort_keys=False)
 
 
-def write_version(path: Path, messages: Sequence[Message], version: int) -> Path:
+def write_version(path, messages, version):
     """Write a bag as the recorder of metadata `version` did, with sqlite3."""
     schema = 1 if version < 4 else 2 if version < 7 else 3
     write_database(path / 'bag_0.db3', messages, schema=schema)
@@ -185,14 +167,7 @@ def write_version(path: Path, messages: Sequence[Message], version: int) -> Path
     return path
 
 
-def write_mcap(
-    path: Path,
-    messages: Sequence[Message],
-    *,
-    compression: str | None = '',
-    index: bool = True,
-    chunk_size: int = 4000,
-) -> Path:
+def write_mcap(path, messages, *, compression='', index=True, chunk_size=4000):
     """Write an .mcap in chunks, or without (`compression` None), with an index or without."""
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = McapWriter(
@@ -218,9 +193,7 @@ def write_mcap(
     return path
 
 
-def write_ros1(
-    path: Path, messages: Sequence[Message], compression: str = '', chunk_size: int = 1 << 20
-) -> Path:
+def write_ros1(path, messages, compression='', chunk_size=1 << 20):
     """Write a ROS 1 .bag."""
     path.parent.mkdir(parents=True, exist_ok=True)
     ros2, ros1 = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)
@@ -244,7 +217,7 @@ def write_ros1(
 # Whole bags.
 
 
-def write_split(path: Path, messages: Sequence[Message]) -> Path:
+def write_split(path, messages):
     """Write a bag in twelve files, so that names in order are not files in order."""
     size = -(-len(messages) // 12)
     parts = [messages[start : start + size] for start in range(0, len(messages), size)]
@@ -257,12 +230,12 @@ def write_split(path: Path, messages: Sequence[Message]) -> Path:
     return path
 
 
-def without_metadata(path: Path) -> Path:
+def without_metadata(path):
     (path / 'metadata.yaml').unlink()
     return path
 
 
-def _packed(path: Path, messages: Sequence[Message], storage: str, mode: str) -> Path:
+def _packed(path, messages, storage, mode):
     """Compress every message, or every file, as `ros2 bag record --compression-mode` does."""
     if mode == 'MESSAGE':
         messages = [m._replace(data=zstandard.compress(m.data)) for m in messages]
@@ -277,7 +250,7 @@ def _packed(path: Path, messages: Sequence[Message], storage: str, mode: str) ->
     return path
 
 
-def _other_text(path: Path, messages: Sequence[Message]) -> Path:
+def _other_text(path, messages):
     """A bag whose metadata and database tell types and QoS in other words."""
     write_database(path / 'bag_0.db3', messages, qos='')
     text = metadata(4, ['bag_0.db3'], messages, kind=lambda name: name.replace('/msg/', '/'))
@@ -285,8 +258,7 @@ def _other_text(path: Path, messages: Sequence[Message]) -> Path:
     return path
 
 
-Format = Callable[[Path, Sequence[Message]], Path]
-FORMATS: dict[str, Format] = {
+FORMATS = {
     **{f'version {v}': lambda p, m, v=v: write_version(p, m, v) for v in (1, 5, 9)},
     'sqlite3': write_rosbags,
     'sqlite3 zstd file': lambda p, m: _packed(p, m, 'sqlite3', 'FILE'),

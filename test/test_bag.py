@@ -5,7 +5,6 @@
 import os
 import shutil
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,17 +40,17 @@ from sfa_localization.data.errors import BagError
 
 
 @pytest.fixture(scope='session')
-def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
+def messages(tmp_path_factory):
     """Return the drive that all bags hold."""
     return drive(tmp_path_factory.mktemp('drive'))
 
 
-def snapshot(path: Path) -> dict[str, tuple[bytes, int]]:
+def snapshot(path):
     """Return every file with its content and time of change."""
     return {str(f): (f.read_bytes(), f.stat().st_mtime_ns) for f in path.rglob('*') if f.is_file()}
 
 
-def received(path: Path, start_ns: int = 0) -> list[tuple[int, str, bytes]]:
+def received(path, start_ns=0):
     """Return reception, topic and bytes of all messages."""
     with Bag(path) as bag:
         return [(at, c.name, data) for c, at, data in bag.messages(bag.topics, start_ns)]
@@ -187,7 +186,7 @@ def test_fewer_messages_than_declared_are_counted_as_lost(tmp_path, messages):
 # Damage.
 
 
-def overwrite(path: Path, start: int, size: int) -> Path:
+def overwrite(path, start, size):
     """Spoil bytes in the middle of a file."""
     data = bytearray(path.read_bytes())
     data[start : start + size] = b'\xff' * size
@@ -195,7 +194,7 @@ def overwrite(path: Path, start: int, size: int) -> Path:
     return path
 
 
-def salvaged(path: Path) -> float:
+def salvaged(path):
     """Return the share of odometry that a damaged bag yields; each message is as recorded."""
     with Bag(path) as bag:
         odometry = bag.odometry()

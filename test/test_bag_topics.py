@@ -4,8 +4,6 @@
 
 import math
 import re
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 COUNT = 6
 
 
-def stamped(kind: str, stamp_ns: int, frame: str = 'world', **fields: Any) -> Any:
+def stamped(kind, stamp_ns, frame='world', **fields):
     """Return a message with a header; `kind` is package/Name."""
     message = blank(STORE, kind.replace('/', '/msg/'))
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
@@ -34,41 +32,41 @@ def stamped(kind: str, stamp_ns: int, frame: str = 'world', **fields: Any) -> An
     return message
 
 
-def placed(message: Any, place: Any, turn: Any, x: float, y: float, yaw: float) -> Any:
+def placed(message, place, turn, x, y, yaw):
     """Fill in where a message tells that the robot is."""
     place.x, place.y, place.z = float(x), float(y), 0.3
     turn.z, turn.w = math.sin(yaw / 2), math.cos(yaw / 2)
     return message
 
 
-def pose_stamped(stamp_ns: int, *pose: float) -> Any:
+def pose_stamped(stamp_ns, *pose):
     message = stamped('geometry_msgs/PoseStamped', stamp_ns)
     return placed(message, message.pose.position, message.pose.orientation, *pose)
 
 
-def with_covariance(stamp_ns: int, *pose: float) -> Any:
+def with_covariance(stamp_ns, *pose):
     message = stamped('geometry_msgs/PoseWithCovarianceStamped', stamp_ns)
     return placed(message, message.pose.pose.position, message.pose.pose.orientation, *pose)
 
 
-def transform_stamped(stamp_ns: int, *pose: float, child: str = 'base_link') -> Any:
+def transform_stamped(stamp_ns, *pose, child='base_link'):
     message = stamped('geometry_msgs/TransformStamped', stamp_ns, child_frame_id=child)
     return placed(message, message.transform.translation, message.transform.rotation, *pose)
 
 
-def tf(stamp_ns: int, x: float, y: float, yaw: float, *others: Any) -> Any:
+def tf(stamp_ns, x, y, yaw, *others):
     message = blank(STORE, 'tf2_msgs/msg/TFMessage')
     message.transforms = [*others, transform_stamped(stamp_ns, x, y, yaw)]
     return message
 
 
-def odometry(stamp_ns: int, x: float, y: float, yaw: float, v: float = 1.0) -> Any:
+def odometry(stamp_ns, x, y, yaw, v=1.0):
     message = stamped('nav_msgs/Odometry', stamp_ns, 'odom', child_frame_id='base_link')
     message.twist.twist.linear.x = v
     return placed(message, message.pose.pose.position, message.pose.pose.orientation, x, y, yaw)
 
 
-def picture(stamp_ns: int, **changes: Any) -> Any:
+def picture(stamp_ns, **changes):
     fields = {'height': 4, 'width': 20, 'encoding': 'bgr8', 'step': 60}
     fields |= {'data': np.full(240, 7, np.uint8), **changes}
     return stamped('sensor_msgs/Image', stamp_ns, 'camera', **fields)
@@ -77,7 +75,7 @@ def picture(stamp_ns: int, **changes: Any) -> Any:
 Entry = tuple[str, int, Any]
 
 
-def record(path: Path, entries: list[Entry], serialization: str = 'cdr') -> Path:
+def record(path, entries, serialization='cdr'):
     """Write (topic, reception, message or bytes of a std_msgs/String) to a bag."""
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -91,7 +89,7 @@ def record(path: Path, entries: list[Entry], serialization: str = 'cdr') -> Path
     return path
 
 
-def poses_of(make_message: Callable[..., Any], topic: str) -> list[Entry]:
+def poses_of(make_message, topic):
     return [(topic, stamp(i) + 1000, make_message(stamp(i), *pose(i))) for i in range(COUNT)]
 
 
@@ -156,7 +154,7 @@ def test_odometry_that_was_reset_is_joined(tmp_path):
 # Which topic is taken.
 
 
-def full(path: Path, *more: Entry) -> Path:
+def full(path, *more):
     entries = [('/camera', stamp(i), picture(stamp(i))) for i in range(COUNT)]
     return record(path, [*entries, *poses_of(odometry, '/odom'), *more])
 
@@ -222,7 +220,7 @@ def test_faulty_messages_are_skipped_and_counted(tmp_path):
 # Stamps.
 
 
-def used_of(path: Path, stamps: list[int]) -> tuple[list[int], dict[str, int]]:
+def used_of(path, stamps):
     """Return the stamps that are used, and the reasons of others, received every 0.1 s."""
     entries = [('/p', stamp(i), pose_stamped(s, 0.0, 0.0, 0.0)) for i, s in enumerate(stamps)]
     with Bag(record(path, entries)) as bag:

@@ -22,7 +22,7 @@ from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
 from sfa_localization.data.errors import BagError, DataError
-from sfa_localization.data.files import atomic_write, read_regular
+from sfa_localization.data.files import atomic_write
 
 BAGS = Path(__file__).parents[1] / 'bags'
 FULL = OSError(errno.ENOSPC, 'No space left on device')
@@ -268,16 +268,3 @@ def test_a_report_replaces_its_own_files_only(tmp_path, capsys):
 
 def interrupt(*_):
     raise KeyboardInterrupt
-
-
-def test_files_of_the_system_that_may_never_end_are_not_read(tmp_path, capsys):
-    """They say that they are empty; `/proc/kmsg` waits for the next message."""
-    system = Path('/proc/version')
-    if not system.exists() or system.stat().st_size:
-        pytest.skip('no such file here')
-    link = tmp_path / 'link.mcap'
-    link.symlink_to(system)
-    for command in ('inspect {}', 'evaluate {} bag', 'calibrate {}'):
-        assert main(command.format(link).split()) == 1
-        assert f'{link}: ' in capsys.readouterr().err
-    assert system.read_bytes() and read_regular(system, 1000) == b''

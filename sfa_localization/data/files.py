@@ -52,12 +52,9 @@ def first_bytes(path: Path, most: int = _BEGINNING) -> bytes:
 
 
 def start_of(path: Path | str, most: int) -> bytes:
-    """The beginning of a file that is there. Raises OSError.
-
-    A file that says that it holds nothing is not read: below /proc, that may never end.
-    """
+    """The beginning of a file that is there. Raises OSError."""
     with open(path, 'rb') as file:
-        return file.read(most) if os.fstat(file.fileno()).st_size else b''
+        return file.read(most)
 
 
 def resolved(path: Path) -> Path:

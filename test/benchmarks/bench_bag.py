@@ -25,7 +25,7 @@ STORAGES = ('mcap', 'sqlite3')
 Counter = Callable[[Path], tuple[int, int]]
 
 
-def write_drive(path: Path, storage: str, pictures: int = 1200) -> Path:
+def write_drive(path, storage, pictures=1200):
     """A drive with 10 JPEG panoramas, 50 odometry and 50 gyro messages per second."""
     rng = np.random.default_rng(1)
     panorama = rng.integers(0, 256, (60, 600, 3), np.uint8)
@@ -39,7 +39,7 @@ def write_drive(path: Path, storage: str, pictures: int = 1200) -> Path:
     return path
 
 
-def bare_raw(path: Path) -> tuple[int, int]:
+def bare_raw(path):
     """Messages and bytes, by rosbags alone."""
     count = size = 0
     with Reader(path) as reader:
@@ -48,7 +48,7 @@ def bare_raw(path: Path) -> tuple[int, int]:
     return count, size
 
 
-def our_raw(path: Path) -> tuple[int, int]:
+def our_raw(path):
     """Messages and bytes, by ours."""
     count = size = 0
     with Bag(path) as bag:
@@ -57,7 +57,7 @@ def our_raw(path: Path) -> tuple[int, int]:
     return count, size
 
 
-def bare_decoded(path: Path) -> tuple[int, int]:
+def bare_decoded(path):
     """Messages and bytes, each deserialized by rosbags."""
     count = size = 0
     with Reader(path) as reader:
@@ -67,7 +67,7 @@ def bare_decoded(path: Path) -> tuple[int, int]:
     return count, size
 
 
-def our_decoded(path: Path) -> tuple[int, int]:
+def our_decoded(path):
     """Messages, each deserialized, its stamp judged and counted, by ours."""
     count = 0
     with Bag(path) as bag:
@@ -79,13 +79,13 @@ def our_decoded(path: Path) -> tuple[int, int]:
 CASES = {'raw': (our_raw, bare_raw), 'decoded': (our_decoded, bare_decoded)}
 
 
-def seconds(read: Counter, path: Path) -> float:
+def seconds(read, path):
     start = time.perf_counter()
     read(path)
     return time.perf_counter() - start
 
 
-def in_turns(ours: Counter, bare: Counter, path: Path, rounds: int) -> tuple[float, float]:
+def in_turns(ours, bare, path, rounds):
     """Median of the ratios of speed, and our median seconds."""
     ratios, times = [], []
     for turn in range(rounds):
@@ -96,7 +96,7 @@ def in_turns(ours: Counter, bare: Counter, path: Path, rounds: int) -> tuple[flo
     return statistics.median(ratios), statistics.median(times)
 
 
-def bench_bag(folder: Path, rounds: int = 9) -> dict[str, float]:
+def bench_bag(folder, rounds=9):
     """Speed of our iteration over that of bare rosbags, the lesser storage's, and each case."""
     result: dict[str, float] = {}
     for storage in STORAGES:
