@@ -208,6 +208,11 @@ def test_a_gyroscope_that_shows_something_else_is_left_out(sample):
     assert run.yaw_rate is None and 'left out' in check.corrected[0]
 
 
+def test_a_gyroscope_of_another_epoch_is_left_out(sample):
+    (run,), (check,) = check_drives([sample.later(gyro_s=1e6).run()], [sample.seen()])
+    assert run.yaw_rate is None and 'another clock' in check.corrected[0]
+
+
 @pytest.mark.parametrize(
     ('late_s', 'circle', 'text'),
     [
@@ -250,6 +255,13 @@ def test_odometry_that_jumps_goes_on_as_before(sample, tmp_path, seconds, meters
     assert text in report.as_text()
     (run,), _ = check_drives([jumping.run()], [sample.seen()])
     assert np.abs(run.odometry.poses - sample.odometry.poses)[:, :2].max() < 0.03
+
+
+def test_small_jumps_of_slow_odometry_are_found(sample):
+    slow = Odometry(*(getattr(sample.odometry, name)[::3] for name in Odometry.__slots__))
+    jumping = replace(sample, odometry=slow).jumping(np.arange(3.0, 32.0, 3.0), 0.2)
+    joined, text = without_jumps(jumping.odometry)
+    assert 'jumps 10 times' in text and np.abs(joined.poses - slow.poses)[:, :2].max() < 0.1
 
 
 def test_training_stops_unless_it_is_forced(sample, tmp_path, caplog):

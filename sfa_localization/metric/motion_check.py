@@ -176,7 +176,7 @@ def _speed(source: Source) -> float:
     if source.driven is None:
         return 0.0
     seconds = (source.stamps_ns - source.stamps_ns[0]) * 1e-9
-    at = np.unique(np.searchsorted(seconds, np.arange(0.0, seconds[-1], 1.0)))
+    at = np.flatnonzero(np.diff(np.floor(seconds), prepend=-1.0))
     driven = np.diff(source.driven[at])
     speed = np.abs(driven) / np.maximum(np.diff(seconds[at]), 0.1)
     return float(np.percentile(speed, 90)) if len(speed) else 0.0
@@ -291,6 +291,9 @@ def _correct(check: MotionCheck, kind: str, text: str, factor: float) -> None:
 
 def _judge_clocks(check: MotionCheck) -> None:
     """Correct the stamps of the gyroscope; those of images are corrected by the training."""
+    if check.gyro is not None and not check.odometry.trajectory.covers(check.gyro.stamps_ns).any():
+        check.corrected.append(f'{GYRO}: stamped by another clock than the odometry; left out')
+        check.gyro = None
     for name in (GYRO, IMAGES):
         pair = check.pair(POSE, name)
         if pair is None or pair.differs('alike') or not pair.late_s:
@@ -303,6 +306,8 @@ def _judge_clocks(check: MotionCheck) -> None:
 
 def without_jumps(odometry: Odometry) -> tuple[Odometry, str]:
     """Odometry whose poses go on through jumps as before and after, and a sentence; '' for none."""
+    if len(odometry.stamps_ns) < 3:
+        return odometry, ''
     found, usual = _jumps(odometry.stamps_ns, odometry.poses)
     number = int(found.sum())
     if not number:
@@ -332,25 +337,28 @@ def _jumps(stamps: Stamps, poses: Array) -> tuple[Mask, Array]:
     at = (stamps[:-1] - stamps[0]) * 1e-9 + dt / 2
     first, last = np.searchsorted(at, at - reach), np.searchsorted(at, at + reach, 'right')
     values, found = np.column_stack([step, dt]), np.zeros(len(step), bool)
-    # Messages may be stamped in bundles, or late: a step may have taken less than its time.
-    longest = np.maximum(dt, period)[:, None]
+    # Messages may be stamped in bundles, or late: nobody knows how long a step took.
+    unsure_s = float(np.percentile(np.abs(dt - period), 90))
+    times = np.maximum(dt - unsure_s, 0.0)[:, None], (np.maximum(dt, period) + unsure_s)[:, None]
+    # A jump is a single step: a robot that turns fast, or slips, does so for several.
+    change = np.abs(np.diff(step, axis=0)).max(1)
+    alone = np.minimum(np.append(np.inf, change), np.append(change, np.inf))
     for _ in range(2):
         kept = values * ~found[:, None]
         sums = np.vstack([np.zeros(4), np.cumsum(kept, axis=0)])
         around = sums[last] - sums[first] - kept
         speed = around[:, :3] / np.maximum(around[:, 3:], period)
         beyond = np.maximum(
-            _beyond(step[:, :2], speed[:, :2], longest) - period * np.hypot(*speed[:, :2].T),
-            _beyond(step[:, 2:], speed[:, 2:], longest) - period * np.abs(speed[:, 2]),
+            _beyond(step[:, :2], speed[:, :2], *times), _beyond(step[:, 2:], speed[:, 2:], *times)
         )
         noise = MEDIAN_TO_STD * float(np.median(np.abs(step - speed * dt[:, None])[:, :2].max(1)))
-        allowed = JUMP + ACCELERATION * longest[:, 0] ** 2 + NOISE * noise
-        found = (dt < reach) & (around[:, 3] > 0) & (beyond > allowed)
+        allowed = JUMP + ACCELERATION * np.maximum(dt, period) ** 2 + NOISE * noise
+        found = (dt < reach) & (around[:, 3] > 0) & (np.minimum(beyond, alone) > allowed)
     return found, speed * dt[:, None]
 
 
-def _beyond(step: Array, speed: Array, longest_s: Array) -> Array:
-    """How far (N,) steps (N, K) lie from what a speed (N, K) reaches in some of the time (N, 1)."""
+def _beyond(step: Array, speed: Array, shortest_s: Array, longest_s: Array) -> Array:
+    """How far (N,) steps (N, K) lie from where a speed (N, K) leads in one of the times (N, 1)."""
     square = np.maximum((speed**2).sum(1, keepdims=True), 1e-12)
-    time = np.clip((step * speed).sum(1, keepdims=True) / square, 0.0, longest_s)
+    time = np.clip((step * speed).sum(1, keepdims=True) / square, shortest_s, longest_s)
     return np.asarray(np.linalg.norm(step - speed * time, axis=1))
