@@ -48,8 +48,6 @@ JUMP, ACCELERATION = 0.05, 5.0
 speed (m/s^2, rad/s^2), explain has jumped: wheels do not."""
 NOISE = 6.0
 """Standard deviations of noisy wheels that a jump exceeds, too."""
-OFTEN_PER_MINUTE = 1.0
-"""Odometry that jumps more often is corrected by a localization."""
 # s around a step in which its usual speed is measured.
 _AROUND_S = 0.5
 # Stamps, in all and in each second, of which the unit can be told.
@@ -321,7 +319,7 @@ def without_jumps(odometry: Odometry) -> tuple[Odometry, str]:
     minutes = max((odometry.stamps_ns[-1] - odometry.stamps_ns[0]) / 60e9, 1.0)
     times = 'once' if number == 1 else f'{number} times'
     text = f'{POSE} jumps {times}, by up to {far:.2f} m: joined by its motion around'
-    if number > OFTEN_PER_MINUTE * minutes:
+    if number > minutes:  # not the reset of a driver
         text += '; if a localization corrects it, record the frame odom instead of map'
     return replace(odometry, poses=np.column_stack([x, y, wrap_angle(yaw)])), text
 

@@ -240,17 +240,12 @@ def _usual(x: Array) -> float:
     return float(size[np.searchsorted(total, total[-1] / 2)]) if len(size) else 0.0
 
 
-def _told(x: Array) -> float:
-    """The motion in steps that are clearly some."""
-    return float(np.abs(x[np.abs(x) > _STEP / 2]).sum())
-
-
 def _fitted(what: str, a: str, b: str, x: Array, y: Array) -> Pair | None:
     """The best of the delays: x (D, M) against y (D, M)."""
     middle = len(_GRID) // 2
-    # Images that stand still add up noise.
-    told = [_told(s[middle]) for s, name in ((x, a), (y, b)) if name != IMAGES]
-    if max(told, default=0.0) < ENOUGH[what]:
+    # Noise adds up where nothing moves, and that of images may be large.
+    steps = [np.abs(s[middle]) for s, name in ((x, a), (y, b)) if name != IMAGES]
+    if max(s[s > _STEP / 2].sum() for s in steps) < ENOUGH[what]:
         return None
     limit = np.array([_usual(x[middle]), _usual(y[middle])])
     # Shifts of images may be wrong by any angle.
