@@ -47,7 +47,7 @@ class Robot:
         at = rng.uniform(0.2, 0.7, 2) * length_s
         return cls(
             frame=frame,
-            gyro=str(rng.choice(['none', 'whole', 'gap', 'ends', 'upside down'])),
+            gyro=str(rng.choice(['none', 'whole', 'gap', 'ends', 'whole'])),
             gyro_bias=float(rng.normal(0, 0.01)),
             gyro_gap_s=(at[0], at[0] + rng.uniform(3, 10)),
             every=int(rng.choice([1, 2, 5, 10])),
@@ -74,7 +74,6 @@ class Robot:
         if self.gyro == 'ends':
             kept = seconds < start
         omega = exact.omega + self.gyro_bias
-        omega = -omega if self.gyro == 'upside down' else omega
         return YawRate(exact.stamps_ns[kept], omega[kept], exact.variance[kept])
 
 

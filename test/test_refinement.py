@@ -78,7 +78,7 @@ def learned_world() -> World:
 
 
 def fitted_of(segments, coarse, spectra, views) -> LearnedRefinement:
-    return learn_refinement(spectra, views, segments, coarse, -1.0, CONFIG)
+    return learn_refinement(spectra, views, segments, coarse, -1.0)
 
 
 def unseen(count=200, seed=4):

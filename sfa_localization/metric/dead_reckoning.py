@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,8 +19,6 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Complex = NDArray[np.complex128]
 
-logger = logging.getLogger(__name__)
-
 GAP_MAX_S = 0.5
 """Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""
 JUMP_MAX_M = 0.3
@@ -32,10 +29,6 @@ _PERIODS = 2.5
 # A pause up to this long is bridged where the twists before and after differ by no more.
 _BRIDGE_MAX_S = 1.5
 _UNSURE_M, _UNSURE_RAD = 0.05, 0.1
-# A gyroscope is compared with wheels that have turned this much, rad^2 in steps of a second, and
-# must then agree within this factor: skidding wheels are off by two, degrees by 57.
-_TURNS_TO_JUDGE = 1.0
-_GYRO_RATIO = 5.0
 # Yaw rates are averaged over this long before they are compared with a threshold.
 _SMOOTHING_S = 0.3
 
@@ -102,7 +95,7 @@ class OdometryTrack:
         yaw = np.unwrap(poses[:, 2])
         gyro = None if config.yaw_source == 'odometry' else _usable_gyro(yaw_rate)
         if gyro is not None:
-            turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, config, skipped)
+            turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, skipped)
             measured = yaw[0] + np.concatenate([[0.0], np.cumsum(turns)])
             poses, yaw = _with_yaw(poses, yaw, measured), measured
             twists = np.column_stack([twists[:, 0], np.gradient(yaw, seconds_since_start(stamps))])
@@ -206,7 +199,6 @@ def _gyro_turns(
     variances: Array,
     unbroken: Mask,
     gyro: YawRate,
-    config: SegmentConfig,
     skipped: dict[str, int],
 ) -> tuple[Array, Array]:
     """Turns (N - 1,) between the odometry's stamps, and the variances (N,) of their rate.
@@ -221,12 +213,10 @@ def _gyro_turns(
     wheels, dt = np.diff(yaw), np.diff(at)
     measured = _bridged(stamps, gyro.stamps_ns, round(GAP_MAX_S * 1e9))
     both = measured & unbroken
-    sign = _gyro_sign(turns[both], wheels[both], at[:-1][both], config)
-    if sign == 0.0 or not both.any():
+    if not both.any():
         tally(skipped, 'without a usable gyroscope', unbroken)
         return wheels, variances
     tally(skipped, 'in a gap of the gyroscope', unbroken & ~measured)
-    turns *= sign
     offset = float((turns - wheels)[both].sum() / dt[both].sum())
     own = np.interp(at, seconds, np.maximum(gyro.variance, 0.0))
     own = np.where(np.append(measured, measured[-1]), own, variances)
@@ -241,28 +231,6 @@ def _bridged(stamps: Stamps, readings: Stamps, gap_ns: int) -> Mask:
     pauses = np.concatenate([[0], np.cumsum(np.diff(readings) > gap_ns)])
     before, after = np.clip([before, after], 0, len(readings) - 1)
     return np.asarray(inside & (pauses[before] == pauses[after]))
-
-
-def _gyro_sign(turns: Array, wheels: Array, at_s: Array, config: SegmentConfig) -> float:
-    """1, or -1 for a gyroscope mounted upside down, or 0 for one that measures something else.
-
-    Compared over whole seconds with the turns of the wheels, where these turn at all.
-    """
-    second = np.unique(np.floor(at_s), return_inverse=True)[1]
-    gyro, odometry = (np.bincount(second, per_step) for per_step in (turns, wheels))
-    power = float(odometry @ odometry)
-    if config.yaw_source == 'gyro' or power < _TURNS_TO_JUDGE:
-        return 1.0
-    slope = float(gyro @ odometry) / power
-    if not 1 / _GYRO_RATIO < abs(slope) < _GYRO_RATIO:
-        logger.warning(
-            'the gyroscope turns %.2g times as far as the odometry: it is not used; check its '
-            'axis and unit (rad/s), or trust it with yaw_source: gyro', slope
-        )  # fmt: skip
-        return 0.0
-    if slope < 0:
-        logger.warning('the gyroscope turns opposite to the odometry: taken as upside down')
-    return float(np.sign(slope))
 
 
 def _with_yaw(poses: Array, yaw: Array, measured: Array) -> Array:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -209,7 +209,6 @@ def learn_refinement(
     segments: Segments,
     first: MetricResult,
     sign: float,
-    config: MetricConfig,
     seed: int = 0,
 ) -> LearnedRefinement:
     """Learn the finer map, at the certified headings of the first one.
@@ -226,8 +225,7 @@ def learn_refinement(
         features[rows] = projection.features(turned)
     # They count by their own size, as principal components do.
     scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
-    process = replace(config, solver='certified', metric_map='gp', slow_features=0)
-    metric = learn_metric(features, segments, process, seed, Span(POINTS, scale), first)
+    metric = learn_metric(features, segments, MetricConfig(), seed, Span(POINTS, scale), first)
     agreement = left_out_agreement(disagreement, metric)
     assert isinstance(metric.map.basis, Process)
     fast = metric.map
@@ -253,7 +251,7 @@ def refined(
         return None
     views, sign = images.disagreement, heading.compass.sign
     try:
-        return learn_refinement(images.spectra, views, segments, first, sign, config, seed)
+        return learn_refinement(images.spectra, views, segments, first, sign, seed)
     except DataError as error:
         logger.warning('positions are not refined: %s', error)
         return None
