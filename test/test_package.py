@@ -194,16 +194,6 @@ def test_functions_are_short():
     assert statistics.median(lengths.values()) <= TYPICAL_FUNCTION
 
 
-MOST_PARAMETERS = 60
-"""In the parameter file: a person can read so many; what nobody would turn is a constant."""
-
-
-def test_the_parameter_file_stays_readable():
-    sections = yaml.safe_load((ROOT / 'config/localization.yaml').read_text('utf-8')).values()
-    names = [name for part in sections for name in part['ros__parameters']]
-    assert 0 < len(names) <= MOST_PARAMETERS
-
-
 def test_robot_needs_no_training_code():
     modules = set().union(*(reached(f'{NAME}.nodes.{node}') for node in NODES))
     assert not modules & OWN_NOT_ON_THE_ROBOT
@@ -277,12 +267,6 @@ def test_a_signal_ends_a_node_of_a_workspace_before_its_imports(tmp_path):
             assert (done.returncode, done.stderr) == (code, ''), (node, name)
 
 
-def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
-    monkeypatch.setattr(sys, 'argv', ['/workspace/lib/sfa_localization/config'])
-    assert cli.executable() == 0
-    assert 'ekf_node:' in capsys.readouterr().out
-
-
 def test_commands_import_only_what_they_need():
     """The overview imports none of them; an inspection without a report imports no figures."""
     code = 'import sys\nfrom sfa_localization import cli\ntry:\n    cli.main({})\nfinally:\n'
@@ -296,26 +280,32 @@ def test_commands_import_only_what_they_need():
     assert done.stdout.splitlines()[-1] == '[]', done.stderr
 
 
-def test_a_wrong_command_ends_with_exit_code_2():
+def test_an_executable_runs_the_command_it_is_named_after(monkeypatch, capsys):
+    """And a wrong command ends with exit code 2."""
+    monkeypatch.setattr(sys, 'argv', ['/workspace/lib/sfa_localization/config'])
+    assert cli.executable() == 0
+    assert 'ekf_node:' in capsys.readouterr().out
     for words in ([], ['trian'], ['--', 'train']):
         with pytest.raises(SystemExit) as raised:
             sys.exit(cli.main(words))
         assert raised.value.code == 2
 
 
-def test_installed_files_exist():
+def test_what_is_installed_exists():
     arguments = setup_arguments()
     files = [ROOT / name for _, names in arguments['data_files'] for name in names]
     assert ROOT / 'package.xml' in files
     assert ROOT / f'resource/{NAME}' in files
     assert [path for path in files if not path.is_file()] == []
     assert (PACKAGE / 'py.typed').is_file()
-
-
-def test_rosdep_keys_cover_the_messages_used():
     keys = {item.text for item in ET.parse(ROOT / 'package.xml').getroot().iter('exec_depend')}
-    used = set().union(*(foreign(module) & ROS for module in MODULES))
-    assert used <= keys
+    assert set().union(*(foreign(module) & ROS for module in MODULES)) <= keys
+
+
+def test_the_parameter_file_stays_readable():
+    """A person can read so many; what nobody would turn is a constant."""
+    sections = yaml.safe_load((ROOT / 'config/localization.yaml').read_text('utf-8')).values()
+    assert 0 < len([name for part in sections for name in part['ros__parameters']]) <= 60
 
 
 def test_commands_show_examples_before_their_options():
