@@ -196,16 +196,14 @@ def place_among(
         basis = basis.about(found.place)
         compared = [part.about(basis.mean) for part in parts]
         found = _found(compared, trust, basis)
-    remainders = [
-        part.remainder(found, one, columns) for part, one in zip(parts, compared, strict=True)
-    ]
-    moved = sum(by * each for by, (_, each) in zip(trust, remainders, strict=True))
-    left = np.concatenate([of_channel for of_channel, _ in remainders])
+    both = zip(parts, compared, strict=True)
+    left, moves = zip(*(part.remainder(found, one, columns) for part, one in both), strict=True)
+    moved = np.tensordot(trust, moves, 1)
     offset = places - found.place
     aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
     *tilt, turning = found.changed
     pose, noise = np.append(found.place, -turning), moved @ moved.T
-    made = Match(pose, found.unlike, found.variation, aside, noise, left=left)
+    made = Match(pose, found.unlike, found.variation, aside, noise, left=np.concatenate(left))
     return replace(made, tilt=np.array(tilt)) if tilt else made
 
 
