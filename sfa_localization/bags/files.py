@@ -109,10 +109,10 @@ class McapFile:
         wanted = {key: topic for key, topic in self.topics.items() if topic.name in names}
         for records in self._parts(start_ns):
             for record in records:
-                if type(record) is not Message or record.channel_id not in wanted:
-                    continue
-                if start_ns <= record.log_time < LATEST:
-                    yield wanted[record.channel_id], record.log_time, record.data
+                if type(record) is Message and (topic := wanted.get(record.channel_id)):
+                    stamp_ns = record.log_time
+                    if start_ns <= stamp_ns < LATEST:
+                        yield topic, stamp_ns, record.data
 
     def _read_index(self) -> str:
         """Take the topics from the end of the file; return its damage in words."""
