@@ -33,7 +33,7 @@ from sfa_localization.fusion.track import LONGEST_DELAY_S, Columns, Image, Track
 
 LIKELY = 0.9
 """Probability of nothing harmful from which the estimate is trusted."""
-PRIOR = {'late': 1e-2, 'lever': 5e-3, 'turned': 5e-3, 'scale': 5e-3, 'unrelated': 5e-3}
+PRIOR = {'late': 2e-2, 'lever': 5e-3, 'turned': 5e-3, 'scale': 5e-3, 'unrelated': 5e-3}
 """Probabilities of what is the matter, in any window: once in some hundred meters."""
 LEVER_STD_M, TURNED_STD_RAD, SCALE_STD = 1.0, 0.6, 0.5
 """How large nuisances are, if there are any: cameras move by a meter and half a right angle, wheels
@@ -58,7 +58,8 @@ _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 
 
 class Health(NamedTuple):
-    """The probability that all is `well`, and the likeliest fault with its size.
+    """The probability that all is `well`, the likeliest fault with its size, and what faults may
+    add to the variances of x, y and yaw.
 
     `confirmed_m` of `needed_m` were driven since the estimate was placed.
     """
@@ -66,6 +67,7 @@ class Health(NamedTuple):
     well: float
     fault: str
     size: complex
+    variances: tuple[float, float, float]
     confirmed_m: float
     needed_m: float
 
@@ -105,13 +107,17 @@ def health_of(track: Track, images: Sequence[Image]) -> Health:
     confirmed_m = max(traveled_m - placed_m[-1], 0.0)
     new = [image for image in images if image.is_new]
     if len(new) <= 3:  # so few always lie on some path
-        return Health(1.0, '', 0j, confirmed_m, needed_m)
+        return Health(1.0, '', 0j, (0.0, 0.0, 0.0), confirmed_m, needed_m)
     found = _Window(track, new).hypotheses()
     largest = max(item.log_odds for item in found)
     odds = np.exp([item.log_odds - largest for item in found])
     odds = np.where([item.is_harmful for item in found], odds, 0.0) / odds.sum()
     worst = found[int(np.argmax(odds))]
-    return Health(1 - float(odds.sum()), worst.name, complex(worst.size), confirmed_m, needed_m)
+    place, turned = (odds @ np.square([(item.off_m, item.off_rad) for item in found])).tolist()
+    well = 1 - float(odds.sum())
+    # What nothing shows, as a delay on a circle, makes nobody doubt.
+    off = (0.0, 0.0, 0.0) if well >= LIKELY else (place / 2, place / 2, turned)
+    return Health(well, worst.name, complex(worst.size), off, confirmed_m, needed_m)
 
 
 class _Hypothesis(NamedTuple):

@@ -283,7 +283,15 @@ class PoseFilter:
         delay_ns = round(self._compensated_s * 1e9) if self._open_loop.found else 0
         robot_ns = stamp_ns - delay_ns if self._history.reaches(stamp_ns - delay_ns) else stamp_ns
         state = self._ekf.coast(self._history.before(robot_ns), robot_ns).state
-        return state and replace(state, stamp_ns=stamp_ns)
+        return state and replace(self._widened(state), stamp_ns=stamp_ns)
+
+    def _widened(self, state: State) -> State:
+        """The estimate, less certain by what may be the matter."""
+        if not any(self.health.variances):
+            return state
+        covariance = state.covariance.copy()
+        covariance[:3, :3] += np.diag(self.health.variances)
+        return replace(state, covariance=covariance)
 
     @property
     def health(self) -> Health:
@@ -298,7 +306,9 @@ class PoseFilter:
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
-        status = status_of(self._history.newest, self.health, self.config)
+        newest = self._history.newest
+        state = newest.state and self._widened(newest.state)
+        status = status_of(newest, state, self.health, self.config)
         doubts, delay_s = self._timeline.problems, self._camera.clock.delay_s
         if abs(self._camera.clock.delay_ns) > DELAY_LIMIT_NS:
             late = 'late' if delay_s > 0 else 'early'

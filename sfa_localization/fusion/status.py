@@ -54,9 +54,9 @@ class Status:
         return Status(max(level, self.level, key=lambda one: one.value), reasons)
 
 
-def status_of(belief: Belief, health: Health, config: FilterConfig) -> Status:
-    """The status of a belief with this health."""
-    state, memory = belief.state, belief.memory
+def status_of(belief: Belief, state: State | None, health: Health, config: FilterConfig) -> Status:
+    """The status of a belief with this state and health."""
+    memory = belief.memory
     if state is None:
         return Status(Level.UNINITIALISED, (_missing(belief),))
     lost = uncertainty(state, config)
