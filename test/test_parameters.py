@@ -109,8 +109,6 @@ def of_filter(settings: FilterConfig) -> Any:
             told = (-1.0, -1.0) if 10 < t < 14 or 30 < t < 32 else (1e-8, 1e-8)
             told = (4e-3, 4e-3) if 14 < t < 17 else told
             fused.add_odometry(stamp, *trip.read[index], told)
-            if index == 600:
-                fused.add_odometry(stamp + 80 * 10**9, 1.0, 0.0)
         elif 20.5 < t < 25.5 or 33 < t < 38:
             continue
         else:
