@@ -117,9 +117,10 @@ def check(diagnostics: Diagnostics) -> None:
             f'with {diagnostics.crossings} crossings, and odometry does not connect it: drive in '
             'other directions too, across earlier tracks'
         )
-    if np.rad2deg(diagnostics.angle_std_rad) > ANGLE_STD_MAX_DEG:
+    uncertain = min(float(np.rad2deg(diagnostics.angle_std_rad)), 180.0)
+    if uncertain > ANGLE_STD_MAX_DEG:
         raise DataError(
-            f'directions are uncertain by up to {np.rad2deg(diagnostics.angle_std_rad):.0f} deg: '
+            f'directions are uncertain by up to {uncertain:.0f} deg: '
             'drive longer, in more directions, and cross earlier tracks '
             f'({diagnostics.crossings} crossings now)'
         )
