@@ -161,6 +161,7 @@ SPECIAL: dict[type[Settings], dict[str, Other]] = {
         'initial_pose': Other((1.0, -1.0, 0.5)),
         'initial_position_std': Other(1.0, START),
         'initial_yaw_std': Other(1.0, START),
+        'lost_yaw_std': Other(0.1),
     },
 }
 ELSEWHERE: dict[type[Settings], str] = {
