@@ -50,7 +50,7 @@ from sfa_localization.metric.refinement import Refinement
 from sfa_localization.metric.saved_map import MetricMap
 
 FORMAT = 'sfa_localization place model'
-VERSION = 9
+VERSION = 10
 FARTHEST_M = 1e6
 """No place is farther from the origin of its map: there a pose's last digits are still micrometers.
 """

@@ -44,6 +44,13 @@ class Spheres:
         heights, radii = rng.uniform(-2.0, 3.0, count), rng.uniform(0.4, 1.6, count)
         return cls(places, heights, radii, rng.uniform(-90, 90, (count, 3)))
 
+    def symmetric(self) -> Spheres:
+        """The same world four times over, a quarter turn apart."""
+        quarters = ((1, 0), (0, 1), (-1, 0), (0, -1))
+        turned = [self.places @ np.array([[c, s], [-s, c]]) for c, s in quarters]
+        again = (np.concatenate([part] * 4) for part in (self.heights, self.radii, self.colors))
+        return Spheres(np.concatenate(turned), *again)
+
     def panoramas(self, poses: np.ndarray, config: PanoramaConfig) -> np.ndarray:
         """Panoramas (T, H, W, 3) uint8 from poses (T, 3)."""
         return np.stack([self._panorama(pose, config) for pose in poses])

@@ -180,8 +180,7 @@ def place_among(
     match is the angle rad by which `turned` would still turn the image to them.
 
     `channels` are rows that may be unlike for reasons of their own: each counts by how well the
-    keyframes explain it. Keyframes of different `drives` (N,) may differ by their light, so that
-    only differences within one show the place; all of one drive by default.
+    keyframes explain it. Keyframes of different `drives` (N,) may differ by their light.
     """
     scale = _scale(image.shape[-1], columns)
     image, count = image if image.ndim == 3 else image[None], len(places)
