@@ -320,20 +320,12 @@ def test_odometry_whose_pose_and_twist_contradict_each_other(tmp_path):
         ((0.0, 0.0), 1.0, 0.0, 0.0, ''),  # a twist that is never set claims nothing
         ((1.0, 0.5), 1.0, 0.0, 0.4, ''),  # a frame that is not on the axle swings in turns
         ((-1.0, 0.5), 1.0, math.pi, 0.0, ''),  # always backward
-        ((0.9, 0.5), 1.0, 0.5, 0.0, r'drive [0-9.]+ m sideways and [0-9.]+ m ahead: only'),
-        (
-            (0.0, 0.5),
-            1.0,
-            math.pi / 2,
-            0.0,
-            r'drive [0-9.]+ m sideways and [0-9.e-]+ m ahead: only',
-        ),
         ((1000.0, 0.5), 1.0, 0.0, 0.0, r'drive 1[0-9.]+ m, twists 1[.0-9]+e\+04 m: are'),
         ((1.0, 28.6), 1.0, 0.0, 0.0, r'turn 7[0-9.]* rad, twists 4[0-9]+ rad: are both'),
         ((1.0, 0.5), 0.0, 0.0, 0.0, r'turn 0 rad, twists 7[0-9.]* rad: are both in'),
     ],
 )
-def test_other_units_and_motion_aside_are_named(twist, turns, askew, axle, found, tmp_path):
+def test_other_units_are_named(twist, turns, askew, axle, found, tmp_path):
     """A circle of 2 m at 1 m/s, headed `askew` off the motion, seen `axle` m ahead of the axle;
     then the robot stands, with a flickering twist.
     """

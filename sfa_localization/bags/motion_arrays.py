@@ -26,10 +26,6 @@ _COMPARED_S, _COUNTED = 1.0, 0.05
 stands for long adds up noise."""
 _ENOUGH, _UNEQUAL = 3.0, 1.5
 """From such a sum on (m, rad) a larger factor between them is none of wheels or of sampling."""
-_SLIGHT_TURN_RAD = 1.0
-"""Where a robot turns by less between two poses, its chord shows where it was heading."""
-_ASIDE = 0.25
-"""So much of the way ahead no robot slips sideways, nor does one whose frame is not on its axle."""
 
 
 def _stamps(values: StampedValues) -> Stamps:
@@ -66,7 +62,7 @@ def to_odometry(values: StampedValues) -> tuple[Odometry, int, str]:
     if len(stamps) > 1 and not np.ptp(poses, axis=0).any() and speeds.max() > _DRIVING_MPS:
         integrated = replace(odometry, poses=integrate(stamps, odometry.twists))
         return integrated, resets, 'the pose is constant; the twist is integrated instead'
-    return odometry, resets, (_disagreement(odometry) or _sideways(odometry)) if values else ''
+    return odometry, resets, _disagreement(odometry) if values else ''
 
 
 def _disagreement(odometry: Odometry) -> str:
@@ -94,21 +90,6 @@ def _by_second(odometry: Odometry) -> tuple[Array, NDArray[np.int64]]:
     """Seconds (N,) since the first message, and indices of the first one in each _COMPARED_S."""
     seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
     return seconds, np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
-
-
-def _sideways(odometry: Odometry) -> str:
-    """How far poses drive sideways, in words; '' where they drive ahead or back, as wheels do."""
-    _, at = _by_second(odometry)
-    step = relative(odometry.poses[at[:-1]], odometry.poses[at[1:]])
-    half = step[:, 2] / 2
-    chord = step[:, 0] + 1j * step[:, 1]
-    counted = (np.abs(chord) > _COUNTED) & (np.abs(half) < _SLIGHT_TURN_RAD / 2)
-    moved = (chord * np.exp(-1j * half))[counted]
-    ahead, aside = np.abs(moved.real).sum(), np.abs(moved.imag).sum()
-    if aside > _ENOUGH and aside > _ASIDE * ahead:
-        driven = f'poses drive {aside:.3g} m sideways and {ahead:.3g} m ahead'
-        return f'{driven}: only motion ahead is used; is the heading right?'
-    return ''
 
 
 def _joined(stamps: Stamps, poses: Array, twists: Array) -> tuple[Array, int]:

@@ -21,6 +21,7 @@ from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.motion_sources import (
+    ENOUGH,
     EQUAL,
     GYRO,
     HEAD,
@@ -46,6 +47,9 @@ FASTEST_MPS = 30.0
 JUMP, ACCELERATION = 0.05, 5.0
 """A pose that moves so much (m, rad) beyond what its motion before and after, and this change of
 speed (m/s^2, rad/s^2), explain has jumped: wheels do not."""
+ASIDE, SLIGHT_TURN = 0.25, 1.0
+"""So much of the way ahead no robot slips sideways while it turns by less than this, rad, in a
+second, nor does one whose frame is off its axle; twice that is no slip at all."""
 NOISE = 6.0
 """Standard deviations of noisy wheels that a jump exceeds, too."""
 # s around a step in which its usual speed is measured.
@@ -55,7 +59,8 @@ _STAMPS_MIN, _STAMPS_MIN_PER_S = 20, 3
 _IMAGES_REMEDIES = {
     'alike': 'switch direction lock and stabilization off, and record one omnidirectional camera',
     'sign': 'set `clockwise` of the panorama, or `mirrored` of the calibration',
-    'scale': 'a panorama shows all around once, so that a full turn shifts it by its width',
+    'scale': 'a panorama shows all around once, so that a full turn shifts it by its width; or is '
+    'the track of the wheels too wide?',
 }
 
 
@@ -140,8 +145,11 @@ def check_motion(
     check.wrong += impossible
     _judge_way(check)
     if not impossible:
+        _judge_axes(check)
         _judge_turns(check)
         _judge_clocks(check)
+    if images is not None and not any(IMAGES in (pair.a, pair.b) for pair in check.pairs):
+        check.notes.append('images: the drive turns too little to tell whether they are mirrored')
     if not panoramas:
         check.notes += [text for text in check.wrong if text.startswith('images')]
         check.wrong = [text for text in check.wrong if not text.startswith('images')]
@@ -156,6 +164,21 @@ def _impossible(sources: Sequence[Source]) -> Iterator[str]:
             yield f'{source.name}: {problem}'
         elif not problem and (speed := _speed(source)) > FASTEST_MPS:
             yield f'{source.name} drives at {speed:.3g} m/s: publish meters, not millimeters'
+
+
+def _judge_axes(check: MotionCheck) -> None:
+    """Whether poses drive ahead or back, second by second, as wheels do."""
+    stamps, poses = check.odometry.stamps_ns, check.odometry.poses
+    at = np.flatnonzero(np.diff((stamps - stamps[0]) // 1_000_000_000, prepend=-1))
+    step = relative(poses[at[:-1]], poses[at[1:]])
+    chord = (step[:, 0] + 1j * step[:, 1]) * np.exp(-0.5j * step[:, 2])
+    # A chord shows where the robot was heading, where that turned by little.
+    counted = chord[(np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)]
+    ahead, aside = np.abs(counted.real).sum(), np.abs(counted.imag).sum()
+    if aside > max(ENOUGH['way'], ASIDE * ahead):
+        text = f'{POSE} drives {aside:.3g} m sideways and {ahead:.3g} m ahead: correct its heading'
+        text += ' and axes (x ahead, y to the left, yaw counterclockwise)'
+        (check.wrong if aside > 2 * ASIDE * ahead else check.notes).append(text)
 
 
 def stamp_problem(stamps_ns: Stamps) -> str:
@@ -250,7 +273,9 @@ def _blame(check: MotionCheck, kind: str, camp: set[str], others: set[str]) -> N
         remedy += (
             ', or swap left and right wheel' if (kind, _devices(others)) == ('sign', 1) else ''
         )
-        wrong = {'alike': pair.independent, 'sign': True, 'scale': factor > EQUAL}[kind]
+        # Alone, wheels that skid turn farther than the robot does.
+        blamed = factor > 1 or _devices(others) > 1
+        wrong = {'alike': pair.independent, 'sign': True, 'scale': blamed}[kind]
     elif camp >= {POSE, TWIST}:
         remedy = 'swap left and right wheel' if kind == 'sign' else 'do the wheels skid?'
         wrong = kind == 'sign' or far

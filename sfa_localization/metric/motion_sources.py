@@ -34,6 +34,9 @@ LOCKED = 0.4
 as far as it does."""
 EQUAL = 1.5
 """A larger factor between two sources is none of sampling or of a loosely calibrated wheel."""
+WHOLE, CERTAIN = 1.15, 0.95
+"""Panoramas that turn as the robot does, with a correlation of at least the second, and by another
+factor than this, do not show a whole turn; those that do were found to be within 3 %."""
 UNIT = 1.2
 """A scale within this factor of that between two units is taken for it."""
 LATE_S = 0.05
@@ -136,7 +139,8 @@ class Pair:
             return self.correlation < ALIKE or self.independent
         if kind == 'sign':
             return self.scale < 0
-        return not 1 / EQUAL < abs(self.scale) < EQUAL
+        limit = WHOLE if self.b == IMAGES and self.correlation >= CERTAIN else EQUAL
+        return not 1 / limit < abs(self.scale) < limit
 
     def sentence(self) -> str:
         """What it means, in words."""
