@@ -52,6 +52,8 @@ ASIDE, SLIGHT_TURN = 0.25, 1.0
 second, nor does one whose frame is off its axle; twice that is no slip at all."""
 NOISE = 6.0
 """Standard deviations of noisy wheels that a jump exceeds, too."""
+LATEST_S = 0.5
+"""Images stamped later, or earlier, are not corrected: see fusion.pose_filter.DELAY_LIMIT_NS."""
 # s around a step in which its usual speed is measured.
 _AROUND_S = 0.5
 # Stamps, in all and in each second, of which the unit can be told.
@@ -321,6 +323,8 @@ def _judge_clocks(check: MotionCheck) -> None:
         pair = check.pair(POSE, name)
         if pair is None or pair.differs('alike') or not pair.late_s:
             continue
+        if name == IMAGES and abs(pair.late_s) > LATEST_S:
+            continue  # clocks that are so far apart are a reason of their own to stop
         if name == GYRO and check.gyro is not None:
             stamps = check.gyro.stamps_ns - round(pair.late_s * 1e9)
             check.gyro = replace(check.gyro, stamps_ns=stamps)
