@@ -49,7 +49,23 @@ def interval(belief: Belief, event: OdometryEvent) -> Interval | None:
     v = max(abs(before.v), abs(reading.v), motion.UNKNOWN_SPEED)
     omega = max(abs(before.omega), abs(reading.omega), motion.UNKNOWN_RATE)
     shown = _shown(belief, event, silence_s, reading._replace(v=v, omega=omega))
+    if shown is None and silence_s <= COAST_S:
+        shown = _between(before, reading, silence_s)
     return shown and Interval(shown, reading, reading.omega)
+
+
+def _between(a: Twist, b: Twist, seconds: float) -> Twist:
+    """The mean twist over a silence of which nothing but both ends is known. The variance of a
+    uniform distribution between them is their difference squared over 12; that of the mean of the
+    random walk that joins them, CTRV's, is a twelfth of the walk's.
+    """
+    walk = motion.ACCELERATION**2 * seconds
+    return Twist(
+        (a.v + b.v) / 2,
+        (a.omega + b.omega) / 2,
+        max(a.v_variance, b.v_variance) + ((a.v - b.v) ** 2 + walk) / 12,
+        max(a.omega_variance, b.omega_variance) + ((a.omega - b.omega) ** 2 + walk) / 12,
+    )
 
 
 def _shown(belief: Belief, event: OdometryEvent, seconds: float, fastest: Twist) -> Twist | None:
