@@ -51,9 +51,6 @@ from sfa_localization.metric.saved_map import MetricMap
 
 FORMAT = 'sfa_localization place model'
 VERSION = 10
-FARTHEST_M = 1e6
-"""No place is farther from the origin of its map: there a pose's last digits are still micrometers.
-"""
 SCALE_STD = 0.01
 """Of the scale of a map: its meters are those of wheels, seldom known better."""
 _LONGEST_DELAY_S = 10.0

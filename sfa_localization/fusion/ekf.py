@@ -148,10 +148,8 @@ class Ekf:
             )
         held, reading = interval(belief, event), event.twist
         if held is None:
-            belief, held = (
-                self.coast(belief, event.stamp_ns),
-                Interval(reading, reading, reading.omega),
-            )
+            belief = self.coast(belief, event.stamp_ns)
+            held = Interval(reading, reading, reading.omega)
         dt = (event.stamp_ns - belief.stamp_ns) * 1e-9
         step = motion.drive(belief.mean, held.twist, dt, self._noise, held.now)
         return self._moved(belief, event.stamp_ns, step, event, held)

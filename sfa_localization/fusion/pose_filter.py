@@ -38,6 +38,7 @@ from sfa_localization.fusion.timeline import (
     ClockWentBack,
     Timeline,
 )
+from sfa_localization.fusion.track import newest_new
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
@@ -298,7 +299,7 @@ class PoseFilter:
         """What the last images show of the estimate."""
         belief = self._history.newest
         images, placed_m = belief.memory.images, belief.track.placed_m
-        newest = next((image for image in reversed(images) if image.is_new), None), placed_m
+        newest = newest_new(images), placed_m
         if self._judged is None or self._judged[0] != newest:
             self._judged = newest, health_of(belief.track, images)
         return self._judged[1]

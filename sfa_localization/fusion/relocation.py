@@ -104,10 +104,10 @@ def _turns(seen: Columns) -> list[tuple[float, float]]:
     if seen.has_yaw[-1]:
         turn = float(wrap_angle(seen.yaw[-1] - seen.path_yaw[-1]))
         found.append((turn, float(seen.yaw_variance[-1])))
-    both, way = seen.variance + seen.variance[-1], seen.path - seen.path[-1]
-    for i in np.flatnonzero(np.abs(way) > AGREEING_STDS * np.sqrt(both)):
-        turn = float(np.angle((seen.place[i] - seen.place[-1]) * np.conj(way[i])))
-        found.append((turn, float(both[i] / abs(way[i]) ** 2)))
+    both, reach = seen.variance + seen.variance[-1], np.abs(seen.path)
+    for i in np.flatnonzero(reach > AGREEING_STDS * np.sqrt(both)):
+        turn = float(np.angle((seen.place[i] - seen.place[-1]) * np.conj(seen.path[i])))
+        found.append((turn, float(both[i] / reach[i] ** 2)))
     return found
 
 
@@ -118,9 +118,9 @@ def _yaw_residual(seen: Columns, turn: float) -> Array:
 
 def _agreeing(seen: Columns, turn: float, turn_variance: float) -> NDArray[np.bool_]:
     """Mask of the images that agree with the newest one under a turn."""
-    way = seen.path - seen.path[-1]
-    residual = seen.place - seen.place[-1] - np.exp(1j * turn) * way
-    allowed = seen.variance + seen.variance[-1] + seen.drift + turn_variance * np.abs(way) ** 2
+    residual = seen.place - seen.place[-1] - np.exp(1j * turn) * seen.path
+    allowed = seen.variance + seen.variance[-1] + seen.drift
+    allowed = allowed + turn_variance * np.abs(seen.path) ** 2
     allowed_yaw = seen.yaw_variance + turn_variance + seen.drift
     near = _yaw_residual(seen, turn) ** 2 <= AGREEING_STDS**2 * allowed_yaw
     return np.asarray(near & (np.abs(residual) ** 2 <= AGREEING_STDS**2 * allowed))

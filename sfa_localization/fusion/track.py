@@ -50,7 +50,7 @@ class Image(NamedTuple):
 
 def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
     """The images with one more, without what is too far behind."""
-    last = next((image for image in reversed(images) if image.is_new), None)
+    last = newest_new(images)
     if last is not None and not _moved(last, newest):
         newest = newest._replace(is_new=False)
     reach_m, first = max(REACH_M, REACH_STDS * math.sqrt(newest.variance)), 0
@@ -63,14 +63,20 @@ def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
     return (*older[LATEST - CAPACITY :], *kept[-LATEST:])
 
 
+def newest_new(images: Sequence[Image]) -> Image | None:
+    """The latest image that showed something new."""
+    return next((image for image in reversed(images) if image.is_new), None)
+
+
 def _moved(last: Image, image: Image) -> bool:
     turn = math.remainder(image.dead_reckoned[2] - last.dead_reckoned[2], 2 * math.pi)
     return image.traveled_m - last.traveled_m >= SPACING_M or abs(turn) >= SPACING_RAD
 
 
 class Columns:
-    """Images as arrays (N,), the newest last: `place` and the dead-reckoned `path` as complex
-    numbers in the plane, `yaw` with the mask `has_yaw`, variances, and meters `behind_m`.
+    """Images as arrays (N,), the newest last: `place`, and the dead-reckoned `path` from the newest
+    one, as complex numbers in the plane, `yaw` with the mask `has_yaw`, variances, and meters
+    `behind_m`.
     """
 
     def __init__(self, images: Sequence[Image]) -> None:
@@ -78,7 +84,7 @@ class Columns:
         self.place = np.array([image.place for image in images])
         rows = [(*i.dead_reckoned, i.yaw, i.variance, i.yaw_variance, i.traveled_m) for i in images]
         x, y, self.path_yaw, yaw, self.variance, self.yaw_variance, traveled_m = np.array(rows).T
-        self.path, self.behind_m = x + 1j * y, traveled_m[-1] - traveled_m
+        self.path, self.behind_m = x - x[-1] + 1j * (y - y[-1]), traveled_m[-1] - traveled_m
         self.has_yaw: NDArray[np.bool_] = np.isfinite(yaw)
         self.yaw = np.where(self.has_yaw, yaw, 0.0)
         self.drift = (ODOMETRY_DRIFT * self.behind_m) ** 2
