@@ -12,8 +12,7 @@ import json
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal, stats
 
-from sfa_localization.bags.drives import as_live, image_cache, read_drive
+from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.bags.reader import Bag
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
@@ -176,17 +175,16 @@ def _scores(
     return scores
 
 
-@contextmanager
 def observed(
     bag: Path, observer: Observer, recipe: Recipe, progress: bool, want_truth: bool = True
-) -> Iterator[tuple[Run, list[Observation]]]:
+) -> tuple[Run, list[Observation]]:
     """A drive, and what the model makes of its images as the nodes see them; `recipe` is live.
 
-    Its images are there until the end. Raises BagError or DataError, also without a wanted truth.
+    Raises BagError or DataError, also without a wanted truth.
     """
-    with _read(bag, recipe, progress, want_truth) as run:
-        title, images = _title(run), len(run.panoramas)
-        yield run, [*progress_over(observer.observe_run(run), title, images, shown=progress)]
+    run = _read(bag, recipe, progress, want_truth)
+    title, images = _title(run), len(run.panoramas)
+    return run, [*progress_over(observer.observe_run(run), title, images, shown=progress)]
 
 
 def _present(path: Path, recipe: Recipe) -> Recipe:
@@ -201,15 +199,12 @@ def _present(path: Path, recipe: Recipe) -> Recipe:
     return replace(recipe, topics=replace(recipe.topics, **missing))
 
 
-@contextmanager
-def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Iterator[Run]:
-    with image_cache(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate') as cache:
-        run = read_drive(bag, cache, recipe, progress, want_truth=truth)
-        if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
-            raise DataError(
-                f'{bag}: no ground truth to judge by; name it with --ground-truth-topic'
-            )
-        yield run
+def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
+    cache = image_folder(Path(tempfile.gettempdir()) / 'sfa_localization_evaluate')
+    run = read_drive(bag, cache, recipe, progress, want_truth=truth)
+    if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
+        raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
+    return run
 
 
 def _title(run: Run) -> str:
@@ -218,9 +213,9 @@ def _title(run: Run) -> str:
 
 def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Drive:
     """Run model and filter over a bag. Raises BagError or DataError."""
-    with _read(bag, recipe, progress) as run:
-        observations, fused, states = _replayed(localizer, run, progress)
-        clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
+    run = _read(bag, recipe, progress)
+    observations, fused, states = _replayed(localizer, run, progress)
+    clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
     usable = [one for one in observations if not one.problem]
     if not usable:
         raise DataError(f'{run.name}: no image can be used: {observations[0].problem}')

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sfa_localization.bags.drives import image_cache, read_drives
+from sfa_localization.bags.drives import image_folder, read_drives
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -82,21 +82,21 @@ def train(
     BagError, ConfigError, DataError or ModelError; then no model is written.
     """
     recipe, output = recipe or Recipe(), Path(output)
-    with image_cache(output) as cache:
-        runs = read_drives(bags, cache, recipe, progress, strict=strict)  # step 1
-        runs, checks = compared(runs, recipe, force)
-        settings = (recipe.network, recipe.architecture, recipe.panorama, recipe.camera)
-        checkpoint = Checkpoint.beside(output, settings, runs)
-        if not resume:
-            checkpoint.remove()
-        with one_core():
-            given = TrainingInput.of(runs, recipe, progress)  # step 2
-        network = train_hierarchy(given, checkpoint)  # step 3
-        with one_core():
-            trained = _learn(network, given, strict)  # steps 4 to 9
-            compare_with_map(checks, given.drives, trained.segments, trained.metric)
-        trained.model.save(output)
+    cache = image_folder(output)
+    runs = read_drives(bags, cache, recipe, progress, strict=strict)  # step 1
+    runs, checks = compared(runs, recipe, force)
+    settings = (recipe.network, recipe.architecture, recipe.panorama, recipe.camera)
+    checkpoint = Checkpoint.beside(output, settings, runs)
+    if not resume:
         checkpoint.remove()
+    with one_core():
+        given = TrainingInput.of(runs, recipe, progress)  # step 2
+    network = train_hierarchy(given, checkpoint)  # step 3
+    with one_core():
+        trained = _learn(network, given, strict)  # steps 4 to 9
+        compare_with_map(checks, given.drives, trained.segments, trained.metric)
+    trained.model.save(output)
+    checkpoint.remove()
     return replace(trained, checks=checks)
 
 

@@ -77,8 +77,8 @@ def read_drive(
 ) -> TuningDrive:
     """A bag's odometry, and the poses of its images by the model. Raises BagError, DataError."""
     live = as_live(recipe, model.panorama)
-    with observed(bag, Observer(model, watch), live, True, want_truth) as (run, observations):
-        usable = [one for one in observations if not one.problem]
+    run, observations = observed(bag, Observer(model, watch), live, True, want_truth)
+    usable = [one for one in observations if not one.problem]
     if len(usable) < MIN_IMAGES:
         raise DataError(
             f'{bag}: {len(usable)} images are too few to tune on: {MIN_IMAGES} at least'

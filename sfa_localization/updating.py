@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sfa_localization.bags.drives import ReadingRecipe, as_live, image_cache, read_drive
+from sfa_localization.bags.drives import ReadingRecipe, as_live, image_folder, read_drive
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
@@ -98,13 +98,13 @@ def update(
     Raises BagError, DataError or ModelError; then no model is written.
     """
     recipe, added = as_live(recipe or ReadingRecipe(), model.panorama), []
-    with image_cache(Path(output)) as cache:
-        for bag in bags:
-            run = read_drive(bag, cache, recipe, progress, strict=strict)
-            new = new_views(model, run, config, watch, progress=progress)
-            model = extended(model, new, Path(bag).name)
-            added.append((Path(bag).name, len(new)))
-        model.save(Path(output))
+    cache = image_folder(Path(output))
+    for bag in bags:
+        run = read_drive(bag, cache, recipe, progress, strict=strict)
+        new = new_views(model, run, config, watch, progress=progress)
+        model = extended(model, new, Path(bag).name)
+        added.append((Path(bag).name, len(new)))
+    model.save(Path(output))
     return Updated(model, tuple(added))
 
 

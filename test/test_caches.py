@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sfa_localization import cli
-from sfa_localization.bags.drives import image_cache
+from sfa_localization.bags.drives import image_folder
 from sfa_localization.data.errors import ModelError
 
 ROOT = Path(__file__).parents[1]
@@ -20,14 +20,13 @@ TRAIN_AND_WAIT = """
 import sys, time
 from pathlib import Path
 from sfa_localization import cli
-from sfa_localization.bags.drives import image_cache, read_drive
+from sfa_localization.bags.drives import image_folder, read_drive
 from sfa_localization.commands import train
 
 def run(arguments):
-    with image_cache(arguments.output) as cache:
-        run = read_drive(arguments.bags[0], cache)
-        print('ready', len(run.panoramas), flush=True)
-        time.sleep(60)
+    run = read_drive(arguments.bags[0], image_folder(arguments.output))
+    print('ready', len(run.panoramas), flush=True)
+    time.sleep(60)
 
 train.run = run
 sys.exit(cli.main(['train', 'bags/sample_test', '--output', sys.argv[1]]))
@@ -53,8 +52,8 @@ def test_an_output_that_cannot_be_written_is_named_before_the_training(tmp_path)
         '/dev/null/a': 'cannot be written', '/dev/null': 'no regular file',
         tmp_path / 'link': 'no regular file',
     }.items():  # fmt: skip
-        with pytest.raises(ModelError, match=why), image_cache(Path(path)):
-            raise AssertionError
+        with pytest.raises(ModelError, match=why):
+            image_folder(Path(path))
 
 
 def test_a_full_machine_is_one_line(capsys):

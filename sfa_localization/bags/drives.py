@@ -7,7 +7,6 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Collection, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -62,7 +61,7 @@ def as_live(recipe: R, panorama: PanoramaConfig) -> R:
     return replace(recipe, panorama=panorama, odometry_tolerance_s=0.0)
 
 
-def image_cache(output: Path) -> AbstractContextManager[Path]:
+def image_folder(output: Path) -> Path:
     """The folder of `output`, for decoded images: files without a name, gone with their process.
 
     Raises ModelError where `output` could not be written in the end.
@@ -72,7 +71,7 @@ def image_cache(output: Path) -> AbstractContextManager[Path]:
         output.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ModelError(f'{output}: cannot be written: {error.strerror or error}') from None
-    return nullcontext(output.parent)
+    return output.parent
 
 
 def read_drives(

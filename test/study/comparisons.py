@@ -61,11 +61,11 @@ def baselines(site: Site, results: Results, world: str) -> None:
     missing = [n for n in names if results.find(world=world, features=n) is None]
     if not missing:
         return
-    with site.study() as study:
-        model = site.model(study)
-        for name in missing:
-            site.progress.say(f'{world}: {name}')
-            results.keep({'world': world, 'features': name, **_judged(site, study, model, name)})
+    study = site.study()
+    model = site.model(study)
+    for name in missing:
+        site.progress.say(f'{world}: {name}')
+        results.keep({'world': world, 'features': name, **_judged(site, study, model, name)})
 
 
 def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
@@ -194,15 +194,15 @@ def ablations(site: Site, results: Results, world: str) -> None:
     missing = [n for n in VARIANTS if results.find(world=world, variant=n) is None]
     if not missing:
         return
-    with site.study() as study:
-        whole = site.model(study)
-        for name in missing:
-            site.progress.say(f'{world}: {name}')
-            try:
-                cell = _ablated(site, study, whole, VARIANTS[name])
-            except LocalizationError as error:
-                cell = {'problem': str(error)}
-            results.keep({'world': world, 'variant': name, **cell})
+    study = site.study()
+    whole = site.model(study)
+    for name in missing:
+        site.progress.say(f'{world}: {name}')
+        try:
+            cell = _ablated(site, study, whole, VARIANTS[name])
+        except LocalizationError as error:
+            cell = {'problem': str(error)}
+        results.keep({'world': world, 'variant': name, **cell})
 
 
 def _exact(run: Run) -> Run:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sfa_localization.bags.drives import as_live, image_cache, read_drive
+from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform
@@ -181,21 +181,21 @@ def _fill(work: _Work, training: Training, keep: Callable[[Cell], None]) -> None
     drives = [work.test(test) for test in training.tests]
     model = work.model(training.lights, bags)
     recipe = as_live(Recipe(), work.panorama)
-    with image_cache(work.out / 'images') as cache:
-        runs = [_read(bag, cache / bag.name, recipe) for bag in bags]
-        retrieval, transform = _retrieval(runs), None
-        paper = _paper_recipe(model, runs[0]) if len(runs) == 1 else None
-        for test, drive in zip(training.tests, drives, strict=True):
-            work.progress.say(f'{" + ".join(training.lights)}, tested in {" ".join(test)}')
-            run = _read(drive, cache / drive.name, recipe)
-            cell, transform = _judged(model, drive, bags, transform)
-            beside = {'retrieval': _retrieved(retrieval, run)}
-            if transform is not None:
-                beside['slow'] = _slow_alone(model, run, transform)
-            if paper is not None:
-                beside['paper'] = paper(run)
-            names = {'trained': training.trained, 'light': test[0], 'season': test[1]}
-            keep({**names, **cell, **beside})
+    cache = image_folder(work.out / 'images')
+    runs = [_read(bag, cache / bag.name, recipe) for bag in bags]
+    retrieval, transform = _retrieval(runs), None
+    paper = _paper_recipe(model, runs[0]) if len(runs) == 1 else None
+    for test, drive in zip(training.tests, drives, strict=True):
+        work.progress.say(f'{" + ".join(training.lights)}, tested in {" ".join(test)}')
+        run = _read(drive, cache / drive.name, recipe)
+        cell, transform = _judged(model, drive, bags, transform)
+        beside = {'retrieval': _retrieved(retrieval, run)}
+        if transform is not None:
+            beside['slow'] = _slow_alone(model, run, transform)
+        if paper is not None:
+            beside['paper'] = paper(run)
+        names = {'trained': training.trained, 'light': test[0], 'season': test[1]}
+        keep({**names, **cell, **beside})
 
 
 def _read(bag: Path, cache: Path, recipe: Recipe) -> Run:

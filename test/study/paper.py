@@ -56,26 +56,26 @@ def experiment(site: Site, results: Results, name: str, seed: int, figures: Path
 
     Figures in the style of the paper's go to the folder `figures`. Raises LocalizationError.
     """
-    with site.study() as study:
-        model = site.model(study)
-        features = study.features(slow_of(model.network))
-        columns: dict[str, Cell] = {}
-        paths: dict[str, Paths] = {}
-        for column, config in RECIPES.items():
-            site.progress.say(f'{name}, seed {seed}: {column}')
-            columns[column], made = _by_recipe(study, features, config)
-            paths |= {column: made} if made else {}
-        site.progress.say(f'{name}, seed {seed}: ours')
-        columns['ours'], paths['ours'] = _ours(site, study, model)
-        descent: list[report.Panel] = []
-        if name == 'simulator':
-            descent = _random_start(study, features, seed, columns)
-        if figures is not None:
-            if descent:
-                firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
-                report.panels_figure(figures / 'figure_4.png', {"paper's descent": descent})
-            _figures(figures, name, study, paths)
-        drift = mean_distance(odometry_from_start(study.truth, study.test), study.truth)
+    study = site.study()
+    model = site.model(study)
+    features = study.features(slow_of(model.network))
+    columns: dict[str, Cell] = {}
+    paths: dict[str, Paths] = {}
+    for column, config in RECIPES.items():
+        site.progress.say(f'{name}, seed {seed}: {column}')
+        columns[column], made = _by_recipe(study, features, config)
+        paths |= {column: made} if made else {}
+    site.progress.say(f'{name}, seed {seed}: ours')
+    columns['ours'], paths['ours'] = _ours(site, study, model)
+    descent: list[report.Panel] = []
+    if name == 'simulator':
+        descent = _random_start(study, features, seed, columns)
+    if figures is not None:
+        if descent:
+            firing_maps_figure(figures / f'figure_1d_{name}.png', study.places, features[0])
+            report.panels_figure(figures / 'figure_4.png', {"paper's descent": descent})
+        _figures(figures, name, study, paths)
+    drift = mean_distance(odometry_from_start(study.truth, study.test), study.truth)
     counts = [len(run.panoramas) for run in (*study.training, study.test)]
     results.keep({'seed': seed, 'images': counts, 'odometry': drift, 'columns': columns})
 

@@ -4,12 +4,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sfa_localization.bags.drives import as_live, image_cache
+from sfa_localization.bags.drives import as_live, image_folder
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
@@ -85,11 +84,10 @@ class Site:
         recipe = as_live(Recipe(), PanoramaConfig(width=width, height=height))
         return cls(folder, tuple(bags[:-1]), bags[-1], recipe, progress)
 
-    @contextmanager
-    def study(self) -> Iterator[Study]:
-        """The drives, read; their images are in a folder that is removed in the end."""
-        with image_cache(self.folder / 'images') as cache:
-            yield Study.read(self.training, self.test, cache, self.recipe)
+    def study(self) -> Study:
+        """The drives, read."""
+        cache = image_folder(self.folder / 'images')
+        return Study.read(self.training, self.test, cache, self.recipe)
 
     def model(self, study: Study) -> PlaceModel:
         """What this package makes of all training drives, with the network of the first one."""
