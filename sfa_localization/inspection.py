@@ -24,11 +24,11 @@ from sfa_localization.camera import kinds
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError
+from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
-from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late

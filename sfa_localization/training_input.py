@@ -13,6 +13,7 @@ from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.camera.kinds import require_one_view
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import headings
+from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
 from sfa_localization.features import mdp_engine
@@ -23,7 +24,6 @@ from sfa_localization.features.network_training import ImageSequence, train_netw
 from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import camera_clock
-from sfa_localization.fusion.pose_filter import DELAY_LIMIT_NS
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig

@@ -11,6 +11,8 @@ import numpy as np
 from sfa_localization.data.run import Stamps
 
 ODOMETRY, IMAGE = range(2)
+DELAY_LIMIT_NS = 500_000_000
+"""Largest delay of the camera's stamps, either way, that is compensated."""
 
 
 def merge_by_stamp(odometry_ns: Stamps, images_ns: Stamps) -> Iterator[tuple[int, int, int]]:

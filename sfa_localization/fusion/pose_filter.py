@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
+from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
@@ -42,8 +43,6 @@ from sfa_localization.fusion.track import newest_new
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
-DELAY_LIMIT_NS = 500_000_000
-"""Largest delay of the camera's stamps, either way, that is compensated."""
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
 # Standard deviation, s, of a delay learned with the model: clocks differ from day to day.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
+from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
@@ -52,8 +53,6 @@ ASIDE, SLIGHT_TURN = 0.25, 1.0
 second, nor does one whose frame is off its axle; twice that is no slip at all."""
 NOISE = 6.0
 """Standard deviations of noisy wheels that a jump exceeds, too."""
-LATEST_S = 0.5
-"""Images stamped later, or earlier, are not corrected: see fusion.pose_filter.DELAY_LIMIT_NS."""
 # s around a step in which its usual speed is measured.
 _AROUND_S = 0.5
 # Stamps, in all and in each second, of which the unit can be told.
@@ -323,7 +322,7 @@ def _judge_clocks(check: MotionCheck) -> None:
         pair = check.pair(POSE, name)
         if pair is None or pair.differs('alike') or not pair.late_s:
             continue
-        if name == IMAGES and abs(pair.late_s) > LATEST_S:
+        if name == IMAGES and abs(pair.late_s) * 1e9 > DELAY_LIMIT_NS:
             continue  # clocks that are so far apart are a reason of their own to stop
         if name == GYRO and check.gyro is not None:
             stamps = check.gyro.stamps_ns - round(pair.late_s * 1e9)
