@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 import yaml
 from study.__main__ import study_parser
-from test_style import DOCUMENTS
 
 from sfa_localization import cli
 from sfa_localization.bags.reader import Bag
@@ -31,8 +30,8 @@ from sfa_localization.nodes.entry import CANNOT_START, DIED
 from sfa_localization.nodes.settings import EkfNodeConfig
 
 ROOT = Path(__file__).parents[1]
-README_LINES = 130
-"""At most so many: a stranger decides in half a minute."""
+DOCUMENTS = [*ROOT.glob('*.md'), *ROOT.glob('config/*.md'), *ROOT.glob('bags/*.md'),
+             *ROOT.glob('test/*.md')]  # fmt: skip
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
 BLOCK = re.compile(r'```(?:bash|sh)\n(.*?)```', re.DOTALL)
 INLINE = re.compile(r'`([a-z_]+ [^`]+)`')
@@ -134,15 +133,6 @@ def topics() -> set[str]:
     return {text.lstrip('/') for text in strings if re.fullmatch(r'/?[a-z_]+(/[a-z_]+)*', text)}
 
 
-def test_the_readme_is_short_and_says_what_its_figures_are():
-    lines = (ROOT / 'README.md').read_text('utf-8').splitlines()
-    assert len(lines) <= README_LINES
-    figures = [k for k, line in enumerate(lines) if line.startswith('![')]
-    assert figures
-    for k in figures:
-        assert re.match(r'\*(Rendered|Half-real|Real)\b', lines[k + 2]), lines[k]
-
-
 def test_links_and_topics_exist():
     named = {path: path.read_text('utf-8') for path in [*DOCUMENTS, *ROOT.glob('config/*.rviz')]}
     broken = [
@@ -166,31 +156,22 @@ def test_foxglove_layout_is_complete_and_its_topics_exist():
     assert {name.lstrip('/') for name in named} <= topics()
 
 
-def test_robot_localization_takes_position_and_heading_of_our_pose():
+def test_robot_localization_finds_a_robot_that_starts_anywhere(launch):
+    """It takes x, y and yaw; a first image hundreds of meters away, or turned, is not rejected."""
     text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
     settings = yaml.safe_load(text)['ekf_filter_node_map']['ros__parameters']
     assert settings['pose0'].lstrip('/') in topics()
     assert len(settings['pose0_config']) == len(settings['odom0_config']) == 15
     used = [index for index, wanted in enumerate(settings['pose0_config']) if wanted]
     assert used == [0, 1, 5], 'x, y and yaw'
-
-
-def test_the_page_leaves_out_ekf_node_where_robot_localization_is_alone(launch):
+    covariance = np.reshape(settings['initial_estimate_covariance'], (15, 15))
+    apart = np.array([200.0, -200.0, math.pi])
+    d2 = apart @ np.linalg.solve(covariance[np.ix_(used, used)], apart)
+    assert d2 <= settings['pose0_rejection_threshold'] ** 2
     text = (ROOT / 'config/robot_localization.md').read_text('utf-8')
     (line,) = (line for line in text.splitlines() if line.startswith('ros2 launch'))
     arguments = dict(word.split(':=') for word in shlex.split(line)[4:])
-    assert [*launch(**arguments)] == ['omnicam_node', 'sfa_node']
-
-
-def test_robot_localization_finds_a_robot_that_starts_anywhere():
-    """A first image that is hundreds of meters away, or turned around, is not rejected."""
-    text = (ROOT / 'config/robot_localization.yaml').read_text('utf-8')
-    settings = yaml.safe_load(text)['ekf_filter_node_map']['ros__parameters']
-    covariance = np.reshape(settings['initial_estimate_covariance'], (15, 15))[:6, :6]
-    apart = np.array([200.0, -200.0, 0.0, 0.0, 0.0, math.pi])
-    used = np.ix_([0, 1, 5], [0, 1, 5])
-    d2 = apart[[0, 1, 5]] @ np.linalg.solve(covariance[used], apart[[0, 1, 5]])
-    assert d2 <= settings['pose0_rejection_threshold'] ** 2
+    assert [*launch(**arguments)] == ['omnicam_node', 'sfa_node'], 'no second filter'
 
 
 def test_nav2_uses_our_frames():
@@ -263,30 +244,21 @@ def launch(launch_file):
     return start
 
 
-def test_a_missing_parameter_file_stops_the_launch(launch):
-    """launch_ros itself only warns, and starts the nodes with every default."""
-    with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
-        launch(config='/nowhere.yaml')
-
-
 def test_launch_file_starts_all_nodes_with_known_parameters_and_topics(launch):
-    launched = launch(model='model.npz')
-    assert [*launched] == list(NODES)
-    for node in [*launched.values(), *launch(panorama='/panorama').values()]:
+    """The transform stays in the namespace unless asked; nodes can be left out."""
+    launched, without = launch(model='model.npz'), launch(panorama='/panorama')
+    assert [*launched] == list(NODES) and [*without] == ['sfa_node', 'ekf_node']
+    for node in [*launched.values(), *without.values()]:
         _file, given = node['parameters']
         assert set(given) <= parameters()
         known = topics() | {'image_raw', 'odom', '/tf'}
         assert {source for source, _ in node['remappings']} <= known
-
-
-def test_launch_arguments(launch):
-    """The transform stays in the namespace unless asked; nodes can be left out."""
-    assert ('/tf', 'tf') in launch()['ekf_node']['remappings']
+    assert ('/tf', 'tf') in launched['ekf_node']['remappings']
     assert ('/tf', '/tf') in launch(tf='/tf')['ekf_node']['remappings']
     assert [*launch(ekf='false')] == ['omnicam_node', 'sfa_node']
-    without = launch(panorama='/panorama')
-    assert [*without] == ['sfa_node', 'ekf_node']
     assert ('panorama', '/panorama') in without['sfa_node']['remappings']
+    with pytest.raises(FileNotFoundError, match=r'config:=/nowhere\.yaml'):
+        launch(config='/nowhere.yaml')  # launch_ros itself only warns, and starts with defaults
 
 
 def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch, launch_file):
@@ -307,33 +279,34 @@ def test_a_launch_ends_with_what_cannot_start_and_starts_again_what_dies(launch,
     assert exited(CANNOT_START, ending) is None
 
 
-def replay():
-    """Return launch arguments and bag of the replay that the README shows."""
+def test_the_replay_of_the_readme_feeds_the_launched_nodes(launch):
     text = (ROOT / 'README.md').read_text('utf-8')
     (block,) = (block for block in BLOCK.findall(text) if 'ros2 bag play' in block)
-    launched, played = (shlex.split(line, comments=True) for line in block.splitlines())
-    assert launched[:3] == ['ros2', 'launch', 'sfa_localization']
-    assert played[:3] == ['ros2', 'bag', 'play'] and len(played) == 4
-    return dict(word.split(':=') for word in launched[4:]), ROOT / played[3]
-
-
-def test_the_replay_of_the_readme_feeds_the_launched_nodes(launch):
-    arguments, path = replay()
-    launched = launch(**arguments)
+    typed, played = (shlex.split(line, comments=True) for line in block.splitlines())
+    launched = launch(**dict(word.split(':=') for word in typed[4:]))
     assert [*launched] == ['sfa_node', 'ekf_node'], 'the bag holds panoramas'
-    with Bag(path) as bag:
-        played = {name: topic.kind for name, topic in bag.topics.items()}
+    with Bag(ROOT / played[3]) as bag:
+        held = {name: topic.kind for name, topic in bag.topics.items()}
     panorama = dict(launched['sfa_node']['remappings'])['panorama']
     assert launched['sfa_node']['parameters'][1]['image_transport'] == 'compressed'
-    assert played[f'{panorama}/compressed'] == 'sensor_msgs/msg/CompressedImage'
+    assert held[f'{panorama}/compressed'] == 'sensor_msgs/msg/CompressedImage'
     odometry = dict(launched['ekf_node']['remappings'])['odom']
-    assert played[f'/{odometry}'] == 'nav_msgs/msg/Odometry'
+    assert held[f'/{odometry}'] == 'nav_msgs/msg/Odometry'
 
 
-def test_make_help_lists_every_target():
-    text = (ROOT / 'Makefile').read_text('utf-8')
-    targets = set(re.search(r'\.PHONY: (.*)', text).group(1).split())
-    shown = subprocess.run(
-        ['make', 'help'], cwd=ROOT, check=True, capture_output=True, text=True
-    ).stdout
-    assert set(re.findall(r'make (\w+)', shown)) == targets
+TEST_NAME = re.compile(r'`(test_\w+\.py)::(\w+)`')
+
+
+def test_pages_name_tests_that_there_are_and_states_that_are_said():
+    """And each row of the tables of problems has a cause and a remedy."""
+    for page in ('config/problems.md', 'test/README.md'):
+        named = TEST_NAME.findall((ROOT / page).read_text('utf-8'))
+        sources = {file: (ROOT / 'test' / file).read_text('utf-8') for file, _ in named}
+        assert [n for n in named if f'def {n[1]}(' not in sources[n[0]]] == [] and len(named) > 10
+    text = (ROOT / 'config/troubleshooting.md').read_text('utf-8')
+    rows = [row.strip('|').split('|') for row in text.splitlines() if row.startswith('| `')]
+    assert all(len(row) == 3 and all(cell.strip() for cell in row) for row in rows)
+    code = ' '.join(path.read_text('utf-8') for path in (ROOT / 'sfa_localization').rglob('*.py'))
+    code = re.sub(r"'\s+f?'", '', code)  # texts that go on in the next line
+    parts = [part.strip() for row in rows for part in row[0].strip()[1:-1].split('…')]
+    assert len(rows) > 20 and [part for part in parts if part not in code] == []

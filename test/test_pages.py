@@ -3,8 +3,6 @@
 """The pages of reports: one file each, complete, without scripts, legible on a phone."""
 
 import base64
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,15 +15,8 @@ from test_training import RECIPE, write_bag
 
 from sfa_localization.bags.drives import images_at
 from sfa_localization.cli import main
-from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Trajectory
-from sfa_localization.reports import page, training
-from sfa_localization.reports.evaluation import (
-    judgment,
-    worst_of,
-    write_evaluation_page,
-    write_report,
-)
+from sfa_localization.reports import evaluation, page, training
 from sfa_localization.training import train
 
 VOID = {'meta', 'img', 'br', 'hr', 'link', 'input'}
@@ -108,26 +99,19 @@ def test_the_worst_images_are_those_and_lie_apart(trained):
             assert np.hypot(one.x_m - other.x_m, one.y_m - other.y_m) >= 1.0
 
 
-def with_quality(trained, **values):
-    result = trained[0]
-    model = replace(result.model, quality={**result.model.quality, **values})
-    return replace(result, model=model)
-
-
 def test_the_answer_about_a_map_follows_its_figures(trained):
+    result, _, _ = trained
     good = {'expected_error_m': 0.1, 'certified': True, 'left_out_within_95': 0.95}
     good['explained'] = 0.99
     for change, level in (
-        ({}, page.GOOD),
-        ({'expected_error_m': 0.6}, page.WEAK),
-        ({'certified': False}, page.WEAK),
-        ({'left_out_within_95': 0.7}, page.WEAK),
-        ({'expected_error_m': 2.1}, page.BAD),
+        ({}, page.GOOD), ({'expected_error_m': 0.6}, page.WEAK), ({'certified': False}, page.WEAK),
+        ({'left_out_within_95': 0.7}, page.WEAK), ({'expected_error_m': 2.1}, page.BAD),
         ({'explained': 0.3}, page.BAD),
-    ):
-        assert training.judgment(with_quality(trained, **{**good, **change}))[0] == level
-    found = with_quality(trained, certified=False)
-    assert training.trust_lines(found)[0].startswith('NOT proven')
+    ):  # fmt: skip
+        quality = {**result.model.quality, **good, **change}
+        found = replace(result, model=replace(result.model, quality=quality))
+        assert training.judgment(found)[0] == level
+        assert training.trust_lines(found)[0].startswith('NOT proven') != quality['certified']
 
 
 @pytest.fixture
@@ -152,14 +136,16 @@ def judged(tmp_path):
 
 def test_the_page_of_an_evaluation(judged, tmp_path):
     truth, estimates, scores, counts = judged
-    worst = worst_of(truth, estimates['sfa'])
+    worst = evaluation.worst_of(truth, estimates['sfa'])
     first, stamp_ns = next(iter(worst.items()))
     assert first[:3] == (pytest.approx(3.0), 0.0, 3.0) and stamp_ns == 3_100_000_000
     pictures = dict.fromkeys(worst, np.random.default_rng(0).integers(0, 255, (9, 90, 3), np.uint8))
     features = np.random.default_rng(1).standard_normal((100, 8))
     places = truth.poses[:, :2]
-    write_report(tmp_path, truth, estimates, scores, places, features)
-    write_evaluation_page(tmp_path, 'a <model>', truth, estimates, scores, counts, pictures)
+    evaluation.write_report(tmp_path, truth, estimates, scores, places, features)
+    evaluation.write_evaluation_page(
+        tmp_path, 'a <model>', truth, estimates, scores, counts, pictures
+    )
     found = read(tmp_path)
     assert found.headings == ['How far off?', 'Where is it weak?', 'May I trust it?',
                               'What was rejected?', 'Worst images']  # fmt: skip
@@ -171,53 +157,68 @@ def test_the_page_of_an_evaluation(judged, tmp_path):
 
 def test_the_answer_about_a_drive_follows_its_figures(judged):
     _, _, scores, counts = judged
-    assert judgment(scores, counts)[0] == page.GOOD
-    assert judgment(scores, {**counts, 'false_localised_s': 2.0})[0] == page.BAD
+    assert evaluation.judgment(scores, counts)[0] == page.GOOD
+    assert evaluation.judgment(scores, {**counts, 'false_localised_s': 2.0})[0] == page.BAD
     for change, level in (({'mean': 0.2}, page.WEAK), ({'mean': None}, page.BAD),
                           ({'within_95': 0.5}, page.WEAK)):  # fmt: skip
-        assert judgment({**scores, 'ekf': {**scores['ekf'], **change}}, counts)[0] == level
+        assert (
+            evaluation.judgment({**scores, 'ekf': {**scores['ekf'], **change}}, counts)[0] == level
+        )
 
 
-@pytest.fixture(scope='module')
-def inspected(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp('inspection')
-    write_drive(folder / 'few', pictures=200)
-    assert main(['inspect', str(folder / 'few'), '--report', str(folder / 'report')]) == 0
-    return folder / 'report'
-
-
-def test_the_page_of_an_inspection(inspected):
-    found = read(inspected)
+def test_the_page_of_an_inspection(tmp_path):
+    """And of a bag that cannot be read."""
+    write_drive(tmp_path / 'few', pictures=200)
+    assert main(['inspect', str(tmp_path / 'few'), '--report', str(tmp_path / 'few_report')]) == 0
+    found = read(tmp_path / 'few_report')
     assert 'few is not enough to train on yet.' in found.text
     assert '200 images with odometry are few: drive until there are 300' in found.text
     assert found.headings[:2] == ['What do I drive or change next?', 'What is in it?']
     assert len(found.images) == 2
-
-
-def test_a_bag_that_cannot_be_read_has_a_page_too(tmp_path):
     assert main(['inspect', str(tmp_path / 'none'), '--report', str(tmp_path / 'report')]) == 1
     assert 'none is not enough to train on yet.' in read(tmp_path / 'report').text
 
 
-def test_a_missing_figure_is_one_error(tmp_path):
-    with pytest.raises(LocalizationError, match=r'none\.png: cannot be read'):
-        page.figure(tmp_path / 'none.png', 'nothing')
+# Figures and tables of an evaluation.
 
 
-CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser')
+def straight(seconds, poses):
+    stamps = np.array([round(second * 1_000_000_000) for second in seconds], np.int64)
+    return Trajectory(stamps, np.array(poses, float))
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason='chromium is not installed')
-@pytest.mark.parametrize('width', [500, 1200])
-def test_a_browser_shows_the_page_within_its_width(inspected, tmp_path, width):
-    """500 is the narrowest window of a headless browser: a phone held upright has about 400."""
-    target = tmp_path / 'shown.png'
-    subprocess.run(
-        [CHROMIUM, '--headless=new', '--no-sandbox', '--disable-gpu', '--hide-scrollbars',
-         f'--user-data-dir={tmp_path / "profile"}', f'--window-size={width},1500',
-         f'--screenshot={target}', (inspected / page.PAGE).as_uri()],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
-    shown = cv2.imread(str(target))
-    assert shown.shape[1] == width and shown.std() > 5
-    assert (shown[:, -10:] == 255).all(), 'something is wider than the screen'
+TRUTH = straight([5, 15], [[0, 0, 0], [10, 0, 0]])
+"""One meter a second along x, for ten seconds."""
+
+
+def test_errors_by_hand():
+    """3-4-5 triangles. Headings wrap; unknown ones, and those before the truth, are left out."""
+    estimate = straight([4, 6, 7], [[9, 9, 9], [1 + 3, 4, np.radians(190)], [2, -5, np.nan]])
+    for found, times, expected in (
+        (evaluation.position_errors(TRUTH, estimate), [1, 2], [5, 5]),
+        (evaluation.heading_errors(TRUTH, estimate), [1], [-170]),
+    ):
+        np.testing.assert_allclose(found[0], times)
+        np.testing.assert_allclose(found[1], expected)
+
+
+def test_figures_show_paths_to_scale_and_tables_what_could_not_be_judged(tmp_path):
+    """A square path must come out as a square: equal axes."""
+    row = {'mean': 0.12345, 'median': 0.1, 'p95': 0.2, 'rmse': 0.15, 'max': 0.3, 'n': 42}
+    scores = {'ekf': row, 'my filter': {**row, 'mean': 2.0}}
+    places = np.random.default_rng(0).uniform(0, 10, (50, 2))
+    features = np.column_stack([places / 5 - 1, places[:, 0] / 5 - 1])
+    square = straight([5, 6, 7, 8, 9], [[0, 0, 0], [4, 0, 0], [4, 4, np.nan], [0, 4, 0], [0, 0, 0]])
+    estimates = {'ekf': square, 'my filter': square}
+    evaluation.write_report(tmp_path / 'new', TRUTH, estimates, scores, places, features)
+    pictures = {path.name: cv2.imread(str(path)) for path in (tmp_path / 'new').iterdir()}
+    assert set(pictures) == {'overview.png', 'errors.png'}
+    assert all(min(p.shape[:2]) > 600 and p.std() > 10 for p in pictures.values())
+    picture = pictures['overview.png'].astype(int)
+    paths = picture[: int(0.7 * len(picture)), : picture.shape[1] // 2]  # without the legend
+    rows, columns = np.nonzero(np.abs(paths - (0xB2, 0x72, 0x00)).sum(axis=2) < 12)
+    assert np.ptp(columns) == pytest.approx(np.ptp(rows), rel=0.02) and np.ptp(rows) > 100
+    scores['ekf'] |= {'mean': None, 'yaw_deg': {'mean': 1.234, 'median': 1.0, 'p95': 3.0}}
+    assert evaluation.table(scores).splitlines()[2].split('|')[2].strip() == '-'
+    lines = evaluation.heading_table(scores).splitlines()
+    assert len(lines) == 3 and lines[2].split('|')[2].strip() == '1.23'
