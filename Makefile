@@ -39,7 +39,7 @@ robustness: $(READY)  ## run the tests of test/README.md; print what each fault 
 	PYTHONPATH=.:test $(PY) -m robustness --live --lights
 
 animation: $(READY)  ## film the three nodes while the robot is kidnapped: resource/kidnapped.webp
-	PYTHONPATH=.:test $(PY) -m robustness.animation resource/kidnapped.webp
+	PYTHONPATH=.:test $(PY) -m study.animation resource/kidnapped.webp
 
 fuzz: $(READY)  ## thousands of damaged messages, models, bags, YAML and image files (ARGS='-k bags')
 	FUZZ_INPUTS=10000 $(PY) -m pytest -q test/test_fuzz.py $(ARGS)

@@ -1,7 +1,7 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
 """What reaches the filter in each fault, recorded once: never LOCALISED and wrong for long, and
-LOCALISED where it can be. `python -m robustness.frozen` prints the same as a table.
+LOCALISED where it can be. `python -m robustness --frozen` prints the same as a table.
 """
 
 import functools
@@ -9,14 +9,15 @@ import json
 import math
 
 import pytest
-from robustness.faults import FAULTS, SAME_PLACE_S
-from robustness.frozen import LIE_S, LIES, LIGHTS, MEANS, Frozen, judged, totals
+from robustness.faults import FAULTS, LIES, SAME_PLACE_S
+from robustness.frozen import LIGHTS, MEANS, Frozen, judged, totals
 
 pytestmark = pytest.mark.slow  # a minute for each light
 NAMES = [light for light, _ in LIGHTS]
 DAY = NAMES[0]
-WRONG_S = 1.5
-"""A robot that is carried in the dark is believed to be where it was for some images."""
+WRONG_S, LIE_S = 1.5, 5.0
+"""A robot that is carried in the dark is believed to be where it was for some images; a lie that
+contradicts nothing at first, longer."""
 ALL_LIES_S = 25.0
 LOCALISED_S, LOCALISED_IN_LIES_S, LOCALISED_WITHOUT_S = 5300.0, 246.0, 54.0
 WORSE_M = 0.01
@@ -46,15 +47,8 @@ def test_no_lie_is_believed_for_long(name, light):
     assert round(verdict(light, name).false_s, 1) <= LIE_S, verdict(light, name)
 
 
-def test_all_lies_together_are_believed_for_seconds():
+def test_lies_together_are_believed_for_seconds_and_it_is_localised_as_long_as_it_can_be():
     false_s, localised_s = totals(verdict(DAY, name) for name in LIES)
     assert false_s <= ALL_LIES_S and localised_s >= LOCALISED_IN_LIES_S
-
-
-def test_it_is_localised_as_long_as_it_can_be():
     assert totals(verdict(light, name) for light in NAMES for name in FAULTS)[1] >= LOCALISED_S
-
-
-@pytest.mark.parametrize('light', NAMES)
-def test_without_a_fault_it_is_localised_after_two_meters(light):
-    assert verdict(light, 'nothing').localised_s >= LOCALISED_WITHOUT_S
+    assert min(verdict(light, 'nothing').localised_s for light in NAMES) >= LOCALISED_WITHOUT_S

@@ -1,8 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Print what each fault of a drive did, and draw what the filter claimed.
+"""Print what each fault of a drive did, and what the filter claimed.
 
 PYTHONPATH=.:test python -m robustness --live --lights 'wheels slip' kidnapped
+PYTHONPATH=.:test python -m robustness --frozen     the filter alone, also against lies: seconds
 """
 
 import argparse
@@ -10,13 +11,11 @@ import os
 import sys
 import tempfile
 
-from robustness.faults import FAULTS
-from robustness.judged import head, judge, row
-from robustness.plot import draw, summary
-from robustness.recorded import CACHE, OTHER_LIGHTS, two_laps
+from robustness import frozen
+from robustness.faults import FAULTS, LIES
+from robustness.judged import head, judge, row, summary
+from robustness.recorded import OTHER_LIGHTS, two_laps
 from robustness.replay import replayed
-
-PLOT = CACHE / 'calibration.png'
 
 
 def live():
@@ -32,18 +31,18 @@ def live():
     return played
 
 
-def run(names, play, world):
-    """Print a row for each fault; the names of those that are not allowed, and all outputs."""
-    wrong, outputs, width = [], [], max(map(len, names))
-    tell(head(width))
+def table(title, names, outputs_of):
+    """Print a row for each fault; names of those that are not allowed, all outputs, means."""
+    wrong, outputs, means, width = [], [], {}, max(map(len, names))
+    tell(f'\nThrough {title}:\n\n{head(width)}')
     for name in names:
-        fault = FAULTS[name]
-        found = play(fault.messages(world), world.times_ns[0])
+        found, fault = outputs_of(name), {**FAULTS, **LIES}[name]
         verdict = judge(found, fault.ends_s)
         tell(row(name, verdict, width))
-        wrong += [] if fault.allows(verdict.false_s) else [name]
+        wrong += [] if name in LIES or fault.allows(verdict.false_s) else [f'{name}, {title}']
+        means[name] = verdict.mean_m
         outputs += found
-    return wrong, outputs
+    return wrong, outputs, means
 
 
 def tell(text):
@@ -52,27 +51,52 @@ def tell(text):
     sys.stdout.flush()
 
 
+def ways(options):
+    """Titles, and what gives the outputs of a fault by name."""
+
+    def through(play, *when):
+        drive = two_laps(*when)
+        return lambda name: play(FAULTS[name].messages(drive), drive.start_ns)
+
+    if options.frozen or options.means:
+        kept = frozen.Frozen()
+        for light, _ in frozen.LIGHTS:
+            yield light, lambda name, light=light: frozen.outputs_of(kept, light, name)
+        return
+    yield 'the Localizer', through(replayed)
+    if options.live:
+        yield 'the nodes', through(live())
+    for when in OTHER_LIGHTS if options.lights else ():
+        yield f'the Localizer, {" in ".join(when)}', through(replayed, *when)
+
+
 def main():
     """Run all faults, or those that are named; 1 where the filter was wrong and sure too long."""
     parser = argparse.ArgumentParser(
         prog='robustness', description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument('faults', nargs='*', metavar='FAULT', help='some of them, by name')
-    parser.add_argument('--live', action='store_true', help='also through the three nodes')
-    parser.add_argument('--lights', action='store_true', help='also in other lights and seasons')
+    for option, text in (
+        ('--live', 'also through the three nodes'),
+        ('--lights', 'also in other lights and seasons'),
+        ('--frozen', 'the filter alone, on what was recorded by day and in the evening'),
+        ('--means', 'the same; keep the mean errors, which test_frozen.py lets get no worse'),
+        ('--record', 'locate all images anew: after training, features or keyframes change'),
+    ):
+        parser.add_argument(option, action='store_true', help=text)
     options = parser.parse_args()
-    ways = [('the Localizer', replayed, ())]
-    ways += [('the nodes', live(), ())] if options.live else []
-    for when in OTHER_LIGHTS if options.lights else ():
-        ways.append((f'the Localizer, {" in ".join(when)}', replayed, when))
-    everything, wrong = [], []
-    for way, play, when in ways:
-        tell(f'\nThrough {way}:\n')
-        refused, outputs = run(options.faults or list(FAULTS), play, two_laps(*when))
-        everything += outputs
-        wrong += [f'{name}, through {way}' for name in refused]
-    draw(everything, PLOT)
-    tell(f'\n{summary(everything)}\n\n{PLOT}: written')
+    if options.record:
+        frozen.record(tell)
+        return 0
+    everything, wrong, means = [], [], {}
+    lies = [*LIES] if options.frozen or options.means else []
+    for title, outputs_of in ways(options):
+        refused, outputs, found = table(title, options.faults or [*FAULTS, *lies], outputs_of)
+        everything, wrong = everything + outputs, wrong + refused
+        means[title] = {name: found[name] for name in found if name in FAULTS}
+    if options.means:
+        frozen.keep(means)
+    tell(f'\n{summary(everything)}\n')
     for name in wrong:
         sys.stderr.write(f'robustness: {name}: LOCALISED and wrong for too long\n')
     return 1 if wrong else 0

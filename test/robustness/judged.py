@@ -2,22 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a drive with a fault gave: how wrong, how long wrong and sure, how soon right again."""
 
-import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from robustness.recorded import to_truth
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.evaluation import WRONG_M
 
 WRONG_DEG = 15.0
 RELIEF_S = 0.5
 """Recovered is what stays LOCALISED and right for so long."""
+WITHIN_95 = math.sqrt(-2 * math.log(0.05)), 1.96
+"""Standard deviations that hold 95 % of the errors: of two coordinates, and of one."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Output:
+class Output(NamedTuple):
     """What the filter said at one odometry message: `level` by name, and the pose.
 
     `second` of the drive, errors `error_m` and `yaw_deg`, and the standard deviations claimed.
@@ -29,18 +29,16 @@ class Output:
     yaw_deg: float
     std_m: float
     yaw_std_deg: float
-    reasons: tuple = ()
 
     @property
     def wrong(self):
         return self.error_m > WRONG_M or self.yaw_deg > WRONG_DEG
 
 
-def output(second, status, pose, covariance, true, transform=None):
+def output(second, status, pose, covariance, true, transform):
     """Compare a pose (3,) in the map, with covariance (3, 3), with the truth (3,), to which a
-    transform leads: that of the recorded drives by default.
+    transform leads.
     """
-    transform = transform or to_truth()
     x, y = transform.apply(np.array(pose[:2])[None])[0]
     yaw = float(transform.apply_yaw(np.array(pose[2])))
     return Output(
@@ -50,12 +48,10 @@ def output(second, status, pose, covariance, true, transform=None):
         math.degrees(abs(wrap_angle(yaw - true[2]))),
         math.sqrt(max(covariance[0, 0], covariance[1, 1])),
         math.degrees(math.sqrt(covariance[2, 2])),
-        status.reasons,
     )
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     """A row of the table: errors in meters, times in seconds; NaN where there is none."""
 
     max_m: float
@@ -74,13 +70,9 @@ def judge(outputs, ends_s):
     sure = np.array([one.level == 'LOCALISED' for one in outputs])
     wrong = np.array([one.wrong for one in outputs])
     errors = np.array([one.error_m for one in outputs])
-    return Verdict(
-        float(errors.max()),
-        float(errors.mean()),
-        float(lasted[sure & wrong].sum()),
-        float(lasted[sure].sum()),
-        recovery_s(seconds, sure & ~wrong, ends_s),
-    )
+    times = lasted[sure & wrong].sum(), lasted[sure].sum()
+    made = float(errors.max()), float(errors.mean()), *map(float, times)
+    return Verdict(*made, recovery_s(seconds, sure & ~wrong, ends_s))
 
 
 def recovery_s(seconds, right, ends_s):
@@ -105,19 +97,34 @@ def head(width):
 
 def row(name, one, width):
     """A verdict as text."""
+    far, mean, again = (shown(*v) for v in ((one.max_m, 'm'), (one.mean_m, 'm'),
+                                            (one.recovered_s, 's')))  # fmt: skip
     return (
-        f'{name:{width}s}  {meters(one.max_m):>9s}  {meters(one.mean_m):>10s}'
-        f'  {one.false_s:13.1f} s  {one.localised_s:7.1f} s  {shown(one.recovered_s):>11s}'
+        f'{name:{width}s}  {far:>9s}  {mean:>10s}  {one.false_s:13.1f} s'
+        f'  {one.localised_s:7.1f} s  {again:>11s}'
     )
 
 
-def meters(error):
-    """An error in words."""
-    return '-' if math.isnan(error) else f'{error:.2f} m'
+def shown(value, unit):
+    """Meters or seconds in words."""
+    if not math.isfinite(value):
+        return '-' if math.isnan(value) else 'never'
+    return f'{value:.{2 if unit == "m" else 1}f} {unit}'
 
 
-def shown(seconds):
-    """Seconds of recovery in words."""
-    if math.isnan(seconds):
-        return '-'
-    return 'never' if math.isinf(seconds) else f'{seconds:.1f} s'
+def summary(outputs):
+    """A line for each state: its seconds, its errors, and the share that its claims hold."""
+    rows = [f'{"state":10s}   share  95 % of errors below  wrong  within 95 % (position, heading)']
+    for level in ('LOCALISED', 'DEGRADED', 'LOST'):
+        mine = [one for one in outputs if one.level == level]
+        if not mine:
+            continue
+        error, std, yaw, yaw_std, wrong = np.transpose(
+            [(one.error_m, one.std_m, one.yaw_deg, one.yaw_std_deg, one.wrong) for one in mine]
+        )
+        within = np.mean(error <= WITHIN_95[0] * std), np.mean(yaw <= WITHIN_95[1] * yaw_std)
+        rows.append(
+            f'{level:10s}  {len(mine) / len(outputs):6.1%}  {np.percentile(error, 95):18.2f} m'
+            f'  {np.mean(wrong):5.1%}  {within[0]:6.1%}, {within[1]:6.1%}'
+        )
+    return '\n'.join(rows)

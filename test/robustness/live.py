@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from ros_bench import Bench, listeners, until
 
-from robustness.faults import NODES, Reading, Restart
+from robustness.faults import NODES
 from robustness.judged import output
+from robustness.messages import Reading, Restart
 from robustness.recorded import model_path, to_truth
 from sfa_localization.data.messages import read_stamp, read_yaw
 from sfa_localization.nodes.conversions import to_odometry, to_stamp
@@ -133,7 +134,7 @@ class Chain:
         second = (message.at_ns - self.start_ns) * 1e-9
         spread = covariance[np.ix_(_PLANAR, _PLANAR)]
         status = ekf.status()
-        self.outputs.append(output(second, status, place, spread, message.true))
+        self.outputs.append(output(second, status, place, spread, message.true, to_truth()))
 
     def wait(self, condition):
         """Wait for a moment; what does not happen is counted as lost."""

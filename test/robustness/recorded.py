@@ -6,14 +6,15 @@ Model, other lights and foreign pictures are made once, and kept in build/ while
 them stays.
 """
 
-import dataclasses
 import functools
 import hashlib
 import tempfile
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
+from robustness.messages import Message, Picture, Reading
 from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.data.geometry import compose, relative
 from sfa_localization.data.run import Trajectory
@@ -25,7 +26,6 @@ from sfa_localization.training import Recipe, train
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
 CACHE = ROOT / 'build/robustness'
-SECOND_NS = 1_000_000_000
 LEARNING = ('bags', 'camera', 'data', 'features', 'metric', 'place_model.py', 'training.py')
 """Rooms that decide what a training gives."""
 RENDERING = ('bags', 'camera', 'data', 'simulation')
@@ -39,7 +39,7 @@ OTHER_LIGHTS = (
 )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class World:
     """What happens: times (ns) of odometry (N,) and pictures (M,), and what both show.
 
@@ -56,8 +56,19 @@ class World:
     pictures: np.ndarray
 
     @property
-    def truth(self):
-        return Trajectory(self.times_ns, self.true)
+    def start_ns(self):
+        return int(self.times_ns[0])
+
+    @property
+    def messages(self):
+        """Odometry, then pictures, without any fault."""
+        poses = [np.zeros(3)]
+        for step in self.steps[1:]:
+            poses.append(compose(poses[-1], step))
+        said = zip(self.times_ns, poses, self.twists, self.variances, self.true, strict=True)
+        found = [Message(int(t), int(t), Reading(*values), true) for t, *values, true in said]
+        seen = zip(self.pictures_ns.tolist(), self.pictures, strict=True)
+        return found + [Message(t, t, Picture(image)) for t, image in seen]
 
     def seconds(self, times_ns):
         """Seconds since the begin."""
@@ -69,15 +80,14 @@ class World:
             (start_s <= t) & (t < stop_s)
             for t in (self.seconds(self.times_ns), self.seconds(self.pictures_ns))
         )
-        odometry = [getattr(self, f.name)[kept] for f in dataclasses.fields(self)[:5]]
+        odometry = [getattr(self, f.name)[kept] for f in fields(self)[:5]]
         return World(*odometry, self.pictures_ns[seen], self.pictures[seen])
 
     def followed_by(self, other, pause_ns=40_000_000):
         """Both, one after the other: the pose may jump between them."""
         later = self.times_ns[-1] + pause_ns - other.times_ns[0]
         joined = [
-            np.concatenate([getattr(self, f.name), getattr(other, f.name)])
-            for f in dataclasses.fields(self)
+            np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)
         ]
         joined[0][len(self.times_ns) :] += later
         joined[5][len(self.pictures_ns) :] += later
@@ -187,7 +197,7 @@ def two_laps(light=RECORDED[0], season=RECORDED[1]):
     start_s = float(whole.seconds(whole.times_ns)[np.argmin(off)])
     lap = whole.part(start_s, np.inf)
     again = noisy(lap.pictures, np.random.default_rng(1))
-    return lap.followed_by(dataclasses.replace(lap, pictures=again))
+    return lap.followed_by(replace(lap, pictures=again))
 
 
 def noisy(pictures, rng, std=SENSOR_STD):
@@ -201,11 +211,3 @@ def foreign_pictures():
     """Panoramas (M, H, W, 3) of another garden; needs what simulates."""
     bag = simulated('foreign', seed=5, world=FOREIGN_WORLD, length=12.0)
     return read(bag)[1]
-
-
-def odometry_poses(steps):
-    """Poses (N, 3) in the frame of the odometry."""
-    poses = np.zeros_like(steps)
-    for i in range(1, len(steps)):
-        poses[i] = compose(poses[i - 1], steps[i])
-    return poses

@@ -4,21 +4,23 @@
 
 from types import SimpleNamespace
 
-from robustness.faults import Picture, Restart
+import numpy as np
+
 from robustness.judged import output
-from robustness.recorded import model
+from robustness.messages import Picture, Reading, Restart
+from robustness.recorded import model, to_truth
 from sfa_localization.camera.encodings import read_compressed
-from sfa_localization.data.errors import MessageError
-from sfa_localization.localizer import Localizer, Observer
+from sfa_localization.data.errors import MessageError, ModelError
+from sfa_localization.localizer import Localizer, Observation, Observer
 
 
 class Robot:
     """Hears messages, and notes what it makes of each of the odometry."""
 
-    def __init__(self, start_ns):
-        self.localizer = Localizer(model())
-        self.outputs, self.start_ns = [], start_ns
-        self.down = set()
+    def __init__(self, start_ns, model, transform):
+        self.start_ns, self.model, self.transform = start_ns, model, transform
+        self.localizer = Localizer(model)
+        self.outputs, self.down = [], set()
 
     def hear(self, message):
         """Take the next message."""
@@ -26,18 +28,31 @@ class Robot:
             self.restart(message.content)
         elif isinstance(message.content, Picture):
             self.see(message)
+        elif not isinstance(message.content, Reading):
+            self.fuse(message, message.content)
         elif 'ekf_node' not in self.down:
             self.drive(message)
 
     def see(self, message):
         """Locate and fuse a picture, where nodes are up and it can be decoded."""
+        picture = message.content
         if self.down:
             return
         try:
-            image = decoded(message.content)
-        except MessageError:
+            image = picture.image
+            if picture.jpeg is not None:
+                image = read_compressed(SimpleNamespace(data=picture.jpeg, format='jpeg'))
+            seen = self.localizer.observer.observe(message.stamp_ns, image)
+        except (MessageError, ModelError):
             return
-        self.localizer.add_panorama(message.stamp_ns, image)
+        self.fuse(message, seen)
+
+    def fuse(self, message, seen):
+        """Take what an image shows."""
+        features, at = np.zeros(1), message.stamp_ns
+        self.localizer.add_observation(
+            Observation(seen.pose, seen.covariance, features, stamp_ns=at, turned=seen.turned)
+        )
 
     def drive(self, message):
         """Take odometry, and note the estimate."""
@@ -50,7 +65,7 @@ class Robot:
         if state is not None:
             self.outputs.append(output(
                 (message.at_ns - self.start_ns) * 1e-9, localizer.status,
-                state.pose, state.pose_covariance, message.true,
+                state.pose, state.pose_covariance, message.true, self.transform,
             ))  # fmt: skip
 
     def restart(self, event):
@@ -60,24 +75,16 @@ class Robot:
             return
         self.down.discard(event.node)
         if event.node == 'sfa_node':
-            self.localizer.observer = Observer(model())
+            self.localizer.observer = Observer(self.model)
         if event.node == 'ekf_node':
-            self.localizer.filter = Localizer(model()).filter
+            self.localizer.filter = Localizer(self.model).filter
 
 
-def decoded(picture):
-    """The image of a picture. Raises MessageError."""
-    if picture.jpeg is None:
-        return picture.image
-    image = read_compressed(SimpleNamespace(data=picture.jpeg, format='jpeg'))
-    if image.shape[:2] != (model().panorama.height, model().panorama.width):
-        raise MessageError('another size')
-    return image
-
-
-def replayed(messages, start_ns):
-    """Outputs of a robot that hears messages in this order."""
-    robot = Robot(start_ns)
+def replayed(messages, start_ns, place=None, transform=None):
+    """Outputs of a robot that hears messages in this order; its model is that of the sample, and
+    the transform leads to the truth there.
+    """
+    robot = Robot(start_ns, place or model(), transform or to_truth())
     for message in messages:
         robot.hear(message)
     return robot.outputs

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film the three nodes while a robot drives, is kidnapped and finds itself again: FILE.webp.
 
-PYTHONPATH=.:test python -m robustness.animation resource/kidnapped.webp
+PYTHONPATH=.:test python -m study.animation resource/kidnapped.webp
 """
 
 import argparse
@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-
 from robustness.__main__ import live
-from robustness.faults import FAULTS, FROM_S, Picture
+from robustness.faults import FAULTS, FROM_S
+from robustness.messages import Picture
 from robustness.recorded import to_truth, two_laps
 
 START_S, STOP_S = 6.0, 26.0
