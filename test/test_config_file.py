@@ -11,12 +11,14 @@ import yaml
 from ros_domains import free_domain
 
 from sfa_localization import config as config_file
+from sfa_localization.camera.calibration_files import read_calibration
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.cli import main
 from sfa_localization.config import SECTIONS, ignored_sections, load_settings, render, write_config
-from sfa_localization.data.errors import ConfigError
+from sfa_localization.data import plain_yaml
+from sfa_localization.data.errors import CameraError, ConfigError
+from sfa_localization.data.plain_yaml import load_yaml
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.nodes.settings import NodeConfig
 
 DOMAIN = free_domain()
 
@@ -44,7 +46,6 @@ def test_every_parameter_is_explained_and_has_the_type_that_ros_needs():
     text = render()
     lines, document = text.splitlines(), yaml.safe_load(text)
     assert '# columns of the panorama [px]; 16..8192\n    width: 600\n' in text
-    assert 'may change while running' in text
     for section, kinds in SECTIONS.items():
         items = [item for kind in kinds for item in dataclasses.fields(kind)]
         assert len({item.name for item in items}) == len(items), 'names do not clash'
@@ -58,13 +59,22 @@ def test_every_parameter_is_explained_and_has_the_type_that_ros_needs():
 
 def test_parameters_of_ros_are_kept(tmp_path):
     """A file that is read and written again keeps the parameters of ROS, and all others."""
-    path = saved(tmp_path, '/**:\n  ros__parameters:\n    use_sim_time: true\n    width: 300\n'
-                           'ekf_node:\n  ros__parameters:\n    lost_std: 3\n'
-                           '    slip_per_metre: 1e-3\n'
-                           '    qos_overrides: {/odom: {subscription: {depth: 3}}}\n'
-                           'omnicam_node:\n  ros__parameters:\n'
-                           '    qos_overrides./panorama.publisher.depth: 7\n'
-                           'training:\n  ros__parameters:\n    slow_features: 7\n')  # fmt: skip
+    path = saved(
+        tmp_path,
+        """
+/**: {ros__parameters: {use_sim_time: true, width: 300}}
+ekf_node:
+  ros__parameters:
+    lost_std: 3
+    slip_per_metre: 1e-3
+    qos_overrides: {/odom: {subscription: {depth: 3}}}
+omnicam_node: {ros__parameters: {qos_overrides./panorama.publisher.depth: 7}}
+training: {ros__parameters: {slow_features: 7}}
+""",
+    )
+    assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig(width=300)
+    found = load_settings(path, 'ekf_node', FilterConfig)
+    assert found == FilterConfig(lost_std=3.0, slip_per_metre=1e-3), 'whole numbers, no points'
     changes = config_file.load_changes(path)
     write_config(tmp_path / 'new.yaml', changes)
     sections = yaml.safe_load((tmp_path / 'new.yaml').read_text())
@@ -78,16 +88,6 @@ def test_parameters_of_ros_are_kept(tmp_path):
     assert (ekf['slip_per_metre'], type(ekf['lost_std'])) == (1e-3, float), 'as ROS reads them'
     assert (omnicam['width'], training['slow_features']) == (300, 7)
     assert config_file.load_changes(tmp_path / 'new.yaml')['ekf_node'].items() >= ekf.items()
-
-
-def test_parameters_of_all_nodes_apply_to_the_sections_that_have_them(tmp_path):
-    path = saved(tmp_path, '/**:\n  ros__parameters:\n    autostart: false\n    width: 300\n'
-                           '/ekf_node:\n  ros__parameters:\n    lost_std: 3\n'
-                           '    slip_per_metre: 1e-3\n')  # fmt: skip
-    assert not load_settings(path, 'ekf_node', NodeConfig).autostart
-    found = load_settings(path, 'ekf_node', FilterConfig)
-    assert found == FilterConfig(lost_std=3.0, slip_per_metre=1e-3), 'whole numbers, no points'
-    assert load_settings(path, 'omnicam_node', PanoramaConfig) == PanoramaConfig(width=300)
 
 
 VALUES = '{ros__parameters: {lost_std: 3.0}}'
@@ -140,7 +140,8 @@ def test_a_robot_of_its_own_comes_before_all_robots(tmp_path):
 
 
 INVALID = [
-    ('ekf_node: [1', 'is not YAML'), ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
+    ('ekf_node: [1', 'is not YAML'), ('a: 1\n---\nb: 1', 'is not YAML'),
+    ('- 1\n', 'must hold sections'), ('3\n', 'must hold sections'),
     ('efk_node: {}\n', "unknown section 'efk_node'"),
     ('ekf_node: {lost_std: 3}\n', 'ros__parameters'),
     ('ekf_node: {ros__parameters: 3}\n', 'names and values'),
@@ -157,34 +158,49 @@ INVALID = [
 ]  # fmt: skip
 
 
-def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(tmp_path):
-    for text, why in INVALID:
+# Text that is no parameter file, and no other YAML of a user.
+REJECTED = {
+    'a: 2001-99-99': 'has a date or a number that cannot be: month must',
+    'a: ' + '[' * 40 + ']' * 40: 'nested deeper than 32',
+    'a: 1\nb: 2\na: 3': "the key 'a' twice",
+    'a: !!python/object/apply:os.system [x]': 'could not determine a constructor',
+    'a: [': 'not YAML',
+}
+
+
+@pytest.mark.parametrize('loader', dict.fromkeys((plain_yaml.YamlLoader, yaml.SafeLoader)))
+def test_an_invalid_file_is_rejected_with_its_name_and_the_reason(loader, tmp_path, monkeypatch):
+    """With libyaml and without, as a parameter file and as a calibration."""
+    monkeypatch.setattr(plain_yaml, 'YamlLoader', loader)
+    for text, why in [*INVALID, *REJECTED.items()]:
         path = saved(tmp_path, text)
         with pytest.raises(ConfigError, match=why) as raised:
             load_settings(path, 'ekf_node', FilterConfig)
         assert str(path) in str(raised.value) and '\n' not in str(raised.value), text
+        if text in REJECTED:
+            with pytest.raises(CameraError, match=why):
+                read_calibration(path)
+    long = saved(tmp_path, f'ekf_node: {{ros__parameters: {{lost_std: [{"1, " * 10**3}]}}}}')
+    with pytest.raises(ConfigError, match='lost_std') as raised:
+        load_settings(long, 'ekf_node', FilterConfig)
+    assert len(str(raised.value)) < 600
+    shared = 'a: &x {k: 1}\nb: *x\nc: {<<: *x, <<: {m: 2}}\n'
+    assert load_yaml(shared)['c'] == {'k': 1, 'm': 2} and load_yaml('') is None
 
 
-def test_a_pipe_is_no_parameter_file(tmp_path, capsys):
-    """It would be waited for; and one that a shell fills can be read once, but has sections."""
-    os.mkfifo(tmp_path / 'pipe')
-    reading, writing = os.pipe()
-    os.write(writing, b'ekf_node: {ros__parameters: {lost_std: 3.0}}\n')
-    os.close(writing)
-    for path, why in {
-        tmp_path / 'pipe': 'it is no regular file', f'/dev/fd/{reading}': 'it is no regular file',
-        tmp_path / 'none.yaml': 'No such file',
-    }.items():  # fmt: skip
-        words = ['train', 'no_bag', '--output', str(tmp_path / 'a.npz'), '--config', str(path)]
-        assert main(words) == 1
-        assert f'{path}: cannot be read: {why}' in capsys.readouterr().err
-    os.close(reading)
-
-
-def test_the_command_prints_and_writes(tmp_path, capsys):
+def test_the_command_prints_and_writes_and_others_name_a_file_that_cannot_be_read(tmp_path, capsys):
+    """A pipe would be waited for."""
     assert main(['config']) == 0
     assert capsys.readouterr().out == render()
     assert main(['config', '--output', str(tmp_path / 'c.yaml')]) == 0
     assert (tmp_path / 'c.yaml').read_text() == render()
-    assert main(['config', '--output', str(tmp_path / 'c.yaml' / 'd.yaml')]) == 1
-    assert 'c.yaml/d.yaml: cannot be written' in capsys.readouterr().err
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'bad.yaml').write_text('a: [')
+    for name, why in {
+        'pipe': 'cannot be read: it is no regular file', 'none.yaml': 'cannot be read: No such',
+        'bad.yaml': 'is not YAML',
+    }.items():  # fmt: skip
+        words = ['train', 'no_bag', '--output', str(tmp_path / 'a.npz')]
+        assert main([*words, '--config', str(tmp_path / name)]) == 1
+        error = capsys.readouterr().err
+        assert error.startswith(f'error: {tmp_path / name}: {why}') and error.count('\n') == 1
