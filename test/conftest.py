@@ -5,6 +5,7 @@
 import os
 import signal
 import tempfile
+from types import SimpleNamespace
 
 import pytest
 from robustness.readme import robustness_table
@@ -95,3 +96,15 @@ def small_network():
         patch.setattr(selection, '_SEARCH_POINTS', 60)
         patch.setattr(selection, 'INDUCING_POINTS', 100)
         yield
+
+
+@pytest.fixture(scope='session')
+def trained(tmp_path_factory):
+    """A small training as `bag` to `model`, paths, by SMALL_RECIPE; its `result`."""
+    from cylinder_worlds import SMALL_RECIPE, write_bag
+
+    from sfa_localization.training import train
+
+    folder = tmp_path_factory.mktemp('training')
+    bag, model = write_bag(folder / 'drive'), folder / 'new' / 'model.npz'
+    return SimpleNamespace(bag=bag, model=model, result=train([bag], model, SMALL_RECIPE))

@@ -6,9 +6,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
+from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
 from sfa_localization.features.network import Architecture, Layer
@@ -154,3 +156,28 @@ def drive(count: int = 12, seed: int = 0, size: tuple[int, int] = SIZE) -> Image
     """Panoramas of a short drive, all neighbors."""
     run = run_in(Spheres.about(seed), wander(count, seed), panorama_config(size))
     return ImageSequence(run.panoramas, np.ones(count - 1, bool))
+
+
+PICTURES = 160
+SMALL_ARCHITECTURE = replace(
+    PLACE_ARCHITECTURE,
+    layers=tuple(
+        replace(layer, linear=linear, outputs=6)
+        for layer, linear in zip(PLACE_ARCHITECTURE.layers, (6, 6, 8), strict=True)
+    ),
+)
+SMALL_RECIPE = replace(
+    recipe(), architecture=SMALL_ARCHITECTURE, metric=replace(recipe().metric, slow_features=4)
+)
+"""Learns the drive of `write_bag` in seconds."""
+
+
+def write_bag(path: Path, seed: int = 2, size: tuple[int, int] = PLACE_SIZE) -> Path:
+    """Record a wandering drive of PICTURES pictures."""
+    run = run_in(Spheres.about(1), wander(PICTURES, seed, hz=4.0), panorama_config(size))
+    odometry, images = run.odometry, run.panoramas.read(0, PICTURES)
+    with BagWriter(path) as bag:
+        for k, stamp in enumerate(odometry.stamps_ns.tolist()):
+            bag.odometry('/odom', stamp, odometry.poses[k], odometry.twists[k], (1e-4, 1e-4))
+            bag.image('/panorama', stamp, images[k], 'base_link')
+    return path

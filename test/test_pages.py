@@ -10,14 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from cylinder_worlds import SMALL_RECIPE
 from test_inspection import write as write_drive
-from test_training import RECIPE, write_bag
 
 from sfa_localization.bags.drives import images_at
 from sfa_localization.cli import main
 from sfa_localization.data.run import Trajectory
 from sfa_localization.reports import evaluation, page, training
-from sfa_localization.training import train
 
 VOID = {'meta', 'img', 'br', 'hr', 'link', 'input'}
 
@@ -65,19 +64,16 @@ def read(folder: Path) -> Page:
 
 
 @pytest.fixture(scope='module')
-def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('training')
-    bag = write_bag(folder / 'garden')
-    result = train([bag], folder / 'model.npz', RECIPE)
-    worst = training.worst_of(result)
-    pictures = images_at(bag, [stamp for _, stamp in worst.values()], RECIPE)
+def reported(trained, tmp_path_factory):
+    folder, worst = tmp_path_factory.mktemp('report'), training.worst_of(trained.result)
+    pictures = images_at(trained.bag, [stamp for _, stamp in worst.values()], SMALL_RECIPE)
     samples = {one: pictures[stamp] for one, (_, stamp) in worst.items()}
-    training.write_training_report(folder / 'report', result, samples)
-    return result, folder / 'report', [*worst]
+    training.write_training_report(folder, trained.result, samples)
+    return trained.result, folder, [*worst]
 
 
-def test_the_page_of_a_training_answers_its_four_questions(trained):
-    result, folder, worst = trained
+def test_the_page_of_a_training_answers_its_four_questions(reported):
+    result, folder, worst = reported
     found = read(folder)
     assert found.headings[:4] == [
         'Is my map good?', 'Where is it weak?', 'May I trust it?', 'What do I drive next?',
@@ -89,8 +85,8 @@ def test_the_page_of_a_training_answers_its_four_questions(trained):
     assert 1 <= len(worst) <= 6
 
 
-def test_the_worst_images_are_those_and_lie_apart(trained):
-    result, _, worst = trained
+def test_the_worst_images_are_those_and_lie_apart(reported):
+    result, _, worst = reported
     errors = np.hypot(*result.metric.residuals.T)
     assert worst[0].error_m == pytest.approx(errors.max())
     assert [one.error_m for one in worst] == sorted((one.error_m for one in worst), reverse=True)
@@ -99,8 +95,8 @@ def test_the_worst_images_are_those_and_lie_apart(trained):
             assert np.hypot(one.x_m - other.x_m, one.y_m - other.y_m) >= 1.0
 
 
-def test_the_answer_about_a_map_follows_its_figures(trained):
-    result, _, _ = trained
+def test_the_answer_about_a_map_follows_its_figures(reported):
+    result, _, _ = reported
     good = {'expected_error_m': 0.1, 'certified': True, 'left_out_within_95': 0.95}
     good['explained'] = 0.99
     for change, level in (

@@ -9,10 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, panorama_config, recipe, run_in, wander
+from cylinder_worlds import (
+    PICTURES,
+    PLACE_ARCHITECTURE,
+    SMALL_ARCHITECTURE,
+    SMALL_RECIPE,
+    Spheres,
+    recipe,
+    run_in,
+    write_bag,
+)
 
 from sfa_localization import training
-from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
 from sfa_localization.features import checkpoint as checkpoints
@@ -24,47 +32,6 @@ from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
 from sfa_localization.training import learn_place, train
-
-PICTURES = 160
-ARCHITECTURE = replace(
-    recipe().architecture,
-    layers=tuple(
-        replace(layer, linear=linear, outputs=6)
-        for layer, linear in zip(recipe().architecture.layers, (6, 6, 8), strict=True)
-    ),
-)
-RECIPE = replace(
-    recipe(), architecture=ARCHITECTURE, metric=replace(recipe().metric, slow_features=4)
-)
-
-
-def write_bag(path: Path, seed: int = 2, size: tuple[int, int] = (12, 72)) -> Path:
-    run = run_in(Spheres.about(1), wander(PICTURES, seed, hz=4.0), panorama_config(size))
-    odometry = run.odometry
-    with BagWriter(path) as bag:
-        for stamp, pose, twist, image in zip(
-            odometry.stamps_ns.tolist(),
-            odometry.poses,
-            odometry.twists,
-            run.panoramas.read(0, PICTURES),
-            strict=True,
-        ):
-            bag.odometry('/odom', stamp, pose, twist, np.array([1e-4, 1e-4]))
-            bag.image('/panorama', stamp, image, 'base_link')
-    return path
-
-
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory) -> Path:
-    return write_bag(tmp_path_factory.mktemp('bags') / 'drive')
-
-
-@pytest.fixture(scope='module')
-def whole(bag, tmp_path_factory) -> bytes:
-    """The bytes of an undisturbed training."""
-    output = tmp_path_factory.mktemp('whole') / 'model.npz'
-    train([bag], output, RECIPE)
-    return output.read_bytes()
 
 
 class Cut(Exception):
@@ -84,114 +51,87 @@ def cut_off(bag: Path, output: Path, stages: int, error: BaseException) -> None:
 
         patch.setattr(checkpoints.Checkpoint, 'write', write_then_fail)
         with pytest.raises(type(error)):
-            train([bag], output, RECIPE)
-
-
-def test_it_says_what_error_to_expect_and_where_it_is_worst(bag, tmp_path):
-    trained = train([bag], tmp_path / 'model.npz', RECIPE)
-    quality = PlaceModel.load(tmp_path / 'model.npz').quality
-    worst = quality['worst']
-    assert 0.0 < quality['expected_error_m'] < worst['expected_error_m']
-    told = (
-        f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image on paths '
-        f'between the trained ones; worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m: '
-        f'{worst["expected_error_m"]:.2f} m'
-    )
-    assert told in summary(trained).splitlines()
-    assert f'expect {quality["expected_yaw_error_deg"]:.1f} degrees' in summary(trained)
-    _, places = positions(trained.metric, trained.segments)
-    assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
-
-
-def test_with_too_few_headings_it_learns_and_expects_none(bag, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(image_features, 'SAMPLES', 15)
-    trained = train([bag], tmp_path / 'model.npz', RECIPE)
-    assert 'too few to learn a compass' in caplog.text
-    assert trained.model.compass is None
-    assert trained.model.refinement is None and not trained.model.quality['refined']
-    assert 'expected_yaw_error_deg' not in trained.model.quality
-    assert 'heading' not in summary(trained)
-
-
-def test_turned_maps_refine_the_map(bag, tmp_path):
-    trained = train([bag], tmp_path / 'model.npz', RECIPE)
-    assert trained.model.quality['refined']
-    assert '4 slow features refined by turned maps' in summary(trained)
-    # What is expected, and reported, is what the finer map was learned from.
-    finest = trained.metric.map, trained.model.refinement.metric
-    places = [each.predict(np.zeros((1, 32)))[0] for each in finest]
-    np.testing.assert_allclose(*places, atol=1e-6)
-
-
-def test_maps_that_cannot_refine_leave_the_first_map(bag, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(refinement, 'learn_metric', _fail)
-    trained = train([bag], tmp_path / 'model.npz', RECIPE)
-    assert 'positions are not refined: the drive cannot fix a map' in caplog.text
-    assert trained.model.compass is not None and trained.model.refinement is None
-    assert 'refined' not in summary(trained)
-
-
-def test_two_layers_have_none_to_refine_with(bag, tmp_path):
-    bottom, _, top = ARCHITECTURE.layers
-    two = replace(ARCHITECTURE, layers=(bottom, replace(top, field=(3, 6))))
-    trained = train([bag], tmp_path / 'model.npz', replace(RECIPE, architecture=two))
-    assert trained.model.compass is not None and trained.model.refinement is None
+            train([bag], output, SMALL_RECIPE)
 
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_only_the_model_is_left(bag, tmp_path):
-    trained = train([bag], tmp_path / 'new' / 'model.npz', RECIPE)
-    assert names(tmp_path / 'new') == ['model.npz']
-    model = PlaceModel.load(tmp_path / 'new' / 'model.npz')
-    assert model.quality['pictures'] == PICTURES
-    assert model.quality['certified']
-    assert trained.features.shape == (PICTURES, 6)
+def test_a_training_leaves_the_model_and_says_what_error_to_expect(trained):
+    """And where it is worst; what is reported is what the finer map was learned from."""
+    model, result = PlaceModel.load(trained.model), trained.result
+    quality, told = model.quality, summary(result)
+    assert names(trained.model.parent) == ['model.npz']
+    assert quality['pictures'] == PICTURES and quality['certified'] and quality['refined']
+    assert result.features.shape == (PICTURES, 6)
+    worst = quality['worst']
+    assert 0.0 < quality['expected_error_m'] < worst['expected_error_m']
+    assert f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image' in told
+    assert f'worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m' in told
+    assert f'expect {quality["expected_yaw_error_deg"]:.1f} degrees' in told
+    assert '4 slow features refined by turned maps' in told
+    _, places = positions(result.metric, result.segments)
+    assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
+    finest = result.metric.map, result.model.refinement.metric
+    np.testing.assert_allclose(*(m.predict(np.zeros((1, 32)))[0] for m in finest), atol=1e-6)
 
 
-def test_same_bag_same_bytes(bag, whole, tmp_path):
-    train([bag], tmp_path / 'model.npz', RECIPE)
-    assert (tmp_path / 'model.npz').read_bytes() == whole
+def test_without_headings_or_finer_maps_it_learns_without(trained, tmp_path, monkeypatch, caplog):
+    bottom, _, top = SMALL_ARCHITECTURE.layers
+    two = replace(SMALL_ARCHITECTURE, layers=(bottom, replace(top, field=(3, 6))))
+    shallow = replace(SMALL_RECIPE, architecture=two)
+    for module, name, value, by, said in (
+        (image_features, 'SAMPLES', 15, SMALL_RECIPE, 'too few to learn a compass'),
+        (refinement, 'learn_metric', _fail, SMALL_RECIPE, 'positions are not refined: the drive'),
+        (training, 'STEPS', training.STEPS, shallow, ''),
+    ):
+        caplog.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            found = train([trained.bag], tmp_path / 'model.npz', by)
+        assert said in caplog.text
+        assert found.model.refinement is None and 'refined' not in summary(found)
+        without = name == 'SAMPLES'
+        assert (found.model.compass is None) == without
+        assert ('expected_yaw_error_deg' not in found.model.quality) == without
+        assert ('heading' not in summary(found)) == without
 
 
-@pytest.mark.parametrize('stages', [1, 4, 6])
-@pytest.mark.parametrize('error', [Cut(), KeyboardInterrupt()])
-def test_resuming_gives_the_same_bytes(bag, whole, tmp_path, stages, error):
+@pytest.mark.parametrize(
+    ('stages', 'error'), [(1, KeyboardInterrupt()), (4, Cut()), (6, KeyboardInterrupt())]
+)
+def test_resuming_gives_the_same_bytes(trained, tmp_path, stages, error):
+    """As a training that was not interrupted."""
     output = tmp_path / 'model.npz'
-    cut_off(bag, output, stages, error)
+    cut_off(trained.bag, output, stages, error)
     assert names(tmp_path) == ['.model.npz.checkpoint.npz']
-    train([bag], output, RECIPE, resume=True)
-    assert output.read_bytes() == whole
+    train([trained.bag], output, SMALL_RECIPE, resume=True)
+    assert output.read_bytes() == trained.model.read_bytes()
     assert names(tmp_path) == ['model.npz']
 
 
-@pytest.mark.parametrize('other', ['recipe', 'bag'])
-def test_a_checkpoint_of_something_else_is_refused(bag, tmp_path, other):
-    cut_off(bag, tmp_path / 'model.npz', 2, Cut())
-    changed = replace(RECIPE, network=replace(RECIPE.network, seed=5))
-    bags = [write_bag(tmp_path / 'other', seed=8)] if other == 'bag' else [bag]
-    with pytest.raises(ModelError, match='other bags or parameters: train without --resume'):
-        train(bags, tmp_path / 'model.npz', changed if other == 'recipe' else RECIPE, resume=True)
-
-
-def test_a_damaged_checkpoint_is_refused(bag, tmp_path):
-    cut_off(bag, tmp_path / 'model.npz', 2, Cut())
-    checkpoint = tmp_path / '.model.npz.checkpoint.npz'
+def test_a_damaged_checkpoint_and_one_of_something_else_are_refused(trained, tmp_path):
+    output, checkpoint = tmp_path / 'model.npz', tmp_path / '.model.npz.checkpoint.npz'
+    cut_off(trained.bag, output, 2, Cut())
+    changed = replace(SMALL_RECIPE, network=replace(SMALL_RECIPE.network, seed=5))
+    other = write_bag(tmp_path / 'other', seed=8)
+    for bag, by in ((trained.bag, changed), (other, SMALL_RECIPE)):
+        with pytest.raises(ModelError, match='other bags or parameters: train without --resume'):
+            train([bag], output, by, resume=True)
     checkpoint.write_bytes(checkpoint.read_bytes()[:500])
     with pytest.raises(ModelError, match='train without --resume'):
-        train([bag], tmp_path / 'model.npz', RECIPE, resume=True)
+        train([trained.bag], output, SMALL_RECIPE, resume=True)
 
 
 @pytest.mark.parametrize('late', [False, True])
-def test_after_an_error_no_model_is_left(bag, tmp_path, late, monkeypatch):
+def test_after_an_error_no_model_is_left(trained, tmp_path, late, monkeypatch):
     if late:
         monkeypatch.setattr(training, 'learn_map', _fail)
-    wrong = replace(ARCHITECTURE, size=(12, 36))
-    recipe = RECIPE if late else replace(RECIPE, architecture=wrong)
+    wrong = replace(SMALL_ARCHITECTURE, size=(12, 36))
+    by = SMALL_RECIPE if late else replace(SMALL_RECIPE, architecture=wrong)
     with pytest.raises(LocalizationError):
-        train([bag], tmp_path / 'model.npz', recipe)
+        train([trained.bag], tmp_path / 'model.npz', by)
     assert 'model.npz' not in names(tmp_path)
     assert not any('cache' in name for name in names(tmp_path))
 
@@ -200,37 +140,33 @@ def _fail(*args, **kwargs):
     raise DataError('the drive cannot fix a map')
 
 
-def test_bags_of_other_sizes_are_refused(bag, tmp_path):
-    other = write_bag(tmp_path / 'other', size=(12, 96))
-    with pytest.raises(DataError, match=r'different sizes \(drive: 72x12, other: 96x12\)'):
-        train([bag, other], tmp_path / 'model.npz', RECIPE)
-
-
-def test_an_output_that_cannot_be(bag, tmp_path):
+def test_bags_and_outputs_that_cannot_be_are_refused(trained, tmp_path):
+    """Of a copy, what is left out would be known, and the forecast would promise too much."""
+    other, bag = write_bag(tmp_path / 'other', size=(12, 96)), trained.bag
     (tmp_path / 'file').write_text('')
-    with pytest.raises(ModelError, match='cannot be written'):
-        train([bag], tmp_path / 'file' / 'model.npz', RECIPE)
+    (tmp_path / 'link').symlink_to('/dev/null')
+    for bags, output, error, why in (
+        ([bag, other], 'm.npz', DataError, r'different sizes \(drive: 72x12, other: 96x12\)'),
+        ([bag, bag], 'm.npz', DataError, r'the same drive as .*: name each drive once'),
+        ([bag], 'file/m.npz', ModelError, 'cannot be written'),
+        ([bag], 'link', ModelError, 'no regular file'),
+    ):
+        with pytest.raises(error, match=why):
+            train(bags, tmp_path / output, SMALL_RECIPE)
+    assert names(tmp_path) == ['file', 'link', 'other']
 
 
-def test_the_mdp_engine_learns_the_same_place(bag, tmp_path):
+def test_the_mdp_engine_learns_the_same_place(trained, tmp_path):
     pytest.importorskip('future', reason='the extra mdp is not installed')
-    ours = train([bag], tmp_path / 'ours.npz', RECIPE)
-    config = replace(RECIPE, network=replace(RECIPE.network, engine='mdp'))
-    theirs = train([bag], tmp_path / 'theirs.npz', config)
-    for a, b in zip(ours.features.T, theirs.features.T, strict=True):
+    config = replace(SMALL_RECIPE, network=replace(SMALL_RECIPE.network, engine='mdp'))
+    theirs = train([trained.bag], tmp_path / 'theirs.npz', config)
+    for a, b in zip(trained.result.features.T, theirs.features.T, strict=True):
         assert abs(np.corrcoef(a, b)[0, 1]) > 0.999
-
-
-def test_a_drive_given_twice_is_refused(bag, tmp_path):
-    """What is left out would be known from its copy, and the forecast would promise too much."""
-    with pytest.raises(DataError, match=r'the same drive as .*: name each drive once'):
-        train([bag, bag], tmp_path / 'm.npz', RECIPE)
-    assert not (tmp_path / 'm.npz').exists()
 
 
 def straight_route(speed):
     """A drive straight ahead of 12 m at 4 Hz and less, whose odometry states no variance."""
-    count = 400
+    count = 250
     stamps = 10**9 + np.arange(count) * round(12e9 / speed / count)
     twists = np.tile([speed, 0.0], (count, 1))
     poses = integrate(stamps, twists, np.array([-6.0, 0.0, 0.0]))
@@ -249,10 +185,10 @@ def test_one_straight_route_gives_a_model_and_one_sentence(speed, caplog):
     assert [record.message for record in caplog.records].count(ROUTE) == 1
     assert trained.segments.images.skipped == {}
     aside = np.array([[x, 1.5, 0.0] for x in (-2.0, 0.0, 2.0)])
-    on = trained.model.locate_all(run.panoramas.read(150, 250))
+    on = trained.model.locate_all(run.panoramas.read(90, 160))
     off = trained.model.locate_all(Spheres.about(1).panoramas(aside, recipe().panorama))
     places = np.array([one.position for one in on])
-    assert np.hypot(*(places - run.odometry.poses[150:250, :2]).T).mean() < 0.1
+    assert np.hypot(*(places - run.odometry.poses[90:160, :2]).T).mean() < 0.1
     surest, least = (
         pick(np.trace(one.covariance[:2, :2]) for one in part)
         for pick, part in ((max, on), (min, off))
