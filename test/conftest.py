@@ -108,3 +108,11 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp('training')
     bag, model = write_bag(folder / 'drive'), folder / 'new' / 'model.npz'
     return SimpleNamespace(bag=bag, model=model, result=train([bag], model, SMALL_RECIPE))
+
+
+@pytest.fixture(scope='session')
+def messages(tmp_path_factory):
+    """The small drive of `bag_formats`, as messages."""
+    from bag_formats import drive
+
+    return drive(tmp_path_factory.mktemp('drive'))

@@ -16,15 +16,14 @@ from bag_formats import (
     PER_IMAGE,
     PERIOD,
     Message,
-    drive,
     image,
     metadata,
     pose,
     stamp,
     write_database,
     write_mcap,
+    write_pictures,
     write_ros1,
-    write_rosbags,
     write_split,
     write_version,
 )
@@ -37,12 +36,6 @@ from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.errors import BagError
-
-
-@pytest.fixture(scope='session')
-def messages(tmp_path_factory):
-    """Return the drive that all bags hold."""
-    return drive(tmp_path_factory.mktemp('drive'))
 
 
 def snapshot(path):
@@ -90,12 +83,15 @@ def test_every_format_is_read_exactly(name, tmp_path, messages):
     assert snapshot(tmp_path) == before
 
 
-@pytest.mark.parametrize('name', ['sqlite3', 'ROS 1 bz2'])
-def test_messages_come_in_order_of_reception(name, tmp_path, messages):
-    by_topic = sorted(messages, key=lambda message: message.topic)
-    found = received(FORMATS[name](tmp_path / 'bag', by_topic))
+@pytest.mark.parametrize('name', ['mcap', 'sqlite3', 'ROS 1 bz2'])
+def test_messages_come_in_order_of_reception_from_any_moment_on(name, tmp_path, messages):
+    stored = messages if name == 'mcap' else sorted(messages, key=lambda m: m.topic)
+    found = received(FORMATS[name](tmp_path / 'bag', stored))
     assert sorted(part[:2] for part in found) == sorted((m.receive_ns, m.topic) for m in messages)
     assert [at for at, _, _ in found] == sorted(m.receive_ns for m in messages)
+    middle = stamp(IMAGES / 2)
+    later = [at for at, _, _ in received(tmp_path / 'bag', middle)]
+    assert later == sorted(m.receive_ns for m in messages if m.receive_ns >= middle)
 
 
 def test_ros_1_topics_written_one_after_the_other_are_read_whole(tmp_path):
@@ -135,13 +131,6 @@ def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
         return most
 
     assert peak(30_000) < 1.1 * peak(6_000) + 100_000
-
-
-@pytest.mark.parametrize('name', ['mcap', 'sqlite3', 'ROS 1'])
-def test_reading_can_start_later(name, tmp_path, messages):
-    path, middle = FORMATS[name](tmp_path / 'bag', messages), stamp(IMAGES / 2)
-    receptions = [at for at, _, _ in received(path, middle)]
-    assert receptions == [m.receive_ns for m in messages if m.receive_ns >= middle]
 
 
 def test_stamps_of_reception_can_be_chosen(tmp_path, messages):
@@ -186,14 +175,6 @@ def test_fewer_messages_than_declared_are_counted_as_lost(tmp_path, messages):
 # Damage.
 
 
-def overwrite(path, start, size):
-    """Spoil bytes in the middle of a file."""
-    data = bytearray(path.read_bytes())
-    data[start : start + size] = b'\xff' * size
-    path.write_bytes(bytes(data))
-    return path
-
-
 def salvaged(path):
     """Return the share of odometry that a damaged bag yields; each message is as recorded."""
     with Bag(path) as bag:
@@ -217,15 +198,15 @@ CUT_OFF = {
 }
 
 
-@pytest.mark.parametrize('share', [0.4, 0.7, 0.95])
 @pytest.mark.parametrize('name', CUT_OFF)
-def test_a_cut_off_file_is_read_up_to_the_cut(name, share, tmp_path, messages):
+def test_a_cut_off_file_is_read_up_to_the_cut(name, tmp_path, messages):
     path = CUT_OFF[name](tmp_path, messages)
-    every = received(path)
-    os.truncate(path, int(path.stat().st_size * share))
-    assert 0.5 * share < salvaged(path) <= 1
-    found = received(path)
-    assert set(found) <= set(every) and found == sorted(found, key=lambda part: part[0])
+    every, size = received(path), path.stat().st_size
+    for share in (0.95, 0.7, 0.4):
+        os.truncate(path, int(size * share))
+        assert 0.5 * share < salvaged(path) <= 1
+        found = received(path)
+        assert set(found) <= set(every) and found == sorted(found, key=lambda part: part[0])
 
 
 @pytest.mark.parametrize('name', ['version 5', 'mcap', 'mcap zstd file'])
@@ -237,19 +218,19 @@ def test_a_cut_off_bag_counts_what_is_lost(name, tmp_path, messages):
     assert 0 < salvaged(path) < 1
 
 
-def test_a_damaged_part_costs_itself_alone(tmp_path, messages):
-    path = write_mcap(tmp_path / 'bag.mcap', messages, compression='zstd')
-    data = path.read_bytes()
-    overwrite(path, data.index(b'\x28\xb5\x2f\xfd', len(data) // 2), 40)
-    with Bag(path) as bag:
-        assert 0.8 < len(bag.odometry().stamps_ns) / COUNTS['/odom'] < 1
-        assert any('a damaged chunk is skipped' in problem for problem in bag.problems)
-
-
-def test_a_damaged_database_is_read_up_to_the_damage(tmp_path, messages):
-    path = write_database(tmp_path / 'bag.db3', messages)
-    overwrite(path, path.stat().st_size // 2 // 4096 * 4096, 4096)
-    assert 0.3 < salvaged(path) < 1
+@pytest.mark.parametrize(('storage', 'least'), [('mcap', 0.8), ('db3', 0.3)])
+def test_a_damaged_part_costs_itself_or_what_follows(storage, least, tmp_path, messages):
+    """Of mcap a chunk; of a database all that comes after."""
+    path = tmp_path / f'bag.{storage}'
+    if storage == 'mcap':
+        write_mcap(path, messages, compression='zstd')
+    else:
+        write_database(path, messages)
+    data = bytearray(path.read_bytes())
+    start = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2) if storage == 'mcap' else len(data) // 2
+    data[start : start + 40] = b'\xff' * 40
+    path.write_bytes(data)
+    assert least < salvaged(path) < 1
 
 
 @pytest.mark.parametrize('data', [b'\x28\xb5\x2f\xfd' + bytes(20), b''])
@@ -293,17 +274,15 @@ def test_what_holds_no_bag_is_one_error(content, complaint, tmp_path):
     assert '\n' not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    'text', ['', 'a: [', '[1, 2]', 'a: 3', 'rosbag2_bagfile_information: {}', '[' * 30_000]
-)
-def test_damaged_metadata_is_rebuilt(text, tmp_path, messages):
+def test_damaged_metadata_is_rebuilt(tmp_path, messages):
     path = write_version(tmp_path / 'bag', messages, 5)
-    (path / 'metadata.yaml').write_text(text)
-    with Bag(path) as bag:
-        assert {t.name: t.count for t in bag.topics.values()} == COUNTS
-    damaged = pytest.raises(BagError, match=r'metadata\.yaml is damaged .*ros2 bag reindex')
-    with damaged, Bag(path, strict=True):
-        pass
+    for text in ('', 'a: [', '[1, 2]', 'a: 3', 'rosbag2_bagfile_information: {}', '[' * 30_000):
+        (path / 'metadata.yaml').write_text(text)
+        with Bag(path) as bag:
+            assert {t.name: t.count for t in bag.topics.values()} == COUNTS
+        damaged = pytest.raises(BagError, match=r'metadata\.yaml is damaged .*ros2 bag reindex')
+        with damaged, Bag(path, strict=True):
+            pass
 
 
 def test_messages_that_are_left_in_a_log_are_told_of(tmp_path, messages):
@@ -313,20 +292,14 @@ def test_messages_that_are_left_in_a_log_are_told_of(tmp_path, messages):
         assert 'bag.db3-wal: holds more messages' in bag.problems[0]
 
 
-@pytest.mark.parametrize('name', ['bag.mcap', 'bag/b.mcap'])
-def test_a_pipe_is_no_bag(name, tmp_path):
-    (tmp_path / 'bag').mkdir()
-    os.mkfifo(tmp_path / name)
-    path = tmp_path / name.partition('/')[0]
-    with pytest.raises(BagError, match=r'regular file|neither a file nor a folder'), Bag(path):
+def test_odd_names_are_opened_and_a_pipe_is_no_bag(tmp_path, messages):
+    for name in ('a?b', 'a#b', 'a%20b', 'ä b', '\udcff'):
+        FORMATS['sqlite3'](tmp_path / name, messages)
+        with Bag(tmp_path / name, strict=True) as bag:
+            assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
+    os.mkfifo(tmp_path / 'pipe.mcap')
+    with pytest.raises(BagError, match='regular file'), Bag(tmp_path / 'pipe.mcap'):
         pass
-
-
-@pytest.mark.parametrize('name', ['a?b', 'a#b', 'a%20b', 'ä b', '\udcff'])
-def test_odd_names_are_opened(name, tmp_path, messages):
-    write_rosbags(tmp_path / 'plain', messages).rename(tmp_path / name)
-    with Bag(tmp_path / name, strict=True) as bag:
-        assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
 
 
 # Runs.
@@ -346,10 +319,7 @@ def test_images_without_odometry_are_skipped_and_counted(tmp_path, messages):
 @pytest.mark.parametrize(('distinct', 'used'), [(False, [0, 1, 2, 3, 4, 5]), (True, [0, 3, 5])])
 def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, tmp_path):
     """A driver that was late sends an old image with a new stamp: it shows another place."""
-    with BagWriter(tmp_path / 'bag') as bag:
-        for index, shown in enumerate((0, 0, 0, 3, 3, 0)):
-            bag.image('/image', stamp(index), image(shown), 'camera')
-            bag.odometry('/odom', stamp(index), pose(index), (1, 0), (0, 0))
+    write_pictures(tmp_path / 'bag', [image(shown) for shown in (0, 0, 0, 3, 3, 0)])
     run = read_drive(tmp_path / 'bag', tmp_path / 'cache', ReadingRecipe(distinct=distinct))
     assert run.panoramas.stamps_ns.tolist() == [stamp(i) for i in used]
     skipped = {'image repeats the one before': 3} if distinct else {}
@@ -370,20 +340,14 @@ def test_truth_is_read_only_when_wanted(tmp_path, messages):
 
 
 def test_images_are_unwrapped_when_they_are_no_panoramas(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag:
-        for index in range(3):
-            bag.image('/image', stamp(index), np.full((20, 40, 3), index, np.uint8), 'camera')
-            bag.odometry('/odom', stamp(index), pose(index), (1, 0), (0, 0))
+    write_pictures(tmp_path / 'bag', [np.full((20, 40, 3), k, np.uint8) for k in range(3)])
     camera = CameraConfig(camera_model='equirectangular')
     run = read_drive(tmp_path / 'bag', tmp_path, ReadingRecipe(camera=camera))
     assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == 3
 
 
 def test_nothing_is_left_behind_after_an_error(tmp_path):
-    with BagWriter(tmp_path / 'bag') as bag:
-        for index in range(3):
-            bag.image('/image', stamp(index), image(index), 'camera')
-            bag.odometry('/odom', stamp(index + 36_000), pose(index), (1, 0), (0, 0))
+    write_pictures(tmp_path / 'bag', [image(k) for k in range(3)], later=36_000)
     with pytest.raises(BagError, match=r'none of 3 images of /image has odometry within 0\.5 s'):
         read_drive(tmp_path / 'bag', tmp_path / 'cache')
     assert list((tmp_path / 'cache').iterdir()) == []
