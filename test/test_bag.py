@@ -130,7 +130,7 @@ def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
         tracemalloc.stop()
         return most
 
-    assert peak(30_000) < 1.1 * peak(6_000) + 100_000
+    assert peak(10_000) < 1.1 * peak(2_000) + 33_000
 
 
 def test_stamps_of_reception_can_be_chosen(tmp_path, messages):
@@ -218,19 +218,15 @@ def test_a_cut_off_bag_counts_what_is_lost(name, tmp_path, messages):
     assert 0 < salvaged(path) < 1
 
 
-@pytest.mark.parametrize(('storage', 'least'), [('mcap', 0.8), ('db3', 0.3)])
-def test_a_damaged_part_costs_itself_or_what_follows(storage, least, tmp_path, messages):
-    """Of mcap a chunk; of a database all that comes after."""
-    path = tmp_path / f'bag.{storage}'
-    if storage == 'mcap':
-        write_mcap(path, messages, compression='zstd')
-    else:
-        write_database(path, messages)
+def test_a_damaged_part_costs_itself_alone(tmp_path, messages):
+    path = write_mcap(tmp_path / 'bag.mcap', messages, compression='zstd')
     data = bytearray(path.read_bytes())
-    start = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2) if storage == 'mcap' else len(data) // 2
+    start = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2)
     data[start : start + 40] = b'\xff' * 40
     path.write_bytes(data)
-    assert least < salvaged(path) < 1
+    with Bag(path) as bag:
+        assert 0.8 < len(bag.odometry().stamps_ns) / COUNTS['/odom'] < 1
+        assert any('a damaged chunk is skipped' in problem for problem in bag.problems)
 
 
 @pytest.mark.parametrize('data', [b'\x28\xb5\x2f\xfd' + bytes(20), b''])
@@ -294,7 +290,7 @@ def test_messages_that_are_left_in_a_log_are_told_of(tmp_path, messages):
 
 def test_odd_names_are_opened_and_a_pipe_is_no_bag(tmp_path, messages):
     for name in ('a?b', 'a#b', 'a%20b', 'ä b', '\udcff'):
-        FORMATS['sqlite3'](tmp_path / name, messages)
+        FORMATS['sqlite3'](tmp_path / 'plain', messages).rename(tmp_path / name)
         with Bag(tmp_path / name, strict=True) as bag:
             assert len(bag.odometry().stamps_ns) == COUNTS['/odom']
     os.mkfifo(tmp_path / 'pipe.mcap')

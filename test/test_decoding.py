@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from sfa_localization.bags.decoding import IMAGE
 from sfa_localization.bags.drives import read_drive
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.writer import BagWriter
+from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import MessageError
 from sfa_localization.data.messages import (
@@ -114,18 +114,14 @@ def test_bags_and_topics_take_and_refuse_the_same_quaternions(tmp_path):
 
 def test_of_a_camera_of_few_bits_inspect_training_and_nodes_see_the_same(tmp_path):
     """And it is not dark."""
-    bits = 12
-    rng = np.random.default_rng(0)
+    bits, rng = 12, np.random.default_rng(0)
     pictures = [rng.integers(0, 256, (8, 60), np.uint16) << (bits - 8) for _ in range(20)]
-    typestore = get_typestore(Stores.ROS2_JAZZY)
-    kinds = typestore.types
     with BagWriter(tmp_path / 'bag') as bag:
         for k, words in enumerate(pictures, 1):
-            header = kinds['std_msgs/msg/Header'](
-                kinds['builtin_interfaces/msg/Time'](k, 0), 'camera'
-            )
-            data = words.astype('<u2').view(np.uint8).ravel()
-            message = kinds[IMAGE](header, 8, 60, 'mono16', 0, 120, data)
+            message = blank(get_typestore(Stores.ROS2_JAZZY), IMAGE)
+            message.header.stamp.sec, message.header.frame_id = k, 'camera'
+            message.height, message.width, message.step = 8, 60, 120
+            message.encoding, message.data = 'mono16', words.astype('<u2').view(np.uint8).ravel()
             bag.message('/images', k * 10**9, message)
             bag.odometry('/odom', k * 10**9, [0.2 * k, 0.0, 0.0], [0.2, 0.0], [0.01, 0.01])
     assert not [lack for lack in inspect(tmp_path / 'bag').lacks if 'dark' in lack]
