@@ -1,15 +1,20 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry whose stamps are irregular, because messages are bundled or stamped on reception."""
+"""Odometry whose stamps are irregular, because messages are bundled or stamped on reception; and
+odometry that repeats commands, which the robot follows by the camera's delay later.
+"""
 
 import math
 
 import numpy as np
 import pytest
-from filter_drives import START_NS, Drive, known
+from filter_drives import SECOND, START_NS, Drive, known
 
 from sfa_localization.data.run import Trajectory
+from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
+
+SURE = np.diag([0.0025, 0.0025, 0.0004])
 
 
 def bursts(times):
@@ -26,9 +31,8 @@ def received(times):
 def stalled(times):
     """Stamps s of odometry of which 0.4 s arrive together, 0.1 ms apart, every second."""
     count = np.arange(len(times))
-    held = (times % 1.0) > 0.6
     end = np.floor(times) + 1.0
-    return np.where(held, end - 1e-4 * (1 + 50 - count % 50), times)
+    return np.where((times % 1.0) > 0.6, end - 1e-4 * (1 + 50 - count % 50), times)
 
 
 @pytest.mark.parametrize('stamped', [bursts, received, stalled])
@@ -45,7 +49,7 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
             fused.add_odometry(stamp_ns, *drive.read[i], drive.variances(), drive.reckoned[i])
             continue
         pose = path.at(np.array([stamp_ns]))[0]
-        update = fused.add_measurement(stamp_ns, pose, np.diag([0.0025, 0.0025, 0.0004]))
+        update = fused.add_measurement(stamp_ns, pose, SURE)
         errors.append(math.hypot(*(fused.state.pose - pose)[:2]))
         assert update.accepted and abs(fused.state.twist[0]) < 2.5
         if t > 8.0:
@@ -56,25 +60,60 @@ def test_odometry_with_poses_may_be_stamped_irregularly(stamped):
 def test_images_stamped_with_the_odometry_after_a_stall_belong_where_they_came():
     """A delay of 20 ms would put an image before all that came together, 0.4 m away."""
     drive, fused = Drive(seconds=20, omega_std=0.01, v_std=0.02, every=7), PoseFilter()
-    errors = []
     fused.expect_delay(0.02)
-    times = stalled(np.arange(len(drive.stamps_ns)) / 50.0)
-    for i, t in enumerate(times.tolist()):
-        stamp_ns = START_NS + round(t * 1e9)
+    for i, t in enumerate(stalled(np.arange(1000) / 50.0).tolist()):
+        stamp_ns, pose = START_NS + round(t * 1e9), drive.poses[i]
         fused.add_odometry(stamp_ns, *drive.read[i], drive.variances(), drive.reckoned[i])
         if i in drive.pictures:
-            pose, covariance = drive.poses[i], np.diag([0.0025, 0.0025, 0.0004])
-            assert fused.add_measurement(stamp_ns + 50_000, pose, covariance).accepted
-            errors.append(math.hypot(*(fused.state.pose - pose)[:2]))
-    assert max(errors) < 0.1
+            assert fused.add_measurement(stamp_ns + 50_000, pose, SURE).accepted
+            assert math.hypot(*(fused.state.pose - pose)[:2]) < 0.1
 
 
 def test_a_speed_that_no_twist_says_is_not_that_of_a_stall():
     """Of odometry that fills its poses only, bundled ones show how far it was, not how fast."""
     drive, fused = Drive(seconds=10), known()
     times = stalled(np.arange(len(drive.stamps_ns)) / 50.0)
-    speeds = []
     for t, pose in zip(times.tolist(), drive.reckoned, strict=True):
         fused.add_odometry(START_NS + round(t * 1e9), 0.0, 0.0, (0.0, 0.0), pose)
-        speeds.append(fused.state.twist[0])
-    assert max(speeds) < 2.5
+        assert fused.state.twist[0] < 2.5
+
+
+# Commands.
+
+DELAY_S, RATE_HZ = 0.3, 50
+
+
+def held(noise=0.0, speed=1.0):
+    """Twists (N, 2) that are commanded twice a second, and read with noise."""
+    rng = np.random.default_rng(0)
+    commands = np.column_stack([speed * rng.uniform(0.5, 1.0, 24), speed * rng.uniform(-1, 1, 24)])
+    return np.repeat(commands, RATE_HZ // 2, 0) + noise * rng.standard_normal((600, 2))
+
+
+@pytest.mark.parametrize(('twists', 'repeats'), [
+    (held(), True), (np.tile([0.5, 0.0], (600, 1)), True),
+    (held(noise=1e-3), False), (held(speed=0.0), False), (held()[:100], False),
+])  # fmt: skip
+def test_equal_twists_of_a_robot_that_moves_are_commands(twists, repeats):
+    odometry = OpenLoop()
+    for v, omega in twists.tolist():
+        odometry.add(v, omega)
+    assert odometry.found is repeats
+
+
+@pytest.mark.parametrize(('noise', 'delay_s'), [(0.0, DELAY_S), (1e-3, 0.0)])
+def test_the_estimate_is_where_commands_led_a_camera_delay_ago(noise, delay_s):
+    drive, fused = Drive(twists=held(noise)), known(std=0.01)
+    fused.expect_delay(DELAY_S)
+    for stamp_ns, (v, omega) in zip(drive.stamps_ns.tolist(), drive.twists.tolist(), strict=True):
+        fused.add_odometry(stamp_ns, v, omega)
+    for i in (450, 520, 599):
+        state = fused.at(int(drive.stamps_ns[i]))
+        assert state.stamp_ns == int(drive.stamps_ns[i])
+        assert np.allclose(state.pose, drive.poses[i - round(delay_s * RATE_HZ)], atol=1e-4)
+    assert np.array_equal(fused.state.pose, state.pose)
+    times = START_NS + np.round(np.arange(9.0, 13.0, 0.005) * SECOND).astype(int)
+    poses = np.array([fused.at(at).pose for at in times.tolist()])
+    # A twist holds from the stamp before: what a message changes is known one period later.
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.02
+    assert np.abs(np.diff(poses[:, 2])).max() < 0.03

@@ -18,7 +18,6 @@ from sfa_localization.fusion.motion import (
     SIZE,
     YAW,
     MotionNoise,
-    State,
     Twist,
     V,
 )
@@ -46,30 +45,24 @@ def differences(function, mean, step=1e-6):
 
 @pytest.mark.parametrize('omega', [0.7, -1.5, 1e-3, 1e-7, 0.0])
 @pytest.mark.parametrize('v', [1.0, -0.6])
-def test_jacobian_of_driving_is_the_derivative(v, omega):
-    mean = random_mean(np.random.default_rng(1))
-    twist = Twist(v, omega, 1e-4, 1e-4)
-    step = motion.drive(mean, twist, 0.3, NOISE)
-    # The shared error fades with the distance; that derivative is second order and left out.
-    numeric = differences(lambda m: motion.drive(m, twist, 0.3, NOISE).mean, mean)
-    assert np.allclose(step.jacobian[:ERROR], numeric[:ERROR], atol=1e-7)
-    assert np.allclose(step.jacobian[ERROR:, ERROR:], numeric[ERROR:, ERROR:], atol=1e-7)
+def test_jacobians_are_the_derivatives(v, omega):
+    mean, twist = random_mean(np.random.default_rng(1)), Twist(v, omega, 1e-4, 1e-4)
+    mean[V], mean[OMEGA] = v, omega
+    for step in (motion.drive, motion.coast):
+        jacobian = step(mean, twist, 0.3, NOISE).jacobian
+        # The shared error fades with the distance; that derivative is second order and left out.
+        numeric = differences(lambda m, step=step: step(m, twist, 0.3, NOISE).mean, mean)
+        assert np.allclose(jacobian[:ERROR], numeric[:ERROR], atol=1e-7)
+        assert np.allclose(jacobian[ERROR:, ERROR:], numeric[ERROR:, ERROR:], atol=1e-7)
 
 
-@pytest.mark.parametrize('omega', [0.7, 1e-3, 1e-8, 0.0])
-def test_jacobian_of_coasting_is_the_derivative(omega):
-    mean = random_mean(np.random.default_rng(2))
-    mean[V], mean[OMEGA] = 0.8, omega
-    twist = Twist(0.8, omega, 1e-4, 1e-4)
-    step = motion.coast(mean, twist, 0.2, NOISE)
-    numeric = differences(lambda m: motion.coast(m, twist, 0.2, NOISE).mean, mean)
-    assert np.allclose(step.jacobian[:ERROR], numeric[:ERROR], atol=1e-7)
-
-
-def test_a_quarter_circle_is_a_quarter_circle():
-    twist = Twist(math.pi / 2, math.pi / 2, 0.0, 0.0)
-    after = motion.drive(np.zeros(SIZE), twist, 1.0, NOISE).mean
+def test_a_quarter_circle_is_a_quarter_circle_and_the_heading_stays_wrapped():
+    twist, start = Twist(math.pi / 2, math.pi / 2, 0.0, 0.0), np.zeros(SIZE)
+    after = motion.drive(start, twist, 1.0, NOISE).mean
     assert np.allclose(after[:3], [1.0, 1.0, math.pi / 2], atol=1e-12)
+    start[YAW] = 3.1
+    after = motion.drive(start, Twist(1.0, 1.0, 0.0, 0.0), 0.2, NOISE).mean
+    assert after[YAW] == pytest.approx(3.3 - 2 * math.pi)
 
 
 def test_the_straight_line_limit_is_continuous():
@@ -120,13 +113,12 @@ def test_a_standing_robot_neither_moves_nor_becomes_less_sure():
     assert not step.noise[:3, :3].any()
 
 
-@pytest.mark.parametrize('twist', [Twist(1, 0.3, 4e-4, 1e-4), Twist(-0.2, 0, 1e-2, 1e-2)])
-def test_noise_is_symmetric_and_positive(twist):
+def test_noise_is_symmetric_and_positive():
     mean = random_mean(np.random.default_rng(5))
-    for step in (motion.drive(mean, twist, 0.02, NOISE), motion.coast(mean, twist, 0.02, NOISE),
-                 motion.halt(mean, twist, 1.0, NOISE)):  # fmt: skip
-        assert np.allclose(step.noise, step.noise.T)
-        assert np.linalg.eigvalsh(step.noise)[0] > -1e-15
+    for twist in (Twist(1, 0.3, 4e-4, 1e-4), Twist(-0.2, 0, 1e-2, 1e-2)):
+        for step in (motion.drive, motion.coast, motion.halt):
+            noise = step(mean, twist, 0.02, NOISE).noise
+            assert np.allclose(noise, noise.T) and np.linalg.eigvalsh(noise)[0] > -1e-15
 
 
 def test_the_shared_error_fades_over_the_distance_and_keeps_unit_variance():
@@ -136,16 +128,6 @@ def test_the_shared_error_fades_over_the_distance_and_keeps_unit_variance():
     assert np.allclose(step.mean[ERROR:], math.exp(-1))
     after = step.jacobian @ np.eye(SIZE) @ step.jacobian.T + step.noise
     assert np.allclose(np.diag(after)[ERROR:], 1.0)
-
-
-def test_a_state_names_its_parts():
-    mean = np.arange(10.0)
-    covariance = np.diag([4.0, 1.0, 0.25, 1, 1, 1, 1, 1, 1, 1])
-    covariance[0, 1] = covariance[1, 0] = 1.5
-    state = State(5, mean, covariance)
-    assert list(state.pose) == [0, 1, 2] and list(state.twist) == [3, 4]
-    assert (state.yaw_rate_bias, state.wheel_scale, state.yaw_std) == (5.0, 7.0, 0.5)
-    assert state.position_std == pytest.approx(math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
 
 
 @pytest.mark.parametrize(('loss', 'v', 'omega', 'speed'), [

@@ -23,7 +23,7 @@ either = pytest.mark.parametrize('heading', [True, False])
 
 
 @either
-@pytest.mark.parametrize('start', [(0, 0, 0), (3.0, -2.0, math.pi), (0, 0, -math.pi + 1e-3)])
+@pytest.mark.parametrize('start', [(3.0, -2.0, math.pi), (0, 0, -math.pi + 1e-3)])
 def test_exact_data_gives_zero_error(heading, start):
     found = Drive(seconds=20, start=start).feed(known(start), heading)
     assert max(error for _, _, error, _ in found) < 1e-6
@@ -33,7 +33,7 @@ def test_exact_data_gives_zero_error(heading, start):
 @pytest.mark.parametrize('speed', [1.0, -0.7, 1e-30])
 @pytest.mark.parametrize('turn', [0.0, 5e-324, 1e-7, 0.8])
 def test_exact_data_straight_turning_and_reversing(speed, turn):
-    drive, fused = Drive(twists=np.tile([speed, turn], (500, 1))), known()
+    drive, fused = Drive(twists=np.tile([speed, turn], (100, 1))), known()
     assert max(error for _, _, error, _ in drive.feed(fused)) < 1e-6
     assert np.isfinite(fused.state.covariance).all()
 
@@ -49,7 +49,7 @@ def test_odometry_whose_pose_is_headed_off_its_motion_gives_way_to_its_twist(ask
     assert np.allclose(fused.state.pose, drive.poses[-1], atol=1e-3)
 
 
-def test_prediction_to_a_stamp_recalls_and_extrapolates():
+def test_prediction_to_a_stamp_recalls_and_extrapolates_less_and_less_sure():
     drive, fused = Drive(twists=np.tile([1.0, 0.0], (200, 1))), known()
     drive.feed(fused, pictures=False)
     newest = int(drive.stamps_ns[-1])
@@ -57,6 +57,11 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates():
         at = fused.at(newest + round(later_s * 1e9))
         assert at.pose[0] == pytest.approx(199 / 50 + later_s, abs=1e-6)
     assert fused.at(newest - 100 * SECOND) is None
+    stds = [fused.at(newest + k * SECOND).position_std for k in (0, 1, 2, 5, 20)]
+    assert all(a < b for a, b in itertools.pairwise(stds))
+    far = fused.at(newest + 10**5 * SECOND)
+    # It does not run on for ever at the last speed.
+    assert np.isfinite(far.covariance).all() and math.dist(far.pose[:2], fused.state.pose[:2]) < 2.5
 
 
 # Time.
@@ -65,7 +70,7 @@ def test_prediction_to_a_stamp_recalls_and_extrapolates():
 @either
 @pytest.mark.parametrize('late_s', [0.5, 4.0])
 def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, late_s):
-    drive, rng = Drive(seconds=20, **NOISY), np.random.default_rng(1)
+    drive, rng = Drive(seconds=15, **NOISY), np.random.default_rng(1)
     drive.seen[40:44, :2] += 3.0
     # Pictures come late, odometry up to 0.1 s: then in the order of arrival.
     arrives = {e: e[0] + rng.uniform(0, late_s if e[1] else 0.1) * 1e9 for e in drive.events()}
@@ -76,28 +81,30 @@ def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, lat
     assert ordered.status == late.status
 
 
-def test_what_is_older_than_the_history_is_rejected_and_counted():
-    fused = fed(known(), Drive(seconds=20))
-    before = snapshot(fused)
-    assert fused.add_measurement(START_NS + SECOND, [0, 0], np.eye(2)).reason == 'too old'
-    assert fused.add_odometry(START_NS + SECOND, 1.0, 0.0) == 'too old'
-    assert fused.counts['measurement: too old'] == fused.counts['odometry: too old'] == 1
-    assert snapshot(fused) == before
+@pytest.mark.parametrize(('later_ns', 'moved_m', 'decided'), [
+    (lambda kind: 1000, 0.0, 0),
+    (lambda kind: 1000 * kind, 5e-6, 0),  # at 1 m/s, the robot drives a micrometer
+    (lambda kind: -1000 * kind, 0.01, 1),  # fused by the motion of the message before
+])  # fmt: skip
+def test_no_decision_hangs_on_a_microsecond_and_another_start_of_time_changes_no_bit(
+    later_ns, moved_m, decided
+):
+    drive, runs = Drive(seconds=40, **NOISY), []
+    drive.kidnap(200, (4.0, 1.0, 0.5))
+    for shift in (lambda kind: 0, later_ns):
+        fused, poses, reasons = PoseFilter(), [], []
+        for stamp_ns, kind, index in drive.events():
+            update = drive.give(fused, (stamp_ns + shift(kind), kind, index), True)
+            reasons += [update.reason] if kind else []
+            poses += [fused.state.pose] if fused.state else []
+        runs.append((np.array(poses), reasons))
+    (plain, said), (later, then) = runs
+    assert 'restarted elsewhere' in said and 'outside the gate' in said
+    assert sum(a != b for a, b in zip(said, then, strict=True)) <= decided
+    np.testing.assert_allclose(later, plain, rtol=0, atol=moved_m)
 
 
-def test_duplicate_stamps_are_rejected_and_counted():
-    drive = Drive(seconds=2)
-    fused = fed(known(), drive)
-    before = snapshot(fused)
-    assert fused.add_odometry(int(drive.stamps_ns[-1]), 5.0, 5.0) == 'duplicate stamp'
-    stamp_ns = int(drive.stamps_ns[drive.pictures[-1]])
-    assert fused.add_measurement(stamp_ns, [9, 9], np.eye(2)).reason == 'duplicate stamp'
-    assert snapshot(fused) == before
-    kinds = ('measurement', 'odometry')
-    assert [fused.counts[f'{kind}: duplicate stamp'] for kind in kinds] == [1, 1]
-
-
-@pytest.mark.parametrize('seconds', [60, 2])
+@pytest.mark.parametrize('seconds', [15, 2])
 def test_a_bag_that_loops_starts_the_filter_anew(seconds):
     config, drive = FilterConfig(initial_pose=(0.0, 0.0, 0.0)), Drive(seconds=seconds)
     once = fed(PoseFilter(config), drive, heading=False)
@@ -107,19 +114,6 @@ def test_a_bag_that_loops_starts_the_filter_anew(seconds):
     assert np.allclose(looped.state.pose, once.state.pose, atol=0.2)
     assert looped.state.stamp_ns == once.state.stamp_ns
     assert looped.status.level is Level.LOCALISED
-
-
-@pytest.mark.parametrize('back_s', [0.83, 2.303])
-def test_a_clock_that_goes_back_by_less_than_the_history_starts_the_filter_anew(back_s):
-    drive, fused, sure = Drive(seconds=20), known(), []
-    for stamp_ns, kind, index in drive.events():
-        after_s = seconds_of((stamp_ns,)) - 10.0
-        stamp_ns -= round(back_s * 1e9) if after_s >= 0 else 0
-        drive.give(fused, (stamp_ns, kind, index), True)
-        if 0 <= after_s < 1 and fused.status.level is Level.LOCALISED:
-            sure.append(after_s)
-    assert max(sure) < 0.1 and fused.counts['clock went back'] == 1
-    assert fused.status.level is Level.LOCALISED and drive.error(fused, -1)[0] < 0.05
 
 
 @pytest.mark.parametrize('held_s', [0.5, 2.0])
@@ -134,8 +128,8 @@ def test_odometry_that_was_held_up_does_not_come_once_more(held_s):
 
 
 def test_a_long_pause_of_the_recording_is_survived_and_reported():
-    drive, fused = Drive(seconds=10), known()
-    drive.feed(fused, stop=5)
+    drive, fused = Drive(seconds=5), known()
+    drive.feed(fused)
     sure = fused.state.position_std
     for step in range(20):
         fused.add_odometry(START_NS + 1000 * SECOND + step * SECOND // 50, 0.0, 0.0)
@@ -143,7 +137,7 @@ def test_a_long_pause_of_the_recording_is_survived_and_reported():
     assert fused.state.position_std > 10 * sure and fused.status.level is Level.LOST
 
 
-@pytest.mark.parametrize('apart_s', [-1e9, -7, 7, 100])
+@pytest.mark.parametrize('apart_s', [-1e9, -7, 100])
 def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart_s):
     drive, fused = Drive(seconds=8), known()
     for stamp_ns, kind, index in drive.events():
@@ -159,17 +153,9 @@ def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart
     assert not any('stamped' in reason for reason in fused.status.reasons)
 
 
-def test_after_a_pause_images_alone_go_on():
-    fused = fed(known(), Drive(seconds=2))
-    stamps_ns = [START_NS + (20 + k) * SECOND for k in range(4)]
-    reasons = [fused.add_measurement(at, [0.0, 0.0], np.eye(2)).reason for at in stamps_ns]
-    assert reasons[:2] == ['stamp ahead of the odometry'] * 2
-    assert 'stamp' not in reasons[2] + reasons[3]
-
-
 @pytest.mark.parametrize('late_s', [0.3, -0.3, 0.9])
 def test_turns_show_by_how_much_images_are_stamped_late(late_s):
-    drive, fused, errors = Drive(seconds=90, **NOISY), PoseFilter(), []
+    drive, fused, errors = Drive(seconds=90, rate_hz=25, every=4, **NOISY), PoseFilter(), []
     late_ns = round(late_s * 1e9)
     order = sorted(drive.events(), key=lambda event: event[0] + event[1] * max(late_ns, 0))
     for stamp_ns, kind, index in order:
@@ -184,7 +170,7 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
         assert fused.status.level is not Level.LOCALISED
         assert any('synchronize the clocks' in reason for reason in fused.status.reasons)
     else:
-        assert np.mean(errors[-1000:]) < 0.15 and fused.status.level is Level.LOCALISED
+        assert np.mean(errors[-500:]) < 0.15 and fused.status.level is Level.LOCALISED
 
 
 # Consistency; as many drives as chi-square tests need are in test_filter_consistency.py.
@@ -208,14 +194,14 @@ def test_standing_still_neither_drifts_nor_becomes_overconfident():
 
 def test_covariance_stays_symmetric_positive_over_a_long_run():
     drive, fused = Drive(seconds=120, rate_hz=20, every=4, **NOISY), known()
-    for lap in range(5):
+    for lap in range(3):
         for stamp_ns, kind, index in drive.events():
             drive.give(fused, (stamp_ns + lap * 120 * SECOND, kind, index), True)
             if index % 500 == 0:
                 covariance = fused.state.covariance
                 assert np.array_equal(covariance, covariance.T)
                 assert np.linalg.eigvalsh(covariance)[0] > 0
-    assert fused.counts['odometry: used'] == 5 * len(drive.stamps_ns)
+    assert fused.counts['odometry: used'] == 3 * len(drive.stamps_ns)
 
 
 def test_bias_and_scale_are_learnt():
@@ -238,24 +224,23 @@ def test_stretches_of_images_that_lie_off_pull_less():
     """Errors of images have heavy tails; with all their weight they would make 0.064 m."""
     errors = []
     for seed in range(4):
-        drive, rng = (
-            Drive(seconds=60, position_std=0.06, claimed_m=0.3, seed=seed),
-            np.random.default_rng(seed),
-        )
+        drive = Drive(seconds=60, position_std=0.06, claimed_m=0.3, seed=seed)
+        rng = np.random.default_rng(seed)
         for start in rng.choice(len(drive.seen) - 10, 12, replace=False):
             drive.seen[start : start + 10, :2] += rng.normal(0, 0.4, 2)
         errors += [error for _, _, error, _ in drive.feed(PoseFilter(), True)]
     assert np.mean(errors) < 0.05
 
 
-@pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6), (0.9, 1.0)])
-def test_another_models_errors_may_correlate_otherwise(share, length_m):
+@pytest.mark.parametrize(('share', 'length_m'), [(0.3, LEAST_M), (0.7, 1e6)])
+def test_parameters_and_errors_of_the_model_change_without_losing_the_estimate(share, length_m):
     fused, drive = known(), Drive(seconds=20, position_std=0.05, yaw_std=0.02)
     drive.feed(fused, True, stop=10)
-    before = snapshot(fused)
-    fused.reconfigure(correlation=ErrorCorrelation(share, length_m))
-    assert snapshot(fused) == before
-    drive.feed(fused, True, start=10)
+    before, correlation = snapshot(fused), ErrorCorrelation(share, length_m)
+    fused.reconfigure(dataclasses.replace(fused.config, measurement_factor=4.0))
+    fused.reconfigure(correlation=correlation)
+    assert snapshot(fused) == before and fused.correlation == correlation
+    assert all(update.accepted for _, update, _, _ in drive.feed(fused, True, start=10))
     assert np.isfinite(fused.state.covariance).all() and drive.error(fused, -1)[0] < 0.15
 
 
@@ -266,7 +251,7 @@ def test_another_models_errors_may_correlate_otherwise(share, length_m):
     ((3.0, 3.0, 0.0), True), ((3.0, 3.0, 0.0), False), ((0.0, 0.0, 1.0), True),
 ])  # fmt: skip
 def test_a_spike_is_rejected_and_moves_nothing(off, heading):
-    drive = Drive(seconds=20, **NOISY)
+    drive = Drive(seconds=15, **NOISY)
     drive.seen[100] = drive.seen[100] + off
     found = drive.feed(known(), heading)
     update = found[100][1]
@@ -275,24 +260,20 @@ def test_a_spike_is_rejected_and_moves_nothing(off, heading):
 
 
 @either
-def test_a_sustained_offset_is_believed_in_the_end(heading):
-    drive = Drive(seconds=40, **NOISY)
+def test_a_sustained_offset_is_believed_in_the_end_but_no_images_in_disagreement(
+    heading,
+):
+    drive, other = Drive(seconds=40, **NOISY), Drive(seconds=40, **NOISY)
     drive.seen[150:, :2] += [1.5, 0.0]
     found = drive.feed(known(), heading)
     assert not found[152][1].accepted and abs(found[-1][2] - 1.5) < 0.5
-
-
-@either
-def test_wrong_images_that_contradict_each_other_are_never_believed(heading):
-    drive = Drive(seconds=40, **NOISY)
-    drive.seen[150:180, :2] += np.random.default_rng(3).uniform(-8, 8, (30, 2))
-    found = drive.feed(known(), heading)
+    other.seen[150:180, :2] += np.random.default_rng(3).uniform(-8, 8, (30, 2))
+    found = other.feed(known(), heading)
     assert max(error for _, _, error, _ in found) < 1.0 and found[-1][2] < 0.5
 
 
-@either
-@pytest.mark.parametrize('outage', [5.0, 30.0])
-def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(heading, outage):
+@pytest.mark.parametrize(('outage', 'heading'), [(5.0, True), (30.0, True), (30.0, False)])
+def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(outage, heading):
     drive, fused = Drive(seconds=60, **NOISY), known()
     drive.feed(fused, heading, stop=15)
     first = int(np.searchsorted(drive.pictures, (15 + outage) * 50))
@@ -308,12 +289,16 @@ def test_a_cluster_of_wrong_images_after_an_outage_is_not_trusted_at_once(headin
 # Start and recovery.
 
 
-def test_one_picture_with_heading_starts_at_once():
+def test_one_picture_with_heading_starts_at_once_and_one_that_is_wrong_is_outvoted():
     drive, fused = Drive(seconds=5, start=(4.0, -3.0, 2.0), **NOISY), PoseFilter()
     assert fused.state is None and fused.status.level is Level.UNINITIALISED
     found = drive.feed(fused, heading=True)
     assert found[0][1].accepted and found[0][1].reason == 'started'
     assert found[-1][2] < 0.6 and abs(found[-1][3]) < 0.2
+    drive = Drive(seconds=5, **NOISY)
+    drive.seen[0] = [9.0, 9.0, 2.0]
+    found = drive.feed(PoseFilter(), heading=True)
+    assert found[0][1].accepted and not found[1][1].accepted and found[3][2] < 0.8
 
 
 @pytest.mark.parametrize('seed', range(10))
@@ -325,13 +310,6 @@ def test_without_heading_the_first_metres_start_it(seed):
     assert abs(found[-1][3]) < 0.3 and found[-1][2] < 0.8
 
 
-def test_a_first_picture_that_is_wrong_is_outvoted():
-    drive = Drive(seconds=5, **NOISY)
-    drive.seen[0] = [9.0, 9.0, 2.0]
-    found = drive.feed(PoseFilter(), heading=True)
-    assert found[0][1].accepted and not found[1][1].accepted and found[3][2] < 0.8
-
-
 def test_positions_without_motion_show_no_heading():
     fused = PoseFilter()
     for stamp_ns in range(START_NS, START_NS + 2 * SECOND, SECOND // 50):
@@ -341,117 +319,103 @@ def test_positions_without_motion_show_no_heading():
     assert fused.status.reasons == ('images show no heading yet: drive on',)
 
 
+@pytest.mark.parametrize('stds', [(2.5, 0.1, 0.1), (0.1, 2.5, 0.1), (0.1, 0.1, 0.9)])
+def test_an_uncertain_image_does_not_start_the_filter(stds):
+    fused = PoseFilter()
+    update = fused.add_measurement(START_NS, [1, 2, 0], np.diag(np.square(stds)))
+    assert update.reason == 'too uncertain to start from' and fused.state is None
+    sure = fused.add_measurement(START_NS + 1, [1, 2, 0], np.diag(np.square([1.5, 1.5, 0.5])))
+    assert sure.accepted and fused.status.level is Level.DEGRADED
+
+
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize(('heading', 'images'), [(True, 5), (False, 30)])
-def test_a_kidnapped_robot_recovers(heading, images, seed):
+def test_a_kidnapped_robot_knows_that_it_is_lost_and_recovers(heading, images, seed):
     """After five images, or three meters where they have no heading."""
     drive, fused = Drive(seconds=30, **NOISY, seed=seed), known()
     drive.kidnap(150, (5.0, -4.0, 2.0))
-    found = drive.feed(fused, heading)
+    found = drive.feed(fused, heading, stop=15.6)
+    error, _ = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))
+    if not heading:
+        assert 4 < error < 4 * fused.state.position_std and fused.status.level is Level.LOST
+    found += drive.feed(fused, heading, start=15.6)
     assert any(update.reason == 'restarted elsewhere' for _, update, _, _ in found)
     assert max(error for _, _, error, _ in found[150 + images :]) < 1.2
     assert found[-1][2] < 0.6 and fused.status.level is Level.LOCALISED
 
 
-def test_while_lost_the_state_shows_it_and_the_covariance_covers_the_error():
-    drive, fused = Drive(seconds=30, **NOISY), known()
-    drive.kidnap(150, (5.0, -4.0, 2.0))
-    drive.feed(fused, stop=16.0)
-    error, _ = drive.error(fused, np.searchsorted(drive.stamps_ns, fused.state.stamp_ns))
-    assert error > 4 and error < 4 * fused.state.position_std
-    assert fused.status.level is Level.LOST
-
-
 # Poses from outside, and settings.
 
 
-def test_a_pose_from_outside_is_taken_at_any_time():
-    drive, fused = Drive(seconds=10), known(pose=(50.0, 50.0, 1.0))
-    drive.feed(fused, stop=5, pictures=False)
-    fused.set_pose(fused.state.stamp_ns, drive.poses[249], np.eye(3) * 1e-4)
-    drive.feed(fused, start=5, pictures=False)
-    assert np.allclose(fused.state.pose, drive.poses[-1], atol=1e-6)
-
-
-@pytest.mark.parametrize('stamp', [1, START_NS - SECOND, START_NS + 10**6 * SECOND, None])
-def test_a_pose_given_before_the_first_message_is_not_lost(stamp):
+@pytest.mark.parametrize('stamp', [1, START_NS + 10**6 * SECOND, None, 'later'])
+def test_a_pose_from_outside_is_taken_at_any_time(stamp):
+    """Also before the first message, by its own clock, and where the filter was wrong."""
     pose = (3.0, 1.0, math.pi)
     drive = Drive(seconds=5, start=pose)
     fused = PoseFilter(FilterConfig(initial_pose=() if stamp else pose))
-    if stamp:
+    if stamp == 'later':
+        fused.set_pose(START_NS, (50.0, 50.0, 1.0), np.eye(3))
+        drive.feed(fused, stop=2.5, pictures=False)
+        fused.set_pose(fused.state.stamp_ns, drive.poses[124], np.eye(3) * 1e-4)
+    elif stamp:
         fused.set_pose(stamp, pose, np.eye(3) * 1e-4)
-    drive.feed(fused, pictures=False)
+    drive.feed(fused, start=2.5 if stamp == 'later' else 0, pictures=False)
     assert drive.error(fused, -1)[0] < 1e-6
 
 
-@pytest.mark.parametrize('pose', [(math.nan, 0, 0), (0, 0), (1e12, 0, 0)])
-def test_a_malformed_pose_is_rejected(pose):
-    with pytest.raises(DataError):
-        PoseFilter().set_pose(1, pose)
+def test_a_malformed_pose_and_parameters_that_do_not_fit_are_rejected():
+    for pose in ((math.nan, 0, 0), (0, 0), (1e12, 0, 0)):
+        with pytest.raises(DataError):
+            PoseFilter().set_pose(1, pose)
     with pytest.raises(DataError):
         PoseFilter().set_pose(1, (0, 0, 0), -np.eye(3))
-
-
-def test_parameters_change_without_losing_the_estimate():
-    drive, fused = Drive(seconds=10), known()
-    drive.feed(fused, stop=5)
-    before = snapshot(fused)
-    fused.reconfigure(dataclasses.replace(fused.config, measurement_factor=4.0))
-    assert snapshot(fused) == before
-    assert all(update.accepted for _, update, _, _ in drive.feed(fused, start=5))
-
-
-def test_reset_forgets_the_pose_but_not_the_counts():
-    fused = fed(known(), Drive(seconds=2))
-    fused.reset()
-    assert fused.state is None and fused.counts['reset'] == 1
-    assert fused.counts['odometry: used'] == 100
-
-
-@pytest.mark.parametrize(('values', 'why'), [
-    ({'degraded_std': 3.0}, 'degraded_std'), ({'lost_std': 200.0}, 'outside'),
-    ({'speed_std': math.nan}, 'finite'), ({'odometry_factor': 0.0}, 'outside'),
-    ({'initial_pose': (1.0, 2.0)}, '2 numbers given; give x'),
-    ({'initial_pose': (1.0, 2.0, math.inf)}, 'finite'),
-    ({'initial_pose': (1.0, 2.0, 90.0)}, 'give radians'),
-    ({'initial_pose': ('x', 2.0, 3.0)}, 'initial_pose'),
-])  # fmt: skip
-def test_parameters_are_checked_together(values, why):
-    with pytest.raises(ConfigError, match=why):
-        FilterConfig(**values)
+    for values, why in (
+        ({'degraded_std': 3.0}, 'degraded_std'), ({'lost_std': 200.0}, 'outside'),
+        ({'speed_std': math.nan}, 'finite'), ({'odometry_factor': 0.0}, 'outside'),
+        ({'initial_pose': (1.0, 2.0)}, '2 numbers given; give x'),
+        ({'initial_pose': (1.0, 2.0, math.inf)}, 'finite'),
+        ({'initial_pose': (1.0, 2.0, 90.0)}, 'give radians'),
+        ({'initial_pose': ('x', 2.0, 3.0)}, 'initial_pose'),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=why):
+            FilterConfig(**values)
 
 
 # Bad input and silence.
 
-
-@pytest.mark.parametrize(('value', 'covariance', 'reason'), [
-    ([math.nan, 0], np.eye(2), 'position is not finite'),
-    ([1e300, 0], np.eye(2), 'position is not finite'),
-    ([0, 0], -np.eye(2), 'covariance is not symmetric positive'),
-    ([0, 0], [[1, 5], [5, 1]], 'covariance is not symmetric positive'),
-    ([0, 0], [[1, 0.5], [0, 1]], 'covariance is not symmetric positive'),
-    ([0, 0], np.full((2, 2), math.nan), 'covariance is not symmetric positive'),
-    ([0, 0], np.eye(2) * 1e9, 'covariance means that nothing is known'),
-    ([0, 0, 0, 0], np.eye(4), 'shape is not that of a position or a pose'),
-    ([0, 0], np.eye(3), 'shape is not that of a position or a pose'),
-])  # fmt: skip
-def test_a_malformed_measurement_is_counted_and_changes_nothing(value, covariance, reason):
-    fused = fed(known(), Drive(seconds=2))
-    before = snapshot(fused)
-    update = fused.add_measurement(fused.state.stamp_ns + 1, value, covariance)
-    assert not update.accepted and update.reason == reason
-    assert fused.counts[f'measurement: {reason}'] == 1 and snapshot(fused) == before
+SHAPE = 'shape is not that of a position or a pose'
+NOT_POSITIVE, FAST = 'covariance is not symmetric positive', 'not finite, or absurdly fast'
 
 
-@pytest.mark.parametrize(('v', 'omega', 'reason'), [
-    (math.nan, 0, 'not finite, or absurdly fast'), (1e6, 0, 'not finite, or absurdly fast'),
-])  # fmt: skip
-def test_malformed_odometry_is_counted_and_changes_nothing(v, omega, reason):
-    fused = fed(known(), Drive(seconds=2))
-    before = snapshot(fused)
-    assert fused.add_odometry(fused.state.stamp_ns + 1, v, omega) == reason
-    assert fused.add_odometry(0, 1.0, 0.0) == 'zero or negative stamp'
-    assert fused.counts[f'odometry: {reason}'] == 1 and snapshot(fused) == before
+def test_what_cannot_be_used_is_counted_and_changes_nothing():
+    fused = fed(known(), Drive(seconds=12))
+    before, newest, counted = snapshot(fused), fused.state.stamp_ns, dict(fused.counts)
+    taken = START_NS + 5 * (SECOND // 50) * (599 // 5)
+    for stamp_ns, value, covariance, reason in (
+        (newest + 1, [math.nan, 0], np.eye(2), 'position is not finite'),
+        (newest + 1, [1e300, 0], np.eye(2), 'position is not finite'),
+        (newest + 1, [0, 0], -np.eye(2), NOT_POSITIVE),
+        (newest + 1, [0, 0], [[1, 5], [5, 1]], NOT_POSITIVE),
+        (newest + 1, [0, 0], [[1, 0.5], [0, 1]], NOT_POSITIVE),
+        (newest + 1, [0, 0], np.full((2, 2), math.nan), NOT_POSITIVE),
+        (newest + 1, [0, 0], np.eye(2) * 1e9, 'covariance means that nothing is known'),
+        (newest + 1, [0, 0, 0, 0], np.eye(4), SHAPE),
+        (newest + 1, [0, 0], np.eye(3), SHAPE),
+        (START_NS + SECOND, [0, 0], np.eye(2), 'too old'),
+        (taken, [9, 9], np.eye(2), 'duplicate stamp'),
+    ):
+        update = fused.add_measurement(stamp_ns, value, covariance)
+        assert not update.accepted and update.reason == reason
+        counted[f'measurement: {reason}'] = counted.get(f'measurement: {reason}', 0) + 1
+    for stamp_ns, v, reason in (
+        (newest + 1, math.nan, FAST), (newest + 1, 1e6, FAST), (0, 1.0, 'zero or negative stamp'),
+        (START_NS + SECOND, 1.0, 'too old'), (newest, 5.0, 'duplicate stamp'),
+    ):  # fmt: skip
+        assert fused.add_odometry(stamp_ns, v, 0.0) == reason
+        counted[f'odometry: {reason}'] = counted.get(f'odometry: {reason}', 0) + 1
+    assert snapshot(fused) == before and dict(fused.counts) == counted
+    fused.reset()
+    assert fused.state is None and dict(fused.counts) == {**counted, 'reset': 1}
 
 
 @pytest.mark.parametrize('variances', [(0, 0), (-1, -1), (math.nan, math.inf), (1e300, 1e3)])
@@ -463,7 +427,7 @@ def test_unusable_variances_give_way_to_the_configured_ones(variances):
     assert snapshot(fused) == snapshot(plain)
 
 
-def test_a_heading_that_is_not_known_is_left_out():
+def test_a_heading_that_is_not_known_is_left_out_and_zero_covariance_is_unknown_not_certain():
     drive = Drive(seconds=2)
     with_unknown, without = fed(known(), drive), fed(known(), drive)
     stamp, (x, y, _) = int(drive.stamps_ns[-1]) + 1, drive.poses[-1]
@@ -471,23 +435,8 @@ def test_a_heading_that_is_not_known_is_left_out():
     with_unknown.add_measurement(stamp, [x, y, math.nan], flat)
     without.add_measurement(stamp, [x, y], flat[:2, :2])
     assert snapshot(with_unknown) == snapshot(without)
-
-
-def test_zero_covariance_means_unknown_not_certain():
-    fused = fed(known(), Drive(seconds=2))
-    update = fused.add_measurement(fused.state.stamp_ns + 1, [50.0, 0.0], np.zeros((2, 2)))
-    assert not update.accepted and fused.state.position_std > 0.01
-
-
-def test_silent_odometry_makes_the_estimate_less_and_less_sure():
-    fused = fed(known(), Drive(seconds=5))
-    newest = fused.state.stamp_ns
-    stds = [fused.at(newest + k * SECOND).position_std for k in (0, 1, 2, 5, 20)]
-    assert all(a < b for a, b in itertools.pairwise(stds))
-    far = fused.at(newest + 10**5 * SECOND)
-    assert np.isfinite(far.covariance).all()
-    # It does not run on for ever at the last speed.
-    assert math.dist(far.pose[:2], fused.state.pose[:2]) < 2.5
+    update = without.add_measurement(stamp + 1, [50.0, 0.0], np.zeros((2, 2)))
+    assert not update.accepted and without.state.position_std > 0.01
 
 
 def test_images_alone_carry_it_through_an_outage_of_the_odometry():
@@ -499,6 +448,12 @@ def test_images_alone_carry_it_through_an_outage_of_the_odometry():
     assert any('no odometry' in reason for reason in fused.status.reasons)
     found = drive.feed(fused, heading=True, start=20)
     assert found[-1][2] < 0.5 and fused.status.level is Level.LOCALISED
+    # After a pause of both, some images are too far ahead; then it goes on with them.
+    last = fused.state.stamp_ns
+    reasons = [fused.add_measurement(last + (20 + k) * SECOND, [0.0, 0.0], np.eye(2)).reason
+               for k in range(4)]  # fmt: skip
+    assert reasons[:2] == ['stamp ahead of the odometry'] * 2
+    assert 'stamp' not in reasons[2] + reasons[3]
 
 
 def test_after_a_long_gap_the_heading_is_lost_and_found_again():
@@ -510,13 +465,6 @@ def test_after_a_long_gap_the_heading_is_lost_and_found_again():
             assert fused.status.level is Level.LOST
     assert drive.error(fused, -1)[0] < 0.4 and abs(drive.error(fused, -1)[1]) < 0.2
     assert fused.status.level is Level.LOCALISED
-
-
-@pytest.mark.parametrize('gap', [0.3, 1.5])
-def test_dropouts_of_the_odometry_are_bridged(gap):
-    drive = Drive(seconds=30, **NOISY)
-    events = [event for event in drive.events() if event[1] or seconds_of(event) % 5.0 > gap]
-    assert drive.error(fed(known(), drive, events), -1)[0] < 0.6
 
 
 def through_a_gap(pose=None):
@@ -541,7 +489,7 @@ def test_in_a_gap_of_the_odometry_its_own_pose_shows_what_else_is_uncertain():
 
 
 def test_the_state_machine_reports_why():
-    drive, fused = Drive(seconds=30, **NOISY), PoseFilter()
+    drive, fused = Drive(seconds=20, **NOISY), PoseFilter()
     assert fused.status.reasons == ('no odometry and no images yet',)
     drive.feed(fused, stop=0.05)
     assert fused.status.reasons == ('no usable image yet',)
@@ -552,12 +500,3 @@ def test_the_state_machine_reports_why():
     assert 'no usable image for 4 s' in fused.status.reasons
     drive.feed(fused, heading=True, start=14)
     assert fused.status.level is Level.LOCALISED
-
-
-@pytest.mark.parametrize('stds', [(2.5, 0.1, 0.1), (0.1, 2.5, 0.1), (0.1, 0.1, 0.9)])
-def test_an_uncertain_image_does_not_start_the_filter(stds):
-    fused = PoseFilter()
-    update = fused.add_measurement(START_NS, [1, 2, 0], np.diag(np.square(stds)))
-    assert update.reason == 'too uncertain to start from' and fused.state is None
-    sure = fused.add_measurement(START_NS + 1, [1, 2, 0], np.diag(np.square([1.5, 1.5, 0.5])))
-    assert sure.accepted and fused.status.level is Level.DEGRADED

@@ -52,15 +52,11 @@ def test_nothing_reaches_back_beyond_a_kidnapping():
     assert np.median(far) < 0.2 and np.count_nonzero(far > 1) < 4 * 50
 
 
-def test_late_messages_are_smoothed_as_if_in_time():
-    drive = Drive(seconds=20, **NOISY)
+def test_late_messages_are_smoothed_as_if_in_time_and_a_reset_begins_another_drive():
+    drive, fused = Drive(seconds=20, **NOISY), Smoother()
     late = sorted(drive.events(), key=lambda event: event[0] + event[1] * 400_000_000)
     a, b = (fed(Smoother(), drive, events).smoothed() for events in (None, late))
     assert max(np.abs(x.mean - y.mean).max() for x, y in zip(a, b, strict=True)) < 1e-9
-
-
-def test_a_reset_begins_another_drive():
-    drive, fused = Drive(seconds=20, **NOISY), Smoother()
     assert fused.smoothed() == []
     events = drive.events()
     fed(fused, drive, events[: len(events) // 2]).reset()
