@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, signal, stats
+from scipy import signal, stats
 
 from sfa_localization.bags.drives import as_live, image_folder, read_drive
 from sfa_localization.bags.reader import Bag
@@ -38,7 +38,6 @@ from sfa_localization.data.geometry import (
 )
 from sfa_localization.data.progress import progress_bar, progress_over
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
-from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.motion import State
@@ -48,7 +47,6 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
 from sfa_localization.localizer import Localizer, Observation, Observer
-from sfa_localization.metric.basis import Basis, expand
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -117,7 +115,6 @@ class _Drive:
         return self.tracks['sfa'].poses
 
 
-@one_core()
 def evaluate(
     model: PlaceModel,
     bag: Path,
@@ -146,8 +143,6 @@ def evaluate(
     aligned_on = earlier if transform else bags
     transform = transform or fit_transform(*((one.truth, one.images) for one in trained or [drive]))
     estimates = _in_truth(drive, transform)
-    if trained:
-        estimates['supervised'] = _supervised(model, trained, drive)
     return Evaluation(
         drive.truth,
         estimates,
@@ -409,28 +404,6 @@ def _summary(values: Array) -> dict[str, float]:
         'median': float(np.median(values)),
         'p95': float(np.percentile(values, 95)),
     }
-
-
-def _supervised(model: PlaceModel, trained: Sequence[_Drive], drive: _Drive) -> Trajectory:
-    """The drive by the model's own regression, fitted on the ground truth of training drives."""
-    features, places = [], []
-    for one in trained:
-        stamps = one.images.stamps_ns
-        mask = known(one.truth, stamps)
-        features.append(one.features[mask])
-        places.append(one.truth.at(stamps[mask])[:, :2])
-    weights = regression(model.metric.basis, np.concatenate(features), np.concatenate(places))
-    positions = expand(model.metric.basis, drive.features) @ weights
-    unknown = np.full(len(positions), np.nan)
-    stamps = drive.images.stamps_ns
-    return Trajectory(stamps, np.column_stack([positions, unknown]))
-
-
-def regression(basis: Basis, features: Array, places: Array) -> Array:
-    """Weights (m, 2) from the expansion of features (M, K) to true places (M, 2) m."""
-    expanded = expand(basis, features)
-    normal = expanded.T @ expanded + np.diag(basis.ridge)
-    return np.asarray(linalg.lstsq(normal, expanded.T @ places)[0])
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -21,9 +21,8 @@ from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Image
-from sfa_localization.data.threads import one_core
 from sfa_localization.features.image_features import (
-    REFINING_LAYER,
+    TURNED_LAYER,
     layer_harmonics,
     slow_features,
     spectrum,
@@ -47,11 +46,11 @@ from sfa_localization.features.observation import (
 from sfa_localization.features.rotation import Map
 from sfa_localization.features.rotation_spread import Agreement, disagreement
 from sfa_localization.metric.compass import Compass
-from sfa_localization.metric.refinement import Refinement
 from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.metric.turned_maps import TurnedMaps
 
 FORMAT = 'sfa_localization place model'
-VERSION = 10
+VERSION = 11
 SCALE_STD = 0.01
 """Of the scale of a map: its meters are those of wheels, seldom known better."""
 _LONGEST_DELAY_S = 10.0
@@ -60,11 +59,11 @@ _LONGEST_DELAY_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass, refinement and keyframes, learned from one place.
+    """Network, metric map, compass and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
-    neighboring images.
+    neighboring images. The map reads `turned` maps, or slow features where there are none.
     """
 
     network: Network
@@ -72,12 +71,12 @@ class PlaceModel:
     panorama: PanoramaConfig
     keyframes: Keyframes
     agreement: Agreement
+    turned: TurnedMaps | None = None
     compass: Compass | None = None
     yaw_agreement: Agreement | None = None
     heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
-    refinement: Refinement | None = None
 
     @property
     def camera_delay_s(self) -> float:
@@ -93,7 +92,6 @@ class PlaceModel:
         require_panorama(panorama)
         return self.locate_all(panorama[None])[0]
 
-    @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show."""
         slow = self.slow_poses(panoramas)
@@ -109,18 +107,20 @@ class PlaceModel:
         maps = self.network.maps(np.stack([image.panorama for image in level]))
         slow = slow_features(maps)
         spread = disagreement(maps[-1])
-        positions, own = self.metric.predict(slow)
         yaw, yaw_variance = self.headings(maps, slow)
         if self.yaw_agreement is not None:
             yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
-        own = own * self.agreement.factor(spread)[:, None, None]
-        if self.refinement is not None:
-            positions, own = self.refinement.refine(
-                spectrum(maps[REFINING_LAYER]), yaw, yaw_variance, spread, (positions, own)
-            )
+        yaw_variance = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
+        by_yaw: Array | float = 0.0
+        if self.turned is None:
+            positions, own = self.metric.predict(slow)
+        else:
+            spectra = spectrum(maps[TURNED_LAYER])
+            positions, own, by_yaw = self.turned.predict(self.metric, spectra, yaw, yaw_variance)
+        own = own * self.agreement.factor(spread)[:, None, None] + by_yaw
         covariances = np.zeros((len(slow), 3, 3))
         covariances[:, :2, :2] = own
-        covariances[:, 2, 2] = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
+        covariances[:, 2, 2] = yaw_variance
         poses = np.column_stack([positions, yaw])
         return [
             Observation(pose, covariance, features, leveled=image)
@@ -186,7 +186,7 @@ class PlaceModel:
         Raises ModelError where the results are not finite, or certain beyond reason.
         """
         check_weights(self.network)
-        turned = [part for part in (self.compass, self.refinement) if part is not None]
+        turned = [part for part in (self.compass, self.turned) if part is not None]
         if any(abs(part.sign) != 1.0 for part in turned):
             raise ModelError('it turns neither way')
         height, width = self.network.architecture.size
@@ -224,16 +224,18 @@ class PlaceModel:
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
         arrays |= _prefixed('agreement/', self.agreement.to_arrays())
-        for name in ('compass', 'yaw_agreement', 'refinement'):
-            part = getattr(self, name)
-            if part is not None:
-                arrays |= _prefixed(f'{name}/', part.to_arrays())
+        if self.compass is not None:
+            arrays |= _prefixed('compass/', self.compass.to_arrays())
+        if self.yaw_agreement is not None:
+            arrays |= _prefixed('yaw_agreement/', self.yaw_agreement.to_arrays())
+        if self.turned is not None:
+            arrays |= _prefixed('turned/', self.turned.to_arrays())
         return arrays
 
     @classmethod
     def _from_arrays(cls, arrays: Arrays, header: dict[str, Any]) -> PlaceModel:
-        compass, yaw_agreement, refinement = (
-            _under(arrays, name) for name in ('compass/', 'yaw_agreement/', 'refinement/')
+        turned, compass, yaw_agreement = (
+            _under(arrays, name) for name in ('turned/', 'compass/', 'yaw_agreement/')
         )
         panorama = PanoramaConfig.from_mapping(header['panorama'], 'panorama')
         return cls(
@@ -242,12 +244,12 @@ class PlaceModel:
             panorama,
             Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
+            TurnedMaps.from_arrays(turned) if turned else None,
             Compass.from_arrays(compass) if compass else None,
             Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,
             tuple(header['heading_layers']),
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
-            Refinement.from_arrays(refinement) if refinement else None,
         )
 
 

@@ -8,8 +8,8 @@
 4  slow features of all images (section 2.2)             features/image_features.py
 5  cut the odometry into segments (section 3.1)          metric/segments.py
 6  learn the certified map (section 3, eq. 1 and eq. 5)  metric/learning.py
-7  learn the heading                                     metric/compass_training.py
-8  refine the map with turned maps                       metric/refinement.py
+7  learn it again, from maps turned by its headings      metric/turned_maps.py
+8  learn the heading                                     metric/compass_training.py
 9  keyframes, and the model for section 5                metric/keyframe_map.py, place_model.py
 
 Steps 2, 7, 8 and keyframes go beyond the paper.
@@ -39,8 +39,8 @@ from sfa_localization.metric.learning import (
     left_out_agreement,
 )
 from sfa_localization.metric.motion_check import MotionCheck
-from sfa_localization.metric.refinement import refined
 from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.turned_maps import with_turned
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe
@@ -51,7 +51,7 @@ from sfa_localization.training_input import TrainingInput, compared, train_hiera
 class Trained:
     """The model and the intermediate results of its training, for reports.
 
-    `features` (N, K) of all images, drive after drive; `metric` is that of the finest map.
+    `features` (N, K) of all images, drive after drive; `metric` is that of the model's map.
     """
 
     model: PlaceModel
@@ -64,7 +64,6 @@ class Trained:
     """Of each drive: what its sources of motion tell of each other."""
 
 
-@one_core()
 def train(
     bags: Sequence[Path],
     output: Path,
@@ -90,10 +89,12 @@ def train(
     checkpoint = Checkpoint.beside(output, settings, runs)
     if not resume:
         checkpoint.remove()
-    given = TrainingInput.of(runs, recipe, progress)  # step 2
+    with one_core():
+        given = TrainingInput.of(runs, recipe, progress)  # step 2
     network = train_hierarchy(given, checkpoint)  # step 3
-    trained = _learn(network, given, strict)  # steps 4 to 9
-    compare_with_map(checks, given.drives, trained.segments, trained.metric)
+    with one_core():
+        trained = _learn(network, given, strict)  # steps 4 to 9
+        compare_with_map(checks, given.drives, trained.segments, trained.metric)
     trained.model.save(output)
     checkpoint.remove()
     return replace(trained, checks=checks)
@@ -116,33 +117,35 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         images = features_of_runs(network, given.runs, layers, bar.update)
     given.say(6, 'cut the odometry, and learn the map')  # steps 5 and 6
     segments, first = learn_map(given.drives, images.slow, config, seed, strict)
-    given.say(7, 'learn the heading')
-    heading = learn_heading(images, segments, first)
-    given.say(8, 'refine the map')
-    finer = refined(images, segments, first, heading, config, seed)
+    given.say(7, 'learn the map again, from turned maps')
+    sign = -1.0 if given.panorama.clockwise else 1.0
+    turned, result = with_turned(images.spectra, segments, first, sign, config, seed)
+    given.say(8, 'learn the heading')
+    heading = learn_heading(images, segments, result, sign)
+    if heading is None:
+        turned, result = None, first
     given.say(9, 'choose keyframes, and check the map')
-    agreement = left_out_agreement(images.disagreement, first)
-    result, finest = (finer.metric, finer.refinement.agreement) if finer else (first, agreement)
+    agreement = left_out_agreement(images.disagreement, result)
     known = learn_keyframes(
-        given.views, images.disagreement, segments, result, finest, given.recipe.panorama.sphere
+        given.views, images.disagreement, segments, result, agreement, given.recipe.panorama.sphere
     )
     result = replace(result, forecast=result.forecast.improved(known.improvement))
     delays = [drive.delay_s for drive in given.drives.items]
-    quality: dict[str, Any] = {'features_used': first.map.features, 'refined': finer is not None}
+    quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality['camera_delay_s'] = delays
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
     quality |= {**images.quality, **segments.quality, **result.quality, **known.quality}
     model = PlaceModel(
         network,
-        first.map,
+        result.map,
         given.panorama,
         known.keyframes,
         agreement,
+        turned,
         heading.compass if heading else None,
         heading.agreement if heading else None,
         layers if heading else (),
         {**quality, **(heading.quality if heading else {})},
         correlation_along_drive(result, segments, TURN_RADIUS_M),
-        finer.refinement if finer else None,
     )
     return Trained(model, given.runs, images.slow, segments, result, heading)

@@ -26,7 +26,7 @@ CHANGES = {
     'not finite': lambda a: filled(a, 'network/1/slow', np.nan),
     'damaged': lambda a: {**a, 'keyframes/textures': a['keyframes/textures'][:, 1:]},
     'not fit': lambda a: {**a, 'network/0/linear': a['network/0/linear'][:9]},
-    'turns neither way': lambda a: filled(a, 'refinement/scalars', 0),
+    'turns neither way': lambda a: filled(a, 'turned/sign', 0),
     'outside': lambda a: changed_header(a, panorama={'width': 10**9, 'height': 60}),
     'different sizes': lambda a: changed_header(a, panorama={'width': 600, 'height': 60}),
     'delay is not that': lambda a: changed_header(a, quality={'camera_delay_s': [1e9]}),

@@ -10,7 +10,6 @@ import pytest
 from sfa_localization.metric.phases import (
     angle_hessian,
     certify,
-    metric_upgrade,
     phase_cost,
     refine,
     synchronize,
@@ -85,24 +84,3 @@ def test_the_hessian_is_the_slope_of_the_gradient():
         costs = [phase_cost(h, np.exp(1j * (angles + s * e + t * f))) for s, t in corners]
         numeric = (costs[0] - costs[1] - costs[2] + costs[3]) / (4 * small**2)
         assert hessian[i, j] == pytest.approx(numeric, abs=1e-4)
-
-
-def lines_only(angles):
-    """G of lines whose directions are all that a linear map has to explain."""
-    u = np.column_stack([np.cos(angles), np.sin(angles)])
-    q = np.linalg.qr(u)[0]
-    return np.eye(len(u)) - q @ q.T
-
-
-def test_the_metric_upgrade_undoes_any_affine_map():
-    angles = np.random.default_rng(1).uniform(0, np.pi, 10)
-    z, condition = metric_upgrade(lines_only(angles))
-    same, mirrored = z * np.exp(-1j * angles), z * np.exp(1j * angles)
-    off = min(np.abs(w - w[0]).max() for w in (same, mirrored))
-    assert off < 1e-9
-    assert condition > 0.1
-
-
-def test_two_directions_leave_the_upgrade_without_condition():
-    angles = np.array([0.0, np.pi / 2] * 5)
-    assert metric_upgrade(lines_only(angles))[1] < 1e-9

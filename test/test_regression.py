@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sfa_localization.data.errors import DataError, ModelError
-from sfa_localization.metric import saved_map
 from sfa_localization.metric.basis import (
     Monomials,
     Process,
@@ -128,17 +127,6 @@ def test_arrays_bring_back_the_same_map(metric_map):
     again = MetricMap.from_arrays(metric_map.to_arrays())
     for a, b in zip(metric_map.predict(FEATURES), again.predict(FEATURES), strict=True):
         assert np.array_equal(a, b)
-
-
-def test_a_large_process_is_saved_in_single_precision(monkeypatch):
-    basis = BASES['gp']
-    exact = MetricMap.of(basis, regressed(basis), 1.0)
-    monkeypatch.setattr(saved_map, '_EXACT_POINTS', 10)
-    rounded = MetricMap.of(basis, regressed(basis), 1.0).to_arrays()
-    assert rounded['factor'].nbytes == 60 * 61 / 2 * 4
-    places, covariances = MetricMap.from_arrays(rounded).predict(FEATURES)
-    assert np.array_equal(places, exact.predict(FEATURES)[0])
-    assert np.allclose(covariances, exact.predict(FEATURES)[1], rtol=0.01, atol=1e-12)
 
 
 def test_one_row_predicts_as_many_do(metric_map):

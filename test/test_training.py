@@ -26,7 +26,7 @@ from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integ
 from sfa_localization.features import checkpoint as checkpoints
 from sfa_localization.features import image_features
 from sfa_localization.features.network_training import ImageSequence, train_network
-from sfa_localization.metric import refinement
+from sfa_localization.metric import turned_maps
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
@@ -59,31 +59,30 @@ def names(folder: Path) -> list[str]:
 
 
 def test_a_training_leaves_the_model_and_says_what_error_to_expect(trained):
-    """And where it is worst; what is reported is what the finer map was learned from."""
+    """And where it is worst; what is reported is of the map that the model holds."""
     model, result = PlaceModel.load(trained.model), trained.result
     quality, told = model.quality, summary(result)
     assert names(trained.model.parent) == ['model.npz']
-    assert quality['pictures'] == PICTURES and quality['certified'] and quality['refined']
+    assert quality['pictures'] == PICTURES and quality['certified'] and quality['turned']
     assert result.features.shape == (PICTURES, 6)
     worst = quality['worst']
     assert 0.0 < quality['expected_error_m'] < worst['expected_error_m']
     assert f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image' in told
     assert f'worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m' in told
     assert f'expect {quality["expected_yaw_error_deg"]:.1f} degrees' in told
-    assert '4 slow features refined by turned maps' in told
+    assert '4 slow features, then turned maps, directions' in told
     _, places = positions(result.metric, result.segments)
     assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
-    finest = result.metric.map, result.model.refinement.metric
-    np.testing.assert_allclose(*(m.predict(np.zeros((1, 32)))[0] for m in finest), atol=1e-6)
+    assert result.metric.map is result.model.metric
 
 
-def test_without_headings_or_finer_maps_it_learns_without(trained, tmp_path, monkeypatch, caplog):
+def test_without_headings_or_turned_maps_it_learns_without(trained, tmp_path, monkeypatch, caplog):
     bottom, _, top = SMALL_ARCHITECTURE.layers
     two = replace(SMALL_ARCHITECTURE, layers=(bottom, replace(top, field=(3, 6))))
     shallow = replace(SMALL_RECIPE, architecture=two)
     for module, name, value, by, said in (
         (image_features, 'SAMPLES', 15, SMALL_RECIPE, 'too few to learn a compass'),
-        (refinement, 'learn_metric', _fail, SMALL_RECIPE, 'positions are not refined: the drive'),
+        (turned_maps, 'learn_metric', _fail, SMALL_RECIPE, 'not turned maps: the drive'),
         (training, 'STEPS', training.STEPS, shallow, ''),
     ):
         caplog.clear()
@@ -91,7 +90,7 @@ def test_without_headings_or_finer_maps_it_learns_without(trained, tmp_path, mon
             patch.setattr(module, name, value)
             found = train([trained.bag], tmp_path / 'model.npz', by)
         assert said in caplog.text
-        assert found.model.refinement is None and 'refined' not in summary(found)
+        assert found.model.turned is None and 'turned' not in summary(found)
         without = name == 'SAMPLES'
         assert (found.model.compass is None) == without
         assert ('expected_yaw_error_deg' not in found.model.quality) == without

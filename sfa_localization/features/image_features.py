@@ -24,8 +24,8 @@ from sfa_localization.features.rotation_spread import disagreement
 Complex = NDArray[np.complex128]
 Spectrum = NDArray[np.complex64]
 
-REFINING_LAYER = 1
-"""Layer (0-based), below the top, whose map refines positions: it still holds the heading."""
+TURNED_LAYER = 1
+"""Layer (0-based), below the top, whose map is turned to locate by: it still holds the heading."""
 HARMONICS = 13
 """Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
 # Images whose maps and textures are kept for compass and keyframes, however long the drives.
@@ -77,7 +77,7 @@ class ImageFeatures:
     harmonic: Complex
     """(S, J) of the layers that the compass reads."""
     spectra: Spectrum | None
-    """(N, H, J) of the layer that refines positions; None in a network without it."""
+    """(N, H, J) of the layer that is turned; None in a network without it."""
     variance_shares: dict[str, list[float]]
     """(K,) each: `eta_phi` over rotations and `eta_p` over places, of the total variance."""
 
@@ -115,8 +115,8 @@ def features_of_runs(
         shares.add(maps[-1])
         harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
         # The top's own maps hardly show the heading.
-        if len(maps) > REFINING_LAYER + 1:
-            spectra.append(spectrum(maps[REFINING_LAYER]))
+        if len(maps) > TURNED_LAYER + 1:
+            spectra.append(spectrum(maps[TURNED_LAYER]))
         start += len(images)
         on_images(len(images))
     return ImageFeatures(

@@ -10,7 +10,6 @@ themselves, so one solver serves both.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -18,32 +17,6 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.array_files import Arrays
 from sfa_localization.data.geometry import Array
-
-
-class Basis(Protocol):
-    """An expansion of slow features, phi(s) = [k(s) turn, 1], with the precision of its prior."""
-
-    @property
-    def features(self) -> int:
-        """K: how many of the slowest features it reads."""
-
-    @property
-    def turn(self) -> Array:
-        """(k, m - 1)"""
-
-    @property
-    def ridge(self) -> Array:
-        """(m,) prior precision of each weight over the precision of a point; 0: no prior."""
-
-    @property
-    def prior(self) -> float:
-        """Prior variance of a position over a point's variance; 0: there is no prior."""
-
-    def kernel(self, features: Array) -> Array:
-        """k(s) (M, k) of slow features (M, >= K)."""
-
-    def to_arrays(self) -> Arrays:
-        """What `basis_from` restores it from."""
 
 
 def expand(basis: Basis, features: Array) -> Array:
@@ -155,6 +128,13 @@ class Process:
     def to_arrays(self) -> Arrays:
         points, noise = self.points.astype(np.float32), np.array(self.noise)
         return {'scale': self.scale, 'points': points, 'noise': noise}
+
+
+Basis = Monomials | Process
+"""An expansion of features, phi(s) = [k(s) turn, 1], of the slowest K = `features`: `kernel` gives
+k(s) (M, k), and `turn` is (k, m - 1). `ridge` (m,) is the prior precision of each weight over that
+of a point, `prior` the prior variance of a position over that of a point; 0 where there is none.
+"""
 
 
 def basis_from(arrays: Arrays) -> Basis:

@@ -71,15 +71,19 @@ def compass_layers(depth: int) -> tuple[int, ...]:
 
 
 def learn_heading(
-    images: ImageFeatures, segments: Segments, result: MetricResult
+    images: ImageFeatures, segments: Segments, result: MetricResult, sign: float
 ) -> LearnedHeading | None:
-    """The compass from the certified headings of the sampled images; None with too few of them."""
+    """The compass from the certified headings of the sampled images; None with too few of them.
+
+    `sign` is -1 where columns grow clockwise, seen from above.
+    """
     in_segments, yaw = headings(result, segments)
     labeled, at_sample, at_label = np.intersect1d(images.sampled, in_segments, return_indices=True)
     owner = assignment(segments, len(images.slow))[labeled]
     part = tracks(segments)[owner] % FOLDS
     try:
-        fit = fit_compass(images.slow[labeled], images.harmonic[at_sample], yaw[at_label], part)
+        harmonic = images.harmonic[at_sample]
+        fit = fit_compass(images.slow[labeled], harmonic, yaw[at_label], part, sign)
     except DataError as error:
         logger.warning('no heading is learned: %s', error)
         return None
@@ -106,25 +110,26 @@ class CompassFit:
     std: Array
 
 
-def fit_compass(features: Array, harmonic: Complex, yaw: Array, folds: Indices) -> CompassFit:
+def fit_compass(
+    features: Array, harmonic: Complex, yaw: Array, folds: Indices, sign: float
+) -> CompassFit:
     """Learn the compass from labels `yaw` (T,) rad of images with features and harmonics.
 
     `folds` (T,) numbers the parts that are left out in turn to choose the kernel's length and
-    noise, the direction of the columns, and the variance's calibration.
+    noise, and the variance's calibration.
     Raises DataError when there are too few labels.
     """
     if len(yaw) < _LABELS_MIN or len(np.unique(folds)) < 2:
         raise DataError(f'{len(yaw)} images with a heading are too few to learn a compass')
-    problem = _CompassProblem.of(features, harmonic, yaw, folds)
+    problem = _CompassProblem.of(features, harmonic, yaw, folds, sign)
     choices = [(length, noise) for length in _LENGTHS for noise in _NOISES]
-    sign = min((-1.0, 1.0), key=lambda s: problem.loss(s, _LENGTHS[1], _NOISES[1]))
-    length, noise = min(choices, key=lambda choice: problem.loss(sign, *choice))
-    g, variance = problem.left_out(sign, length, noise)
+    length, noise = min(choices, key=lambda choice: problem.loss(*choice))
+    g, variance = problem.left_out(length, noise)
     error = wrap_angle(sign * np.angle(g) - yaw)
     raw = phase_variance(g, variance)
     calibration = _calibrate(error, raw)
     std = np.sqrt(calibrated(raw, calibration))
-    compass = problem.compass(sign, length, noise, calibration)
+    compass = problem.compass(length, noise, calibration)
     return CompassFit(compass, error, std)
 
 
@@ -138,30 +143,33 @@ class _CompassProblem:
     harmonic_scale: Array
     yaw: Array
     folds: Indices
+    sign: float
     chosen: Indices
 
     @classmethod
-    def of(cls, features: Array, harmonic: Complex, yaw: Array, folds: Indices) -> _CompassProblem:
+    def of(
+        cls, features: Array, harmonic: Complex, yaw: Array, folds: Indices, sign: float
+    ) -> _CompassProblem:
         feature_scale = features[:, :PLACE_FEATURES].std(0) + 1e-12
         harmonic_scale = np.sqrt((np.abs(harmonic) ** 2).mean(0)) + 1e-12
         s, f = scaled_inputs(features, harmonic, feature_scale, harmonic_scale)
         chosen = _evenly(len(yaw), INDUCING_IMAGES)
-        return cls(s, f, feature_scale, harmonic_scale, yaw, folds, chosen)
+        return cls(s, f, feature_scale, harmonic_scale, yaw, folds, sign, chosen)
 
-    def loss(self, sign: float, length: float, noise: float) -> float:
+    def loss(self, length: float, noise: float) -> float:
         """Mean left-out error of a candidate, rad; with fewer inducing images."""
         few = self.chosen[_evenly(len(self.chosen), _SELECTION_IMAGES)]
-        g, _ = self.left_out(sign, length, noise, few)
-        return float(np.abs(wrap_angle(sign * np.angle(g) - self.yaw)).mean())
+        g, _ = self.left_out(length, noise, few)
+        return float(np.abs(wrap_angle(self.sign * np.angle(g) - self.yaw)).mean())
 
     def left_out(
-        self, sign: float, length: float, noise: float, chosen: Indices | None = None
+        self, length: float, noise: float, chosen: Indices | None = None
     ) -> tuple[Complex, Array]:
         """Prediction g (T,) and its variance (T,) for each fold by all the others."""
         m = self.chosen if chosen is None else chosen
         prior = kernel_between(self.s[m], self.f[m], self.s[m], self.f[m], length)
         kernel = kernel_between(self.s, self.f, self.s[m], self.f[m], length)
-        target = np.exp(1j * sign * self.yaw)
+        target = np.exp(1j * self.sign * self.yaw)
         normal, moment = kernel.conj().T @ kernel, kernel.conj().T @ target
         g, variance = np.zeros(len(self.yaw), complex), np.zeros(len(self.yaw))
         for fold in np.unique(self.folds):
@@ -174,18 +182,18 @@ class _CompassProblem:
             variance[out] = np.maximum(prior_variance(self.f[out]) - explained, 0.0) + noise
         return g, variance
 
-    def compass(self, sign: float, length: float, noise: float, calibration: Array) -> Compass:
+    def compass(self, length: float, noise: float, calibration: Array) -> Compass:
         """The compass of all labels, solved for the inducing images as they will be saved."""
         s = self.s[self.chosen].astype(np.float32).astype(np.float64)
         f = self.f[self.chosen].astype(np.complex64).astype(np.complex128)
         kernel = kernel_between(self.s, self.f, s, f, length)
-        moment = kernel.conj().T @ np.exp(1j * sign * self.yaw)
+        moment = kernel.conj().T @ np.exp(1j * self.sign * self.yaw)
         weights, uncertainty = _solve(
             kernel.conj().T @ kernel, moment, kernel_between(s, f, s, f, length), noise
         )
         scales = self.feature_scale, self.harmonic_scale
         factor = np.asfortranarray(lower_root(uncertainty), np.complex64)
-        return Compass(s, f, *scales, weights, factor, length, noise, sign, calibration)
+        return Compass(s, f, *scales, weights, factor, length, noise, self.sign, calibration)
 
 
 def _evenly(count: int, most: int) -> Indices:

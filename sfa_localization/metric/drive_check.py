@@ -14,8 +14,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.map_covariance import angle_covariance
 from sfa_localization.metric.map_fit import MapFit
-from sfa_localization.metric.phases import metric_upgrade
-from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.quadratic_form import Links, Stack
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
@@ -33,8 +32,6 @@ ROUTE = (
 _SEGMENTS_MIN = 3
 # Narrower drives do not cover an area.
 _WIDTH_MIN_M = 0.5
-# Of the metric upgrade's singular values: below, some shear explains the data as well.
-_UPGRADE_MIN = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +47,6 @@ class Diagnostics:
     """Spread of driving directions: 0 all parallel, 1 evenly spread (opposite counts as same)."""
     crossings: int
     """Pairs of segments that cross, of different stretches of the drive."""
-    upgrade_condition: float
-    """0: any shear explains the data; NaN when turns rule that out."""
-    mirror_ambiguous: bool
-    """The mirror image of the map explains the data as well."""
     angle_std_rad: float
     """Uncertainty of a segment's direction relative to the whole map, of all but the least sure
     segments: see SURE_SHARE."""
@@ -61,31 +54,33 @@ class Diagnostics:
     @property
     def one_route(self) -> bool:
         """Whether nothing but odometry, by its turns, connects the parts of the drive."""
-        signed = bool(np.isnan(self.upgrade_condition))
-        return signed and _connects_nothing(self.extent_m, self.crossings)
+        return _connects_nothing(self.extent_m, self.crossings)
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
-def check_amount(stack: Stack) -> None:
-    """Raises DataError when there are too few segments to try."""
+def check_amount(stack: Stack, links: Links) -> None:
+    """Raises DataError when there are too few segments to try, or neither turns nor curves: the
+    mirror image of straight lines, or any shear of them, explains their images as well.
+    """
     if stack.segments < _SEGMENTS_MIN:
         raise DataError(
             f'only {stack.segments} segments of odometry with images: drive at least '
             f'{_SEGMENTS_MIN}, in different directions and crossing each other'
         )
+    if not links.used and not stack.path.imag.any():
+        raise DataError(
+            'the odometry breaks between all straight lines: check it, or set segments: any'
+        )
 
 
 def diagnose(fit: MapFit) -> Diagnostics:
     """Diagnostics of a fit."""
-    places, stack, links = fit.places, fit.stack, fit.problem.links
+    places, stack = fit.places, fit.stack
     steps = stack.path[1:] - stack.path[:-1]
     same = stack.owner[1:] == stack.owner[:-1]
     heading = steps[same] * fit.solution.z[stack.owner[1:][same]]
-    # Curved paths and odometry's links differ from their mirror image.
-    signed = links.used or bool(np.any(stack.path.imag))
-    condition = np.nan if signed else metric_upgrade(np.real(fit.solution.h))[1]
     return Diagnostics(
         segments=stack.segments,
         images=len(places),
@@ -93,8 +88,6 @@ def diagnose(fit: MapFit) -> Diagnostics:
         extent_m=_extent(places),
         directions=_directions(heading),
         crossings=_crossings(places, stack.first),
-        upgrade_condition=float(condition),
-        mirror_ambiguous=not signed and len(links.at) == 0,
         angle_std_rad=_sure(np.sqrt(np.diag(angle_covariance(fit))), stack),
     )
 
@@ -104,19 +97,8 @@ def check(diagnostics: Diagnostics) -> None:
 
     One route determines its own map: see `Diagnostics.one_route`.
     """
-    if diagnostics.upgrade_condition < _UPGRADE_MIN:
-        raise DataError(
-            'without turns the lines leave the map sheared or collapsed: drive at least three '
-            'well-spread directions'
-        )
     if diagnostics.one_route:
         return
-    if _connects_nothing(diagnostics.extent_m, diagnostics.crossings):
-        raise DataError(
-            f'the drive covers {diagnostics.extent_m[0]:.1f} m by {diagnostics.extent_m[1]:.1f} m '
-            f'with {diagnostics.crossings} crossings, and odometry does not connect it: drive in '
-            'other directions too, across earlier tracks'
-        )
     uncertain = min(float(np.rad2deg(diagnostics.angle_std_rad)), 180.0)
     if uncertain > ANGLE_STD_MAX_DEG:
         raise DataError(

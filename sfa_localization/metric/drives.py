@@ -25,16 +25,12 @@ from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
-from sfa_localization.metric.selection import Span
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import with_closures
 from sfa_localization.metric.turn_loss import Shown, way_of
 
 logger = logging.getLogger(__name__)
 
-COARSE_POINTS = 700
-"""Images that span the map: with more, positions and headings are no better, and the model file is
-larger."""
 _LOSS_ROUNDS = 2
 """The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
 
@@ -142,15 +138,15 @@ def learn_map(
     Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
     DataError; `strict` also for a single route, of which else a warning says so.
     """
-    segments, span = drives.cut(), Span(COARSE_POINTS)
-    result = learn_metric(features, segments, config, seed, span)
+    segments = drives.cut()
+    result = learn_metric(features, segments, config, seed)
     for _ in range(_LOSS_ROUNDS if config.solver == 'certified' else 0):
         ways = drives.ways(segments, result)
         if not any(ways):
             break
         try:
             shorter = drives.cut(ways)
-            segments, result = shorter, learn_metric(features, shorter, config, seed, span)
+            segments, result = shorter, learn_metric(features, shorter, config, seed)
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break

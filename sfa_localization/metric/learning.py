@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, RigidTransform, wrap_angle
+from sfa_localization.data.geometry import Array, RigidTransform, align_complex, wrap_angle
 from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
@@ -28,7 +28,7 @@ from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import LeftOut, Span, choose, leave_out, part_of
+from sfa_localization.metric.selection import LeftOut, choose, leave_out, part_of
 from sfa_localization.metric.settings import MetricConfig
 
 Indices = NDArray[np.int64]
@@ -109,23 +109,24 @@ def learn_metric(
     segments: Segments,
     config: MetricConfig,
     seed: int = 0,
-    span: Span | None = None,
+    scale: Array | None = None,
     onto: MetricResult | None = None,
 ) -> MetricResult:
-    """Learn meters from slow features (N, K), one row per image of the runs, and segments.
+    """Learn meters from features (N, K), one row per image of the runs, and segments.
 
-    The result lies in its own map frame, or in that of `onto`, another result of the same segments.
+    `scale` (K,) weights the features, without it their slowness does. The result lies in its own
+    map frame, or in that of `onto`, another result of the same segments.
 
     Raises DataError when the features are unusable, when the drive cannot determine a map (the
     message names what to drive instead), or when optimality is not proven.
     """
     problem = MetricProblem.of(features, segments, config, seed)
-    check_amount(problem.stack)
+    check_amount(problem.stack, problem.links)
     history = np.zeros(0)
     if config.solver == 'paper':
         fit, history = paper_solver.learn(problem)
     else:
-        fit = choose(problem, span)
+        fit = choose(problem, scale)
     left = _Left.of(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
     overfits &= config.solver == 'certified' and not diagnose(fit).one_route
@@ -157,13 +158,10 @@ def _check_certificate(fit: MapFit) -> None:
 
 
 def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
-    """From the fit's arbitrary frame to that of another result, by headings, then positions."""
-    segments, solution = fit.problem.segments, fit.solution
-    (_, yaw), (_, places) = headings(other, segments), positions(other, segments)
-    own_yaw = _headings(np.angle(solution.z), solution.bias, fit.stack)
-    turn = RigidTransform(0.0, 0.0, float(np.angle(np.exp(1j * (yaw - own_yaw)).mean())))
-    x_m, y_m = (places - turn.apply(plane(fit.places))).mean(0).tolist()
-    return RigidTransform(x_m, y_m, turn.yaw_rad)
+    """From the fit's arbitrary frame to that of another result of the same segments."""
+    places = positions(other, fit.problem.segments)[1] @ np.array([1.0, 1.0j])
+    turn, shift = align_complex(fit.places, places)
+    return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,13 +245,8 @@ def positions(result: MetricResult, segments: Segments) -> tuple[Indices, Array]
 def headings(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
     """Images (M,) of the segments, and the robot's yaw (M,) rad in the map frame."""
     stack = Stack.of(segments)
-    return stack.images, _headings(result.angles, result.yaw_bias, stack)
-
-
-def _headings(angles: Array, bias: Array, stack: Stack) -> Array:
-    """Yaw (M,) rad of the images, from the directions (N,) rad and the biases (R,) rad/s."""
-    own = stack.headings - bias[stack.period[stack.owner]] * stack.times_s
-    return wrap_angle(angles[stack.owner] + own)
+    own = stack.headings - result.yaw_bias[stack.period[stack.owner]] * stack.times_s
+    return stack.images, wrap_angle(result.angles[stack.owner] + own)
 
 
 def correlation_along_drive(

@@ -90,7 +90,8 @@ class MetricProblem:
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
             loops = self.loops.form(self.stack, solution)
             form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
-            solution = self._solve(form, solution)
+            bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
+            solution = form.solve(solution.z if solution else None, bias)
             links, links_before = learned(self.links, form, solution), links
             weights = elimination.weights(solution.coefficients(self.stack.period))
             predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
@@ -121,23 +122,6 @@ class MetricProblem:
         """
         gram = elimination.gram + variance * loops
         return QuadraticForm(gram, links, self.stack.period, variance, bias_std)
-
-    def _solve(self, form: QuadraticForm, before: Solution | None) -> Solution:
-        if before is None:
-            solution = form.solve(None, np.zeros(self.stack.period[-1] + 1))
-        else:
-            solution = form.solve(before.z, before.bias)
-        return self._unmirrored(solution)
-
-    def _unmirrored(self, solution: Solution) -> Solution:
-        """Where the cost is the same for the mirror image, let the signs of the turns decide."""
-        if np.abs(solution.h.imag).max() > 1e-9 * np.abs(solution.h).max():
-            return solution
-        at, turn = self.links.at, self.links.turn
-        turned = np.angle(solution.z[at + 1] * np.conj(solution.z[at]))
-        if np.cos(turned - turn).sum() >= np.cos(turned + turn).sum():
-            return solution
-        return replace(solution, z=np.conj(solution.z), o=np.conj(solution.o))
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +178,7 @@ class MapFit:
         correlation = LINK_WEIGHT * _correlation(errors, stack)
         noise = variance * correlation
         form = problem.form(self.elimination, self.loops, problem.links, noise, YAW_BIAS_STD)
-        solution = problem._unmirrored(form.solve(None, np.zeros(stack.period[-1] + 1)))
+        solution = form.solve(None, np.zeros(stack.period[-1] + 1))
         weights = self.elimination.weights(solution.coefficients(stack.period))
         predicted = self.expanded @ weights.real + 1j * (self.expanded @ weights.imag)
         residuals = np.asarray(solution.places(stack) - predicted)

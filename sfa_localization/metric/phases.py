@@ -9,7 +9,7 @@ eliminated; the paper descends on the angles instead, eq. 2 and eq. 6 to eq. 8.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,22 +61,20 @@ def certify(h: Complex, z: Complex) -> Certificate:
 def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> tuple[Complex, Certificate]:
     """Global minimizer z (N,) and its certificate.
 
-    Starts from `starts`, then from the smallest eigenvector, and from the metric upgrade; the first
-    certified minimum ends the search. The result may be uncertified: check the certificate.
+    Starts from `starts`; from the smallest eigenvector without any, or where they do not lead to a
+    certified minimum, and then from the mirror image of the best so far. The result may be
+    uncertified: check the certificate.
     """
-    first = [unit(s) for s in starts] or [spectral_start(h)]
-    z = min([refine(h, s) for s in first], key=lambda c: phase_cost(h, c))
+    z = min((refine(h, unit(s)) for s in starts or [spectral_start(h)]), key=_by_cost(h))
     certificate = certify(h, z)
-    for more in (_spectral_starts, _upgraded_starts):
-        if certificate.certified:
-            break
-        z = min([z, *(refine(h, c) for c in more(h, z))], key=lambda c: phase_cost(h, c))
+    if not certificate.certified:
+        z = min([z, *(refine(h, s) for s in (spectral_start(h), np.conj(z)))], key=_by_cost(h))
         certificate = certify(h, z)
     return z, certificate
 
 
-def _spectral_starts(h: Complex, z: Complex) -> list[Complex]:
-    return [spectral_start(h)]
+def _by_cost(h: Complex) -> Callable[[Complex], float]:
+    return lambda z: phase_cost(h, z)
 
 
 def unit(z: Complex) -> Complex:
@@ -88,29 +86,6 @@ def unit(z: Complex) -> Complex:
 def spectral_start(h: Complex) -> Complex:
     """Phases of the smallest eigenvector of H."""
     return unit(scipy.linalg.eigh(h, subset_by_index=[0, 0])[1][:, 0])
-
-
-def metric_upgrade(g: Complex) -> tuple[Complex, float]:
-    """Phases from the two smallest eigenvectors of real G, and how well they are fixed.
-
-    The eigenvectors give the directions u_n up to an affine map; the symmetric B (2, 2) with
-    u_n^T B u_n = 1 for all n undoes it, up to rotation and mirror. The condition is the smallest
-    singular value over the largest of that linear problem: 0 when fewer than three directions
-    are known, and any shear explains the data.
-    """
-    u = scipy.linalg.eigh(np.real(g), subset_by_index=[0, 1])[1]
-    u = u * np.sqrt(len(u))
-    design = np.column_stack([u[:, 0] ** 2, u[:, 1] ** 2, 2 * u[:, 0] * u[:, 1]])
-    singular = np.linalg.svd(design, compute_uv=False)
-    a, b, c = np.linalg.lstsq(design, np.ones(len(u)), rcond=1e-10)[0]
-    values, axes = np.linalg.eigh(np.array([[a, c], [c, b]]))
-    points = u @ axes * np.sqrt(np.maximum(values, 1e-12))
-    return unit(points[:, 0] + 1j * points[:, 1]), float(singular[-1] / singular[0])
-
-
-def _upgraded_starts(h: Complex, z: Complex) -> list[Complex]:
-    start = metric_upgrade(h)[0] if len(h) > 2 else z
-    return [start, np.conj(start), np.conj(z)]
 
 
 def refine(h: Complex, z: Complex) -> Complex:

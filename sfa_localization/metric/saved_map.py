@@ -9,8 +9,7 @@ are learned, everything that is predicted is linear or quadratic in k:
     variance  c + k a - |k C|^2,    C C^T = W (p I - Q) W^T
 
 with Q the weights' posterior covariance, below its prior p I. Without a prior, C C^T = W Q W^T is
-added instead. So two m x m products become one triangular one, which reads a quarter of the memory,
-or an eighth where float32 suffices.
+added instead. So two m x m products become one triangular one, which reads a quarter of the memory.
 """
 
 from __future__ import annotations
@@ -18,21 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.array_files import Arrays, packed, unpacked
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.basis import Basis, Process, basis_from, matern
+from sfa_localization.metric.basis import Basis, basis_from
 from sfa_localization.metric.lower_factor import lower_root, squares
-
-Factor = NDArray[np.float32] | NDArray[np.float64]
-
-# Error of the variance, over the variance of a point, that float32 may make.
-_TOLERANCE = 2e-3
-# Factors of more points are rounded to float32, half of the model file: standard deviations
-# change by 0.5 % at most where the map is surest. Fewer points are of maps that may be exact.
-_EXACT_POINTS = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +51,7 @@ class MetricMap:
     basis: Basis
     linear: Array
     constant: Array
-    factor: Factor
+    factor: Array
     floor: float
     inflation: float
 
@@ -73,14 +63,13 @@ class MetricMap:
         q = weights.spread @ weights.spread.T
         inner = _sign(basis) * (q[:-1, :-1] - prior * np.eye(len(q) - 1))
         quadratic = basis.turn @ inner @ basis.turn.T
-        factor = lower_root((quadratic + quadratic.T) / 2)
-        if len(factor) > _EXACT_POINTS:
-            factor = factor.astype(np.float32).astype(np.float64)
+        # Rounded as model files hold it: standard deviations change by 0.5 % at most.
+        factor = lower_root((quadratic + quadratic.T) / 2).astype(np.float32)
         rows = np.column_stack([weights.mean, 2 * q[:, -1], weights.sway.reshape(len(q), -1)])
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + floor + prior
-        small = _rounded(factor, basis, floor)
-        return cls(basis, basis.turn @ rows[:-1], constant, small, floor, inflation)
+        linear = basis.turn @ rows[:-1]
+        return cls(basis, linear, constant, np.asfortranarray(factor, float), floor, inflation)
 
     @property
     def features(self) -> int:
@@ -107,13 +96,11 @@ class MetricMap:
 
     def to_arrays(self) -> Arrays:
         """Plain arrays, the factor packed."""
-        rounded = len(self.factor) > _EXACT_POINTS
         return {
             **self.basis.to_arrays(),
             'linear': self.linear,
             'constant': self.constant,
-            'factor': packed(self.factor.astype(np.float32) if rounded else self.factor),
-            'in_double': np.array(self.factor.dtype == np.float64),
+            'factor': packed(self.factor.astype(np.float32)),
             'scalars': np.array([self.floor, self.inflation]),
         }
 
@@ -122,10 +109,7 @@ class MetricMap:
         """The map of saved arrays. Raises ModelError where one is missing."""
         try:
             floor, inflation = (float(value) for value in arrays['scalars'])
-            factor: Factor = unpacked(arrays['factor'])
-            if arrays['in_double']:
-                factor = np.asfortranarray(factor, np.float64)
-            basis = basis_from(arrays)
+            factor, basis = unpacked(arrays['factor']).astype(float), basis_from(arrays)
             return cls(basis, arrays['linear'], arrays['constant'], factor, floor, inflation)
         except KeyError as error:
             raise ModelError(f'the metric map lacks {error}') from None
@@ -134,14 +118,3 @@ class MetricMap:
 def _sign(basis: Basis) -> float:
     """Of the quadratic part of the variance."""
     return -1.0 if basis.prior else 1.0
-
-
-def _rounded(factor: Array, basis: Basis, floor: float) -> Factor:
-    """The factor in float32 where the variance of a process stays accurate, in Fortran order."""
-    if not isinstance(basis, Process):
-        return np.asfortranarray(factor)
-    small, points = np.asfortranarray(factor, np.float32), basis.points
-    probe = matern(points[:: max(1, len(points) // 64)] * 1.02, points)
-    change = squares(probe, small) - ((probe @ factor) ** 2).sum(1)
-    accurate = np.abs(change).max() < _TOLERANCE * floor
-    return small if accurate else np.asfortranarray(factor)

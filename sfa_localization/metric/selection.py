@@ -20,38 +20,25 @@ from sfa_localization.metric.quadratic_form import Stack, eliminate, schur
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
-INDUCING_POINTS = 1500
-"""Most images that span the Gaussian process: more are exact, but slow to predict with."""
+INDUCING_POINTS = 1000
+"""Most images that span the Gaussian process: with half as many more it is no better, and the model
+file and the time of an estimate are larger."""
 RIDGES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Penalties of the monomials that are tried, over the mean square of an image's residual."""
 LEFT_OUT_FOLDS = 8
 """Parts of the drive that are left out in turn."""
 LEFT_OUT_LENGTH_M = 10.0
 """Longest stretch that is left out as a whole: longer gaps do not occur in a covered area."""
-# Counts of slow features that are tried; the paper uses 8.
-_COUNTS = {'gp': (8, 12, 16, 24, 32), 'monomials': (3, 4, 5, 6, 8, 10, 12)}
-# The search, and the comparison, use fewer inducing points than the final map: both rank alike.
-_SEARCH_POINTS = 300
-_SCORE_POINTS = 700
-# Of features at given weights: with 300 the search ends with too much noise.
-_SCALED_SEARCH_POINTS = 800
+# Counts of slow features that are tried with monomials; the paper uses 8.
+_COUNTS = (3, 4, 5, 6, 8, 10, 12)
+# Inducing points while length and noise are searched; with 300 the search ends with too much noise.
+_SEARCH_POINTS = 800
 # Length (in typical distances of two images) and noise (over the signal) that the search starts at.
 _FIRST_HYPER = (1.0, 1e-3)
 _LENGTH_BOUNDS = (0.05, 20.0)
 _NOISE_BOUNDS = (1e-6, 1.0)
 # Keeps the logarithm of an exact prediction finite.
 _FLOOR_M = 1e-12
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """What spans a Gaussian process: at most `points` images. It weights the features by their
-    slowness and chooses how many it reads; with `scale` (K,), it weights them by that and reads
-    all; a unit length is then the typical distance of two images.
-    """
-
-    points: int = INDUCING_POINTS
-    scale: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,29 +159,27 @@ def feature_scale(features: Array, stack: Stack, count: int) -> Array:
     return np.asarray(weights / np.where(std > 0, std, 1.0))
 
 
-def choose(problem: MetricProblem, span: Span | None = None) -> MapFit:
-    """The fit of the best basis of the kind that the settings name."""
-    span = span or Span()
-    size = min(span.points, INDUCING_POINTS)
+def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
+    """The fit of the best basis of the kind that the settings name.
+
+    `scale` (K,) weights the features of a Gaussian process, in which a unit length then is the
+    typical distance of two images; without it their slowness does.
+    """
     if problem.config.metric_map == 'monomials':
         return _choose_monomials(problem)
-    if span.scale is None:
-        return _choose_process(problem, size)
-    return _choose_scaled(problem, size, span.scale)
-
-
-def _counts(problem: MetricProblem) -> list[int]:
-    available = problem.features.shape[1]
-    if problem.config.slow_features:
-        return [min(problem.config.slow_features, available)]
-    return [k for k in _COUNTS[problem.config.metric_map] if k < available] + [available]
+    if scale is None:
+        count = problem.config.slow_features or problem.features.shape[1]
+        scale = feature_scale(problem.features, problem.stack, count)
+    return _choose_process(problem, scale)
 
 
 def _choose_monomials(problem: MetricProblem) -> MapFit:
     """Count and ridge with the smallest left-out error."""
     features = problem.features
     best: tuple[float, MapFit] | None = None
-    for count in _counts(problem):
+    available = features.shape[1]
+    counts = [k for k in _COUNTS if k < available] + [available]
+    for count in [problem.config.slow_features] if problem.config.slow_features else counts:
         if 1 + count + count * (count + 1) // 2 > len(features) / 2 and best is not None:
             break
         for ridge in RIDGES:
@@ -207,57 +192,18 @@ def _choose_monomials(problem: MetricProblem) -> MapFit:
     return problem.fit(best[1].basis, best[1])
 
 
-def _choose_process(problem: MetricProblem, size: int) -> MapFit:
-    """Length and noise by the evidence, the count of features by what is left out."""
-    best: tuple[float, MapFit, tuple[float, float]] | None = None
-    hyper = _FIRST_HYPER
-    for count in _counts(problem):
-        now, hyper = _scored(count, hyper, problem, best and best[1])
-        error = leave_out(now).typical_m
-        if best is None or error < best[0]:
-            best = error, now, hyper
-    assert best is not None
-    _, now, (length, noise) = best
-    scale = feature_scale(problem.features, problem.stack, now.basis.features) / length
-    basis = Process.fit(problem.features, scale, noise, size)
-    return problem.fit(basis, now)
-
-
-def _choose_scaled(problem: MetricProblem, size: int, scale: Array) -> MapFit:
-    """Length and noise by the evidence, all features at their given weights."""
-    points = min(_SCALED_SEARCH_POINTS, size)
-    now, (length, noise) = _search(problem, scale, points, _FIRST_HYPER, None)
-    basis = Process.fit(problem.features, scale / length, noise, size)
-    return problem.fit(basis, now)
-
-
-def _scored(
-    count: int, hyper: tuple[float, float], problem: MetricProblem, start: MapFit | None
-) -> tuple[MapFit, tuple[float, float]]:
-    """The process over `count` features at its best length and noise, and these."""
-    scale = feature_scale(problem.features, problem.stack, count)
-    now, (length, noise) = _search(problem, scale, _SEARCH_POINTS, hyper, start)
-    points = min(_SCORE_POINTS, INDUCING_POINTS)
-    basis = Process.fit(problem.features, scale / length, noise, points)
-    return problem.fit(basis, now, 2), (length, noise)
-
-
-def _search(
-    problem: MetricProblem,
-    scale: Array,
-    size: int,
-    hyper: tuple[float, float],
-    start: MapFit | None,
-) -> tuple[MapFit, tuple[float, float]]:
-    """The fit of `size` inducing points at the first length and noise, and the best of these."""
+def _choose_process(problem: MetricProblem, scale: Array) -> MapFit:
+    """Length and noise by the evidence, with fewer inducing points: they rank alike."""
     scaled = problem.features[:, : len(scale)] * scale
-    points = scaled[spread(scaled, size)]
+    points = scaled[spread(scaled, min(_SEARCH_POINTS, INDUCING_POINTS))]
 
     def make(length: float, noise: float) -> Process:
         return Process(scale / length, points / length, noise)
 
-    now = problem.fit(make(*hyper), start, 3)
-    return now, _descend(make, hyper, now)
+    now = problem.fit(make(*_FIRST_HYPER), None, 3)
+    length, noise = _descend(make, _FIRST_HYPER, now)
+    basis = Process.fit(problem.features, scale / length, noise, INDUCING_POINTS)
+    return problem.fit(basis, now)
 
 
 def _descend(

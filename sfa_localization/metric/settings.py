@@ -46,7 +46,10 @@ class MetricConfig(Settings):
         'gp', 'Gaussian process, or monomials up to degree 2', choices=('gp', 'monomials')
     )
     slow_features: int = setting(
-        0, 'slowest features used; 0: chosen by leaving out segments', low=0, high=1000
+        0,
+        'slowest features used; 0: all, or of monomials as many as segments left out choose',
+        low=0,
+        high=1000,
     )
     anchor: tuple[float, ...] = setting(
         (),

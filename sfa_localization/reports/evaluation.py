@@ -38,13 +38,11 @@ LABELS = {
     'sfa': 'SFA, one image each',
     'ekf': 'EKF: SFA + odometry',
     'smoothed': 'EKF, smoothed',
-    'supervised': 'supervised reference',
 }
 # Lines above dots above the truth; dots for estimates from single images.
 STYLES: dict[str, dict[str, Any]] = {
     'odometry': {'color': '#E69F00', 'linestyle': '--', 'linewidth': 1.4, 'zorder': 3},
     'sfa': {'color': '#56B4E9', 'linestyle': '', 'marker': 'o', 'markersize': 2.6, 'zorder': 2},
-    'supervised': {'color': '#009E73', 'linestyle': '', 'marker': 'x', 'markersize': 3},
     'ekf': {'color': '#0072B2', 'linestyle': '-', 'linewidth': 1.7, 'zorder': 4},
     'smoothed': {'color': '#D55E00', 'linestyle': '-', 'linewidth': 1.2, 'zorder': 5},
 }

@@ -14,11 +14,11 @@ def summary(trained: Trained) -> str:
     worst = quality['worst']
     along, across = coverage['extent_m']
     proof = 'proven optimal' if quality['certified'] else 'NOT proven optimal'
-    refined = ' refined by turned maps' if quality['refined'] else ''
+    turned = ', then turned maps' if quality['turned'] else ''
     lines = [
         f'images: {quality["pictures"]} in {quality["segments"]} segments of odometry, '
         f'{coverage["length_m"]:.0f} m driven, about {along:.0f} m x {across:.0f} m covered',
-        f'map: {quality["features_used"]} slow features{refined}, directions {proof} '
+        f'map: {quality["features_used"]} slow features{turned}, directions {proof} '
         f'(certificate {quality["certificate"]:.1e})',
         f'position: expect {quality["expected_error_m"]:.2f} m mean error of one image on paths '
         f'between the trained ones; worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m: '

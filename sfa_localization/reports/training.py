@@ -97,7 +97,7 @@ def judgment(trained: Trained) -> tuple[str, str]:
     route = trained.metric.diagnostics.one_route
     if quality['explained'] < EXPLAINED and not route:
         return page.BAD, 'The map cannot be used: the images hardly show where they were taken.'
-    if expected > USEFUL_M or trained.metric.diagnostics.mirror_ambiguous:
+    if expected > USEFUL_M:
         return page.BAD, 'The map cannot be used yet: see what to drive next.'
     sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
     if expected > GOOD_M or not sure:
@@ -139,15 +139,13 @@ def trust_lines(trained: Trained) -> list[str]:
         if quality['certified']
         else 'NOT proven: other directions of the segments may fit better '
     )
-    lines = [
+    return [
         proven + f'(certificate {quality["certificate"]:.1e}, at least zero up to rounding).',
         f'Of the images that were left out, {quality["left_out_within_95"]:.0%} lie in the region '
         'that claims to hold 95 %.',
         f'The least certain direction of a segment is known to {angle:.1f} degrees.',
         'Not included: other light than in training, and a wheel radius that is wrong everywhere.',
     ]
-    mirrored = 'The mirror image of the map fits as well: drive curves.'
-    return [*lines, mirrored] if found.mirror_ambiguous else lines
 
 
 def advice(trained: Trained) -> list[str]:
@@ -160,8 +158,6 @@ def advice(trained: Trained) -> list[str]:
         lines.append('Drive in other directions: most of this drive was parallel.')
     if found.crossings < FEW_CROSSINGS:
         lines.append(f'Cross your own track: this drive does so {found.crossings} times.')
-    if found.mirror_ambiguous:
-        lines.append('Drive some curves: straight lines alone do not show left and right.')
     return [*lines, 'For other light, drive once more when it is cloudy, or at another hour.']
 
 

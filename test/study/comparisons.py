@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from unittest.mock import patch
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from sfa_localization.features.network import (
 )
 from sfa_localization.features.network_training import LIGHT_STD, ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
-from sfa_localization.metric.learning import learn_metric
+from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
@@ -79,10 +80,8 @@ def _judged(site: Site, study: Study, model: PlaceModel, name: str) -> Cell:
     segments = study.segments(SegmentConfig())
     fitted = np.concatenate([segment.images for segment in segments])
     if name == SECOND:
-        if model.refinement is None:
-            return {'problem': 'the network has no layer for a second pass'}
         features = study.features(turned_of(model))
-        return Trial.of(study, model.refinement.metric, features, rows, fitted).errors()
+        return Trial.of(study, model.metric, features, rows, fitted).errors()
     features = study.features(BASELINES[name](study, model))
     try:
         metric = learn_metric(features[0], segments, MetricConfig()).map
@@ -127,8 +126,8 @@ class Variant:
     @property
     def same_map(self) -> bool:
         """Whether it learns the map of the whole package, from its network."""
-        mine = self.metric, self.segments, self.one_drive, self.exact_odometry
-        return mine == (MetricConfig(), SegmentConfig(), False, False)
+        mine = self.metric, self.segments, self.second_pass, self.one_drive, self.exact_odometry
+        return mine == (MetricConfig(), SegmentConfig(), True, False, False)
 
     def recipe(self, base: Recipe) -> Recipe:
         """How it trains."""
@@ -142,8 +141,6 @@ class Variant:
 
     def reduced(self, model: PlaceModel) -> PlaceModel:
         """A model without the parts that it does without."""
-        if not self.second_pass:
-            model = replace(model, refinement=None)
         if not self.keyframes:
             # No correlation is high enough to be believed.
             noise = replace(model.keyframes.noise, lowest=np.inf)
@@ -211,23 +208,35 @@ def _exact(run: Run) -> Run:
     return replace(run, odometry=Odometry.along(run.ground_truth), yaw_rate=None)
 
 
+def _first_pass(
+    _spectra: object, _segments: object, first: MetricResult, *_rest: object
+) -> tuple[None, MetricResult]:
+    """The map of slow features, where else that of turned maps is learned."""
+    return None, first
+
+
 def _ablated(site: Site, study: Study, whole: PlaceModel, variant: Variant) -> Cell:
     """Scores of a variant, aligned on the last training drive."""
     recipe, network = variant.recipe(site.recipe), whole.network
     if not variant.same_network:
-        first = study.training[0]
+        drive = study.training[0]
         network = train_network(
-            variant.architecture(first.panoramas.shape[:2]),
-            [ImageSequence.of(first)],
+            variant.architecture(drive.panoramas.shape[:2]),
+            [ImageSequence.of(drive)],
             recipe.network.seed,
             light_std=variant.light_std,
             rotate=variant.rotate,
         )
-    same = variant.same_network and variant.same_map
-    model = whole if same else learned(network, variant.drives(study), recipe)
+    same, drives = variant.same_network and variant.same_map, variant.drives(study)
+    with patch('sfa_localization.training.with_turned', _first_pass):
+        first = learned(network, drives, recipe)
+    if variant.second_pass:
+        model = whole if same else learned(network, drives, recipe)
+    else:
+        model = first
     model = variant.reduced(model)
     judged = evaluate(model, site.test, align_bags=site.training, recipe=site.recipe)
-    alone = Variant(second_pass=False, keyframes=False).reduced(model)
+    alone = Variant(keyframes=False).reduced(first)
     slow = evaluate(alone, site.test, align_bags=site.training, recipe=site.recipe)
     heading = judged.scores['ekf']['yaw_deg']
     return {

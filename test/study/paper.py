@@ -105,12 +105,9 @@ def flat(places: Array) -> Array:
 
 def _ours(site: Site, study: Study, model: PlaceModel) -> tuple[Cell, Paths]:
     """Errors of the finest map, of one image as the node publishes it, and of the filter."""
-    refined = model.refinement is not None
-    of = turned_of(model) if refined else slow_of(model.network)
-    metric = model.refinement.metric if model.refinement is not None else model.metric
     fitted = np.concatenate([segment.images for segment in study.segments(SegmentConfig())])
     rows = study.laid_on(STRAIGHT)
-    trial = Trial.of(study, metric, study.features(of), rows, fitted)
+    trial = Trial.of(study, model.metric, study.features(turned_of(model)), rows, fitted)
     judged = evaluate(
         model, site.test, recipe=site.recipe, transform=trial.transform,
         config=known_start(study.test, trial.transform),

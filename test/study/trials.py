@@ -21,13 +21,13 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
-from sfa_localization.evaluation import known, regression, score
+from sfa_localization.evaluation import known, score
 from sfa_localization.features.closures import Closures
-from sfa_localization.features.image_features import REFINING_LAYER, slow_features, spectrum
+from sfa_localization.features.image_features import TURNED_LAYER, slow_features, spectrum
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.basis import expand
+from sfa_localization.metric.basis import Basis, expand
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.paper_solver import PAPER_FEATURES
 from sfa_localization.metric.saved_map import MetricMap
@@ -133,16 +133,24 @@ def slow_of(network: Network) -> Features:
 
 
 def turned_of(model: PlaceModel) -> Features:
-    """What a model's finer map reads: maps turned by the compass, reduced."""
-    refinement = model.refinement
-    assert refinement is not None
+    """What a model's map reads: maps turned by the compass, reduced, or else slow features."""
+    turned = model.turned
+    if turned is None:
+        return slow_of(model.network)
 
-    def turned(images: Image) -> Array:
+    def components(images: Image) -> Array:
         maps = model.network.maps(images)
         yaw, _ = model.headings(maps, slow_features(maps))
-        return refinement.features(spectrum(maps[REFINING_LAYER]), yaw)
+        return turned.features(spectrum(maps[TURNED_LAYER]), yaw)
 
-    return turned
+    return components
+
+
+def regression(basis: Basis, features: Array, places: Array) -> Array:
+    """Weights (m, 2) from the expansion of features (M, K) to true places (M, 2) m."""
+    expanded = expand(basis, features)
+    normal = expanded.T @ expanded + np.diag(basis.ridge)
+    return np.asarray(np.linalg.lstsq(normal, expanded.T @ places, rcond=None)[0])
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,152 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the map of a model reads: a lower layer's map, turned to the heading of the compass.
+
+Slow features are the same at every heading, and so lose whatever depends on the heading. Once the
+heading is known, a lower layer's map can be turned until its columns point in fixed directions of
+the map frame. Its principal components then depend on the place alone, and hold more of it than
+the slow features do. So metric learning runs twice: on slow features, for certified headings; and
+on maps turned by these, certified in the same way, for the map that the model holds.
+
+A layer's map is kept as its harmonics over the columns, F_k = sum_c Z[c] exp(-2 pi i k c / R). The
+robot's turn by phi multiplies F_k by exp(i k sign phi), sign as the compass has it, so turning
+back is exact also by fractions of a column.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array
+from sfa_localization.features.image_features import Spectrum
+from sfa_localization.metric.learning import MetricResult, headings, learn_metric
+from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.settings import MetricConfig
+
+logger = logging.getLogger(__name__)
+Vectors = NDArray[np.float32]
+
+DIMENSIONS = 32
+"""Principal components that the map reads."""
+# Images that the components are found from, evenly along the drives: they are smooth statistics.
+_COMPONENT_IMAGES = 1500
+# Images turned at a time: memory.
+_BATCH = 1000
+# Three headings with the mean and the variance of an uncertain one, in standard deviations, and
+# their weights: of one of which nothing is known, they are a third of a turn apart.
+_APART, _WEIGHTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3), np.array([2.0, 3.0, 3.0]) / 8
+
+
+def turned_back(spectra: Spectrum, yaw: Array, sign: float) -> Vectors:
+    """Spectra (T, H, J), seen at headings yaw (T,) rad, as they would be at heading 0.
+
+    As real vectors (T, (2 H - 1) J); `sign` as in the compass: -1 where columns grow clockwise.
+    """
+    phase = -1j * sign * np.outer(yaw, np.arange(spectra.shape[1]))
+    at_zero = spectra * np.exp(phase).astype(np.complex64)[:, :, None]
+    parts = [at_zero.real, at_zero.imag[:, 1:]]
+    return np.concatenate(parts, axis=1).reshape(len(spectra), -1)
+
+
+@dataclass(frozen=True, slots=True)
+class TurnedMaps:
+    """Principal components of turned maps: `mean` (D,) and orthonormal `axes` (D, K) of vectors
+    (D,) that are turned back by `sign`.
+    """
+
+    mean: Vectors
+    axes: Vectors
+    sign: float
+
+    @classmethod
+    def fit(cls, spectra: Spectrum, yaw: Array, sign: float, count: int = DIMENSIONS) -> TurnedMaps:
+        """Of spectra (T, H, J) at headings yaw (T,) rad; at most `count` components.
+
+        Raises DataError where all are equal.
+        """
+        vectors = turned_back(spectra, yaw, sign)
+        mean = vectors.mean(0, dtype=np.float64).astype(np.float32)
+        centered = vectors - mean
+        size, count = len(centered), min(count, len(centered) - 1, vectors.shape[1])
+        gram = (centered @ centered.T).astype(np.float64)
+        power, sides = linalg.eigh(gram, subset_by_index=(size - count, size - 1))
+        kept = power > 1e-6 * max(float(power[-1]), 1e-30)
+        if not kept.any():
+            raise DataError('the maps of all images are equal')
+        axes = centered.T @ (sides[:, kept] / np.sqrt(power[kept])).astype(np.float32)
+        return cls(mean, np.ascontiguousarray(axes[:, ::-1]), sign)
+
+    def features(self, spectra: Spectrum, yaw: Array) -> Array:
+        """Components (T, K), the strongest first, of spectra (T, H, J) at headings yaw (T,)."""
+        return np.asarray((turned_back(spectra, yaw, self.sign) - self.mean) @ self.axes, float)
+
+    def predict(
+        self, metric: MetricMap, spectra: Spectrum, yaw: Array, yaw_variance: Array
+    ) -> tuple[Array, Array, Array]:
+        """Positions (T, 2) m by a map of the components, their covariances (T, 2, 2) by the map,
+        and what uncertain headings, yaw (T,) rad with variances (T,), add to these.
+        """
+        yaws = yaw + np.outer(_APART, np.sqrt(yaw_variance))
+        features = self.features(np.tile(spectra, (len(yaws), 1, 1)), yaws.ravel())
+        places, covariances = metric.predict(features)
+        places, covariances = (a.reshape(len(yaws), len(yaw), 2, -1) for a in (places, covariances))
+        apart = places - places[0]
+        by_yaw = np.tensordot(_WEIGHTS, apart @ apart.swapaxes(-1, -2), 1)
+        return places[0, :, :, 0], np.tensordot(_WEIGHTS, covariances, 1), by_yaw
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays to save, without pickle."""
+        return {'mean': self.mean, 'axes': self.axes, 'sign': np.array(self.sign)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> TurnedMaps:
+        """Raises KeyError or ValueError for arrays of something else."""
+        return cls(arrays['mean'], arrays['axes'], float(arrays['sign']))
+
+
+def learn_turned(
+    spectra: Spectrum, segments: Segments, first: MetricResult, sign: float, seed: int = 0
+) -> tuple[TurnedMaps, MetricResult]:
+    """Learn a map of the spectra (N, H, J) of all images, turned by the certified headings of the
+    first map of the same segments, and in its frame. Raises DataError as ``learn_metric``.
+    """
+    images, yaw = headings(first, segments)
+    chosen = np.linspace(0, len(images) - 1, min(len(images), _COMPONENT_IMAGES))
+    rows = np.unique(chosen.round().astype(np.int64))
+    turned = TurnedMaps.fit(spectra[images[rows]], yaw[rows], sign)
+    features = np.zeros((len(spectra), turned.axes.shape[1]))
+    for start in range(0, len(images), _BATCH):
+        part = slice(start, start + _BATCH)
+        features[images[part]] = turned.features(spectra[images[part]], yaw[part])
+    # They count by their own size, as principal components do.
+    scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
+    return turned, learn_metric(features, segments, MetricConfig(), seed, scale, first)
+
+
+def with_turned(
+    spectra: Spectrum | None,
+    segments: Segments,
+    first: MetricResult,
+    sign: float,
+    config: MetricConfig,
+    seed: int = 0,
+) -> tuple[TurnedMaps | None, MetricResult]:
+    """As `learn_turned`; the first map alone without a layer to turn, where no other can be
+    learned, and for the paper's descent and its monomials, which are there for comparison.
+    """
+    if spectra is None or config.solver == 'paper' or config.metric_map == 'monomials':
+        return None, first
+    try:
+        return learn_turned(spectra, segments, first, sign, seed)
+    except DataError as error:
+        logger.warning('the map reads slow features, not turned maps: %s', error)
+        return None, first
