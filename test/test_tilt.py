@@ -137,6 +137,17 @@ def test_a_tilted_image_stays_where_it_is_and_is_known(degrees):
     assert scores.min() > learnt(0.0).noise.lowest
 
 
+@pytest.mark.parametrize('degrees', [(12, 2), (-3, 11)])
+def test_what_a_steep_tilt_hides_counts_neither_for_nor_against_a_place(degrees):
+    keyframes, tilt = learnt(0.0), np.radians(degrees)
+    poses = np.column_stack([np.linspace(-1.4, 1.3, 8), np.linspace(1.2, -1.1, 8), np.arange(8)])
+    for image in Spheres.about(0).panoramas(poses, config()):
+        flat, steep = keyframes.match(image), keyframes.match(tilted(image, tilt, SPHERE))
+        assert steep.score == pytest.approx(flat.score, abs=0.1)
+        assert np.hypot(*(steep.pose - flat.pose)[:2]) < 0.3
+        assert np.hypot(*(steep.tilt - tilt)) < np.radians(1.0)
+
+
 def test_keyframes_of_a_tilted_robot_show_the_place_too():
     flat, *_ = errors(learnt(0.0), 0.0)
     for degrees in (0.0, 2.0):

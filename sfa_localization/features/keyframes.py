@@ -36,7 +36,7 @@ from sfa_localization.features.observation import (
     Spectra,
     unlikeness,
 )
-from sfa_localization.features.tilt import derivatives, find_tilt, leveled
+from sfa_localization.features.tilt import derivatives, find_tilt, leveled, visible
 
 Texture = NDArray[np.float32]
 
@@ -64,6 +64,11 @@ _COARSE, _CANDIDATES = 15, 64
 _LEVELED = 48
 # Images that are tilted by less are as well as level: what a tilt changes is linear.
 _TILTED_RAD = math.radians(0.7)
+# Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees it is, even of a
+# known place, and each of these makes it like them up to 6 degrees on.
+_STEEP_RAD = math.radians(8.0) * np.array(
+    [(math.cos(angle), math.sin(angle)) for angle in np.arange(8) * math.pi / 4]
+)
 # Keyframes near the place show headings that differ by no more than this because things are near.
 _PARALLAX_RAD = 0.3
 
@@ -223,15 +228,43 @@ class Keyframes:
 
     def level(self, panorama: Image) -> Leveled:
         """A panorama (H, W, 3) uint8 BGR without the roll and pitch of the robot that make it
-        likest one of the keyframes that it is likest anyway.
+        likest one of the keyframes that it is likest anyway, or would be with a large tilt.
         """
-        image = texture(panorama)
-        known = Leveled(panorama, panorama, np.zeros(2), spectrum(image), *self._unmatched())
-        self._add(known, self._candidates(known.spectrum[None]))
+        known = self._upright(self._compared(panorama, np.zeros(2)))
+        if known.score >= self.noise.lowest:
+            return known
+        steep = [self._compared(panorama, tilt) for tilt in _STEEP_RAD]
+        likest = self._upright(max(steep, key=lambda one: one.score))
+        return likest if likest.score > known.score else known
+
+    def _seen(self, panorama: Image, tilt: Array) -> Leveled:
+        """A panorama (H, W, 3) that a tilt (2,) rad made."""
+        if not tilt.any():
+            whole = spectrum(texture(panorama))
+            return Leveled(panorama, panorama, tilt, whole, whole, *self._unmatched())
+        level = leveled(panorama, tilt, self.sphere)
+        image = texture(level)
+        rows = [part.stop - part.start for part in self._channels]
+        mask = np.concatenate([visible(tilt, n, self._columns, self.sphere) for n in rows])
+        part = image * mask
+        # What was not seen would count as unlike.
+        part /= np.float32(max(float(np.linalg.norm(part)), 1e-6) * math.sqrt(mask.mean()))
+        spectra = spectrum(image), spectrum(part)
+        return Leveled(panorama, level, tilt, *spectra, *self._unmatched())
+
+    def _compared(self, panorama: Image, tilt: Array) -> Leveled:
+        """The same, correlated with the keyframes that it is likest."""
+        known = self._seen(panorama, tilt)
+        self._add(known, self._candidates(known.visible[None]))
+        return known
+
+    def _upright(self, known: Leveled) -> Leveled:
+        """An image without the tilt that it has against one of its likest keyframes."""
         likely = np.argsort(-known.scores, kind='stable')[:_LEVELED]
         likely = likely[np.isfinite(known.scores[likely])]
         apart = np.asarray(known.shifts[likely], float) * (2 * np.pi / self._columns)
         others = fft.irfft(turned(self.spectra[likely], apart), self._columns)
+        image = fft.irfft(known.spectrum, self._columns)
         tilts, scores = find_tilt(image, others, self._channels, self.sphere)
         return self._leveled(known, tilts[int(scores.argmax())])
 
@@ -241,10 +274,7 @@ class Keyframes:
         """
         if np.hypot(*tilt) < _TILTED_RAD:
             return known
-        whole = known.tilt + tilt
-        panorama = leveled(known.seen, whole, self.sphere)
-        image = spectrum(texture(panorama))
-        new = Leveled(known.seen, panorama, whole, image, *self._unmatched())
+        new = self._seen(known.seen, known.tilt + tilt)
         self._add(new, np.flatnonzero(np.isfinite(known.scores)))
         return new
 
@@ -289,7 +319,7 @@ class Keyframes:
         """Fill in what is still missing of the wanted keyframes' correlations."""
         wanted = wanted[np.isneginf(known.scores[wanted])]
         if len(wanted):
-            found = self._correlated(known.spectrum, wanted)
+            found = self._correlated(known.visible, wanted)
             known.scores[wanted], known.shifts[wanted] = found
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:

@@ -156,16 +156,23 @@ def unlikeness(score: float) -> float:
 @dataclass(frozen=True, slots=True)
 class Leveled:
     """The `panorama` (H, W, 3) that a `tilt`, roll and pitch (2,) rad, made the one that was
-    `seen`, and what is known of it: the `spectrum` (rows, F) of its texture, the correlations
-    `scores` (K,) with the keyframes, -inf where unknown, and the `shifts` (K,) of the columns.
+    `seen`, and what is known of it: the `spectrum` (rows, F) of its texture, that of the part that
+    was `visible`, so that its correlations are those of the whole; the `scores` (K,), correlations
+    with the keyframes, -inf where unknown, and the `shifts` (K,) of the columns.
     """
 
     seen: Image
     panorama: Image
     tilt: Array
     spectrum: Spectra
+    visible: Spectra
     scores: NDArray[np.float32]
     shifts: NDArray[np.float32]
+
+    @property
+    def score(self) -> float:
+        """The correlation with the likest keyframe."""
+        return float(self.scores.max())
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,6 +70,12 @@ def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
     return np.asarray(turned, panorama.dtype).reshape(panorama.shape)
 
 
+def visible(tilt: Array, rows: int, columns: int, sphere: Sphere) -> NDArray[np.bool_]:
+    """Where a panorama (rows, columns) that was `leveled` shows what the tilted one did."""
+    up = sphere.rays(rows, columns) @ rotation(tilt)[:, 2]
+    return np.asarray((up > np.sin(sphere.low)) & (up < np.sin(sphere.high)))
+
+
 def derivatives(texture: Texture, sphere: Sphere) -> Texture:
     """Of a panorama (rows, columns) by roll and pitch: (2, rows, columns) per rad."""
     sin, cos, aside = _waves(sphere, *texture.shape)
