@@ -39,6 +39,7 @@ OPTIONAL = {
     'embreex': 'trimesh embreex',
     'mdp': 'MDP==3.6',
     'mcap': 'mcap',
+    'threadpoolctl': 'threadpoolctl, or: sudo apt install python3-threadpoolctl',
     'rclpy': '"ros-jazzy-rclpy[fastrtps]" ros-jazzy-common-interfaces, or source ROS 2',
 }
 """Packages that only some commands need, and how to install them."""

@@ -38,6 +38,7 @@ from sfa_localization.data.geometry import (
 )
 from sfa_localization.data.progress import progress_bar, progress_over
 from sfa_localization.data.run import Count, Run, Stamps, Trajectory
+from sfa_localization.data.threads import one_core
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.motion import State
@@ -115,6 +116,7 @@ class _Drive:
         return self.tracks['sfa'].poses
 
 
+@one_core()
 def evaluate(
     model: PlaceModel,
     bag: Path,

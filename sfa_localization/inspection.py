@@ -29,6 +29,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.data.threads import one_core
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
@@ -191,6 +192,7 @@ class BagReport:
         return '\n'.join(lines if self.lacks else [*lines, '  enough to train on'])
 
 
+@one_core()
 def inspect(
     path: Path | str,
     *,

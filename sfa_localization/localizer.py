@@ -24,6 +24,7 @@ from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
+from sfa_localization.data.threads import one_core
 from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, distance
 from sfa_localization.features.observation import Observation as Observation
 from sfa_localization.features.other_light import OtherLight
@@ -62,6 +63,7 @@ class Observer:
         require_panorama(panorama)
         return self.observe_all(np.array([stamp_ns]), panorama[None])[0]
 
+    @one_core()
     def observe_all(self, stamps_ns: Stamps, panoramas: Image) -> list[Observation]:
         """The same for panoramas (T, H, W, 3) with stamps (T,), quicker."""
         if len(panoramas):

@@ -21,6 +21,7 @@ from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Image
+from sfa_localization.data.threads import one_core
 from sfa_localization.features.image_features import (
     TURNED_LAYER,
     layer_harmonics,
@@ -92,6 +93,7 @@ class PlaceModel:
         require_panorama(panorama)
         return self.locate_all(panorama[None])[0]
 
+    @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show."""
         slow = self.slow_poses(panoramas)
@@ -224,12 +226,10 @@ class PlaceModel:
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
         arrays |= _prefixed('agreement/', self.agreement.to_arrays())
-        if self.compass is not None:
-            arrays |= _prefixed('compass/', self.compass.to_arrays())
-        if self.yaw_agreement is not None:
-            arrays |= _prefixed('yaw_agreement/', self.yaw_agreement.to_arrays())
-        if self.turned is not None:
-            arrays |= _prefixed('turned/', self.turned.to_arrays())
+        for name in ('compass', 'yaw_agreement', 'turned'):
+            part = getattr(self, name)
+            if part is not None:
+                arrays |= _prefixed(f'{name}/', part.to_arrays())
         return arrays
 
     @classmethod

@@ -64,6 +64,7 @@ class Trained:
     """Of each drive: what its sources of motion tell of each other."""
 
 
+@one_core()
 def train(
     bags: Sequence[Path],
     output: Path,
@@ -89,12 +90,10 @@ def train(
     checkpoint = Checkpoint.beside(output, settings, runs)
     if not resume:
         checkpoint.remove()
-    with one_core():
-        given = TrainingInput.of(runs, recipe, progress)  # step 2
+    given = TrainingInput.of(runs, recipe, progress)  # step 2
     network = train_hierarchy(given, checkpoint)  # step 3
-    with one_core():
-        trained = _learn(network, given, strict)  # steps 4 to 9
-        compare_with_map(checks, given.drives, trained.segments, trained.metric)
+    trained = _learn(network, given, strict)  # steps 4 to 9
+    compare_with_map(checks, given.drives, trained.segments, trained.metric)
     trained.model.save(output)
     checkpoint.remove()
     return replace(trained, checks=checks)

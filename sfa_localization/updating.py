@@ -26,6 +26,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Run, Trajectory
+from sfa_localization.data.threads import one_core
 from sfa_localization.features.keyframes import Keyframes, correlate, quantized, texture
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.settings import FilterConfig
@@ -82,6 +83,7 @@ class Updated:
         return f'added as keyframes: {counts}; the model has {total} keyframes now'
 
 
+@one_core()
 def update(
     model: PlaceModel,
     bags: Sequence[Path],

@@ -220,6 +220,23 @@ def test_pip_installs_one_command_and_the_nodes_and_colcon_every_command_for_ros
         assert executables(command) == {n: e for n, e in expected.items() if n not in scripts}
 
 
+SLOW_TO_IMPORT = {'filterpy', 'mdp', 'matplotlib', 'scipy.optimize', 'scipy.stats'}
+
+
+@pytest.mark.parametrize(
+    ('module', 'unwanted'),
+    [
+        ('fusion.pose_filter', {'cv2', 'scipy', *SLOW_TO_IMPORT}),
+        ('camera.panorama', {'scipy', *SLOW_TO_IMPORT}),
+        ('localizer', SLOW_TO_IMPORT),
+    ],
+)
+def test_what_nodes_import_is_there_at_once(module, unwanted):
+    command = [sys.executable, '-c', f'import sys, {NAME}.{module}\nprint(*sys.modules)']
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert unwanted & set(done.stdout.split()) == set() and NAME in done.stdout
+
+
 def test_commands_import_only_what_they_need():
     """The overview imports none of them; an inspection without a report imports no figures."""
     code = 'import sys\nfrom sfa_localization import cli\ntry:\n    cli.main({})\nfinally:\n'

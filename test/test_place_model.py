@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cylinder_worlds import COLUMN_STEP, PLACE_SIZE, place, visit
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from sfa_localization import evaluation, training, updating
 from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.data.errors import ModelError
+from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.localizer import Localizer
@@ -34,6 +36,32 @@ def pictures() -> np.ndarray:
 def saved(model, tmp_path) -> Path:
     model.save(tmp_path / 'model.npz')
     return tmp_path / 'model.npz'
+
+
+@pytest.mark.parametrize('entry', ['locate', 'localizer', 'train', 'update', 'evaluate'])
+def test_linear_algebra_keeps_to_one_core(model, pictures, entry, tmp_path, monkeypatch):
+    seen = []
+
+    def look(*_, **__):
+        seen.append({pool['num_threads'] for pool in threadpool_info()})
+        raise DataError('seen')
+
+    names = 'training.read_drives', 'updating.read_drive', 'evaluation.read_drive'
+    for name in (*names, 'features.network.input_map'):
+        monkeypatch.setattr(f'sfa_localization.{name}', look)
+    with threadpool_limits(2), pytest.raises(DataError, match='seen'):
+        match entry:
+            case 'locate':
+                model.locate(pictures[0])
+            case 'localizer':
+                Localizer(model).add_panorama(1, pictures[0])
+            case 'train':
+                training.train([tmp_path], tmp_path / 'new.npz')
+            case 'update':
+                updating.update(model, [tmp_path], tmp_path / 'new.npz')
+            case 'evaluate':
+                evaluation.evaluate(model, tmp_path)
+    assert seen == [{1}]
 
 
 @pytest.mark.parametrize('clockwise', [True, False])

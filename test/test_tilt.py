@@ -11,14 +11,13 @@ from cylinder_worlds import Spheres
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.data.sphere import Sphere
+from sfa_localization.data.sphere import Sphere, rotation
 from sfa_localization.features.keyframe_training import fit_keyframes
 from sfa_localization.features.keyframes import Keyframes, quantized, texture
 from sfa_localization.features.tilt import (
     derivatives,
     find_tilt,
     leveled,
-    rotation,
     tilted,
 )
 
@@ -69,7 +68,7 @@ def test_the_derivatives_are_those_of_the_tilted_panorama(clockwise):
 
 def test_leveling_undoes_a_tilt():
     image, tilt = smooth(SPHERE)[..., None], np.array([0.05, -0.07])
-    assert np.allclose(rotation(tilt) @ rotation(tilt).T, np.eye(3))
+    assert np.allclose(rotation(*tilt) @ rotation(*tilt).T, np.eye(3))
     back = leveled(tilted(image, tilt, SPHERE), tilt, SPHERE)
     assert np.abs(back - image)[8:-8].mean() < 0.1 * np.abs(image).mean()
 

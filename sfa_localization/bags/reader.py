@@ -23,7 +23,6 @@ from sfa_localization.bags.settings import BagConfig
 from sfa_localization.bags.topic_stream import Item, Stream
 from sfa_localization.data.errors import BagError, LocalizationError, MessageError
 from sfa_localization.data.messages import NO_STAMP, read_yaw_rate
-from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Image, Odometry, Trajectory, YawRate
 
 OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
@@ -239,7 +238,9 @@ class Bag:
             stream.skipped.add('lost in a damaged bag', expected - stream.received)
         self._raise_problems()
         if stream.required and stream.used == 0:
-            reasons = listed(stream.skipped) or 'none recorded'
+            reasons = (
+                ', '.join(f'{n} {why}' for why, n in stream.skipped.items()) or 'none recorded'
+            )
             remedy = f'; {REMEDY}' if stream.received < expected else ''
             if NO_STAMP in reasons:
                 remedy = '; try the time of reception (stamp_source: receive)'

@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from scipy.spatial.transform import Rotation
 
 from sfa_localization.camera.settings import UNCALIBRATED, LensCalibration, PanoramaConfig
 from sfa_localization.data.errors import CameraError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.sphere import rotation
 
 _LEAST_AFFINE = 1e-3  # determinant of an affine part: 1 for square pixels; at 0 they lie on a line
 _WIDEST_PLANE = 20.0  # radius in the plane of a mirror up to which its distortion is inverted
@@ -271,7 +271,7 @@ def make_camera(
 
 def _rotation(calibration: LensCalibration, mount_rpy: Sequence[float]) -> Array:
     """Rays of the lens to the robot's axes: the axis, then roll, pitch and yaw (REP-103)."""
-    mount = Rotation.from_euler('xyz', mount_rpy, degrees=True).as_matrix()
+    mount = rotation(*np.radians(mount_rpy))
     axis = calibration.axis
     if axis == 'auto' or calibration.camera_model in UNCALIBRATED:
         axis = _USUAL_AXIS.get(calibration.camera_model, 'forward')
@@ -372,6 +372,6 @@ def _ocam_lens(calibration: LensCalibration, center: Array, size: tuple[int, int
 
 def _dual_fisheye_lens(calibration: LensCalibration, first: RadialLens) -> DualFisheyeLens:
     center = np.array([calibration.second_cx, calibration.second_cy])
-    roll = Rotation.from_euler('z', calibration.second_roll, degrees=True).as_matrix()
+    roll = rotation(0.0, 0.0, np.radians(calibration.second_roll))
     to_second = roll @ np.diag([-1.0, 1.0, -1.0])
     return DualFisheyeLens(first, replace(first, center=center), to_second)

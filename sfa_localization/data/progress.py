@@ -56,4 +56,3 @@ def announce(text: str, *, shown: bool) -> None:
     """Say what begins, in a line of its own."""
     if shown:
         sys.stderr.write(f'{text}\n')
-        sys.stderr.flush()

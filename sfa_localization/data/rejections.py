@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 
 LONGEST = 240
 """Characters of a reason: two lines of a terminal."""
@@ -37,11 +36,6 @@ def short_line(text: str) -> str:
 def encodable(text: str) -> str:
     """The text in UTF-8, which names of files may not be: their other bytes become \\udcff."""
     return text.encode(errors='backslashreplace').decode()
-
-
-def listed(skipped: Mapping[str, int]) -> str:
-    """Numbers with their reasons, '' for none."""
-    return ', '.join(f'{number} {reason}' for reason, number in skipped.items())
 
 
 def quoted(value: object) -> str:

@@ -12,6 +12,15 @@ import numpy as np
 from sfa_localization.data.geometry import Array
 
 
+def rotation(roll: float, pitch: float, yaw: float = 0.0) -> Array:
+    """The rotation (3, 3) from the axes of what has roll, pitch and yaw, rad, to level ones."""
+    a, b, c = np.exp(1j * np.array([roll, pitch, yaw]))
+    about_x = [[1, 0, 0], [0, a.real, -a.imag], [0, a.imag, a.real]]
+    about_y = [[b.real, 0, b.imag], [0, 1, 0], [-b.imag, 0, b.real]]
+    about_z = [[c.real, -c.imag, 0], [c.imag, c.real, 0], [0, 0, 1]]
+    return np.asarray(np.array(about_z) @ about_y @ about_x)
+
+
 @dataclass(frozen=True, slots=True)
 class Sphere:
     """The part of the sphere of directions that a panorama shows: all azimuths, with forward in

@@ -116,7 +116,7 @@ def _summed(partial: Partial, shards: Sequence[Shard], on_shard: Callable[[int],
 def _in_threads(partial: Partial, shards: Sequence[Shard]) -> Iterator[Sums]:
     """The sums of the shards in order; one more shard than there are cores is in progress."""
     workers = cores()
-    with one_core(), ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Sums]] = deque()
         try:
             for shard in shards:
@@ -252,6 +252,7 @@ def require_pairs(sequences: Sequence[ImageSequence]) -> None:
         raise DataError('training needs at least two consecutive panoramas')
 
 
+@one_core()
 def train_network(
     architecture: Architecture,
     sequences: Sequence[ImageSequence],
@@ -276,7 +277,6 @@ def train_network(
     shards = shards_of(sequences, seed, light_std)
     while not partial.finished:
         total = _summed(partial, shards, on_shard)
-        with one_core():
-            partial = partial.advanced(total.result(), relative_cut)
+        partial = partial.advanced(total.result(), relative_cut)
         on_stage(partial)
     return partial.network()

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import gammaincinv
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.rotation import Map
@@ -92,7 +92,7 @@ def _relative(disagreement: Array, typical: float) -> Array:
 def _surprise(squared_error: Array, variance: Array, axes: int, weight: Array | None) -> float:
     """Mean negative log-likelihood of heavy-tailed errors at their best common scale."""
     ratio = squared_error / variance
-    scale = quantile(ratio, 0.5, weight) / stats.chi2.ppf(0.5, axes) + 1e-300
+    scale = quantile(ratio, 0.5, weight) / chi_square(0.5, axes) + 1e-300
     tails = (_HEAVY_TAIL + axes) / 2 * np.log1p(ratio / (scale * _HEAVY_TAIL))
     return float(np.average(tails + axes / 2 * np.log(variance * scale), weights=weight))
 
@@ -103,7 +103,7 @@ def needed_factor(ratio: Array, axes: int, weight: Array | None = None) -> float
 
     `ratio` (M,) is the squared error over `axes` axes over the variance of one; `weight` (M,).
     """
-    needed = [quantile(ratio, p, weight) / stats.chi2.ppf(p, axes) for p in _HALF_AND_MOST]
+    needed = [quantile(ratio, p, weight) / chi_square(p, axes) for p in _HALF_AND_MOST]
     return float(max(needed))
 
 
@@ -112,7 +112,12 @@ def share_within(ratio: Array, axes: int, share: float, weight: Array) -> float:
 
     `ratio` (M,) is the squared error over `axes` axes over the variance of one.
     """
-    return float(np.average(ratio <= stats.chi2.ppf(share, axes), weights=weight))
+    return float(np.average(ratio <= chi_square(share, axes), weights=weight))
+
+
+def chi_square(share: float, axes: int) -> float:
+    """Square that so many of the sums of `axes` squared standard normal variables do not exceed."""
+    return float(2 * gammaincinv(axes / 2, share))
 
 
 def quantile(values: Array, share: float, weight: Array | None = None) -> float:

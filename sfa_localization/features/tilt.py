@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
-from sfa_localization.data.sphere import Sphere
+from sfa_localization.data.sphere import Sphere, rotation
 
 Texture = NDArray[np.float32]
 
@@ -36,24 +36,16 @@ _UNLIKELY = 0.01 / np.radians(4.0) ** 2
 """What a correlation with a tilt counts less, per squared rad: few tilts are above 4 degrees."""
 
 
-def rotation(tilt: Array) -> Array:
-    """The rotation (3, 3) from the axes of a robot with roll and pitch (2,) rad to level ones."""
-    (sin_r, sin_p), (cos_r, cos_p) = np.sin(tilt), np.cos(tilt)
-    pitch = np.array([[cos_p, 0, sin_p], [0, 1, 0], [-sin_p, 0, cos_p]])
-    roll = np.array([[1, 0, 0], [0, cos_r, -sin_r], [0, sin_r, cos_r]])
-    return np.asarray(pitch @ roll)
-
-
 def tilted(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
     """What a robot with roll and pitch (2,) rad sees of a panorama (H, W, C) on flat ground; above
     and below it its edges are repeated.
     """
-    return _turned(panorama, rotation(tilt), sphere)
+    return _turned(panorama, rotation(*tilt), sphere)
 
 
 def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
     """What a robot that sees a panorama (H, W, C) with roll and pitch (2,) rad would see level."""
-    return _turned(panorama, rotation(tilt).T, sphere)
+    return _turned(panorama, rotation(*tilt).T, sphere)
 
 
 def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:

@@ -11,8 +11,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
-from scipy.stats import chi2
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array
@@ -26,6 +24,7 @@ from sfa_localization.fusion.belief import (
     PoseEvent,
     Update,
 )
+from sfa_localization.fusion.filterpy_ekf import ExtendedKalmanFilter
 from sfa_localization.fusion.inputs import root, symmetric
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
 from sfa_localization.fusion.odometry import COAST_S, Interval, interval
@@ -40,11 +39,11 @@ ALIKE_SHARE = 0.2
 _LEARNING = 0.1
 """Relative change per image of the usual distance and period: learned over about twenty."""
 _LEAST_SCATTER = 0.05
-_GATE, _OUTLYING, _MEDIAN = (
-    {size: float(chi2.ppf(share, size)) for size in (2, 3)} for share in (0.999, 0.8, 0.5)
-)
-"""Of squared distances of right measurements: one in a thousand is rejected. Errors of images have
-heavy tails, so the outlying fifth loses weight."""
+GATE = {2: 13.815510557964274, 3: 16.26623619623813}
+OUTLYING = {2: 3.2188758248682006, 3: 4.641627676087445}
+MEDIAN = {2: 1.3862943611198906, 3: 2.3659738843753377}
+"""Of squared distances of right measurements, by dimensions (chi-square): one in a thousand is
+rejected. Errors of images have heavy tails, so the outlying fifth loses weight."""
 _OBSERVED = np.eye(3, SIZE)
 
 
@@ -234,18 +233,18 @@ class Ekf:
         """Accept what lies inside the gate; what is outlying within loses weight."""
         kalman, memory, size = self._kalman, belief.memory, event.value.size
         mean, covariance, d2 = kalman.corrected(belief, event)
-        inside = d2 <= _GATE[size]
+        inside = d2 <= GATE[size]
         reason = 'accepted' if inside else 'outside the gate'
-        update = Update(event.stamp_ns, inside, d2, _GATE[size], reason, kalman.y, kalman.S)
+        update = Update(event.stamp_ns, inside, d2, GATE[size], reason, kalman.y, kalman.S)
         memory = memory._replace(update=update, period_s=_period_s(memory, event.stamp_ns))
         if not inside:
             return self._rejected(belief._replace(memory=memory), event, image)
-        outlying = d2 / (memory.scatter * _OUTLYING[size])
+        outlying = d2 / (memory.scatter * OUTLYING[size])
         if outlying > 1 and self._alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
         # At most 1: an image that claims too little is not believed more than it claims.
-        scatter = min(max(_nearer(memory.scatter, d2 / _MEDIAN[size]), _LEAST_SCATTER), 1.0)
+        scatter = min(max(_nearer(memory.scatter, d2 / MEDIAN[size]), _LEAST_SCATTER), 1.0)
         memory = memory._replace(
             support=memory.support + 1,
             rejected=0,

@@ -90,7 +90,7 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     pose, matrix = np.asarray(value, float), np.asarray(covariance, float)
     if pose.shape not in ((2,), (3,)) or matrix.shape != (pose.size, pose.size):
         raise DataError('shape is not that of a position or a pose')
-    if not np.abs(pose[:2]).max() <= _LARGEST_M:
+    if not all(abs(place) <= _LARGEST_M for place in pose[:2].tolist()):
         raise DataError('position is not finite')
     known = math.isfinite(pose[-1]) and matrix[-1, -1] <= YAW_STD_LIMIT**2
     if pose.size == 3 and not (known and (matrix[2, 2] > 0 or not matrix.any())):
@@ -98,11 +98,13 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     if not matrix.any():
         matrix = np.diag(np.square(_UNKNOWN_STDS[: pose.size]))
     require_symmetric(matrix)
-    variances = matrix.diagonal()
-    if max(variances[:2].tolist()) >= LARGEST_VARIANCE:
+    variances = matrix.diagonal().tolist()
+    if max(variances[:2]) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
-    noise = factor * symmetric(matrix)
-    np.fill_diagonal(noise, np.maximum(factor * variances, np.square(_LEAST_STDS[: pose.size])))
+    noise, least = factor * symmetric(matrix), _LEAST_STDS[: pose.size]
+    noise.flat[:: pose.size + 1] = [
+        max(factor * own, std**2) for own, std in zip(variances, least, strict=True)
+    ]
     return pose, noise
 
 

@@ -58,7 +58,7 @@ any is learned: data sheets of cheap gyroscopes, the tolerance of a tire's diame
 the half track of a small robot."""
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
-_DIAGONAL = np.arange(SIZE)
+_DIAGONAL = slice(0, None, SIZE + 1)  # of flat matrices
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,17 +206,16 @@ def drive(
         return _stand(mean)
     v, omega, by_loss = _corrected(mean, twist)
     step = _advance(mean, v, omega, twist, dt, noise)
-    gain = step.jacobian[:, V : OMEGA + 1].copy()
-    step.jacobian[:, V] = step.jacobian[:, OMEGA] = 0.0
-    step.jacobian[:, SCALE] += twist.v * gain[:, 0]
-    step.jacobian[:, LOSS] += by_loss * gain[:, 0]
-    step.jacobian[:, BIAS] -= gain[:, 1]
+    moved, twists = slice(X, OMEGA + 1), slice(V, OMEGA + 1)
+    gain = step.jacobian[moved, twists].copy()
+    step.jacobian[moved, twists] = 0.0
+    step.jacobian[moved, BIAS:ERROR] = gain.dot(((0.0, twist.v, by_loss), (-1.0, 0.0, 0.0)))
+    step.noise[moved, moved] += (gain * twist[2:]).dot(gain.T)
     if now is not None and now is not twist:
         step.mean[V], step.mean[OMEGA], slowed = _corrected(mean, now)
         step.jacobian[V, SCALE] += now.v - twist.v
         step.jacobian[V, LOSS] += slowed - by_loss
-    white = (gain * np.array([twist.v_variance, twist.omega_variance])).dot(gain.T)
-    return Step(step.mean, step.jacobian, white + step.noise)
+    return step
 
 
 def _corrected(mean: Array, twist: Twist) -> tuple[float, float, float]:
@@ -280,37 +279,28 @@ def _advance(
         + [fade * error for error in errors]
     )
     jacobian = np.zeros((SIZE, SIZE))
-    jacobian[_DIAGONAL, _DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
+    jacobian.flat[_DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
     jacobian[X, YAW], jacobian[Y, YAW] = -way.dy, way.dx
     jacobian[X, V], jacobian[Y, V] = way.dx_dv, way.dy_dv
     jacobian[X, OMEGA], jacobian[Y, OMEGA] = way.dx_domega, way.dy_domega
     jacobian[YAW, OMEGA] = dt
-    added = _lasting_noise(jacobian[:3, V : OMEGA + 1], twist, dt)
-    _add_drift(added, abs(v) * dt, abs(omega) * dt, dt, fade, noise)
+    added = _drift(abs(v) * dt, abs(omega) * dt, dt, fade, noise)
+    if dt > 0:
+        # Readings err alike for a while. This does not average out with the rate of the messages:
+        # over dt it moves the pose as a constant error of variance (variance * time / dt) would.
+        gain, share = jacobian[:3, V : OMEGA + 1], ODOMETRY_CORRELATION_S / dt
+        added[:3, :3] += (gain * (twist[2] * share, twist[3] * share)).dot(gain.T)
     return Step(after, jacobian, added)
 
 
-def _lasting_noise(gain: Array, twist: Twist, dt: float) -> Array:
-    """Noise (11, 11) of readings that err alike for a while; `gain` (3, 2) is d pose / d twist.
-
-    Such errors do not average out with the rate of the messages: over dt they move the pose as a
-    constant error of variance (variance * correlation / dt) would.
-    """
-    noise = np.zeros((SIZE, SIZE))
-    if dt > 0:
-        variances = np.array([twist.v_variance, twist.omega_variance])
-        noise[:3, :3] = (gain * (variances * (ODOMETRY_CORRELATION_S / dt))).dot(gain.T)
-    return noise
-
-
-def _add_drift(
-    covariance: Array, meters: float, radians: float, dt: float, fade: float, noise: MotionNoise
-) -> None:
-    """Add slip in proportion to the distance, and the random walks of BIAS to ERROR."""
+def _drift(meters: float, radians: float, dt: float, fade: float, noise: MotionNoise) -> Array:
+    """Slip in proportion to the distance, and the random walks of BIAS to ERROR, (11, 11)."""
     slip, fresh = noise.slip_per_meter**2 * meters, 1 - fade * fade
     yaw = YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
     walks = BIAS_WALK**2 * dt, SCALE_WALK**2 * meters, LOSS_WALK**2 * radians
-    covariance[_DIAGONAL, _DIAGONAL] += (slip, slip, yaw, 0, 0, *walks, fresh, fresh, fresh)
+    covariance = np.zeros((SIZE, SIZE))
+    covariance.flat[_DIAGONAL] = (slip, slip, yaw, 0, 0, *walks, fresh, fresh, fresh)
+    return covariance
 
 
 def wrap(angle: float) -> float:

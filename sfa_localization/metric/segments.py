@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.data.rejections import listed
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import (
@@ -230,7 +229,7 @@ def assignment(segments: Segments, count: int) -> Indices:
 
 
 def _nothing_left(images: int, skipped: dict[str, int], straight: bool) -> str:
-    reasons = listed(skipped) or 'none at all'
+    reasons = ', '.join(f'{n} {why}' for why, n in skipped.items()) or 'none at all'
     remedy = (
         'drive straight lines with turns on the spot, or use segments: any'
         if straight
