@@ -64,7 +64,7 @@ def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
 
 def visible(tilt: Array, rows: int, columns: int, sphere: Sphere) -> NDArray[np.bool_]:
     """Where a panorama (rows, columns) that was `leveled` shows what the tilted one did."""
-    up = sphere.rays(rows, columns) @ rotation(tilt)[:, 2]
+    up = sphere.rays(rows, columns) @ rotation(*tilt)[:, 2]
     return np.asarray((up > np.sin(sphere.low)) & (up < np.sin(sphere.high)))
 
 
