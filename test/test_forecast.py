@@ -13,17 +13,14 @@ from scipy.ndimage import gaussian_filter1d
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align
 from sfa_localization.metric import drive_check, learning, selection
-from sfa_localization.metric.basis import Process
 from sfa_localization.metric.forecast import (
     REACH_M,
     Forecast,
-    _beyond,
-    _gap,
-    _left_out_errors,
+    ground_distances,
+    importance,
     nearest_used,
 )
 from sfa_localization.metric.learning import learn_metric, positions
-from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds
@@ -37,7 +34,6 @@ DRIVES = {
     'wandering more': meander(400.0, seed=4),
     'lanes along and across': (grid(10.0, 1.0, 9), (-5.0, -5.0, 0.0)),
 }
-EVERYWHERE = Forecast(np.zeros((4, 2)), np.array([0.1, 0.2, 0.3, 0.4]), np.ones(4), np.zeros(4))
 
 
 def trained(name, noise=0.05):
@@ -60,14 +56,6 @@ def quick_and_tolerant(patch):
 @cache
 def legs():
     return trained('straight legs')
-
-
-@cache
-def fitted():
-    """A fit of a small process."""
-    _, segments, features, _ = legs()
-    problem = MetricProblem.of(features, segments, CONFIG)
-    return problem.fit(Process.fit(problem.features, np.full(12, 0.3), 1e-2, 60))
 
 
 def between(known, count=1500):
@@ -120,45 +108,10 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     assert error > 1.5 * result.forecast.expected_m
 
 
-def test_images_left_out_together_are_predicted_as_by_a_map_learnt_without_them():
-    whole = fitted()
-    group = np.array([40, 41, 42, 43, 90])
-    places = whole.places
-
-    def off(used):
-        """Errors of the map learnt from the used images; the drive's own positions stay."""
-        weighted = whole.expanded * (whole.weights * used)[:, None]
-        normal = weighted.T @ whole.expanded + np.diag(whole.basis.ridge)
-        return places - whole.expanded @ np.linalg.solve(normal, weighted.T @ places)
-
-    used = np.ones(len(places))
-    residuals, white = off(used), whole.elimination.whitened(whole.expanded).T
-    used[group] = 0.0
-    left_out = _left_out_errors(white[group], whole.weights[group], residuals[group])
-    assert left_out == pytest.approx(off(used)[group], rel=1e-5)
-
-
-def test_points_lie_around_the_drive():
-    result = legs()[3]
-    expected = result.forecast
-    assert expected.points.shape == (1000, 2)
-    assert expected.distances.max() <= REACH_M
-    assert np.all(expected.errors > 0)
-    spread = np.ptp(expected.points, axis=0)
-    assert np.all(spread < np.ptp(result.origins, axis=0) + 2.0)
-
-
-def test_the_gap_ends_at_the_same_distances_as_the_point_has():
-    ends = np.arange(11) * 0.5 + 0j
-    stack = replace(
-        fitted().stack, owner=np.zeros(11, int), first=np.array([0]), images=np.arange(11)
-    )
-    rng = np.random.default_rng(1)
-    gaps = {tuple(_gap(ends, stack, 5, 0.6, 1.2, rng).tolist()) for _ in range(20)}
-    assert gaps == {(3, 4, 5, 6), (4, 5, 6, 7)}
-    places = np.array([[0.0, 1.0], [0.0, -2.0], [3.0, 0.5]])
-    assert _beyond(places, np.zeros((1, 2)), np.array([0])) == pytest.approx([2.0])
-    assert np.isinf(_beyond(places[[0, 2]], np.zeros((1, 2)), np.array([0])))
+def test_points_lie_near_the_drive():
+    places = legs()[3].forecast.places
+    distances = ground_distances(places, np.random.default_rng(0))
+    assert distances.shape == (1000,) and 0.2 < distances.max() <= REACH_M
 
 
 def test_distances_to_another_part():
@@ -170,16 +123,17 @@ def test_distances_to_another_part():
 def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points():
     rng = np.random.default_rng(2)
     wanted, have = rng.uniform(0, 0.5, 4000), rng.uniform(0, 2.0, 4000) ** 1.5
-    weight = Forecast(np.zeros((4000, 2)), wanted, np.ones(4000), np.zeros(4000)).importance(have)
+    weight = importance(have, wanted)
     assert weight.sum() == pytest.approx(1.0)
     assert np.all(weight[have > 0.5] == 0.0)
     assert weight @ have == pytest.approx(0.25, abs=0.01)
-    far = EVERYWHERE.importance(np.array([5.0, 6.0]))
+    far = importance(np.array([5.0, 6.0]), np.array([0.1, 0.2, 0.3, 0.4]))
     assert far == pytest.approx([0.5, 0.5]), 'where none is near enough, all count'
 
 
 def test_keyframes_improve_what_is_left_out_but_not_the_drive():
-    known = Forecast(np.zeros((2, 2)), np.ones(2), np.array([0.3, 0.0]), np.array([0.4, 0.1]))
+    errors = np.array([0.3, 0.0]), np.array([0.4, 0.1])
+    known = Forecast(np.zeros((2, 2)), *errors, np.full(2, 0.5), np.ones(2))
     assert known.errors == pytest.approx([0.5, 0.1])
     assert known.improved(0.5).errors == pytest.approx([np.hypot(0.15, 0.4), 0.1])
 

@@ -246,7 +246,7 @@ def test_left_out_segments_calibrate_the_covariance():
     result = noisy_result()[3]
     ratio = (result.left_out**2).sum(1) / result.left_out_variance
     for share, slack in ((0.5, 1e-3), (0.95, 2e-3)):
-        assert share_within(ratio, 2, share, result.left_out_weight) >= share - slack
+        assert share_within(ratio, 2, share, result.forecast.weight) >= share - slack
 
 
 def test_the_same_seed_gives_the_same_bytes():

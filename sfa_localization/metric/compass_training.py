@@ -23,7 +23,7 @@ from sfa_localization.metric.compass import (
     prior_variance,
     scaled_inputs,
 )
-from sfa_localization.metric.forecast import nearest_used
+from sfa_localization.metric.forecast import importance, nearest_used
 from sfa_localization.metric.learning import MetricResult, headings, positions
 from sfa_localization.metric.lower_factor import lower_root
 from sfa_localization.metric.segments import Segments, assignment
@@ -89,7 +89,7 @@ def learn_heading(
         return None
     of_segments, places = positions(result, segments)
     distances = nearest_used(places[np.searchsorted(of_segments, labeled)], part)
-    weight = result.forecast.importance(distances)
+    weight = importance(distances, result.forecast.distances)
     disagreement = images.disagreement[labeled]
     agreement = Agreement.fit(disagreement, fit.error**2, fit.std**2, axes=1, weight=weight)
     ratio = fit.error**2 / (fit.std**2 * agreement.factor(disagreement))

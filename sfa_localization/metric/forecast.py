@@ -3,17 +3,12 @@
 """The error to expect of one image on a path between the trained ones; needs no ground truth.
 
 A stretch of the drive that is left out is usually farther from all other images than a path of
-later use: legs end at the border, and a lane is alone in its strip. So the forecast draws points
-evenly over the covered ground, and for each finds the distances to the nearest image, and to the
-nearest on the opposite side. Around the image nearest to the point, all images up to these two
-distances on the two sides are left out, and the map predicts it from the rest: it is then as far
-from its neighbors as the point is.
+later use: legs end at the border, and a lane is alone in its strip. So left-out images are weighted
+until as many of them are at each distance from the nearest image that their map was learned from
+as points drawn evenly over the covered ground are from any.
 
 It does not contain what no left-out image can show: other light than that of the trained drives,
 or a wheel radius that is wrong everywhere.
-
-Leaving out images needs no new fit: with residuals r and the hat matrix H of the least squares, the
-errors of a group G that is not used are (I - H_GG)^-1 r_G.
 """
 
 from __future__ import annotations
@@ -25,73 +20,56 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from sfa_localization.data.geometry import Array, RigidTransform
-from sfa_localization.metric.map_fit import MapFit
-from sfa_localization.metric.quadratic_form import Stack
 
 Indices = NDArray[np.int64]
 
 REACH_M = 1.0
 """Ground further than this from every image is not covered by the drive."""
 _NARROW_M = 0.1
-# Enough for the mean and the map of the expected error; each is a small linear system.
+# Points on the ground: enough for the shares of distances.
 _POINTS = 1000
 # Of distances, in which left-out images are weighted.
 _BINS = 12
-# Images before and after one whose direction is the robot's.
-_AROUND = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Expected errors of single images at K points, drawn evenly over the covered ground."""
+    """Expected errors of single images where M images were taken."""
 
-    points: Array
-    """(K, 2) m, in the map frame."""
-    distances: Array
-    """(K,) m to the nearest image of the drive."""
+    places: Array
+    """(M, 2) m, in the map frame."""
     left_out: Array
-    """(K,) m: errors of the map without the images as near as that."""
+    """(M,) m: errors of a map without that stretch of the drive."""
     drive_std: Array
-    """(K,) m: of the drive's own positions there, which a map repeats."""
+    """(M,) m: of the drive's own positions there, which a map repeats."""
+    weight: Array
+    """(M,) of sum 1: how well each of `left_out` represents paths between the trained ones."""
+    distances: Array
+    """(K,) m to the nearest image, of points drawn evenly over the covered ground."""
 
     @property
     def errors(self) -> Array:
-        """(K,) m: of left-out images and of the drive together."""
+        """(M,) m: of left-out images and of the drive together."""
         return np.hypot(self.left_out, self.drive_std)
 
     @property
     def expected_m(self) -> float:
         """Mean error to expect of one image on a path between the trained ones."""
-        return float(self.errors.mean())
+        return float(self.weight @ self.errors)
 
     @property
     def local(self) -> Array:
-        """(K,) m: mean of the errors within `REACH_M` of each point."""
-        near = cKDTree(self.points).query_ball_point(self.points, REACH_M)
-        return np.array([self.errors[rows].mean() for rows in near])
+        """(M,) m: mean of the errors within `REACH_M` of each place, by weight."""
+        near = cKDTree(self.places).query_ball_point(self.places, REACH_M)
+        weight = self.weight + 1e-2 / len(self.weight)  # where none has any, all count
+        return np.array([np.average(self.errors[n], weights=weight[n]) for n in near])
 
     @property
     def worst(self) -> tuple[float, float, float]:
         """x, y (m, map frame) where the expected error is largest, and this error (m)."""
         local = self.local
         at = int(local.argmax())
-        return float(self.points[at, 0]), float(self.points[at, 1]), float(local[at])
-
-    def importance(self, distances: Array) -> Array:
-        """Weights (M,), of sum 1, of left-out images so far (m) from the nearest used one.
-
-        As many, by weight, are then at each distance as points of the covered ground are.
-        """
-        edges = np.quantile(self.distances, np.linspace(0.0, 1.0, _BINS + 1))
-        edges[0] = 0.0
-        bins = np.searchsorted(edges, distances, 'right') - 1
-        inside = (bins >= 0) & (bins < _BINS)
-        if not inside.any():
-            return np.full(len(distances), 1.0 / max(len(distances), 1))
-        bins = np.clip(bins, 0, _BINS - 1)
-        counts = np.bincount(bins[inside], minlength=_BINS)
-        weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)
-        return np.asarray(weights / weights.sum())
+        return float(self.places[at, 0]), float(self.places[at, 1]), float(local[at])
 
     def widened(self, factor: float) -> Forecast:
         """With the variances of the drive's own positions larger by a factor."""
@@ -103,27 +81,31 @@ class Forecast:
 
     def moved(self, frame: RigidTransform) -> Forecast:
         """The same forecast in another frame."""
-        return replace(self, points=frame.apply(self.points))
+        return replace(self, places=frame.apply(self.places))
 
 
-def forecast(fit: MapFit, sway_variance: Array, rng: np.random.Generator) -> Forecast:
-    """The forecast of a fit, in its own frame.
-
-    `sway_variance` (M,) m^2 is how uncertain the drive's own positions are where each image was
-    taken: the map repeats their errors, which leaving out images cannot show.
+def ground_distances(places: Array, rng: np.random.Generator) -> Array:
+    """Distance (K,) m to the nearest of the places (M, 2), of points drawn evenly over the ground
+    that they cover.
     """
-    complex_places = fit.places
-    places = np.column_stack([complex_places.real, complex_places.imag])
-    points = _covered(places, rng)
-    near, nearest = cKDTree(places).query(points)
-    far = _beyond(places, points, nearest)
-    white, weights = fit.elimination.whitened(fit.expanded).T, fit.weights
-    errors = np.empty(len(points))
-    for k, image in enumerate(nearest):
-        gap = _gap(complex_places, fit.stack, int(image), near[k], far[k], rng)
-        left_out = _left_out_errors(white[gap], weights[gap], fit.residuals[gap])
-        errors[k] = abs(complex(left_out[gap == image][0]))
-    return Forecast(points, near, errors, np.sqrt(sway_variance[nearest]))
+    return np.asarray(cKDTree(places).query(_covered(places, rng))[0])
+
+
+def importance(near: Array, distances: Array) -> Array:
+    """Weights (M,), of sum 1, of left-out images so `near` (M,), m, to the nearest used one.
+
+    As many, by weight, are then at each distance as `distances` (K,) of points of the ground are.
+    """
+    edges = np.quantile(distances, np.linspace(0.0, 1.0, _BINS + 1))
+    edges[0] = 0.0
+    bins = np.searchsorted(edges, near, 'right') - 1
+    inside = (bins >= 0) & (bins < _BINS)
+    if not inside.any():
+        return np.full(len(near), 1.0 / max(len(near), 1))
+    bins = np.clip(bins, 0, _BINS - 1)
+    counts = np.bincount(bins[inside], minlength=_BINS)
+    weights = np.where(inside, 1.0 / np.maximum(counts[bins], 1), 0.0)
+    return np.asarray(weights / weights.sum())
 
 
 def nearest_used(places: Array, part: Indices) -> Array:
@@ -160,49 +142,3 @@ def _covered(places: Array, rng: np.random.Generator) -> Array:
         points = points[np.all(points @ normals.T + offsets <= 0.0, axis=1)]
         found.append(points[tree.query(points)[0] <= REACH_M])
     return np.concatenate(found)[:_POINTS]
-
-
-def _beyond(places: Array, points: Array, nearest: Indices) -> Array:
-    """Distance (K,) to the nearest place on the side away from the nearest one of all."""
-    distances = np.empty(len(points))
-    for k, point in enumerate(points):
-        away = places - point
-        opposite = away @ away[nearest[k]] < 0.0
-        distances[k] = np.hypot(*away[opposite].T).min() if opposite.any() else np.inf
-    return distances
-
-
-def _gap(
-    places: NDArray[np.complex128],
-    stack: Stack,
-    image: int,
-    near: float,
-    far: float,
-    rng: np.random.Generator,
-) -> Indices:
-    """Rows around an image: within `near`, and on one side, fore or aft, nearer than `far`."""
-    first = stack.first[stack.owner[image]]
-    last = np.append(stack.first[1:], len(places))[stack.owner[image]] - 1
-    along = places[min(image + _AROUND, last)] - places[max(image - _AROUND, first)]
-    # A robot that turned on the spot has no direction of driving.
-    if along == 0.0:
-        along = np.exp(2j * np.pi * rng.random())
-    side = along * rng.choice([-1.0, 1.0])
-    away = places - places[image]
-    distance = np.abs(away)
-    inside = (distance <= near) | ((np.real(away * np.conj(side)) > 0.0) & (distance < far))
-    inside[image] = True
-    return np.flatnonzero(inside)
-
-
-def _left_out_errors(
-    white: Array, weights: Array, residuals: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Errors (G,) of a group of images by a map learned without them.
-
-    From their whitened features (G, m), weights and residuals (G,) in the map of all images.
-    """
-    remaining = np.eye(len(white)) - (white @ white.T) * weights
-    # Where nothing but the group determines the map, the matrix is singular.
-    remaining[np.diag_indices_from(remaining)] += 1e-9
-    return np.asarray(np.linalg.solve(remaining, residuals))

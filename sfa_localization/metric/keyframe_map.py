@@ -102,7 +102,7 @@ def _judged(
         errors.append(pose[:2] - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)
         alone.append(error)
-        weights.append(result.left_out_weight[row])
+        weights.append(result.forecast.weight[row])
     if len(errors) < _ENOUGH or not sum(weights) > 0:
         return KeyframeMap(keyframes)
     weight, ratio = np.array(weights), (np.array(errors) ** 2).sum(1) / np.array(variances)

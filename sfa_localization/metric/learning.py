@@ -20,7 +20,7 @@ from sfa_localization.data.geometry import Array, RigidTransform, align_complex,
 from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
-from sfa_localization.metric.forecast import Forecast, forecast, nearest_used
+from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
 from sfa_localization.metric.map_covariance import angle_covariance, metric_map, plane, sway
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.map_frame import map_frame
@@ -68,9 +68,6 @@ class MetricResult:
     """(M, 2) m: as `residuals`, of a map learned without that stretch of the drive."""
     left_out_variance: Array
     """(M,) m^2 per axis: what the map claimed for `left_out`, with its inflation."""
-    left_out_weight: Array
-    """(M,) of sum 1: how well each of `left_out` represents paths between the trained ones, by
-    the distance to the nearest image that its map was learned from."""
     explained: float
     """Share of the spread of the places that the features explain in images left out."""
     forecast: Forecast
@@ -129,15 +126,14 @@ def learn_metric(
         fit = choose(problem, scale)
     left = _Left.of(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
-    overfits &= config.solver == 'certified' and not diagnose(fit).one_route
-    if overfits:
+    if overfits and config.solver == 'certified' and not diagnose(fit).one_route:
         fit = fit.weighted(left.variance, left.images.errors)
         left = _Left.of(fit)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
     frame = map_frame(fit) if onto is None else _frame_of(onto, fit)
-    return _result(fit, left, overfits, frame, diagnostics, history)
+    return _result(fit, left, frame, diagnostics, history)
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -166,32 +162,27 @@ def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
 
 @dataclass(frozen=True, slots=True)
 class _Left:
-    """Images left out of a fit, and the forecast by those that are as near to the others as points
-    of the covered ground: their `weight` (M,) of sum 1.
-    """
+    """Images left out of a fit, and the forecast by them."""
 
     images: LeftOut
-    expected: Forecast
-    weight: Array
+    forecast: Forecast
     sway: NDArray[np.complex128]
-    sway_variance: float
     spread: float
     """Mean square distance (m^2) of the images from their middle."""
 
     @classmethod
     def of(cls, fit: MapFit) -> _Left:
-        images, weights_sway, places = leave_out(fit), sway(fit), fit.places
-        variance = (np.abs(fit.expanded @ weights_sway) ** 2).sum(1)
-        expected = forecast(fit, variance, np.random.default_rng(fit.problem.seed))
-        near = nearest_used(plane(places), part_of(fit.stack, fit.problem.seed))
-        spread = float((np.abs(places - places.mean()) ** 2).mean())
-        weight = expected.importance(near)
-        return cls(images, expected, weight, weights_sway, float(variance.mean()), spread)
+        images, weights_sway, places = leave_out(fit), sway(fit), plane(fit.places)
+        drive_std = np.sqrt((np.abs(fit.expanded @ weights_sway) ** 2).sum(1))
+        distances = ground_distances(places, np.random.default_rng(fit.problem.seed))
+        weight = importance(nearest_used(places, part_of(fit.stack, fit.problem.seed)), distances)
+        expected = Forecast(places, np.abs(images.errors), drive_std, weight, distances)
+        return cls(images, expected, weights_sway, float(places.var(0).sum()))
 
     @property
     def variance(self) -> float:
         """Of the position of an image that was left out, m^2 per axis."""
-        return float(self.weight @ np.abs(self.images.errors) ** 2) / 2
+        return float(self.forecast.weight @ self.forecast.left_out**2) / 2
 
     @property
     def explained(self) -> float:
@@ -200,19 +191,10 @@ class _Left:
 
 
 def _result(
-    fit: MapFit,
-    left: _Left,
-    overfits: bool,
-    frame: RigidTransform,
-    diagnostics: Diagnostics,
-    history: Array,
+    fit: MapFit, left: _Left, frame: RigidTransform, diagnostics: Diagnostics, history: Array
 ) -> MetricResult:
-    inflation = max(needed_factor(left.images.ratio, 2, left.weight), 1.0)
-    expected = left.expected.widened(inflation)
-    if overfits:
-        # Beside an image lies another one that errs alike: stretches that were left out do not.
-        mean = float(left.weight @ np.abs(left.images.errors))
-        expected = expected.improved(max(mean / expected.left_out.mean(), 1.0))
+    inflation = max(needed_factor(left.images.ratio, 2, left.forecast.weight), 1.0)
+    expected = left.forecast.widened(inflation)
     turn = np.exp(1j * frame.yaw_rad)
     return MetricResult(
         map=metric_map(fit, left.sway, frame, inflation),
@@ -224,10 +206,9 @@ def _result(
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
         noise_m=float(np.sqrt(fit.variance)),
-        common_m=float(np.sqrt(inflation * left.sway_variance / 2)),
+        common_m=float(np.sqrt((expected.drive_std**2).mean() / 2)),
         left_out=plane(left.images.errors * turn),
         left_out_variance=left.images.variances * inflation,
-        left_out_weight=left.weight,
         explained=left.explained,
         forecast=expected.moved(frame),
         diagnostics=diagnostics,
@@ -277,5 +258,5 @@ def left_out_agreement(disagreement: Array, result: MetricResult) -> Agreement:
         (result.left_out**2).sum(1),
         result.left_out_variance,
         axes=2,
-        weight=result.left_out_weight,
+        weight=result.forecast.weight,
     )

@@ -107,7 +107,7 @@ def judgment(trained: Trained) -> tuple[str, str]:
 
 def weak_places(forecast: Forecast) -> Iterator[tuple[float, float, float]]:
     """x, y (m) and expected error (m) where it is largest, each apart from the others."""
-    local, points = forecast.local, forecast.points
+    local, points = forecast.local, forecast.places
     left = np.ones(len(points), bool)
     for _ in range(_PLACES):
         at = int(np.argmax(np.where(left, local, -np.inf)))
@@ -167,7 +167,7 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     axes = figure.subplots()
     expected = trained.metric.forecast
     dots = axes.scatter(
-        expected.points[:, 0], expected.points[:, 1], c=expected.local, s=30, cmap='viridis'
+        expected.places[:, 0], expected.places[:, 1], c=expected.local, s=30, cmap='viridis'
     )
     figure.colorbar(dots, ax=axes, label='expected position error of one image (m)')
     axes.scatter(places[:, 0], places[:, 1], s=2, color='black')
