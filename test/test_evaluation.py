@@ -12,8 +12,6 @@ from picture_readers import PictureReader, Recording
 from scipy import signal
 
 from sfa_localization import evaluation
-from sfa_localization.bags.settings import TopicNames
-from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.cli import main
 from sfa_localization.config import write_config
@@ -23,7 +21,6 @@ from sfa_localization.fusion import pose_filter
 from sfa_localization.fusion.health import health_of
 from sfa_localization.fusion.track import Track
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.training import Recipe
 
 TRUSTED = Track(since_m=-math.inf)
 
@@ -77,20 +74,6 @@ def test_a_parameter_file_for_other_panoramas_is_refused(command, bag, tmp_path,
     assert not (tmp_path / 'new.yaml').exists()
 
 
-def test_what_the_filter_rejected_and_how_long_it_was_sure_is_printed(
-    bag, tmp_path, monkeypatch, capsys
-):
-    # The pictures of the reader hold its answers, and show no turns.
-    monkeypatch.setattr(VisualGyro, 'add', lambda gyro, picture: np.nan)
-    figures = evaluated(bag, tmp_path, ekf_node={'measurement_factor': 0.02})
-    out = capsys.readouterr().out
-    rejected = figures['counts']['fusion']['measurement: outside the gate']
-    assert f'filter: {rejected} times measurement: outside the gate' in out
-    seconds = figures['counts']['states_s']
-    assert seconds['LOCALISED'] > 1.0
-    assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
-
-
 class Torn(PictureReader):
     """Reads positions beyond x = 7 m as ten meters farther: half of its map is apart."""
 
@@ -100,11 +83,18 @@ class Torn(PictureReader):
         return replace(found, pose=found.pose + shift)
 
 
-def test_seconds_in_which_the_filter_was_sure_and_wrong_are_counted(
+def test_what_the_filter_rejected_and_how_long_it_was_sure_or_wrong_is_printed(
     bag, tmp_path, monkeypatch, capsys
 ):
-    assert evaluated(bag, tmp_path)['counts']['false_localised_s'] == 0.0
-    assert 'an error of more than a meter' not in capsys.readouterr().out
+    # The pictures of the reader hold its answers, and show no turns.
+    monkeypatch.setattr(VisualGyro, 'add', lambda gyro, picture: np.nan)
+    counts = evaluated(bag, tmp_path, ekf_node={'measurement_factor': 0.02})['counts']
+    out, seconds = capsys.readouterr().out, counts['states_s']
+    rejected = counts['fusion']['measurement: outside the gate']
+    assert f'filter: {rejected} times measurement: outside the gate' in out
+    assert seconds['LOCALISED'] > 1.0 and counts['false_localised_s'] == 0.0
+    assert f'state: UNINITIALISED {seconds["UNINITIALISED"]:.1f} s, ' in out
+    assert 'an error of more than a meter' not in out
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: Torn()))
     # Driving would notice it.
     monkeypatch.setattr(pose_filter, 'health_of', lambda *_: health_of(TRUSTED, ()))
@@ -184,12 +174,3 @@ def test_the_map_is_laid_on_the_truth_by_all_training_drives():
         drives.append((truth, Trajectory(estimate.stamps_ns, np.column_stack([places, places]))))
     one, both = evaluation.fit_transform(drives[0]), evaluation.fit_transform(*drives)
     assert one.x_m == pytest.approx(0.0, abs=0.01) and both.x_m == pytest.approx(-0.1, abs=0.03)
-
-
-def test_topics_are_named_for_the_aligning_drive_only_where_it_has_them(tmp_path):
-    with BagWriter(tmp_path / 'bag') as writer:
-        writer.odometry('/odom', 10**9, (0, 0, 0), (0, 0), (0, 0))
-        writer.pose('/truth', 10**9, (0, 0, 0))
-    asked = TopicNames(image='/other/image', odometry='odom', ground_truth='/truth')
-    present = evaluation._present(tmp_path / 'bag', Recipe(topics=asked)).topics
-    assert present == TopicNames(odometry='odom', ground_truth='/truth')

@@ -13,7 +13,6 @@ from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.features.image_features import harmonics
 from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.metric import compass_training
-from sfa_localization.metric.compass import Compass
 from sfa_localization.metric.compass_training import CompassFit, fit_compass
 
 
@@ -50,25 +49,20 @@ def test_harmonics_by_hand():
     assert np.allclose(harmonics(maps), [[2, -1j]])
 
 
-def test_headings_are_learnt():
-    fit = fitted()
-    assert np.degrees(np.abs(fit.error).mean()) < 2
-    features, harmonic, yaw = scene()
-    told, variance = fit.compass.predict(features, harmonic)
-    assert np.degrees(np.abs(wrap_angle(told - yaw)).max()) < 5
-    assert (variance > 0).all() and (variance <= UNKNOWN_YAW_VARIANCE).all()
-
-
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_columns_grow_either_way(sign):
+def test_headings_are_learnt_with_their_variance_whichever_way_columns_grow(sign):
     features, harmonic, yaw = scene()
     fit = fitted(sign * yaw, harmonic, -sign)
-    told, _ = fit.compass.predict(features, harmonic)
+    told, variance = fit.compass.predict(features, harmonic)
+    assert np.degrees(np.abs(fit.error).mean()) < 2
     assert np.degrees(np.abs(wrap_angle(told - sign * yaw)).max()) < 5
+    assert (variance > 0).all() and (variance <= UNKNOWN_YAW_VARIANCE).all()
+    assert 0.9 <= (np.abs(fit.error) < 1.96 * fit.std).mean() <= 1.0  # on left-out pictures
+    assert np.median(fit.std) < np.radians(10)
 
 
 @pytest.mark.parametrize('turn', [0.1, -2.5])
-def test_turning_is_exact(turn):
+def test_turning_is_exact_and_contrast_does_not_matter(turn):
     features, harmonic, _ = scene()
     compass = fitted().compass
     yaw, variance = compass.predict(features, harmonic)
@@ -76,15 +70,8 @@ def test_turning_is_exact(turn):
     assert np.abs(wrap_angle(turned - yaw - turn)).max() < 1e-4
     assert np.allclose(same, variance, rtol=1e-3)
     faint, same = compass.predict(features, 0.1 * harmonic)
-    assert np.abs(wrap_angle(faint - yaw)).max() < 1e-5, 'contrast does not matter'
+    assert np.abs(wrap_angle(faint - yaw)).max() < 1e-5
     assert np.allclose(same, variance, rtol=1e-3)
-
-
-def test_variance_holds_on_left_out_pictures():
-    fit = fitted()
-    within = (np.abs(fit.error) < 1.96 * fit.std).mean()
-    assert 0.9 <= within <= 1.0
-    assert np.median(fit.std) < np.radians(10)
 
 
 def test_ambiguous_scenes_are_unsure():
@@ -111,28 +98,16 @@ def test_foreign_pictures_and_unknown_places_are_unsure():
     assert compass.predict(features + 100, harmonic)[1].min() > 0.5 * UNKNOWN_YAW_VARIANCE
 
 
-@pytest.mark.parametrize('folds', [2])
-def test_symmetric_panoramas_raise_the_variance(folds):
+def test_symmetric_panoramas_raise_the_variance():
     """Scenes that look alike in several directions have no first harmonic to tell them by."""
     pictures, model = visit().panoramas.read(0, 43), place().model
-    step = pictures.shape[2] // folds
-    copies = [np.roll(pictures, i * step, axis=2).astype(float) for i in range(folds)]
-    symmetric = np.mean(copies, axis=0).round().astype(np.uint8)
+    turned = np.roll(pictures, pictures.shape[2] // 2, axis=2)
+    symmetric = np.mean([pictures, turned], axis=0).round().astype(np.uint8)
     known, lost = (
         np.median([e.covariance[2, 2] for e in model.locate_all(p)]) for p in (pictures, symmetric)
     )
     assert lost > 20 * known
     assert np.sqrt(lost) > np.radians(30)
-
-
-def test_arrays_round_trip():
-    features, harmonic, _ = scene()
-    compass = fitted().compass
-    again = Compass.from_arrays(compass.to_arrays())
-    for one, other in zip(
-        compass.predict(features, harmonic), again.predict(features, harmonic), strict=True
-    ):
-        assert np.allclose(one, other, atol=1e-4, rtol=1e-2)
 
 
 @pytest.mark.parametrize(('count', 'folds'), [(19, 6), (0, 6), (100, 1)])

@@ -74,11 +74,10 @@ def test_features_equal_those_of_the_explicit_sequence(broken):
         assert correlations(one, other).min() > 0.9999, f'layer {depth + 1}'
 
 
-@pytest.mark.parametrize('shard', [1, 7])
-def test_shards_equal_the_whole(shard, monkeypatch):
+def test_shards_equal_the_whole(monkeypatch):
     of = drive(40)
     whole = trained(of)
-    monkeypatch.setattr(hierarchy, 'SHARD', shard)
+    monkeypatch.setattr(hierarchy, 'SHARD', 7)
     images = of.panoramas.read(0, 40)
     for one, other in zip(whole.maps(images), trained(of).maps(images), strict=True):
         assert correlations(one, other).min() > 0.99999
@@ -105,9 +104,6 @@ def test_stages_resumed_give_the_same_bytes():
     of, partials = drive(16), []
     whole = trained(of, on_stage=partials.append)
     assert len(partials) == 6
-    told = []
-    trained(of, drive(8, seed=1), on_shard=told.append)
-    assert sum(told) == 6 * 24, 'progress counts every picture in every stage'
     for partial in partials:
         resumed = trained(of, start=partial)
         assert resumed.nodes[-1].slow.tobytes() == whole.nodes[-1].slow.tobytes()

@@ -57,35 +57,21 @@ def test_signs_are_deterministic():
     assert fitted(x, 4).weights.tobytes() == fitted(x.copy(), 4).weights.tobytes()
 
 
-class TestRankDeficiency:
-    """Redundant, constant and nearly constant dimensions make no false slow features."""
-
-    def test_redundant_dimensions_are_cut(self):
-        x = mixed() @ np.random.default_rng(7).normal(size=(4, 12))
-        solution = fitted(x, 4)
-        assert solution.rank == 4
-        assert np.abs(np.diag(np.corrcoef(solution.apply(x).T, sources().T)[:4, 4:])).min() > 0.999
-
-    def test_more_features_than_rank_are_refused(self):
-        x = mixed() @ np.random.default_rng(7).normal(size=(4, 12))
-        with pytest.raises(DataError, match='rank 4, fewer than the 5 slow features'):
-            fitted(x, 5)
-
-    def test_a_constant_signal_is_refused(self):
-        with pytest.raises(DataError, match='rank 0'):
-            fitted(np.full((50, 3), 7.0), 1)
-
-    def test_float32_rounding_is_no_signal(self):
-        x = (mixed() @ np.random.default_rng(7).normal(size=(4, 12))).astype(np.float32)
-        assert fitted(x, 4, relative_cut=1e-6).rank == 4
-
-    def test_the_cut_leaves_as_many_as_asked_for(self):
-        x = mixed() * np.array([1.0, 1e-2, 1e-2, 1e-2])
-        assert fitted(x, 1, relative_cut=0.1).rank < 4
-        assert fitted(x, 4, relative_cut=0.1).rank == 4
-
-
-@pytest.mark.parametrize('count', [0, 1])
-def test_too_little_signal_is_refused(count):
-    with pytest.raises(DataError, match='two consecutive'):
-        fitted(np.zeros((count, 2)), 1)
+def test_redundant_constant_and_rounded_dimensions_make_no_false_slow_features():
+    redundant = mixed() @ np.random.default_rng(7).normal(size=(4, 12))
+    solution = fitted(redundant, 4)
+    assert solution.rank == 4
+    slow = solution.apply(redundant)
+    assert np.abs(np.diag(np.corrcoef(slow.T, sources().T)[:4, 4:])).min() > 0.999
+    assert fitted(redundant.astype(np.float32), 4, relative_cut=1e-6).rank == 4
+    faint = mixed() * np.array([1.0, 1e-2, 1e-2, 1e-2])
+    assert fitted(faint, 1, relative_cut=0.1).rank < 4
+    assert fitted(faint, 4, relative_cut=0.1).rank == 4, 'as many as asked for'
+    for signal, outputs, said in (
+        (redundant, 5, 'rank 4, fewer than the 5 slow features'),
+        (np.full((50, 3), 7.0), 1, 'rank 0'),
+        (np.zeros((0, 2)), 1, 'two consecutive'),
+        (np.zeros((1, 2)), 1, 'two consecutive'),
+    ):
+        with pytest.raises(DataError, match=said):
+            fitted(signal, outputs)

@@ -60,21 +60,14 @@ def test_the_grid_takes_the_least_error(monkeypatch):
     assert best.measurement_factor > 0.25
 
 
-def test_the_error_is_measured_after_rigid_alignment():
-    plain = tuning_drive()
-    there = Trajectory(plain.truth.stamps_ns, plain.truth.poses + np.array([100.0, -50.0, 0.0]))
-    costs = [
-        tuning.error_cost([drive], FilterConfig())
-        for drive in (plain, dataclasses.replace(plain, truth=there))
-    ]
-    assert costs[0] == pytest.approx(costs[1])
-
-
-def test_the_models_error_correlation_is_used():
+def test_the_error_is_measured_after_alignment_and_the_models_error_correlation_is_used():
     """Errors that neighbors share are no surprise to a filter that expects them."""
-    drive = tuning_drive()
+    plain, config = tuning_drive(), FilterConfig()
+    there = Trajectory(plain.truth.stamps_ns, plain.truth.poses + np.array([100.0, -50.0, 0.0]))
+    moved = tuning.error_cost([dataclasses.replace(plain, truth=there)], config)
+    assert moved == pytest.approx(tuning.error_cost([plain], config))
     white, shared = (
-        tuning.likelihood_cost([dataclasses.replace(drive, correlation=one)], FilterConfig())
+        tuning.likelihood_cost([dataclasses.replace(plain, correlation=one)], config)
         for one in (ErrorCorrelation(0.0, 1.0), ErrorCorrelation(0.7, 0.6))
     )
     assert shared < white
