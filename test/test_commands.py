@@ -20,9 +20,7 @@ from test_calibration import scene
 from sfa_localization import cli, training, tuning, updating
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.commands.options import given
 from sfa_localization.data.errors import NodeError
-from sfa_localization.data.settings import Settings
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
 from sfa_localization.updating import Additions
@@ -39,29 +37,6 @@ def options() -> dict[tuple[str, str], Any]:
         for action in parser_of(name)._actions
         if action.option_strings and action.dest != 'help'
     }
-
-
-def words_for(action: Any) -> list[str]:
-    """Return words that the action takes, whatever they mean."""
-    one = str(list(action.choices)[-1]) if action.choices else '7'
-    count = action.nargs if isinstance(action.nargs, int) else 1
-    return [*action.option_strings[:1], *[one] * count]
-
-
-def test_an_option_reaches_one_group_of_settings_at_most():
-    """Whichever groups a command reads, an option meant for one never appears in another."""
-    every, wrong = options(), []
-    groups = {group.__name__: group for group in Settings.__subclasses__()}
-    for (name, option), meant in every.items():
-        parser = parser_of(name)
-        needed = [a for a in parser._actions if a.required and option not in a.option_strings]
-        needed.sort(key=lambda action: bool(action.option_strings))  # BAG before --topics takes it
-        arguments = parser.parse_args([word for a in [*needed, meant] for word in words_for(a)])
-        reached = {n: got for n, group in groups.items() if (got := given(group, arguments))}
-        group, _, setting = meant.dest.partition('.')
-        if reached != ({group: {setting: vars(arguments)[meant.dest]}} if setting else {}):
-            wrong.append((name, option, reached))
-    assert wrong == []
 
 
 # Each option alone, on small inputs: what a command is given without it, and what comes of it.

@@ -42,6 +42,7 @@ def takes_another(node, topic):
 
 
 def test_odometry_of_another_name_is_found(bench):
+    """And images."""
     node = bench.run(EkfNode)
     zero, one, frames = np.zeros(3), np.eye(3), ('odom', 'base_link')
     message = to_odometry(zero, one, zero[:2], one[:2, :2], STAMP_NS, frames)
@@ -50,9 +51,6 @@ def test_odometry_of_another_name_is_found(bench):
     assert node.shown('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
     announce(bench, node, Odometry, '/odom')
     assert until(lambda: node.shown('odom') == '/odom'), 'its own name comes first'
-
-
-def test_images_of_another_name_are_found(bench):
     node = bench.run(OmnicamNode)
     heard = bench.listen(Image, 'panorama')
     message = to_image(np.full((60, 600, 3), 90, np.uint8), STAMP_NS, 'camera')
@@ -60,32 +58,33 @@ def test_images_of_another_name_are_found(bench):
     assert node.shown('image_raw') == '/camera/image'
 
 
-@pytest.mark.parametrize(
-    ('others', 'arguments'),
-    [
-        (['/one', '/two'], []),
-        (['/one', '/odom'], []),
-        (['/one'], ['--ros-args', '-r', 'odom:=/mine']),
-        (['/robot2/wheels'], ['--ros-args', '-r', '__ns:=/robot1']),
-    ],
-)
+@pytest.mark.parametrize(('others', 'arguments'), [
+    (['/one', '/two'], []), (['/one', '/odom'], []),
+    (['/one'], ['--ros-args', '-r', 'odom:=/mine']),
+    (['/robot2/wheels'], ['--ros-args', '-r', '__ns:=/robot1']),
+])  # fmt: skip
 def test_where_there_is_a_choice_it_is_not_made(bench, others, arguments):
+    """Nor where the topic has been heard."""
     node = bench.run(EkfNode, options={'cli_args': arguments})
     announce(bench, node, Odometry, *others)
     assert not takes_another(node, 'odom')
+    if not arguments:
+        node = bench.run(EkfNode)
+        node.monitor('odom').receive()
+        announce(bench, node, Odometry, '/wheels')
+        assert not takes_another(node, 'odom')
 
 
-@pytest.mark.parametrize(
-    ('kind', 'robot', 'there', 'arguments'),
-    [
-        # The driver is in the namespace, or its topic alone, because a bridge has none.
-        (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
-        (OmnicamNode, '/robot1', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
-        # Played from a bag, of another namespace, and of the node's own.
-        (OmnicamNode, '', ['/panorama'], 'image:=NAME or panorama:=NAME'),
-        (OmnicamNode, '', ['/robot1/panorama'], 'image:=NAME or panorama:=NAME'),
-    ],
-)
+IMAGES = 'image:=NAME or panorama:=NAME'
+
+
+@pytest.mark.parametrize(('kind', 'robot', 'there', 'arguments'), [
+    # The driver is in the namespace, or its topic alone, because a bridge has none.
+    (EkfNode, '/robot1', ['/robot1/ekf/odometry', '/robot1/wheels'], 'odom:=NAME'),
+    (OmnicamNode, '/robot1', ['/robot1/panorama'], IMAGES),
+    # Played from a bag of another namespace.
+    (OmnicamNode, '', ['/robot1/panorama'], IMAGES),
+])  # fmt: skip
 def test_the_output_of_another_localizer_is_no_sensor(bench, kind, robot, there, arguments):
     if robot:
         bench.run(kind, options={'namespace': robot})
@@ -122,10 +121,3 @@ def test_without_images_the_diagnostics_name_those_that_there_are(
     words = [f'/{name} (sensor_msgs/msg/Image)' for name in 'ab']
     words += [f'/{name}/packed (sensor_msgs/msg/CompressedImage)' for name in 'ab']
     assert until(lambda: all(word in node.health()[1] for word in words))
-
-
-def test_what_has_been_heard_stays(bench):
-    node = bench.run(EkfNode)
-    announce(bench, node, Odometry, '/wheels')
-    node.monitor('odom').receive()
-    assert not takes_another(node, 'odom')

@@ -18,8 +18,6 @@ from bag_formats import FORMATS, drive, write_version
 from cylinder_worlds import place
 from test_calibration_files import OCAM, echoed
 
-from sfa_localization.bags import decoding
-from sfa_localization.bags.files import Topic
 from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.recording import METADATA, parse_metadata
 from sfa_localization.camera.calibration_files import read_calibration
@@ -125,18 +123,6 @@ def test_damaged_bags(tmp_path):
         found = is_read(lambda: inspect(bag)) or found
         shutil.rmtree(bag)
         return found
-
-    check(use)
-
-
-def test_damaged_messages(tmp_path):
-    reads = {decoding.IMAGE: decoding.image_of, decoding.ODOMETRY: decoding.odometry_of}
-    messages = [m for m in drive(tmp_path) if m.kind in reads]
-
-    def use(random: Random) -> bool:
-        _, kind, _, data = messages[random.integers(len(messages))]
-        topic = Topic('/a', kind, 'cdr', (), 1)
-        return is_read(lambda: reads[kind](decoding.decode(damaged(data, random), topic)))
 
     check(use)
 

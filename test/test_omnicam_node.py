@@ -70,17 +70,15 @@ def pixels(sent):
     return read_image(sent)[1]
 
 
-def test_the_panorama_has_the_stamp_and_frame_of_the_picture(bench):
+def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
+    """The panorama has the stamp and frame of the picture; the camera by a file of `calibrate`."""
     _, heard = start(bench)
     told = answer(bench, heard, message())
     assert (told.header.stamp.sec, told.header.stamp.nanosec) == (12, 34)
     assert told.header.frame_id == 'camera' and told.encoding == 'bgr8'
     assert (told.height, told.width, told.step) == (12, 120, 360)
     np.testing.assert_array_equal(pixels(told), Unwrapper(MIRROR, PANORAMA)(raw_picture()))
-
-
-def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
-    """And the camera by a file of `calibrate`; test_simulation.py shows that the lens is undone."""
+    bench.end(bench.nodes[0])
     path, turned = tmp_path / 'camera.yaml', (0.0, 0.0, 40.0)
     path.write_text(calibration_text(LensCalibration(), turned))
     given = {'calibration_file': str(path), 'mount_rpy': list(turned), 'camera_model': ''}
@@ -185,26 +183,17 @@ def with_rules(*rules):
 
 @pytest.mark.parametrize(('rules', 'heard'), [
     ([], '/image_raw/compressed'),
-    (['image_raw:=/cam/image_raw'], '/cam/image_raw/compressed'),
     (['image_raw:=/cam/image_raw', 'image_raw/compressed:=/jpegs'], '/jpegs'),
     (['__ns:=/robot1', 'image_raw:=front', 'panorama:=/panorama'], '/robot1/front/compressed'),
 ])  # fmt: skip
 def test_a_remap_of_the_base_topic_holds_for_its_transports(bench, rules, heard):
+    """And a node that would hear itself is not configured."""
     bench.run(OmnicamNode, image_transport='compressed', options=with_rules(*rules), **SMALL)
     bench.node.create_subscription(CompressedImage, '/panorama/compressed', lambda _: None, 1)
     assert until(lambda: bench.node.count_subscribers(heard) == 1)
-
-
-def test_a_node_that_would_hear_itself_is_not_configured(bench):
-    for rule, transport in (
-        ('image_raw:=panorama', 'raw'), ('panorama:=/image_raw', 'raw'),
-        ('image_raw:=panorama', 'compressed'),
-    ):  # fmt: skip
-        options = with_rules(rule)
-        node = bench.run(OmnicamNode, start=False, options=options, image_transport=transport)
-        assert not node.start()
-        assert 'which this node itself publishes' in node.failure and 'remap' in node.failure
-        bench.end(node)
+    node = bench.run(OmnicamNode, start=False, options=with_rules('image_raw:=panorama'))
+    assert not node.start()
+    assert 'which this node itself publishes' in node.failure and 'remap' in node.failure
 
 
 def dumped(node):
@@ -233,15 +222,11 @@ def shown(bench, *words):
     return until(lambda: any(all(w in m.status[0].message for w in words) for m in [*told]))
 
 
-def test_a_silent_camera_shows_in_diagnostics(bench):
-    _, heard = start(bench, silence_timeout=0.2)
-    assert shown(bench, 'no image')
-    answer(bench, heard, message())
-
-
-def test_a_frozen_and_a_masked_camera_show_in_diagnostics(bench, monkeypatch):
+def test_a_silent_camera_shows_in_diagnostics(bench, monkeypatch):
+    """And one that is frozen, or masked."""
     monkeypatch.setattr(watch, 'FROZEN_S', 0.2)
-    node, heard = start(bench, blind_sectors=[-100.0, 100.0])
+    node, heard = start(bench, silence_timeout=0.2, blind_sectors=[-100.0, 100.0])
+    assert shown(bench, 'no image')
     answer(bench, heard, message())
     assert shown(bench, 'sees only 4')
     assert bench.publish_until('image_raw', message(), lambda: 'repeated' in node.health()[1])
@@ -264,12 +249,6 @@ def test_a_folder_of_pictures(bench, tmp_path):
     stamps = [read_image(told)[0] for told in heard]
     assert stamps == sorted(stamps) and stamps[0] > 10**18
     assert until(lambda: sum(node.monitor(str(tmp_path)).refused.values()) == 1)
-
-
-def test_a_device_that_is_not_there_is_shown_and_awaited(bench):
-    node, _ = start(bench, source='device', source_path='/dev/no_such_camera')
-    assert until(lambda: node.health()[0] == DiagnosticStatus.ERROR)
-    assert 'no_such_camera' in node.health()[1]
 
 
 def test_of_images_that_come_too_fast_the_newest_is_used(bench):

@@ -15,7 +15,6 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 import yaml
 
@@ -271,25 +270,3 @@ def test_a_node_that_dies_is_started_again_unless_asked(bench, start, model, res
     gone = 'nobody publishes on /sfa/pose_with_covariance'
     assert until(lambda: gone in heard[-1].data, COMMAND_S)
     assert printed('[sfa_node]: active') == 1
-
-
-def test_a_node_ends_at_ctrl_c_as_soon_as_it_handles_signals(start):
-    process = start('run', 'sfa_localization', 'ekf_node')
-    assert until(lambda: any(map(handles_sigterm, psutil.Process(process.pid).children())))
-    _, told = interrupted(process)
-    assert 'Traceback' not in told, told
-
-
-def handles_sigterm(process):
-    """Python itself handles SIGINT alone."""
-    (caught,) = re.findall(r'SigCgt:\s*(\w+)', Path(f'/proc/{process.pid}/status').read_text())
-    return int(caught, 16) >> (signal.SIGTERM - 1) & 1
-
-
-def test_a_second_localizer_takes_no_output_of_the_first(bench, start):
-    start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-r', '__ns:=/robot1')
-    states(bench, '/robot1')
-    second = start('run', 'sfa_localization', 'ekf_node')
-    states(bench)
-    assert until(lambda: 'there are /robot1/ekf/odometry' in second.log.read_text(), COMMAND_S)
-    assert ': odom:=NAME' in second.log.read_text() and 'taking' not in second.log.read_text()

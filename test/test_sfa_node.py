@@ -75,7 +75,9 @@ def message(seed=1, stamp_ns=5_000_000_001, image=None):
 
 
 def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, models):
-    node = bench.run(SfaNode, model='a.npz', map_frame='garden')
+    node = bench.run(SfaNode, model='a.npz', map_frame='garden', silence_timeout=0.2)
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    assert until(lambda: told and 'waiting for images' in told[-1].status[0].message)
     slow = bench.listen(Float64MultiArray, 'sfa/slow_features')
     features = bench.listen(PoseStamped, 'sfa/slow_feature_pose')
     poses = bench.listen(PoseStamped, 'sfa/pose')
@@ -96,6 +98,7 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     bench.publish('panorama', message(seed=2))
     assert until(lambda: 'unlike' in node.health()[1])
     assert node.health()[2]['unlike by light'] == '0 %'
+    assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
 @pytest.mark.parametrize('kind', ['dark', 'frozen', 'foreign'])
@@ -217,14 +220,6 @@ def test_a_missing_model_is_named_with_the_remedy(bench, models):
         assert not node.start()
         assert why in node.failure and 'train' in node.failure
         bench.end(node)
-
-
-def test_waiting_for_images_is_reported(bench, models):
-    bench.run(SfaNode, model='a.npz', silence_timeout=0.2)
-    told = bench.listen(DiagnosticArray, '/diagnostics')
-    assert until(lambda: told and 'waiting for images' in told[-1].status[0].message)
-    bench.publish('panorama', message())
-    assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 
 def test_panoramas_declared_to_show_something_else_are_rejected(bench, models):

@@ -3,10 +3,6 @@
 """The simulator: geometry of its pictures, its routes, its sensors' errors, its bags."""
 
 import hashlib
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -275,20 +271,3 @@ def test_existing_bags_stay_and_senseless_settings_are_refused(tmp_path, capsys)
         text = capsys.readouterr().err
         assert named in text and text.count('\n') == 1
     assert [path.name for path in tmp_path.iterdir()] == ['bag']
-
-
-def test_ctrl_c_leaves_nothing(tmp_path):
-    command = [sys.executable, '-m', 'sfa_localization', 'simulate', str(tmp_path / 'bag')]
-    process = subprocess.Popen(
-        [*command, '--trajectory', 'curves', '--area', '8x8', '--length', '2000'],
-        stderr=subprocess.PIPE,
-    )
-    deadline = time.monotonic() + 60
-    while not any(file.stat().st_size for file in tmp_path.glob('.*/*/*')):
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, text = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert b'Traceback' not in text
-    assert list(tmp_path.iterdir()) == []
