@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 from bag_formats import FORMATS, drive, write_version
-from cylinder_worlds import place
 from test_calibration_files import OCAM, echoed
 
 from sfa_localization.bags.reader import KINDS, Bag
@@ -127,10 +126,9 @@ def test_damaged_bags(tmp_path):
     check(use)
 
 
-def test_damaged_models(tmp_path):
+def test_damaged_models(trained, tmp_path):
     """Hardly any can be read: each part has its checksum."""
-    place().model.save(tmp_path / 'whole.npz')
-    whole, path = (tmp_path / 'whole.npz').read_bytes(), tmp_path / 'model.npz'
+    whole, path = trained.model.read_bytes(), tmp_path / 'model.npz'
     for number in range(INPUTS):
         path.write_bytes(damaged(whole, np.random.default_rng(number)))
         is_read(lambda: PlaceModel.load(path))
