@@ -11,7 +11,7 @@ from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import train
 
-DRIVE = SimulationConfig(area=(6.0, 6.0), length=25.0, images='panorama', images_every=0.25)
+DRIVE = SimulationConfig(area=(6.0, 6.0), length=20.0, images='panorama', images_every=0.4)
 
 
 @pytest.mark.slow
