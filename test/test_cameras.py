@@ -140,22 +140,17 @@ def test_ocam_and_polar_by_hand():
     np.testing.assert_allclose(np.degrees(np.arcsin(forward[:, 2])), [78 - 90, 114 - 90])
 
 
-@pytest.mark.parametrize(
-    ('axis', 'mirrored', 'right', 'top', 'center'),
-    [
-        ('down', 'no', -LEFT, FORWARD, -UP),
-        ('down', 'yes', LEFT, FORWARD, -UP),
-        ('up', 'no', LEFT, FORWARD, UP),
-        ('up', 'yes', -LEFT, FORWARD, UP),
-        ('forward', 'no', -LEFT, UP, FORWARD),
-    ],
-)
-def test_where_the_picture_looks(axis, mirrored, right, top, center):
-    settings = {'axis': axis, 'mirrored': mirrored, 'fx': 100.0, 'fy': 100.0}
-    camera = make_camera(LensCalibration(camera_model='fisheye', **settings, **OPEN), SIZE)
+def test_where_the_picture_looks():
     quarter = 100 * np.pi / 2
     pixels = np.array([[319.5 + quarter, 319.5], [319.5, 319.5 - quarter], [319.5, 319.5]])
-    np.testing.assert_allclose(camera.unproject(pixels), [right, top, center], atol=1e-12)
+    for axis, mirrored, right, top, center in (
+        ('down', 'no', -LEFT, FORWARD, -UP), ('down', 'yes', LEFT, FORWARD, -UP),
+        ('up', 'no', LEFT, FORWARD, UP), ('up', 'yes', -LEFT, FORWARD, UP),
+        ('forward', 'no', -LEFT, UP, FORWARD),
+    ):  # fmt: skip
+        settings = {'axis': axis, 'mirrored': mirrored, 'fx': 100.0, 'fy': 100.0}
+        camera = make_camera(LensCalibration(camera_model='fisheye', **settings, **OPEN), SIZE)
+        np.testing.assert_allclose(camera.unproject(pixels), [right, top, center], atol=1e-12)
 
 
 def test_roll_comes_first_then_pitch_then_yaw():
@@ -188,23 +183,21 @@ def test_distortion_beyond_its_increasing_part_is_not_used():
     assert np.isfinite(pixels[0]).all() and np.isnan(pixels[1]).all()
 
 
-@pytest.mark.parametrize(
-    ('change', 'size', 'words'),
-    [
+def test_impossible_cameras_say_what_is_wrong():
+    singular = {'camera_model': 'ocam', 'polynomial': OCAM, 'affine': (0.5, 0.5, 1.0)}
+    for change, size, words in (
         ({}, (480, 640), '640 x 480'),
         ({}, (0, 640), 'empty'),
         ({'distortion': (0.1,)}, SIZE, 'coefficients'),
+        (singular, SIZE, 'singular'),
         ({'camera_model': 'ocam'}, SIZE, 'polynomial'),
         ({'camera_model': 'ocam', 'polynomial': (100.0, 0.0)}, SIZE, 'negative'),
-        ({'camera_model': 'ocam', 'polynomial': OCAM, 'affine': (0.5, 0.5, 1.0)}, SIZE, 'singular'),
         ({'camera_model': 'ocam', 'polynomial': (-1.0, 0.0, -100.0)}, SIZE, 'does not increase'),
         ({'camera_model': 'polar', 'radius_max': 10.0}, SIZE, 'radius_min'),
         ({'camera_model': 'polar', 'angle_min': 120.0}, SIZE, 'angle_min'),
-    ],
-)
-def test_impossible_cameras_say_what_is_wrong(change, size, words):
-    with pytest.raises(CameraError, match=words):
-        make_camera(LensCalibration(**change), size)
+    ):
+        with pytest.raises(CameraError, match=words):
+            make_camera(LensCalibration(**change), size)
 
 
 def test_the_panorama_model_uses_the_elevations_of_the_panorama():

@@ -32,7 +32,6 @@ from sfa_localization.inspection import (
     hull_area,
     inspect,
     path_length,
-    spacing,
 )
 from sfa_localization.metric.drive_check import ROUTE
 
@@ -174,22 +173,6 @@ def test_pauses_sizes_repeated_images_and_faulty_messages_are_problems(tmp_path)
     assert problems == {'/panorama': ['10 of 20 images repeat the one before'], '/odom': []}
 
 
-def test_what_is_unusual_about_odometry_is_a_problem(tmp_path):
-    """A pose that is never kept, one that was reset, and twists in other units."""
-    x = np.arange(50.0) / 5
-    shown = {
-        'constant': (0 * x, 1.0, 'the pose is constant; the twist is integrated instead'),
-        'reset': (x - 6 * (x >= 6), 1.0, 'odometry was reset 1 times; joined by its twist'),
-        'millimeters': (x, 1000.0, 'poses drive 9 m, twists 9e+03 m: are both in meters, radians '),
-    }
-    for name, (places, speed, text) in shown.items():
-        with BagWriter(tmp_path / name) as bag:
-            for index, place in enumerate(places):
-                bag.odometry('/odom', START + index * STEP, (place, 0, 0), (speed, 0), (0, 0))
-        (problem,) = inspect(tmp_path / name).problems
-        assert problem.startswith(f'/odom: {text}')
-
-
 def test_what_cannot_be_read_is_named(tmp_path, capsys):
     def never(index, at):
         return 0
@@ -235,13 +218,6 @@ def test_ground_within_reach_of_a_square_path():
     )
     # All but the inner 2 m x 2 m.
     assert covered_share(ring, 1.0) == pytest.approx(1 - 4 / 16, abs=0.03)
-
-
-def test_spacing_ignores_images_taken_standing():
-    places = np.zeros((300, 2))
-    places[:100, 0] = 0.3 * np.arange(100)
-    places[100:, 0] = places[99, 0]
-    assert spacing(places) == pytest.approx(0.3)
 
 
 # The camera.

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 
 import cv2
 import numpy as np
@@ -96,111 +95,91 @@ def test_every_camera_gives_the_same_panorama(name, clockwise):
     assert psnr(result[seen], direct(smooth, panorama)[seen]) > 34
 
 
-class TestPanoramaInput:
-    def picture(self):
-        return direct(smooth, PanoramaConfig(width=360, height=48)).astype(np.uint8)
-
-    def test_is_only_resized_and_never_the_input_itself(self):
-        """With camera_model: panorama, and with any other camera, of which it is no picture."""
-        turned = CameraConfig(mount_rpy=(0.0, 0.0, 90.0))
-        for config in (CameraConfig(camera_model='panorama'), turned):
-            assert psnr(Unwrapper(config, SMALL)(self.picture()), direct(smooth, SMALL)) > 40
-        big = PanoramaConfig(width=720, height=96)
-        result = Unwrapper(CameraConfig(camera_model='panorama'), big)(self.picture())
-        assert psnr(result[:, 2:-2], direct(smooth, big)[:, 2:-2]) > 40
-        same = direct(smooth, SMALL).astype(np.uint8)
-        for config in (CameraConfig(), CameraConfig(camera_model='panorama')):
-            result = Unwrapper(config, SMALL)(same)
-            assert np.array_equal(result, same) and not np.shares_memory(result, same)
-
-    def test_is_turned_and_reversed_to_the_convention(self):
-        config = CameraConfig(camera_model='panorama', mount_rpy=(0.0, 0.0, 90.0))
-        turned = Unwrapper(config, SMALL)(self.picture())
-        plain = Unwrapper(CameraConfig(camera_model='panorama'), SMALL)(self.picture())
-        np.testing.assert_array_equal(turned, np.roll(plain, -45, axis=1))
-        mirrored = LensCalibration(camera_model='panorama', mirrored='yes')
-        result = Unwrapper(CameraConfig(), SMALL, mirrored)(self.picture())
-        np.testing.assert_array_equal(result, plain[:, ::-1])
-        other = dataclasses.replace(SMALL, clockwise=False)
-        result = Unwrapper(CameraConfig(camera_model='panorama'), other)(self.picture())
-        assert psnr(result, direct(smooth, other)) > 40
-
-    def test_a_tilted_one_is_levelled(self):
-        config = CameraConfig(camera_model='panorama', mount_rpy=(3.0, 0.0, 0.0))
-        unwrapper = Unwrapper(config, PanoramaConfig(width=360, height=48))
-        picture = picture_of(smooth, unwrapper.calibration, (48, 360), config.mount_rpy)
-        seen = unwrapper.visible((48, 360))
-        assert 0.8 < seen.mean() < 1.0
-        assert psnr(unwrapper(picture)[seen], direct(smooth, unwrapper.panorama)[seen]) > 35
+def test_a_panorama_is_only_resized_turned_and_reversed_to_the_convention():
+    """With camera_model: panorama, and with any other camera, of which it is no picture."""
+    picture = direct(smooth, PanoramaConfig(width=360, height=48)).astype(np.uint8)
+    declared = CameraConfig(camera_model='panorama')
+    for config in (declared, CameraConfig(mount_rpy=(0.0, 0.0, 90.0))):
+        assert psnr(Unwrapper(config, SMALL)(picture), direct(smooth, SMALL)) > 40
+    big = PanoramaConfig(width=720, height=96)
+    result = Unwrapper(declared, big)(picture)
+    assert psnr(result[:, 2:-2], direct(smooth, big)[:, 2:-2]) > 40
+    same = direct(smooth, SMALL).astype(np.uint8)
+    for config in (CameraConfig(), declared):
+        result = Unwrapper(config, SMALL)(same)
+        assert np.array_equal(result, same) and not np.shares_memory(result, same)
+    plain = Unwrapper(declared, SMALL)(picture)
+    turned = dataclasses.replace(declared, mount_rpy=(0.0, 0.0, 90.0))
+    np.testing.assert_array_equal(Unwrapper(turned, SMALL)(picture), np.roll(plain, -45, axis=1))
+    mirrored = LensCalibration(camera_model='panorama', mirrored='yes')
+    result = Unwrapper(CameraConfig(), SMALL, mirrored)(picture)
+    np.testing.assert_array_equal(result, plain[:, ::-1])
+    other = dataclasses.replace(SMALL, clockwise=False)
+    assert psnr(Unwrapper(declared, other)(picture), direct(smooth, other)) > 40
 
 
-def test_raw_images_need_a_description():
-    """And are told of it: another camera's would be taken for the simulator's mirror."""
-    unwrapper = Unwrapper(CameraConfig(), SMALL)
-    for size in ((640, 640), (988, 988), (100, 200)):
-        with pytest.raises(CameraError, match='no camera is described: in the parameter file set'):
-            unwrapper(np.zeros((*size, 3), np.uint8))
+def test_a_tilted_panorama_is_levelled():
+    config = CameraConfig(camera_model='panorama', mount_rpy=(3.0, 0.0, 0.0))
+    unwrapper = Unwrapper(config, PanoramaConfig(width=360, height=48))
+    picture = picture_of(smooth, unwrapper.calibration, (48, 360), config.mount_rpy)
+    seen = unwrapper.visible((48, 360))
+    assert 0.8 < seen.mean() < 1.0
+    assert psnr(unwrapper(picture)[seen], direct(smooth, unwrapper.panorama)[seen]) > 35
 
 
-class TestMasks:
-    def test_a_blind_sector_hides_what_lies_from_its_start_to_its_end(self):
-        for sector, hidden in (
-            ((350.0, 10.0), np.abs(AZIMUTH) < 10), ((-10.0, 10.0), np.abs(AZIMUTH) < 10),
-            ((30.5, 30.5), AZIMUTH > 400), ((100.0, 140.0), np.abs(AZIMUTH - 120) < 20),
-        ):  # fmt: skip
-            seen = Unwrapper(mirror(blind_sectors=sector), SMALL).visible(SIZE)
-            np.testing.assert_array_equal(~seen.all(axis=0), hidden)
+def test_a_blind_sector_hides_what_lies_from_its_start_to_its_end_and_repeats_its_neighbors():
+    for sector, hidden in (
+        ((350.0, 10.0), np.abs(AZIMUTH) < 10), ((-10.0, 10.0), np.abs(AZIMUTH) < 10),
+        ((30.5, 30.5), AZIMUTH > 400), ((100.0, 140.0), np.abs(AZIMUTH - 120) < 20),
+    ):  # fmt: skip
+        seen = Unwrapper(mirror(blind_sectors=sector), SMALL).visible(SIZE)
+        np.testing.assert_array_equal(~seen.all(axis=0), hidden)
+    config = mirror(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
+    result, full = (Unwrapper(c, SMALL)(picture_of(smooth)) for c in (config, mirror()))
+    np.testing.assert_array_equal(result[:, 5:175], full[:, 5:175])
+    np.testing.assert_array_equal(result[:, :5], np.repeat(full[:, 5:6], 5, axis=1))
+    np.testing.assert_array_equal(result[:, 175:], np.repeat(full[:, 174:175], 5, axis=1))
 
-    def test_a_blind_sector_repeats_its_neighbors(self):
-        config = mirror(blind_sectors=(170.0, 190.0))  # behind, so the outer columns
-        result, full = (Unwrapper(c, SMALL)(picture_of(smooth)) for c in (config, mirror()))
-        np.testing.assert_array_equal(result[:, 5:175], full[:, 5:175])
-        np.testing.assert_array_equal(result[:, :5], np.repeat(full[:, 5:6], 5, axis=1))
-        np.testing.assert_array_equal(result[:, 175:], np.repeat(full[:, 174:175], 5, axis=1))
 
-    @pytest.mark.parametrize('size', [SIZE, (100, 100)])
-    def test_a_mask_picture_of_any_size_hides_what_is_black(self, tmp_path, size):
+def test_a_mask_picture_of_any_size_hides_what_is_black(tmp_path):
+    for size in (SIZE, (100, 100)):
         mask = np.full(size, 255, np.uint8)
         mask[: size[0] // 2] = 0  # the upper half of the picture looks forward
-        path = tmp_path / 'mask.png'
-        cv2.imwrite(str(path), mask)
-        seen = Unwrapper(mirror(mask_file=str(path)), SMALL).visible(SIZE)
+        cv2.imwrite(str(tmp_path / 'mask.png'), mask)
+        seen = Unwrapper(mirror(mask_file=str(tmp_path / 'mask.png')), SMALL).visible(SIZE)
         assert not seen[:, 46:134].any()
         assert seen[:, :44].all() and seen[:, 136:].all()
 
-    def test_what_is_outside_the_picture_is_filled(self):
-        lens = LensCalibration(cx=200.0)
-        unwrapper = Unwrapper(CameraConfig(), SMALL, lens)
-        result = unwrapper(picture_of(lambda rays: 0 * rays + 200, lens))
-        assert 0.5 < unwrapper.visible(SIZE).mean() < 0.95
-        assert (result == 200).all()
 
-    def test_rows_beyond_the_camera_repeat_the_last_seen(self):
-        panorama = PanoramaConfig(width=90, height=40, elevation_min=-10.0, elevation_max=60.0)
-        unwrapper = Unwrapper(mirror(), panorama)
-        result, seen = unwrapper(picture_of(smooth)), unwrapper.visible(SIZE)
-        first = int(np.argmax(seen.all(axis=1)))
-        assert first > 5 and not seen[: first - 1].any()
-        np.testing.assert_array_equal(result[0], result[int(np.argmax(seen.any(axis=1)))])
-
-    def test_impossible_masks_say_what_is_wrong(self, tmp_path):
-        os.mkfifo(tmp_path / 'pipe')
-        for config, words in (
-            (mirror(blind_sectors=(0.0,)), 'a start and an end'),
-            (mirror(mask_file='nowhere.png'), r'missing or is no image \(nowhere.png'),
-            (mirror(mask_file=str(tmp_path / 'pipe')), 'missing or is no image'),
-            *((mirror(blind_sectors=whole), 'sees no part') for whole in
-              ((0.0, 359.999), (-180.0, 180.0), (360.0, 0.0), (-10.0, 400.0))),
-        ):  # fmt: skip
-            with pytest.raises(CameraError, match=words):
-                Unwrapper(config, SMALL)(np.zeros((*SIZE, 3), np.uint8))
+def test_what_the_camera_does_not_see_is_filled_from_what_it_sees():
+    lens = LensCalibration(cx=200.0)
+    unwrapper = Unwrapper(CameraConfig(), SMALL, lens)
+    result = unwrapper(picture_of(lambda rays: 0 * rays + 200, lens))
+    assert 0.5 < unwrapper.visible(SIZE).mean() < 0.95
+    assert (result == 200).all()
+    panorama = PanoramaConfig(width=90, height=40, elevation_min=-10.0, elevation_max=60.0)
+    unwrapper = Unwrapper(mirror(), panorama)
+    result, seen = unwrapper(picture_of(smooth)), unwrapper.visible(SIZE)
+    first = int(np.argmax(seen.all(axis=1)))
+    assert first > 5 and not seen[: first - 1].any()
+    np.testing.assert_array_equal(result[0], result[int(np.argmax(seen.any(axis=1)))])
 
 
-def test_wrong_pictures_are_refused():
+def test_wrong_masks_and_pictures_are_refused():
+    """And raw images without a description: they would be taken for the simulator's mirror."""
+    whole = ((0.0, 359.999), (-180.0, 180.0), (360.0, 0.0), (-10.0, 400.0))
+    for config, words in (
+        (mirror(blind_sectors=(0.0,)), 'a start and an end'),
+        (mirror(mask_file='nowhere.png'), r'missing or is no image \(nowhere.png'),
+        *((mirror(blind_sectors=sector), 'sees no part') for sector in whole),
+        (CameraConfig(), 'no camera is described: in the parameter file set'),
+    ):
+        with pytest.raises(CameraError, match=words):
+            Unwrapper(config, SMALL)(np.zeros((*SIZE, 3), np.uint8))
     for picture in (
         np.zeros((400, 400), np.uint8), np.zeros((400, 400, 4), np.uint8),
         np.zeros((400, 400, 3), np.float32), np.zeros((0, 640, 3), np.uint8),
-        np.zeros((480, 640, 3), np.uint8), [[1, 2, 3]], None,
+        np.zeros((480, 640, 3), np.uint8),
     ):  # fmt: skip
         with pytest.raises(CameraError):
             Unwrapper(mirror(), SMALL)(picture)
@@ -208,6 +187,5 @@ def test_wrong_pictures_are_refused():
 
 def test_images_of_several_sizes():
     unwrapper = Unwrapper(mirror(), SMALL)
-    for size in ((400, 400), (320, 320), (400, 400), (200, 200), (100, 100), (120, 120)):
-        result = unwrapper(picture_of(smooth, size=size))
-        assert psnr(result, direct(smooth, SMALL)) > 35
+    for size in ((400, 400), (320, 320), (400, 400), (120, 120)):
+        assert psnr(unwrapper(picture_of(smooth, size=size)), direct(smooth, SMALL)) > 35

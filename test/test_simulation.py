@@ -12,8 +12,6 @@ from rosbags.highlevel import AnyReader
 from sfa_localization.camera.lenses import make_camera
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
-from sfa_localization.cli import main
-from sfa_localization.data.errors import BagError
 from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import differences, integrate
 from sfa_localization.fusion.pose_filter import PoseFilter
@@ -165,23 +163,6 @@ def test_each_route_is_what_it_promises(garden):
 # Sensors
 
 
-def test_the_odometry_frame_lies_anywhere_or_at_the_start(garden):
-    """Frames differ from drive to drive; nothing else of the drive changes with them."""
-    starts = []
-    for seed in range(3):
-        config = SimulationConfig(trajectory='test', seed=seed)
-        recorded, same = (
-            drive(garden, config),
-            drive(garden, replace(config, odometry_frame='start')),
-        )
-        assert np.allclose(same.odometry.poses[0], 0)
-        assert np.array_equal(same.odometry.twists, recorded.odometry.twists)
-        poses = relative(recorded.odometry.poses[0], recorded.odometry.poses)
-        assert np.allclose(relative(poses, same.odometry.poses), 0, atol=1e-9)
-        starts.append(recorded.odometry.poses[0])
-    assert np.ptp(np.array(starts), axis=0).min() > 1.0
-
-
 @pytest.mark.parametrize('rate', [5.0, 50.0])
 def test_exact_twists_lead_to_the_truth_through_the_filter_and_by_sums(garden, rate):
     """One convention: a twist is held since the message before, at any rate."""
@@ -257,17 +238,3 @@ def test_bag_holds_every_message_in_order(tmp_path):
         assert counts == {**shared, topic: len(recorded.image_stamps_ns)}
         assert stamps == sorted(stamps)
         assert image_stamps == list(recorded.image_stamps_ns)
-
-
-def test_existing_bags_stay_and_senseless_settings_are_refused(tmp_path, capsys):
-    (tmp_path / 'bag').mkdir()
-    with pytest.raises(BagError, match='exists'):
-        simulate(TINY, tmp_path / 'bag', SMALL)
-    assert list((tmp_path / 'bag').iterdir()) == []
-    for option, value, named in (
-        ('--area', '3x3', 'area'), ('--size', '300', '--size'), ('--size', '1x1', 'width')
-    ):  # fmt: skip
-        assert main(['simulate', str(tmp_path / 'new'), option, value]) == 1
-        text = capsys.readouterr().err
-        assert named in text and text.count('\n') == 1
-    assert [path.name for path in tmp_path.iterdir()] == ['bag']

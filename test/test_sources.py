@@ -7,6 +7,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -216,26 +217,16 @@ def test_sources_that_are_not_there_are_named(tmp_path, monkeypatch):
 
 
 def test_a_device_is_asked_for_a_size_and_a_rate(monkeypatch, tmp_path):
-    asked = {}
-
-    class Capture:
-        def __init__(self, *_args):
-            pass
-
-        def isOpened(self):
-            return True
-
-        def set(self, what, value):
-            asked[what] = value
-
-    monkeypatch.setattr(cv2, 'VideoCapture', Capture)
+    """Where they are given; else it keeps its own."""
+    capture = mock.Mock(return_value=mock.Mock(isOpened=lambda: True))
+    monkeypatch.setattr(cv2, 'VideoCapture', capture)
     (tmp_path / 'video0').touch()
-    path = str(tmp_path / 'video0')
-    opener(config(source='device', source_path=path, source_size=(1280, 720), source_rate=15.0))()
+    given = {'source': 'device', 'source_path': str(tmp_path / 'video0')}
     wanted = {cv2.CAP_PROP_FRAME_WIDTH: 1280, cv2.CAP_PROP_FRAME_HEIGHT: 720, cv2.CAP_PROP_FPS: 15}
-    assert asked.items() >= wanted.items()
-    asked.clear()
-    opener(config(source='device', source_path=path))()
-    assert not asked.keys() & wanted.keys(), 'a device keeps its own'
+    for more, expected in (({'source_size': (1280, 720), 'source_rate': 15.0}, wanted), ({}, {})):
+        opener(config(**given, **more))()
+        asked = {call.args[0]: call.args[1] for call in capture.return_value.set.call_args_list}
+        assert asked.items() >= expected.items() and (asked.keys() & wanted.keys()) == set(expected)
+        capture.return_value.set.reset_mock()
     with pytest.raises(ConfigError, match='columns and rows'):
         config(source_size=(640.0,))
