@@ -26,15 +26,6 @@ from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import PlaceModel
 
 
-def test_good_dark_and_covered_pictures_are_distinguished():
-    watch = ImageWatch()
-    assert [watch.judge(panorama(seed=seed)) for seed in range(20)] == [''] * 20
-    for level, spread, reason in ((2, 2, 'dark'), (0, 0, 'dark'), (120, 0, 'covered')):
-        picture = panorama(level=level, spread=spread)
-        picture[0] = picture[1]
-        assert reason in ImageWatch().judge(picture)
-
-
 def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
     watch = ImageWatch()
     found = [watch.judge(panorama(seed=seed)) for seed in (1, 1, 1, 1, 1, 1, 2, 2, 1)]
@@ -42,44 +33,24 @@ def test_a_repeated_picture_is_a_frozen_camera_until_it_changes():
     assert ['frozen' in text for text in found] == [False] * 4 + [True] * 2 + [False] * 3
 
 
-def test_foreign_pictures_are_not_believed():
-    told = [ImageWatch().judge_novelty(novelty) for novelty in (0.5, 3.0, 3.1, math.nan)]
-    assert [not problem for problem in told] == [True, True, False, False]
-
-
-def test_the_covariance_of_an_unusable_picture_makes_the_filter_leave_it_out():
-    update = PoseFilter().add_measurement(10**9, [0, 0, 0], unusable_covariance())
-    assert not update.accepted and update.reason == 'covariance means that nothing is known'
-
-
 def test_a_believed_picture_gives_the_models_pose_and_covariance():
     seen = Observer(PictureReader()).observe(7, panorama((3.0, 40.0, 1.0)))
     assert seen.stamp_ns == 7 and seen.problem == ''
     assert seen.pose == pytest.approx([3.0, 40.0, 1.0], abs=1e-4)
     assert np.array_equal(seen.covariance, np.diag([0.02, 0.03, 0.002]))
-
-
-def test_without_a_compass_the_yaw_is_zero_as_on_the_topic():
     seen = Observer(PictureReader(heading=False)).observe(7, panorama((3.0, 4.0, 1.0)))
-    assert seen.pose.tolist() == [3.0, 4.0, 0.0] and math.isnan(seen.yaw)
+    assert seen.pose.tolist() == [3.0, 4.0, 0.0] and math.isnan(seen.yaw), 'as on the topic'
 
 
-def test_an_estimate_that_is_not_finite_says_that_nothing_is_known():
+def test_an_estimate_that_is_not_finite_says_that_nothing_is_known_and_the_filter_leaves_it_out():
     reader = PictureReader()
     reader.locate = lambda image: replace(PictureReader().locate(image), pose=np.full(3, np.nan))
     seen = Observer(reader).observe(7, panorama())
     assert 'no finite estimate' in seen.problem
     assert np.array_equal(seen.pose, np.zeros(3))
     assert np.array_equal(seen.covariance, unusable_covariance())
-
-
-def test_another_size_is_refused_with_the_remedy():
-    for look in (
-        lambda image: Observer(PictureReader()).observe(7, image),
-        lambda image: Observer(PictureReader()).observe_all(np.array([7]), image[None]),
-    ):
-        with pytest.raises(ModelError, match=r'100x20.*64x16.*omnicam_node'):
-            look(np.zeros((20, 100, 3), np.uint8))
+    update = PoseFilter().add_measurement(10**9, seen.pose, seen.covariance)
+    assert not update.accepted and update.reason == 'covariance means that nothing is known'
 
 
 def mixed_run(count=3 * BATCH + 5):
@@ -112,14 +83,19 @@ def test_in_batches_and_one_by_one_images_are_judged_alike():
     assert {next(kind for kind in kinds if kind in text) for text in found} == set(kinds)
 
 
-@pytest.mark.parametrize('image', [
-    None, 'image', b'bytes', [[1, 2, 3]], np.zeros((4, 8)), np.zeros((4, 8, 4), np.uint8),
-    np.zeros((4, 8, 3), np.float32), np.zeros((4, 8, 3), np.uint16), np.array([None]),
-])  # fmt: skip
-def test_what_is_no_panorama_is_one_error(image):
+def test_what_is_no_panorama_or_has_another_size_is_one_error():
     localizer = Localizer(PictureReader())
-    with pytest.raises(ModelError, match=r'a panorama is \(H, W, 3\) uint8, not '):
-        localizer.add_panorama(1, image)
+    for image in (
+        None, 'image', b'bytes', [[1, 2, 3]], np.zeros((4, 8)), np.zeros((4, 8, 4), np.uint8),
+        np.zeros((4, 8, 3), np.float32), np.zeros((4, 8, 3), np.uint16), np.array([None]),
+    ):  # fmt: skip
+        with pytest.raises(ModelError, match=r'a panorama is \(H, W, 3\) uint8, not '):
+            localizer.add_panorama(1, image)
+    other = np.zeros((20, 100, 3), np.uint8)
+    for look in (localizer.observer.observe, localizer.observer.observe_all):
+        stamp, images = (np.array([7]), other[None]) if 'all' in look.__name__ else (7, other)
+        with pytest.raises(ModelError, match=r'100x20.*64x16.*omnicam_node'):
+            look(stamp, images)
 
 
 def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp():
@@ -174,14 +150,11 @@ def test_the_farther_apart_the_less_sure_and_where_they_contradict_keyframes_cou
     assert turned[0][2] == 0.0 and turned[1][2, 2] == pytest.approx(0.1**2)
 
 
-def test_an_unknown_place_is_left_to_slow_features():
+def test_an_unknown_place_is_left_to_slow_features_and_an_unknown_yaw_to_keyframes():
     slow = slow_at(3.0, 0.1)
     pose, covariance = combine(slow, match_at(0.1, known=False), EXACT, doubt=4.0)
     assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(4.0 * slow.covariance)
     assert math.isnan(distance(slow, match_at(0.1, known=False), EXACT))
-
-
-def test_an_unknown_yaw_is_that_of_the_keyframes():
     slow = slow_at(0.0, 0.1, yaw=1.0, yaw_std=np.pi / np.sqrt(3))
     pose, covariance = combine(slow, match_at(0.1), EXACT)
     assert pose[2] == 0.0 and covariance[2, 2] == pytest.approx(0.1**2)
