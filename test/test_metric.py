@@ -370,6 +370,6 @@ def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
         items=tuple(dataclasses.replace(s, start=s.start * [1, -1, -1]) for s in segments),
     )
     config = dataclasses.replace(EXACT, solver='paper')
-    fit, _ = paper_solver.learn(MetricProblem.of(exact_features(run.poses), flipped, config))
+    fit = paper_solver.learn(MetricProblem.of(exact_features(run.poses), flipped, config))
     step = np.diff(np.angle(fit.solution.z))
     assert np.cos(step - turns).mean() > 0.99

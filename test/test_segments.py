@@ -82,18 +82,6 @@ def test_standing_still_is_left_out_and_does_not_break_the_line():
     assert all(s.linked for s in segments.items[:-1])
 
 
-def test_an_odometry_reset_breaks_the_drive():
-    run = drive(straight(12.0))
-    poses = run.odometry.poses.copy()
-    half = len(poses) // 2
-    poses[half:, 0] -= poses[half, 0]
-    odometry = dataclasses.replace(run.odometry, poses=poses)
-    segments = cut(odometry, run.stamps_ns, ANY)
-    assert segments.odometry.skipped == {'resets': 1}
-    assert sum(not s.linked for s in segments) == 2
-    assert all(np.abs(s.path).max() <= PIECE_LENGTH_M + 1e-6 for s in segments)
-
-
 def test_a_pause_of_the_odometry_breaks_the_drive_and_its_pictures_are_counted():
     run = drive(straight(12.0))
     keep = np.ones(len(run.odometry.stamps_ns), bool)

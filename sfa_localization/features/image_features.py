@@ -87,9 +87,14 @@ class ImageFeatures:
         return {'pictures': len(self.slow), **self.variance_shares}
 
 
+def evenly(count: int, most: int) -> NDArray[np.int64]:
+    """Indices (S,) of at most `most` of `count` images, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
 def sample(total: int) -> NDArray[np.int64]:
-    """Indices (S,) of at most `SAMPLES` of so many images, evenly."""
-    return np.unique(np.linspace(0, total - 1, min(total, SAMPLES)).round().astype(np.int64))
+    """Those of so many images whose maps and textures are kept."""
+    return evenly(total, SAMPLES)
 
 
 def features_of_runs(

@@ -60,14 +60,11 @@ class Compass:
         return yaw, calibrated(phase_variance(g, variance), self.calibration)
 
     def _field(self, features: Array, harmonic: Complex) -> tuple[Complex, Array]:
-        s, f = self._scaled(features, harmonic)
+        s, f = scaled_inputs(features, harmonic, self.feature_scale, self.harmonic_scale)
         near = _near(s, self.features, self.length)
         kernel = near.astype(np.float32) * (f.astype(np.complex64) @ self._adjoint)
         left = np.maximum(prior_variance(f) - squares(kernel, self.factor), 0.0)
         return kernel @ self.weights, left + self.noise
-
-    def _scaled(self, features: Array, harmonic: Complex) -> tuple[Array, Complex]:
-        return scaled_inputs(features, harmonic, self.feature_scale, self.harmonic_scale)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""

@@ -13,7 +13,7 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
-from sfa_localization.features.image_features import ImageFeatures
+from sfa_localization.features.image_features import ImageFeatures, evenly
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, Agreement, share_within
 from sfa_localization.metric.compass import (
     Compass,
@@ -153,12 +153,12 @@ class _CompassProblem:
         feature_scale = features[:, :PLACE_FEATURES].std(0) + 1e-12
         harmonic_scale = np.sqrt((np.abs(harmonic) ** 2).mean(0)) + 1e-12
         s, f = scaled_inputs(features, harmonic, feature_scale, harmonic_scale)
-        chosen = _evenly(len(yaw), INDUCING_IMAGES)
+        chosen = evenly(len(yaw), INDUCING_IMAGES)
         return cls(s, f, feature_scale, harmonic_scale, yaw, folds, sign, chosen)
 
     def loss(self, length: float, noise: float) -> float:
         """Mean left-out error of a candidate, rad; with fewer inducing images."""
-        few = self.chosen[_evenly(len(self.chosen), _SELECTION_IMAGES)]
+        few = self.chosen[evenly(len(self.chosen), _SELECTION_IMAGES)]
         g, _ = self.left_out(length, noise, few)
         return float(np.abs(wrap_angle(self.sign * np.angle(g) - self.yaw)).mean())
 
@@ -194,11 +194,6 @@ class _CompassProblem:
         scales = self.feature_scale, self.harmonic_scale
         factor = np.asfortranarray(lower_root(uncertainty), np.complex64)
         return Compass(s, f, *scales, weights, factor, length, noise, self.sign, calibration)
-
-
-def _evenly(count: int, most: int) -> Indices:
-    """At most `most` of `count` images, evenly along the drive."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def _solve(

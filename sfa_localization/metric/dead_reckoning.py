@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, relative, wrap_angle
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
 from sfa_localization.metric.settings import SegmentConfig
 
@@ -21,9 +21,6 @@ Complex = NDArray[np.complex128]
 
 GAP_MAX_S = 0.5
 """Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""
-JUMP_MAX_M = 0.3
-YAW_JUMP_MAX_RAD = 0.5
-"""A pose this far from where the twist leads is an odometry reset."""
 # Periods of the odometry that are no pause, however slow it is.
 _PERIODS = 2.5
 # A pause up to this long is bridged where the twists before and after differ by no more.
@@ -90,7 +87,7 @@ class OdometryTrack:
         twists = odometry.twists[kept]
         # Some drivers publish poses only.
         twists = twists if np.any(twists) else differences(stamps, poses)
-        breaks = _breaks(stamps, poses, twists, skipped)
+        breaks = _breaks(stamps, twists, skipped)
         variances = np.where(odometry.variances[kept, 1] > 0, odometry.variances[kept, 1], 0.0)
         yaw = np.unwrap(poses[:, 2])
         gyro = None if config.yaw_source == 'odometry' else _usable_gyro(yaw_rate)
@@ -141,33 +138,32 @@ def seconds_since_start(stamps_ns: Stamps) -> Array:
     return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
 
 
+def _increasing(stamps: Stamps, finite: Mask) -> Mask:
+    """Mask (N,) of the finite messages whose stamps are later than all before."""
+    never = np.iinfo(np.int64).min
+    known = np.where(finite, stamps, never)
+    return np.asarray(known > np.concatenate([[never], np.maximum.accumulate(known)[:-1]]))
+
+
 def _usable(odometry: Odometry) -> tuple[Mask, dict[str, int]]:
     """Mask of messages with finite numbers and increasing stamps; why others are not used."""
     finite = np.isfinite(odometry.poses).all(1) & np.isfinite(odometry.twists).all(1)
-    stamps = np.where(finite, odometry.stamps_ns, np.iinfo(np.int64).min)
-    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
-    kept = finite & (stamps > before)
+    kept, skipped = _increasing(odometry.stamps_ns, finite), dict[str, int]()
     if kept.sum() < 2:
         raise DataError('fewer than two usable odometry messages: check the odometry topic')
-    reasons = {'not finite': int((~finite).sum()), 'out of order': int((finite & ~kept).sum())}
-    return kept, {reason: number for reason, number in reasons.items() if number}
+    tally(skipped, 'not finite', ~finite)
+    tally(skipped, 'out of order', finite & ~kept)
+    return kept, skipped
 
 
-def _breaks(stamps: Stamps, poses: Array, twists: Array, skipped: dict[str, int]) -> Mask:
-    """Mask (N - 1,) of the steps that odometry does not bridge: pauses and resets."""
+def _breaks(stamps: Stamps, twists: Array, skipped: dict[str, int]) -> Mask:
+    """Mask (N - 1,) of the pauses that odometry does not bridge."""
     dt = np.diff(stamps) * 1e-9
-    step = relative(poses[:-1], poses[1:])
-    speed = np.maximum(np.abs(twists[:-1, 0]), np.abs(twists[1:, 0]))
-    rate = np.maximum(np.abs(twists[:-1, 1]), np.abs(twists[1:, 1]))
     # Odometry that is always slow does not pause at each message.
     gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
     gap &= ~_steady(dt, twists)
-    reset = np.hypot(step[:, 0], step[:, 1]) > speed * dt + JUMP_MAX_M
-    reset |= np.abs(step[:, 2]) > rate * dt + YAW_JUMP_MAX_RAD
-    for reason, mask in (('pauses', gap), ('resets', reset & ~gap)):
-        if mask.any():
-            skipped[reason] = int(mask.sum())
-    return np.asarray(gap | reset)
+    tally(skipped, 'pauses', gap)
+    return np.asarray(gap)
 
 
 def _steady(dt: Array, twists: Array) -> Mask:
@@ -184,13 +180,13 @@ def _usable_gyro(yaw_rate: YawRate | None) -> YawRate | None:
     """The finite readings with increasing stamps; None where they are fewer than two."""
     if yaw_rate is None:
         return None
-    omega = np.where(np.isfinite(yaw_rate.omega), yaw_rate.omega, np.nan)
-    stamps = np.where(np.isfinite(omega), yaw_rate.stamps_ns, np.iinfo(np.int64).min)
-    before = np.concatenate([[np.iinfo(np.int64).min], np.maximum.accumulate(stamps)[:-1]])
-    kept = stamps > before
+    kept = _increasing(yaw_rate.stamps_ns, np.isfinite(yaw_rate.omega))
     if kept.sum() < 2:
         return None
-    return YawRate(stamps[kept], omega[kept], np.nan_to_num(yaw_rate.variance[kept]))
+    stamps, omega, variance = (
+        a[kept] for a in (yaw_rate.stamps_ns, yaw_rate.omega, yaw_rate.variance)
+    )
+    return YawRate(stamps, omega, np.nan_to_num(variance))
 
 
 def _gyro_turns(

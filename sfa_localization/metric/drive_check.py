@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.features.rotation_spread import quantile
 from sfa_localization.metric.map_covariance import angle_covariance
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.quadratic_form import Links, Stack
@@ -78,17 +79,18 @@ def check_amount(stack: Stack, links: Links) -> None:
 def diagnose(fit: MapFit) -> Diagnostics:
     """Diagnostics of a fit."""
     places, stack = fit.places, fit.stack
+    lengths = np.array([segment.length_m for segment in fit.problem.segments])
     steps = stack.path[1:] - stack.path[:-1]
     same = stack.owner[1:] == stack.owner[:-1]
     heading = steps[same] * fit.solution.z[stack.owner[1:][same]]
     return Diagnostics(
         segments=stack.segments,
         images=len(places),
-        length_m=float(np.abs(heading).sum()),
+        length_m=float(lengths.sum()),
         extent_m=_extent(places),
         directions=_directions(heading),
         crossings=_crossings(places, stack.first),
-        angle_std_rad=_sure(np.sqrt(np.diag(angle_covariance(fit))), stack),
+        angle_std_rad=quantile(np.sqrt(np.diag(angle_covariance(fit))), SURE_SHARE, lengths),
     )
 
 
@@ -122,15 +124,6 @@ def is_one_route(places: Complex, length_m: float) -> bool:
 def _connects_nothing(extent_m: tuple[float, float], crossings: int) -> bool:
     """Whether images on different tracks of a drive show no place in common."""
     return min(extent_m) < _WIDTH_MIN_M or crossings == 0
-
-
-def _sure(angle_std: Array, stack: Stack) -> float:
-    """What SURE_SHARE of the driven length, by segments, stays below."""
-    steps = np.abs(np.diff(stack.path, prepend=0)) * (np.diff(stack.owner, prepend=-1) == 0)
-    lengths = np.bincount(stack.owner, steps)
-    order = np.argsort(angle_std)
-    driven = np.cumsum(lengths[order])
-    return float(angle_std[order][np.searchsorted(driven, SURE_SHARE * driven[-1])])
 
 
 def _extent(places: Complex) -> tuple[float, float]:

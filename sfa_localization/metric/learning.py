@@ -61,7 +61,6 @@ class MetricResult:
     """(M,) images of the segments, in order."""
     residuals: Array
     """(M, 2) m: where the segments put an image minus where the map does."""
-    noise_m: float
     common_m: float
     """m: standard deviation along each axis of what the drive's positions have in common errors."""
     left_out: Array
@@ -73,8 +72,6 @@ class MetricResult:
     forecast: Forecast
     """Errors to expect on paths between the trained ones."""
     diagnostics: Diagnostics
-    history: Array
-    """(I,) cost at each iteration of the paper's descent; empty for the certified solver."""
 
     @property
     def left_out_error_m(self) -> float:
@@ -119,11 +116,7 @@ def learn_metric(
     """
     problem = MetricProblem.of(features, segments, config, seed)
     check_amount(problem.stack, problem.links)
-    history = np.zeros(0)
-    if config.solver == 'paper':
-        fit, history = paper_solver.learn(problem)
-    else:
-        fit = choose(problem, scale)
+    fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
     left = _Left.of(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
     if overfits and config.solver == 'certified' and not diagnose(fit).one_route:
@@ -133,7 +126,7 @@ def learn_metric(
     _check_certificate(fit)
     check(diagnostics)
     frame = map_frame(fit) if onto is None else _frame_of(onto, fit)
-    return _result(fit, left, frame, diagnostics, history)
+    return _result(fit, left, frame, diagnostics)
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -191,7 +184,7 @@ class _Left:
 
 
 def _result(
-    fit: MapFit, left: _Left, frame: RigidTransform, diagnostics: Diagnostics, history: Array
+    fit: MapFit, left: _Left, frame: RigidTransform, diagnostics: Diagnostics
 ) -> MetricResult:
     inflation = max(needed_factor(left.images.ratio, 2, left.forecast.weight), 1.0)
     expected = left.forecast.widened(inflation)
@@ -205,14 +198,12 @@ def _result(
         certificate=fit.solution.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
-        noise_m=float(np.sqrt(fit.variance)),
         common_m=float(np.sqrt((expected.drive_std**2).mean() / 2)),
         left_out=plane(left.images.errors * turn),
         left_out_variance=left.images.variances * inflation,
         explained=left.explained,
         forecast=expected.moved(frame),
         diagnostics=diagnostics,
-        history=history,
     )
 
 

@@ -136,8 +136,8 @@ def odometry_start(lines: Lines, starts: Array) -> Parameters:
     return Parameters(np.array(alpha), np.array(origins), weights)
 
 
-def learn(problem: MetricProblem) -> tuple[MapFit, Array]:
-    """The descent from odometry: its fit, and the cost (I,) of its iterations.
+def learn(problem: MetricProblem) -> MapFit:
+    """The fit of the descent from odometry.
 
     Raises DataError when the segments are not straight lines, as the paper's costs assume.
     """
@@ -149,10 +149,10 @@ def learn(problem: MetricProblem) -> tuple[MapFit, Array]:
     turns = np.full(stack.segments - 1, np.nan)
     turns[links.at] = links.turn
     lines = Lines(regressors, stack.path.real, stack.owner, turns)
-    theta, history = descend(lines, odometry_start(lines, stack.starts))
+    theta, _ = descend(lines, odometry_start(lines, stack.starts))
     if _mirrored(theta.alpha, turns):
         theta = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
-    return _fit(theta, regressors, count, problem), history
+    return _fit(theta, regressors, count, problem)
 
 
 def _mirrored(alpha: Array, turns: Array) -> bool:

@@ -52,10 +52,7 @@ IMAGE_STEP_MAX_M = 1.5
 """Longest distance without an image inside a segment."""
 IMAGE_STEP_MIN_M = 0.01
 IMAGE_TURN_MIN_RAD = np.deg2rad(3.0)
-"""Images closer to the one before, and turned less, repeat it: the robot stands still, or is slow
-for its camera."""
-STANDING_S = 1.0
-"""A robot that has not come one such step farther after this time stands still."""
+"""Images closer to the one before, and turned less, repeat it: the robot stands still, or nearly."""
 BIAS_PERIOD_S = 60.0
 """The yaw-rate bias of odometry is constant for about this long: floors and tires change it."""
 SPEED_MIN_MPS = 0.01
@@ -304,12 +301,7 @@ def _without_standstill(poses: ImagePoses, skipped: dict[str, int]) -> ImagePose
         turned = abs(poses.yaw[i] - poses.yaw[last]) >= IMAGE_TURN_MIN_RAD
         keep[i] = moved or turned or poses.part[i] != poses.part[last]
         last = i if keep[i] else last
-    driven = poses.sums[:, LENGTH]
-    later = np.interp(poses.time_s + STANDING_S, poses.time_s, driven) - driven
-    before = driven - np.interp(poses.time_s - STANDING_S, poses.time_s, driven)
-    stands = np.minimum(later, before) < IMAGE_STEP_MIN_M
-    tally(skipped, 'standing still', ~keep & stands)
-    tally(skipped, 'nearly where the one before was', ~keep & ~stands)
+    tally(skipped, 'standing still', ~keep)
     return poses.take(keep)
 
 

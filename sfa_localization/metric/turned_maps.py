@@ -26,7 +26,7 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.image_features import Spectrum
+from sfa_localization.features.image_features import Spectrum, evenly
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
@@ -120,8 +120,7 @@ def learn_turned(
     first map of the same segments, and in its frame. Raises DataError as ``learn_metric``.
     """
     images, yaw = headings(first, segments)
-    chosen = np.linspace(0, len(images) - 1, min(len(images), _COMPONENT_IMAGES))
-    rows = np.unique(chosen.round().astype(np.int64))
+    rows = evenly(len(images), _COMPONENT_IMAGES)
     turned = TurnedMaps.fit(spectra[images[rows]], yaw[rows], sign)
     features = np.zeros((len(spectra), turned.axes.shape[1]))
     for start in range(0, len(images), _BATCH):
