@@ -15,18 +15,11 @@ from metric_worlds import criss_cross, drive, garden_features
 from sfa_localization.data.geometry import align, compose, wrap_angle
 from sfa_localization.data.run import Odometry, YawRate
 from sfa_localization.metric import learning as metric
-from sfa_localization.metric import selection
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 QUICK = MetricConfig(metric_map='monomials', slow_features=5)
 CUT = SegmentConfig()
-
-
-@pytest.fixture(autouse=True)
-def one_ridge(monkeypatch):
-    """The features are monomials of the place: no choice is needed."""
-    monkeypatch.setattr(selection, 'RIDGES', (1e-4,))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from sfa_localization.data.array_files import Arrays
 from sfa_localization.data.geometry import Array
 
+PAPER_FEATURES = 8
+"""Section 4: the eight slowest features, 45 monomials."""
+
 
 def expand(basis: Basis, features: Array) -> Array:
     """Expansion (M, m) of slow features (M, >= K)."""

@@ -25,6 +25,10 @@ from sfa_localization.metric.lower_factor import squares
 
 Complex = NDArray[np.complex128]
 
+LENGTH, NOISE = 1.5, 0.1
+"""l of the kernel, in standard deviations of the slow features, and the noise of its process: from
+half to twice as much of either is no better, and by a tenth worse."""
+
 
 @dataclass(frozen=True, slots=True)
 class Compass:
@@ -42,8 +46,6 @@ class Compass:
     harmonic_scale: Array
     weights: Complex
     factor: NDArray[np.complex64]
-    length: float
-    noise: float
     sign: float
     calibration: Array
     _adjoint: NDArray[np.complex64] = field(init=False, repr=False, compare=False)
@@ -61,10 +63,10 @@ class Compass:
 
     def _field(self, features: Array, harmonic: Complex) -> tuple[Complex, Array]:
         s, f = scaled_inputs(features, harmonic, self.feature_scale, self.harmonic_scale)
-        near = _near(s, self.features, self.length)
+        near = _near(s, self.features)
         kernel = near.astype(np.float32) * (f.astype(np.complex64) @ self._adjoint)
         left = np.maximum(prior_variance(f) - squares(kernel, self.factor), 0.0)
-        return kernel @ self.weights, left + self.noise
+        return kernel @ self.weights, left + NOISE
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
@@ -75,13 +77,12 @@ class Compass:
             'harmonic_scale': self.harmonic_scale,
             'weights': self.weights,
             'factor': packed(self.factor),
-            'scalars': np.array([self.length, self.noise, self.sign]),
+            'sign': np.array(self.sign),
             'calibration': self.calibration,
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Compass:
-        length, noise, sign = (float(v) for v in np.asarray(arrays['scalars'], float))
         return cls(
             np.asarray(arrays['features'], float),
             np.asarray(arrays['harmonic'], np.complex128),
@@ -89,9 +90,7 @@ class Compass:
             np.asarray(arrays['harmonic_scale'], float),
             np.asarray(arrays['weights'], np.complex128),
             unpacked(np.asarray(arrays['factor'], np.complex64)),
-            length,
-            noise,
-            sign,
+            float(np.asarray(arrays['sign'], float)),
             np.asarray(arrays['calibration'], float),
         )
 
@@ -110,15 +109,15 @@ def prior_variance(f: Complex) -> Array:
     return np.asarray((np.abs(f) ** 2).sum(1))
 
 
-def kernel_between(s: Array, f: Complex, s_m: Array, f_m: Complex, length: float) -> Complex:
+def kernel_between(s: Array, f: Complex, s_m: Array, f_m: Complex) -> Complex:
     """k[t, m] = exp(-|s_t - s_m|^2 / 2 l^2) <f_m, f_t>: (T, M)."""
-    return np.asarray(_near(s, s_m, length) * (f @ f_m.conj().T))
+    return np.asarray(_near(s, s_m) * (f @ f_m.conj().T))
 
 
-def _near(s: Array, s_m: Array, length: float) -> Array:
+def _near(s: Array, s_m: Array) -> Array:
     """exp(-|s_t - s_m|^2 / 2 l^2): (T, M)."""
     apart = (s**2).sum(1)[:, None] + (s_m**2).sum(1) - 2 * s @ s_m.T
-    return np.asarray(np.exp(-np.maximum(apart, 0.0) / (2 * length**2)))
+    return np.asarray(np.exp(-np.maximum(apart, 0.0) / (2 * LENGTH**2)))
 
 
 def phase_variance(g: Complex, variance: Array) -> Array:

@@ -16,6 +16,7 @@ from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.features.image_features import ImageFeatures, evenly
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, Agreement, share_within
 from sfa_localization.metric.compass import (
+    NOISE,
     Compass,
     calibrated,
     kernel_between,
@@ -42,12 +43,8 @@ FOLDS = 6
 """Parts of the segments left out in turn to measure the accuracy."""
 INDUCING_IMAGES = 800
 """Images that span the compass: more are more accurate, but slow to predict with."""
-# Fewer labels are too few to choose length, noise and calibration by.
+# Fewer labels are too few to choose the calibration by.
 _LABELS_MIN = 20
-_LENGTHS = (0.7, 1.0, 1.5, 2.5, 4.0)
-_NOISES = (1e-3, 1e-2, 1e-1)
-# Inducing images while length and noise are chosen: the ranking is the same with few.
-_SELECTION_IMAGES = 300
 _POWERS = tuple(np.geomspace(6.0, 0.05, 60).tolist())
 _COVERAGE = 0.95
 
@@ -115,97 +112,59 @@ def fit_compass(
 ) -> CompassFit:
     """Learn the compass from labels `yaw` (T,) rad of images with features and harmonics.
 
-    `folds` (T,) numbers the parts that are left out in turn to choose the kernel's length and
-    noise, and the variance's calibration.
+    `folds` (T,) numbers the parts that are left out in turn for the variance's calibration.
     Raises DataError when there are too few labels.
     """
     if len(yaw) < _LABELS_MIN or len(np.unique(folds)) < 2:
         raise DataError(f'{len(yaw)} images with a heading are too few to learn a compass')
-    problem = _CompassProblem.of(features, harmonic, yaw, folds, sign)
-    choices = [(length, noise) for length in _LENGTHS for noise in _NOISES]
-    length, noise = min(choices, key=lambda choice: problem.loss(*choice))
-    g, variance = problem.left_out(length, noise)
+    scales = (
+        features[:, :PLACE_FEATURES].std(0) + 1e-12,
+        np.sqrt((np.abs(harmonic) ** 2).mean(0)) + 1e-12,
+    )
+    s, f = scaled_inputs(features, harmonic, *scales)
+    chosen = evenly(len(yaw), INDUCING_IMAGES)
+    # The inducing images as they will be saved.
+    s_m = s[chosen].astype(np.float32).astype(np.float64)
+    f_m = f[chosen].astype(np.complex64).astype(np.complex128)
+    prior, kernel = kernel_between(s_m, f_m, s_m, f_m), kernel_between(s, f, s_m, f_m)
+    target = np.exp(1j * sign * yaw)
+    g, explained = _left_out(kernel, target, prior, folds)
     error = wrap_angle(sign * np.angle(g) - yaw)
-    raw = phase_variance(g, variance)
+    raw = phase_variance(g, np.maximum(prior_variance(f) - explained, 0.0) + NOISE)
     calibration = _calibrate(error, raw)
-    std = np.sqrt(calibrated(raw, calibration))
-    compass = problem.compass(length, noise, calibration)
-    return CompassFit(compass, error, std)
+    weights, reduction = _solve(kernel.conj().T @ kernel, kernel.conj().T @ target, prior)
+    factor = np.asfortranarray(lower_root(reduction), np.complex64)
+    compass = Compass(s_m, f_m, *scales, weights, factor, sign, calibration)
+    return CompassFit(compass, error, np.sqrt(calibrated(raw, calibration)))
 
 
-@dataclass(frozen=True, slots=True)
-class _CompassProblem:
-    """Labels and standardized inputs; `chosen` (M,) are the inducing images."""
+def _left_out(
+    kernel: Complex, target: Complex, prior: Complex, folds: Indices
+) -> tuple[Complex, Array]:
+    """Prediction g (T,) of each fold by all the others, and by how much its variance is less (T,).
 
-    s: Array
-    f: Complex
-    feature_scale: Array
-    harmonic_scale: Array
-    yaw: Array
-    folds: Indices
-    sign: float
-    chosen: Indices
-
-    @classmethod
-    def of(
-        cls, features: Array, harmonic: Complex, yaw: Array, folds: Indices, sign: float
-    ) -> _CompassProblem:
-        feature_scale = features[:, :PLACE_FEATURES].std(0) + 1e-12
-        harmonic_scale = np.sqrt((np.abs(harmonic) ** 2).mean(0)) + 1e-12
-        s, f = scaled_inputs(features, harmonic, feature_scale, harmonic_scale)
-        chosen = evenly(len(yaw), INDUCING_IMAGES)
-        return cls(s, f, feature_scale, harmonic_scale, yaw, folds, sign, chosen)
-
-    def loss(self, length: float, noise: float) -> float:
-        """Mean left-out error of a candidate, rad; with fewer inducing images."""
-        few = self.chosen[evenly(len(self.chosen), _SELECTION_IMAGES)]
-        g, _ = self.left_out(length, noise, few)
-        return float(np.abs(wrap_angle(self.sign * np.angle(g) - self.yaw)).mean())
-
-    def left_out(
-        self, length: float, noise: float, chosen: Indices | None = None
-    ) -> tuple[Complex, Array]:
-        """Prediction g (T,) and its variance (T,) for each fold by all the others."""
-        m = self.chosen if chosen is None else chosen
-        prior = kernel_between(self.s[m], self.f[m], self.s[m], self.f[m], length)
-        kernel = kernel_between(self.s, self.f, self.s[m], self.f[m], length)
-        target = np.exp(1j * self.sign * self.yaw)
-        normal, moment = kernel.conj().T @ kernel, kernel.conj().T @ target
-        g, variance = np.zeros(len(self.yaw), complex), np.zeros(len(self.yaw))
-        for fold in np.unique(self.folds):
-            out = self.folds == fold
-            part = kernel[out]
-            rest = normal - part.conj().T @ part
-            weights, uncertainty = _solve(rest, moment - part.conj().T @ target[out], prior, noise)
-            g[out] = part @ weights
-            explained = np.einsum('tm,tm->t', part @ uncertainty, part.conj()).real
-            variance[out] = np.maximum(prior_variance(self.f[out]) - explained, 0.0) + noise
-        return g, variance
-
-    def compass(self, length: float, noise: float, calibration: Array) -> Compass:
-        """The compass of all labels, solved for the inducing images as they will be saved."""
-        s = self.s[self.chosen].astype(np.float32).astype(np.float64)
-        f = self.f[self.chosen].astype(np.complex64).astype(np.complex128)
-        kernel = kernel_between(self.s, self.f, s, f, length)
-        moment = kernel.conj().T @ np.exp(1j * self.sign * self.yaw)
-        weights, uncertainty = _solve(
-            kernel.conj().T @ kernel, moment, kernel_between(s, f, s, f, length), noise
-        )
-        scales = self.feature_scale, self.harmonic_scale
-        factor = np.asfortranarray(lower_root(uncertainty), np.complex64)
-        return Compass(s, f, *scales, weights, factor, length, noise, self.sign, calibration)
+    From the kernel (T, M) of the images, and the `prior` (M, M) of the inducing ones.
+    """
+    normal, moment = kernel.conj().T @ kernel, kernel.conj().T @ target
+    g, explained = np.zeros(len(target), complex), np.zeros(len(target))
+    for fold in np.unique(folds):
+        out = folds == fold
+        part = kernel[out]
+        rest = normal - part.conj().T @ part, moment - part.conj().T @ target[out]
+        weights, reduction = _solve(*rest, prior)
+        g[out] = part @ weights
+        explained[out] = np.einsum('tm,tm->t', part @ reduction, part.conj()).real
+    return g, explained
 
 
-def _solve(
-    normal: Complex, moment: Complex, prior: Complex, noise: float
-) -> tuple[Complex, Complex]:
+def _solve(normal: Complex, moment: Complex, prior: Complex) -> tuple[Complex, Complex]:
     """Weights and reduction of variance of a process spanned by inducing images.
 
     With B = K_nm^H K_nm + r K_mm: weights B^-1 K_nm^H y, reduction K_mm^-1 - r B^-1.
     """
     jitter = 1e-6 * np.eye(len(prior)) * np.trace(prior).real / len(prior)
-    b = linalg.inv(normal + noise * (prior + jitter), check_finite=False)
-    reduction = linalg.inv(prior + jitter, check_finite=False) - noise * b
+    b = linalg.inv(normal + NOISE * (prior + jitter), check_finite=False)
+    reduction = linalg.inv(prior + jitter, check_finite=False) - NOISE * b
     return b @ moment, (reduction + reduction.conj().T) / 2
 
 

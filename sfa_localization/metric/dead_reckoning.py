@@ -147,7 +147,7 @@ def _increasing(stamps: Stamps, finite: Mask) -> Mask:
 
 def _usable(odometry: Odometry) -> tuple[Mask, dict[str, int]]:
     """Mask of messages with finite numbers and increasing stamps; why others are not used."""
-    finite = np.isfinite(odometry.poses).all(1) & np.isfinite(odometry.twists).all(1)
+    finite = np.asarray(np.isfinite(np.hstack([odometry.poses, odometry.twists])).all(1))
     kept, skipped = _increasing(odometry.stamps_ns, finite), dict[str, int]()
     if kept.sum() < 2:
         raise DataError('fewer than two usable odometry messages: check the odometry topic')
@@ -183,10 +183,8 @@ def _usable_gyro(yaw_rate: YawRate | None) -> YawRate | None:
     kept = _increasing(yaw_rate.stamps_ns, np.isfinite(yaw_rate.omega))
     if kept.sum() < 2:
         return None
-    stamps, omega, variance = (
-        a[kept] for a in (yaw_rate.stamps_ns, yaw_rate.omega, yaw_rate.variance)
-    )
-    return YawRate(stamps, omega, np.nan_to_num(variance))
+    variance = np.nan_to_num(yaw_rate.variance[kept])
+    return YawRate(yaw_rate.stamps_ns[kept], yaw_rate.omega[kept], variance)
 
 
 def _gyro_turns(

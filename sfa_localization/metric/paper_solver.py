@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.basis import Monomials, monomials
+from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
 from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
 from sfa_localization.metric.phases import certify, phase_cost
 from sfa_localization.metric.quadratic_form import QuadraticForm, Solution, eliminate, schur
 
 Complex = NDArray[np.complex128]
 
-PAPER_FEATURES = 8
-"""Section 4: the eight slowest features, 45 monomials."""
 ITERATIONS = 1000
 """Section 4: the descent ends at about 1000 iterations."""
 LEARNING_RATE = 1e-5

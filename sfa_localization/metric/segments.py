@@ -52,7 +52,7 @@ IMAGE_STEP_MAX_M = 1.5
 """Longest distance without an image inside a segment."""
 IMAGE_STEP_MIN_M = 0.01
 IMAGE_TURN_MIN_RAD = np.deg2rad(3.0)
-"""Images closer to the one before, and turned less, repeat it: the robot stands still, or nearly."""
+"""Images closer to the one before, and turned less, repeat it: the robot hardly moves."""
 BIAS_PERIOD_S = 60.0
 """The yaw-rate bias of odometry is constant for about this long: floors and tires change it."""
 SPEED_MIN_MPS = 0.01

@@ -47,7 +47,7 @@ class MetricConfig(Settings):
     )
     slow_features: int = setting(
         0,
-        'slowest features used; 0: all, or of monomials as many as segments left out choose',
+        'slowest features used; 0: all, of monomials 8 as in the paper',
         low=0,
         high=1000,
     )

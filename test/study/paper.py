@@ -19,9 +19,9 @@ from sfa_localization.data.geometry import Array, RigidTransform, align
 from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import evaluate, odometry_from_start
 from sfa_localization.fusion.motion import TURN_RADIUS_M
-from sfa_localization.metric.basis import monomials
+from sfa_localization.metric.basis import PAPER_FEATURES, monomials
 from sfa_localization.metric.learning import correlation_along_drive, learn_metric
-from sfa_localization.metric.paper_solver import PAPER_FEATURES, Lines, Parameters, descend
+from sfa_localization.metric.paper_solver import Lines, Parameters, descend
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import assignment
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig

@@ -27,9 +27,8 @@ from sfa_localization.features.image_features import TURNED_LAYER, slow_features
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.metric.basis import Basis, expand
+from sfa_localization.metric.basis import PAPER_FEATURES, Basis, expand
 from sfa_localization.metric.drives import Drive, Drives
-from sfa_localization.metric.paper_solver import PAPER_FEATURES
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
