@@ -3,7 +3,7 @@
 """Learn a place model from recorded drives: the paper in nine steps; ground truth is never read.
 
 1  read the drives                                       bags/drives.py
-2  find loop closures                                    features/closures.py
+2  find loop closures, and measure their offsets         features/closures.py, offsets.py
 3  train the SFA hierarchy (section 2)                   features/network_training.py
 4  slow features of all images (section 2.2)             features/image_features.py
 5  cut the odometry into segments (section 3.1)          metric/segments.py

@@ -65,6 +65,7 @@ class TrainingInput:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         drives = Drives(tuple(map(drive_of, runs)), closures, recipe.segments)
+        drives = drives.measured(views, recipe.panorama.sphere)
         return cls(drives, views, recipe, progress)
 
     @property

@@ -11,14 +11,16 @@ from metric_worlds import criss_cross, drive, garden_features, meander, straight
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.geometry import RigidTransform, align, wrap_angle
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.features.closures import STRETCH_M, Closures, Views, find_closures
 from sfa_localization.features.keyframes import quantized, texture
+from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
-from sfa_localization.metric.loops import Loops
+from sfa_localization.metric.loops import Loops, loops_of
+from sfa_localization.metric.pose_graph import graph_poses
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -141,26 +143,93 @@ def test_closures_tie_drives_that_share_no_feature(wrong, quick):
     assert far < 0.25 and turned < 0.03
 
 
+def mixtures(stack, poses, noise_m=0.0, count=400, seed=0):
+    """Offsets of images among six others within 1.5 m, whose places explain theirs."""
+    rng, found = np.random.default_rng(seed), []
+    places = poses[stack.images]
+    for row in rng.permutation(len(places))[:count]:
+        apart = np.hypot(*(places - places[row])[:, :2].T)
+        near = np.flatnonzero((apart < 1.5) & (np.abs(stack.owner - stack.owner[row]) > 1))
+        if len(near) >= 12:
+            near = rng.permutation(near)[:6]
+            design = np.column_stack([places[near, :2], np.ones(6)]).T
+            wanted = np.append(places[row, :2] + noise_m * rng.standard_normal(2), 1.0)
+            shares = np.linalg.lstsq(design, wanted, rcond=0.02)[0]
+            turn = wrap_angle(places[row, 2] - places[near, 2])
+            if np.allclose(design @ shares, wanted):  # not where they lie on a line
+                found.append((stack.images[row], stack.images[near], shares, turn, 0.1))
+    return Offsets(*map(np.array, zip(*found, strict=True)))
+
+
 def test_the_form_is_the_sum_of_the_weighted_squares():
     poses, _, segments, first = in_two_lights()
     stack = Stack.of(segments)
-    closures = true_closures(poses, first)
-    loops = Loops.of(closures, stack)
+    closures, offsets = true_closures(poses, first), mixtures(stack, poses, count=60)
     rng = np.random.default_rng(0)
     n = stack.segments
     z, o = np.exp(1j * rng.uniform(-3, 3, n)), rng.normal(size=n) + 1j * rng.normal(size=n)
     bias = rng.normal(0, 1e-6, stack.period[-1] + 1)
     x = np.concatenate([o, z, -bias[stack.period] * z])
+    yaw, places = np.full((2, len(poses)), np.nan, complex)
+    own = np.angle(z)[stack.owner] + stack.headings
+    own = own - bias[stack.period[stack.owner]] * stack.times_s
+    yaw[stack.images], places[stack.images] = np.exp(1j * own), solved_places(stack, o, z, bias)
+    used = np.isfinite(yaw[closures.images]).all(1)
+    (a, b), turn = closures.images[used].T, np.exp(1j * closures.turn[used])
+    pair, mixed = loops_of(closures, Offsets.none(), stack)[1], Loops.of(offsets, stack)
+    total = pair.share / pair.turn_std**2 @ np.abs(yaw[b] - turn * yaw[a]) ** 2
+    total += pair.share / pair.place_std**2 @ np.abs(places[b] - places[a]) ** 2
+    assert cost(pair, stack, x) == pytest.approx(total, rel=1e-4)
+    seen = (offsets.shares * np.exp(1j * offsets.turn) * yaw[offsets.others]).sum(1)
+    lies = (offsets.shares * places[offsets.others]).sum(1)
+    total = (np.abs(yaw[offsets.images] - seen) ** 2 / mixed.turn_std**2).sum()
+    total += (np.abs(places[offsets.images] - lies) ** 2 / mixed.place_std**2).sum()
+    assert cost(mixed, stack, x) == pytest.approx(total, rel=1e-4)
+
+
+def solved_places(stack, o, z, bias):
+    return o[stack.owner] + z[stack.owner] * stack.corrected(bias)
+
+
+def cost(loops, stack, x):
     form = loops.form(stack, None)
-    total = 0.0
-    yaw = np.angle(z)[stack.owner] + stack.headings
-    yaw = yaw - bias[stack.period[stack.owner]] * stack.times_s
-    places = o[stack.owner] + z[stack.owner] * stack.corrected(bias)
-    for (a, b), angle, share in zip(loops.rows, loops.turn, loops.share, strict=True):
-        total += share / 0.01**2 * abs(np.exp(1j * yaw[b]) - np.exp(1j * (yaw[a] + angle))) ** 2
-        total += share / 0.3**2 * abs(places[b] - places[a]) ** 2
-    assert np.vdot(x, form @ x).real == pytest.approx(total, rel=1e-4)
     assert np.abs(form - form.conj().T).max() < 1e-9 * np.abs(form).max()
+    return np.vdot(x, form @ x).real
+
+
+def test_offsets_hold_in_any_frame():
+    drives = [wander(250, 0), wander(200, 1)]
+    seen, poses = views(Spheres.about(0), drives, CONFIG), np.concatenate(drives)
+    found = find_offsets(seen, poses, CONFIG.sphere)
+    assert len(found.images) > 20
+    mixed = (found.shares[:, :, None] * poses[found.others, :2]).sum(1)
+    assert np.median(np.hypot(*(mixed - poses[found.images, :2]).T)) < 0.05
+    turn = wrap_angle(poses[found.images, None, 2] - poses[found.others, 2] - found.turn)
+    assert np.median(np.abs(turn)) < np.radians(1.0)
+    moved = RigidTransform(3.0, -1.0, 0.7)
+    elsewhere = np.column_stack([moved.apply(poses[:, :2]), poses[:, 2] + moved.yaw_rad])
+    same = find_offsets(seen, elsewhere, CONFIG.sphere)
+    assert np.array_equal(same.images, found.images)
+    order, its = np.argsort(found.others), np.argsort(same.others)
+    pair = np.take_along_axis(found.shares, order, 1), np.take_along_axis(same.shares, its, 1)
+    np.testing.assert_allclose(*pair, atol=1e-3)
+
+
+def test_offsets_show_what_closures_leave_open():
+    poses, _, segments, _ = in_two_lights()
+    stack = Stack.of(segments)
+    offsets = mixtures(stack, poses, noise_m=0.02)
+    pairs = np.column_stack([offsets.others[:, 0], offsets.images])
+    tied = dataclasses.replace(segments, closures=Closures(pairs, offsets.turn[:, 0]))
+    measured = dataclasses.replace(tied, offsets=offsets)
+    far = []
+    for known in (tied, measured):
+        found = graph_poses(known, len(poses))
+        assert np.isfinite(found[stack.images]).all()
+        frame = align(found[stack.images, :2], poses[stack.images, :2])
+        apart = frame.apply(found[stack.images, :2]) - poses[stack.images, :2]
+        far.append(np.hypot(*apart.T).mean())
+    assert far[1] < 0.5 * far[0], far
 
 
 def twice_along_one_track(sideways=0.1):

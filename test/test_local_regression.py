@@ -45,6 +45,7 @@ def test_a_place_between_keyframes_is_found(columns, place):
     found = place_among(seen(place), keyframes, places, columns)
     assert np.allclose(found.pose[:2], place, atol=0.01)
     assert abs(found.pose[2]) < 5e-3 and 0 <= found.unlike < 1e-3
+    assert np.allclose([*found.shares @ places, found.shares.sum()], [*found.pose[:2], 1.0])
 
 
 @SIZES

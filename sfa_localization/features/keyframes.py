@@ -432,23 +432,29 @@ class Keyframes:
             near = near[known[near]]
             if len(near) < _FEWEST:
                 break
-            around = turned(self.spectra[near], self._sign * (self.poses[near, 2] - pose[2]))
             here = spectrum if pattern is None else spectrum - self._as_seen(pattern, pose[2])
-            found = place_among(
-                np.concatenate([here[None], tilts]),
-                around,
-                self.poses[near, :2],
-                self._columns,
-                self._channels,
-                self.drives[near],
-            )
+            found = self._placed(np.concatenate([here[None], tilts]), float(pose[2]), near)
             step = found.pose[:2] - start[:2]
             apart = float(np.hypot(*step))
             pose[:2] = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
-            pose[2] += self._sign * np.clip(found.pose[2], -limit, limit)
+            pose[2] += np.clip(found.pose[2] - pose[2], -limit, limit)
             found = replace(found, pose=pose.copy())
             if apart < _NEARER * reach:
                 break
+        return found
+
+    def place(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
+        """Where the spectrum (rows, F) of an image with about this yaw rad is among some keyframes:
+        `Match.shares` of them.
+        """
+        return self._placed(np.concatenate([image[None], self._by_tilt(image)]), yaw, near)
+
+    def _placed(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
+        """The same with the derivatives of the image, (3, rows, F)."""
+        around = turned(self.spectra[near], self._sign * (self.poses[near, 2] - yaw))
+        places, drives = self.poses[near, :2], self.drives[near]
+        found = place_among(image, around, places, self._columns, self._channels, drives)
+        found.pose[2] = yaw + self._sign * found.pose[2]
         return found
 
     def _by_tilt(self, image: Spectra) -> Spectra:

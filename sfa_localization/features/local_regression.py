@@ -49,12 +49,14 @@ def turned(spectra: Spectra, angle: Array | float) -> Spectra:
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """A regression of an image. `combine` (3, N + 1 + M) makes of the vectors of N keyframes, of
+    """A regression of an image: its `place` is that of the N keyframes by `shares` (N,) of sum 1.
+    `combine` (3, N + 1 + M) makes of the vectors of N keyframes, of
     the image and of M changes what is left of the image, and the two vectors along which that moves
     the place. `changed` (M,) is how much of each change the image has.
     """
 
     place: Array
+    shares: Array
     changed: Array
     unlike: float
     variation: float
@@ -203,6 +205,7 @@ def place_among(
     *tilt, turning = found.changed
     pose, noise = np.append(found.place, -turning), moved @ moved.T
     made = Match(pose, found.unlike, found.variation, aside, noise, left=np.concatenate(left))
+    made = replace(made, shares=found.shares)
     return replace(made, tilt=np.array(tilt)) if tilt else made
 
 
@@ -305,10 +308,13 @@ def _regressed(products: Array, basis: _Basis) -> _Regression:
     of_image = np.array([1.0, 0.0, 0.0])
     centered = np.column_stack([share, of_image])
     combine = np.zeros((3, len(products)))
-    combine[:, : count + 1] = np.column_stack([share - sums @ means, of_image])
+    own = share - sums @ means
+    combine[:, : count + 1] = np.column_stack([own, of_image])
     combine -= (centered @ apart.out.T) @ apart.common
+    shares = basis.mean - own[0]
     return _Regression(
-        basis.mean @ basis.places - share[0] @ offsets,
+        shares @ basis.places,
+        shares,
         apart.out[1:, -1],
         max(float(centered[0] @ apart.products @ centered[0]), 0.0) / apart.square,
         variation / apart.square,

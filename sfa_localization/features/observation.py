@@ -48,7 +48,8 @@ class Match:
     of them, of their mean distance: 0 among them, 0.64 at a straight border of theirs, 1 far beside
     all. `noise` (2, 2) m^2 is the covariance of the place by what is left of the image, `apart`
     (2, 2) m^2 how far apart several drives put it (in a map they are shifted), and `elsewhere`
-    (3, 3) the scatter of [x, y, yaw] about it of other keyframes that are as like the image.
+    (3, 3) the scatter of [x, y, yaw] about it of other keyframes that are as like the image. The
+    place is that of the keyframes by `shares` (N,) of sum 1; None where several drives say so.
 
     `score` is the correlation with the best keyframe, 1 for the same image, `known` whether it is
     high enough for a known place, and `support` the correlation with the keyframes near a guess
@@ -64,6 +65,7 @@ class Match:
     apart: Array = field(default_factory=lambda: np.zeros((2, 2)))
     elsewhere: Array = field(default_factory=lambda: np.zeros((3, 3)))
     left: Spectra | None = None
+    shares: Array | None = None
     score: float = 0.0
     known: bool = False
     support: float = 0.0

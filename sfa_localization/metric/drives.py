@@ -10,19 +10,22 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run, Stamps
-from sfa_localization.features.closures import Closures
+from sfa_localization.data.sphere import Sphere
+from sfa_localization.features.closures import Closures, Views
+from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
+from sfa_localization.metric.pose_graph import graph_poses
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -57,11 +60,13 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Drives:
-    """All drives, whose images are numbered drive after drive, and their loop closures."""
+    """All drives, whose images are numbered drive after drive, and their loop closures, with
+    and without offsets."""
 
     items: tuple[Drive, ...]
     closures: Closures
     config: SegmentConfig
+    offsets: Offsets = field(default_factory=Offsets.none)
 
     @property
     def starts(self) -> list[int]:
@@ -92,7 +97,13 @@ class Drives:
                 self.items, self.turns(), ways or [None] * len(self.items), strict=True
             )
         ]
-        return with_closures(join(parts, self.starts), self.closures)
+        joined = replace(join(parts, self.starts), offsets=self.offsets)
+        return with_closures(joined, self.closures)
+
+    def measured(self, views: Views, sphere: Sphere) -> Drives:
+        """With the offsets of `views`, which the graph of odometry and closures leads to."""
+        poses = graph_poses(self.cut(), int(views.images.max()) + 1)
+        return replace(self, offsets=find_offsets(views, poses[views.images], sphere))
 
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
         """The way of each drive by the map, where its wheels lose some in turns.

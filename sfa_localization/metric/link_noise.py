@@ -36,13 +36,13 @@ def learned(stated: Links, form: QuadraticForm, solution: Solution) -> Links:
 
     `solution` is that of `form`, whose links are the ones of the step before.
     """
-    (turns, _), (moves, _) = form.link_rows(solution.bias)
+    turns, moves = form.link_squares(solution.bias)
     x, n = np.concatenate([solution.o, solution.z]), len(solution.o)
     origins = np.real(form.system(solution.bias)[:n, :n])
     # Moving all origins together costs nothing: fix the mean.
     unknown_place = scipy.linalg.inv(origins + np.trace(origins) / n**2)
     unknown_turn = angle_covariance(solution.h, solution.z)
-    turned, moved = np.abs(turns @ x) ** 2, np.abs(moves @ x) ** 2 / 2
+    turned, moved = np.abs(turns.roots(x)) ** 2, np.abs(moves.roots(x)) ** 2 / 2
     left_turn, left_move = (
         form.variance * _between(unknown, stated.at) for unknown in (unknown_turn, unknown_place)
     )

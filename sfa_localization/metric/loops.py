@@ -2,19 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closures as squares beside those of odometry's links (see quadratic_form.py).
 
-Image a of segment i and image b of segment j are of one place, with a known turn between them:
+An image b of segment j lies at the mixture of images a_k of segments i_k, by shares c_k of sum 1,
+and is turned by t_k from each; h are the headings in the segments:
 
-    |z_j exp(i h_b) - exp(i turn) z_i exp(i h_a)|^2       the turn, h the headings in the segments
-    |o_j + z_j q_b - o_i - z_i q_a|^2                     the place, to their distance
+    |z_j exp(i h_b) - sum_k c_k exp(i t_k) z_ik exp(i h_ak)|^2       the turn
+    |o_j + z_j q_b - sum_k c_k (o_ik + z_ik q_ak)|^2                 the place
 
-How well they hold is estimated with the map. A few may be wrong: places can look alike. What does
-not fit loses its weight (Cauchy's), so that the form stays quadratic and its solution certified.
+Offsets (features/offsets.py) are such mixtures; closures, of which the distance is unknown, tie two
+images with c = 1 where there are none. How well they hold is estimated with the map. A few may be
+wrong: places can look alike. What does not fit loses its weight (Cauchy's), so that the form stays
+quadratic and its solution certified.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,90 +24,112 @@ from scipy import sparse
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.closures import Closures
+from sfa_localization.features.offsets import Offsets
 from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.metric.quadratic_form import Solution, Stack
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
-# Standard deviations before anything is known, and the least: rad, and m per axis.
-_FIRST_TURN_STD, _LEAST_TURN_STD = 0.01, 0.002
-_FIRST_PLACE_STD_M, _LEAST_PLACE_STD_M = 0.3, 0.05
+# Standard deviations that are expected, rad and m per axis: they grow with `Offsets.unlike`, which
+# closures do not know; and the least part of them that the map may show.
+_TURN_STD, _PLACE_STD_M, _ALIKE, _UNKNOWN = 0.005, 0.65, 0.03, 0.5
+_LEAST = 0.2
 # Residual, in standard deviations, at which a closure counts half.
 _HALF = 2.4
 
 
 @dataclass(frozen=True, slots=True)
 class Loops:
-    """L closures: `rows` (L, 2) of the stack, the `turn` (L,) rad from the first to the second,
-    and `share` (L,), one over how many closures tie the same two segments.
+    """L mixtures: what is squared of the turns, `turns`, and of the places, `places`, (L, 3N) each,
+    of [o, z, -b z]; expected standard deviations `turn_std` rad and `place_std` m, (L,), and
+    `share` (L,), one over how many say the same.
     """
 
-    rows: Indices
-    turn: Array
+    turns: sparse.csr_array
+    places: sparse.csr_array
+    turn_std: Array
+    place_std: Array
     share: Array
 
     @classmethod
-    def of(cls, closures: Closures, stack: Stack) -> Loops:
-        """Those between the images of two segments."""
-        order = np.argsort(stack.images, kind='stable')
-        at = np.searchsorted(stack.images, closures.images, sorter=order)
-        rows = order[np.minimum(at, len(order) - 1)]
-        kept = (stack.images[rows] == closures.images).all(1)
-        kept &= stack.owner[rows[:, 0]] != stack.owner[rows[:, 1]]
-        rows, turn = rows[kept], closures.turn[kept]
-        _, same, count = np.unique(
-            stack.owner[rows], axis=0, return_inverse=True, return_counts=True
-        )
-        return cls(rows, turn, 1.0 / count[same.reshape(-1)])
+    def of(cls, offsets: Offsets, stack: Stack) -> Loops:
+        """Those of images of segments; others count for nothing."""
+        row, others = _rows(offsets.images, stack), _rows(offsets.others, stack)
+        shares = np.where(others >= 0, offsets.shares, 0.0)
+        whole = shares.sum(axis=1)
+        kept = (row >= 0) & (np.abs(whole - 1.0) < _LEAST)
+        shares, unlike = shares[kept] / whole[kept, None], offsets.unlike[kept]
+        squares = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
+        place_std = _PLACE_STD_M * np.hypot(_ALIKE, unlike)
+        return cls(*squares, _TURN_STD * (1 + unlike), place_std, np.ones(len(unlike)))
+
+    @classmethod
+    def of_closures(cls, closures: Closures, stack: Stack, tied: Indices) -> Loops:
+        """Those between the images of two segments, unless offsets have `tied` both."""
+        owner = np.where((rows := _rows(closures.images, stack)) < 0, -1, stack.owner[rows])
+        kept = (rows >= 0).all(1) & (owner[:, 0] != owner[:, 1]) & ~np.isin(owner, tied).all(1)
+        images, turn = closures.images[kept], closures.turn[kept, None]
+        one, unknown = np.ones_like(turn), np.full(len(turn), _UNKNOWN)
+        loops = cls.of(Offsets(images[:, 1], images[:, :1], one, turn, unknown), stack)
+        _, same, count = np.unique(owner[kept], axis=0, return_inverse=True, return_counts=True)
+        return replace(loops, share=1.0 / count[same.reshape(-1)])
 
     def form(self, stack: Stack, before: Solution | None) -> Complex:
         """The quadratic form (3N, 3N) in [o, z, -b z], weighted by the closures' variances: by
         their residuals in the solution `before`."""
-        turns, moves = self._rows(stack)
-        turn_weight, move_weight = self._weights(turns, moves, stack, before)
-        weight = np.sqrt(np.concatenate([turn_weight, move_weight]))
-        rows = sparse.vstack([turns, moves]).multiply(weight[:, None]).tocsr()
+        turn_std, place_std, doubt = self.turn_std, self.place_std, np.ones(len(self.share))
+        if before is not None:
+            x = before.coefficients(stack.period)
+            turned = np.abs(self.turns @ x) / turn_std
+            apart = np.abs(self.places @ x) / place_std
+            turn_part = max(MEDIAN_TO_STD * _median(turned), _LEAST)
+            place_part = max(LENGTH_TO_STD * _median(apart), _LEAST)
+            turn_std, place_std = turn_part * turn_std, place_part * place_std
+            doubt += (turned / (_HALF * turn_part)) ** 2 + (apart / (_HALF * place_part)) ** 2 / 2
+        weight = np.sqrt(np.tile(self.share / doubt, 2)) / np.concatenate([turn_std, place_std])
+        rows = sparse.vstack([self.turns, self.places]).multiply(weight[:, None]).tocsr()
         return np.asarray((rows.conj().T @ rows).toarray())
 
-    def _rows(self, stack: Stack) -> tuple[sparse.sparray, sparse.sparray]:
-        """Rows (L, 3N) whose squares are the turns' and the places' costs; turns to first order
-        in the biases."""
-        n, count = stack.segments, len(self.turn)
-        (i, j), (a, b) = stack.owner[self.rows].T, self.rows.T
-        at_first = np.exp(1j * (stack.headings[a] + self.turn))
-        at_second = np.exp(1j * stack.headings[b])
-        drifts = 1j * stack.times_s[b] * at_second, 1j * stack.times_s[a] * at_first
-        turned = [(n + j, at_second), (n + i, -at_first), (2 * n + j, drifts[0])]
-        turned.append((2 * n + i, -drifts[1]))
-        moved = [(j, np.ones(count)), (i, -np.ones(count))]
-        moved += [(n + j, stack.path[b]), (n + i, -stack.path[a])]
-        moved += [(2 * n + j, stack.drift[b]), (2 * n + i, -stack.drift[a])]
-        return _sparse(turned, (count, 3 * n)), _sparse(moved, (count, 3 * n))
 
-    def _weights(
-        self,
-        turns: sparse.sparray,
-        moves: sparse.sparray,
-        stack: Stack,
-        before: Solution | None,
-    ) -> tuple[Array, Array]:
-        """Of the turns and of the places (L,), 1 / rad^2 and 1 / m^2."""
-        if before is None:
-            return self.share / _FIRST_TURN_STD**2, self.share / _FIRST_PLACE_STD_M**2
-        x = before.coefficients(stack.period)
-        turned, apart = np.abs(turns @ x), np.abs(moves @ x)
-        turn_std = max(MEDIAN_TO_STD * _median(turned), _LEAST_TURN_STD)
-        place_std = max(LENGTH_TO_STD * _median(apart), _LEAST_PLACE_STD_M)
-        doubt = 1.0 + (turned / (_HALF * turn_std)) ** 2 + (apart / (_HALF * place_std)) ** 2 / 2
-        return self.share / doubt / turn_std**2, self.share / doubt / place_std**2
+def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops, Loops]:
+    """Offsets, and closures where there are none."""
+    rows = _rows(offsets.images, stack)
+    tied = np.unique(stack.owner[rows[rows >= 0]])
+    return Loops.of(offsets, stack), Loops.of_closures(closures, stack, tied)
 
 
-def _sparse(parts: list[tuple[Indices, Any]], shape: tuple[int, int]) -> sparse.sparray:
-    """A matrix of so many rows from (columns, values) of one entry per row each."""
-    rows = np.tile(np.arange(shape[0]), len(parts))
-    columns, values = (np.concatenate(list(side)) for side in zip(*parts, strict=True))
-    return sparse.csr_array((values.astype(complex), (rows, columns)), shape=shape)
+def _rows(images: Indices, stack: Stack) -> Indices:
+    """Rows of the stack of images, -1 for those of no segment."""
+    order = np.argsort(stack.images, kind='stable')
+    at = np.searchsorted(stack.images, images, sorter=order)
+    rows = order[np.minimum(at, len(order) - 1)]
+    return np.where(stack.images[rows] == images, rows, -1)
+
+
+def _squares(
+    row: Indices, others: Indices, shares: Array, turn: Array, stack: Stack
+) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Of the turns and of the places, (L, 3N), of rows (L,) of the stack among others (L, K); turns
+    to first order in the biases."""
+    rows = np.column_stack([row, others])
+    minus = np.column_stack([np.ones(len(row)), -shares])
+    turns = minus * np.exp(
+        1j * (stack.headings[rows] + np.column_stack([np.zeros(len(row)), turn]))
+    )
+    n, owner = stack.segments, stack.owner[rows]
+    directions = [(n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)]
+    places = [(owner, minus), (n + owner, minus * stack.path[rows])]
+    places.append((2 * n + owner, minus * stack.drift[rows]))
+    return _sparse(directions, 3 * n), _sparse(places, 3 * n)
+
+
+def _sparse(parts: list[tuple[Indices, Complex]], width: int) -> sparse.csr_array:
+    """A matrix (L, width) from columns and values (L, K) of its rows; equal columns add up."""
+    columns, values = (np.hstack(list(side)) for side in zip(*parts, strict=True))
+    rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+    entries = values.astype(complex).ravel(), (rows, columns.ravel())
+    return sparse.csr_array(entries, shape=(len(columns), width))
 
 
 def _median(values: Array) -> float:

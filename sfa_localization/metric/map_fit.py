@@ -23,7 +23,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.link_noise import learned
-from sfa_localization.metric.loops import Loops
+from sfa_localization.metric.loops import Loops, loops_of
 from sfa_localization.metric.quadratic_form import (
     Elimination,
     Links,
@@ -63,7 +63,7 @@ class MetricProblem:
     segments: Segments
     stack: Stack
     links: Links
-    loops: Loops
+    loops: tuple[Loops, ...]
     config: MetricConfig
     seed: int = 0
     """Of the parts that are left out, and of the points that the forecast draws."""
@@ -75,7 +75,7 @@ class MetricProblem:
         """From features (N, K) of all images. Raises DataError when they are unusable."""
         stack = Stack.of(segments)
         rows = _checked_rows(np.asarray(features, float), stack, config)
-        loops = Loops.of(segments.closures, stack)
+        loops = loops_of(segments.closures, segments.offsets, stack)
         return cls(rows, segments, stack, Links.of(segments), loops, config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
@@ -88,7 +88,7 @@ class MetricProblem:
         links = start.links if start else self.links
         for _ in range(max(rounds, 1)):
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
-            loops = self.loops.form(self.stack, solution)
+            loops = np.sum([one.form(self.stack, solution) for one in self.loops], axis=0)
             form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
             bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
             solution = form.solve(solution.z if solution else None, bias)

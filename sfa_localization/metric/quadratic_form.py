@@ -24,6 +24,7 @@ eq. 2 to eq. 4 are zero, w and o are those of `Elimination.weights` and `schur`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -263,6 +264,37 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True)
+class Squares:
+    """The cost sum_l weight_l |sum_k values_kl x_columns_kl|^2: each square reads K unknowns."""
+
+    columns: Indices
+    """(K, L)"""
+    values: Complex
+    """(K, L)"""
+    weight: Array
+    """(L,)"""
+
+    @classmethod
+    def of(cls, terms: Sequence[tuple[Indices, NDArray[Any]]], weight: Array) -> Squares:
+        """From the columns and values (L,) of each term."""
+        columns, values = zip(*terms, strict=True)
+        return cls(np.array(columns), np.array(values, complex), weight)
+
+    def roots(self, x: Complex) -> Complex:
+        """What is squared (L,), at the unknowns x."""
+        return np.asarray((self.values * x[self.columns]).sum(axis=0))
+
+    def pull(self, x: Complex) -> Complex:
+        """Gradient (K, L) of half the cost by the unknowns of each term."""
+        return np.asarray(self.values.conj() * (self.weight * self.roots(x)))
+
+    def add_to(self, form: Complex) -> None:
+        """Add to a quadratic form in the unknowns."""
+        products = self.values.conj()[:, None] * self.weight * self.values
+        np.add.at(form, (self.columns[:, None], self.columns[None]), products)
+
+
+@dataclass(frozen=True, slots=True)
 class QuadraticForm:
     """The squares of the features and of odometry's links, for a position variance, m^2."""
 
@@ -275,9 +307,9 @@ class QuadraticForm:
     def system(self, bias: Array) -> Complex:
         """The quadratic form (2N, 2N) in [o, z] at the periods' biases (R,)."""
         form = self._biased_gram(bias)
-        for rows, weight in self.link_rows(bias):
-            form = form + rows.conj().T @ (weight[:, None] * rows)
-        return np.asarray(form)
+        for squares in self.link_squares(bias):
+            squares.add_to(form)
+        return form
 
     def _biased_gram(self, bias: Array) -> Complex:
         """S^T gram S (2N, 2N) with [o, z, -b z] = S [o, z], S = [[1, 0], [0, 1], [0, -b]]."""
@@ -289,19 +321,20 @@ class QuadraticForm:
         form[n:] += b[:, None] * product[2 * n :]
         return np.asarray(form)
 
-    def link_rows(self, bias: Array) -> list[tuple[Complex, Array]]:
-        """Rows (L, 2N) whose weighted squares are the turns' and the displacements' costs."""
-        links, n, at = self.links, len(self.period), np.arange(len(self.links.at))
-        turns, moves = np.zeros((2, len(at), 2 * n), complex)
-        own = bias[links.period]
-        turns[at, n + links.at + 1] = 1.0
-        turns[at, n + links.at] = -np.exp(1j * (links.turn - own * links.turn_time))
-        moves[at, links.at + 1] = 1.0
-        moves[at, links.at] = -1.0
-        moves[at, n + links.at] = -(links.displacement - own * links.displacement_drift)
-        turn_weight = self.variance / links.turn_variance
-        move_weight = self.variance / links.displacement_variance
-        return [(turns, turn_weight), (moves, move_weight)]
+    def link_squares(self, bias: Array) -> tuple[Squares, Squares]:
+        """The turns' and the displacements' costs, of [o, z]."""
+        links, n, own = self.links, len(self.period), bias[self.links.period]
+        ones = np.ones(len(links.at))
+        turns = -np.exp(1j * (links.turn - own * links.turn_time))
+        moves = -(links.displacement - own * links.displacement_drift)
+        at, turned = links.at, n + links.at
+        return (
+            Squares.of([(turned + 1, ones), (turned, turns)], self.variance / links.turn_variance),
+            Squares.of(
+                [(at + 1, ones), (at, -ones), (turned, moves)],
+                self.variance / links.displacement_variance,
+            ),
+        )
 
     def slope(self, bias: Array, x: Complex) -> Array:
         """Derivative (R,) of the cost by each bias at [o, z] = x (2N,)."""
@@ -309,13 +342,10 @@ class QuadraticForm:
         z = x[n:]
         right = self.gram[2 * n :] @ np.concatenate([x, -bias[self.period] * z])
         own = np.bincount(self.period, np.real(-np.conj(z) * right), len(bias))
-        (turns, turn_weight), (moves, move_weight) = self.link_rows(bias)
-        turned = -1j * links.turn_time * turns[np.arange(len(links.at)), n + links.at]
-        for change, rows, weight in (
-            (turned, turns, turn_weight),
-            (links.displacement_drift, moves, move_weight),
-        ):
-            pull = np.real(np.conj(change * z[links.at]) * (rows @ x)) * weight
+        turns, moves = self.link_squares(bias)
+        turned = -1j * links.turn_time * turns.values[-1]
+        for change, squares in ((turned, turns), (links.displacement_drift, moves)):
+            pull = np.real(np.conj(change * z[links.at]) * squares.roots(x)) * squares.weight
             own += np.bincount(links.period, pull, len(bias))
         return np.asarray(own + self.variance * bias / self.bias_std**2)
 
@@ -378,8 +408,8 @@ class QuadraticForm:
         right = self.gram @ np.concatenate([x, b * x[n:]])
         pull = right[: 2 * n]
         pull[n:] += b * right[2 * n :]
-        for rows, weight in self.link_rows(bias):
-            pull += rows.conj().T @ (weight * (rows @ x))
+        for squares in self.link_squares(bias):
+            np.add.at(pull, squares.columns, squares.pull(x))
         return np.asarray(pull)
 
 

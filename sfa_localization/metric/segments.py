@@ -21,6 +21,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.features.closures import Closures
+from sfa_localization.features.offsets import Offsets
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     MOMENT,
@@ -117,12 +118,13 @@ class Segment:
 @dataclass(frozen=True, slots=True)
 class Segments:
     """Segments in driving order, how many images and odometry messages were used, the loop closures
-    between their images, and how the way of each run was corrected."""
+    between their images, with and without offsets, and how the way of each run was corrected."""
 
     items: tuple[Segment, ...]
     images: Count = field(default_factory=Count)
     odometry: Count = field(default_factory=Count)
     closures: Closures = field(default_factory=Closures.none)
+    offsets: Offsets = field(default_factory=Offsets.none)
     ways: tuple[Way | None, ...] = (None,)
 
     def __len__(self) -> int:

@@ -1,0 +1,86 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closures with measured offsets: an image lies among those of other tracks around it.
+
+The place that local regression (local_regression.py) gives an image is linear in those of the
+others, sum_k c_k p_k. The shares c_k are of the images alone: they hold in any frame, however bent
+the map is, so that they tie the segments of a drive (metric/loops.py) before there is a map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.sphere import Sphere
+from sfa_localization.features.closures import STRETCH_M, Views
+from sfa_localization.features.keyframes import Keyframes
+from sfa_localization.features.observation import MatchNoise
+
+Indices = NDArray[np.int64]
+
+# Of the views that are located, along a drive: nearer ones err alike.
+_APART_M = 0.5
+# Views that one is located among, the least number, and of how many the own track's are left out.
+_AMONG, _FEWEST, _NEAREST = 64, 12, 256
+# An image of which more than this part is unlike all around is of another place, or beside them.
+_UNLIKE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Offsets:
+    """R of the images of all drives that lie at the mixture, by `shares` (R, K) of sum 1, of the
+    places of `others` (R, K), and are turned by `turn` (R, K) rad from each; `unlike` (R,) is that
+    of the match.
+    """
+
+    images: Indices
+    others: Indices
+    shares: Array
+    turn: Array
+    unlike: Array
+
+    @classmethod
+    def none(cls) -> Offsets:
+        """Of no images."""
+        none = np.zeros((0, 1))
+        return cls(np.zeros(0, np.int64), none.astype(np.int64), none, none, np.zeros(0))
+
+
+def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
+    """Of views whose poses (S, 3) are about known, in any frame; NaN for the others."""
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    if len(known) < _FEWEST:
+        return Offsets.none()
+    drives = views.run[known].astype(np.int32)
+    among = Keyframes.of(views.textures[known], poses[known], MatchNoise(), sphere, drives)
+    path, found = views.path_m[known], []
+    for row in _spaced(path, drives):
+        near = among.nearest(among.poses[row, :2], _NEAREST)
+        own = (drives[near] == drives[row]) & (np.abs(path[near] - path[row]) < STRETCH_M)
+        near = near[~own][:_AMONG]
+        if len(near) < _FEWEST:
+            continue
+        match = among.place(among.spectra[row], among.poses[row, 2], near)
+        if match.unlike < _UNLIKE:
+            shares, turn = np.zeros((2, _AMONG))
+            others = np.full(_AMONG, near[0])
+            others[: len(near)], shares[: len(near)] = near, match.shares
+            turn[: len(near)] = match.pose[2] - among.poses[near, 2]
+            found.append((row, others, shares, turn, match.unlike))
+    if not found:
+        return Offsets.none()
+    rows, others, shares, turn, unlike = map(np.array, zip(*found, strict=True))
+    return Offsets(views.images[known][rows], views.images[known][others], shares, turn, unlike)
+
+
+def _spaced(path_m: Array, drives: NDArray[np.int32]) -> list[int]:
+    """Rows of views (S,) in driving order, each so far from the one before."""
+    rows = [0]
+    for row in range(1, len(path_m)):
+        if drives[row] != drives[rows[-1]] or path_m[row] - path_m[rows[-1]] >= _APART_M:
+            rows.append(row)
+    return rows
