@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder of the demo: what is kept, what must never be touched.
 
-The nodes are tested in test_demo_nodes.py; the complete demo by `make demo` in CI.
+The nodes are tested in test_processes.py; the complete demo by `make demo` in CI.
 """
 
 import pytest

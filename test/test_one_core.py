@@ -44,9 +44,8 @@ def message_of(recording, stamp_ns, kind, index):
         return 'panorama', to_image(recording.pictures[index], stamp_ns, 'omnicam')
     drive, i = recording.drive, recording.kept[index]
     spread, frames = np.diag(drive.variances()), ('odom', 'base_link')
-    return 'odom', to_odometry(
-        drive.reckoned[i], np.eye(3), drive.read[i], spread, stamp_ns, frames
-    )
+    pose = drive.reckoned[i], np.eye(3)
+    return 'odom', to_odometry(*pose, drive.read[i], spread, stamp_ns, frames)
 
 
 def trajectory(messages):
@@ -69,23 +68,14 @@ def live(recording, monkeypatch):
         seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
         # The latched correlation of errors is there before the first picture.
         assert until(lambda: ekf.monitor('sfa/error_correlation').used == 1)
-        sent = 0
+        inputs = [(sfa, 'panorama'), (ekf, SEEN), (ekf, 'odom')]
         for event in recording.events():
             topic, message = message_of(recording, *event)
-            before = ekf.monitor(SEEN).received, ekf.monitor('odom').received
+            shown = topic == 'panorama'
+            due = shown, shown and message.width == SIZE.width, not shown
+            counts = [n.monitor(t).received + one for (n, t), one in zip(inputs, due, strict=True)]
             bench.publish(topic, message)
-            sent += topic == 'panorama'
-            misshapen = topic == 'panorama' and message.width != SIZE.width
-            done = (
-                before[0] + (topic == 'panorama' and not misshapen),
-                before[1] + (topic == 'odom'),
-            )
-            assert until(
-                lambda d=done, n=sent: (
-                    sfa.monitor('panorama').received == n
-                    and (ekf.monitor(SEEN).received, ekf.monitor('odom').received) == d
-                )
-            )
+            assert until(lambda c=counts: [n.monitor(t).received for n, t in inputs] == c)
         last = int(recording.drive.stamps_ns[-1])
         assert until(lambda: fused and read_stamp(fused[-1].header.stamp) == last)
         return trajectory(seen), trajectory(fused)
@@ -110,12 +100,8 @@ def test_live_nodes_localizer_and_evaluate_give_the_same_poses(tmp_path, monkeyp
     for stamp_ns, kind, index in recording.events():
         if kind == ODOMETRY:
             i = recording.kept[index]
-            state = localizer.add_odometry(
-                stamp_ns,
-                *recording.drive.read[i],
-                recording.drive.variances(),
-                recording.drive.reckoned[i],
-            )
+            told = recording.drive.variances(), recording.drive.reckoned[i]
+            state = localizer.add_odometry(stamp_ns, *recording.drive.read[i], *told)
             if state is not None:
                 stamps.append(stamp_ns)
                 poses.append(state.pose)

@@ -53,12 +53,9 @@ def program(words: list[str]) -> list[str]:
 
 def complete(words: list[str], folder: Path) -> None:
     """Run a command in a folder, until it ends."""
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
     done = subprocess.run(
-        program(words),
-        cwd=folder,
-        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-        capture_output=True,
-        text=True,
+        program(words), cwd=folder, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, f'{shlex.join(words)}\n{done.stdout}{done.stderr}'
 
@@ -70,15 +67,12 @@ def folder(tmp_path_factory) -> Path:
     (folder / 'bags').symlink_to(ROOT / 'bags')
     for words in commands('offline'):
         complete(words, folder)
+    assert [words[0] for words in commands('live')] == [*NODES, 'play']
     return folder
 
 
-def test_commands_are_found_in_the_text():
-    assert [words[0] for words in commands('offline')] == ['inspect', 'train', 'evaluate']
-    assert [words[0] for words in commands('live')] == [*NODES, 'play']
-
-
 def test_results_beat_odometry_and_the_mean_position(folder):
+    assert (folder / 'report/index.html').is_file()
     results = json.loads((folder / 'results.json').read_text())
     errors = {name: results[name]['mean'] for name in ('odometry', 'sfa', 'ekf')}
     with Bag(ROOT / 'bags/sample_test') as bag:
@@ -86,11 +80,6 @@ def test_results_beat_odometry_and_the_mean_position(folder):
     mean_position = np.hypot(*(positions - positions.mean(0)).T).mean()
     assert errors['ekf'] < errors['odometry']
     assert errors['ekf'] < 1.1 * errors['sfa'] < 0.3 * mean_position
-
-
-def test_report_contains_its_figures(folder):
-    names = {path.name for path in (folder / 'report').iterdir()}
-    assert {'index.html', 'overview.png', 'errors.png'} <= names
 
 
 @pytest.mark.ros
@@ -107,7 +96,7 @@ def test_nodes_run_as_described(folder, monkeypatch):
     size = PlaceModel.load(folder / 'model.npz').panorama
     extra = {
         'omnicam_node': ['-p', f'width:={size.width}', '-p', f'height:={size.height}'],
-        'play': ['--rate', '3'],
+        'play': ['--rate', '4'],
     }
     programs = {words[0]: program(words + extra.get(words[0], [])) for words in commands('live')}
     live = live_nodes.run_live(programs, folder / 'logs')
