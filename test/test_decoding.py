@@ -11,7 +11,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from sfa_localization.bags.decoding import IMAGE
 from sfa_localization.bags.drives import read_drive
-from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import MessageError
@@ -64,52 +63,6 @@ def test_unknown_variances_are_zero():
     imu.angular_velocity_covariance[0] = -1.0
     with pytest.raises(MessageError, match='unknown'):
         read_yaw_rate(imu)
-
-
-LENGTHS = (1.0, 0.5, 3.0, 0.0, 1.0, 1.001, math.nan)
-"""Of the quaternions of a drive; two of them have no direction."""
-
-
-def scaled(message, length):
-    message.pose.pose.orientation.z *= length
-    message.pose.pose.orientation.w *= length
-    return message
-
-
-def bag_poses(path):
-    """Return the poses of a bag with such quaternions, by stamp."""
-
-    class Writer(BagWriter):
-        def message(self, topic, stamp_ns, message):
-            super().message(topic, stamp_ns, scaled(message, LENGTHS[stamp_ns // 10**9 - 1]))
-
-    with Writer(path) as bag:
-        for k in range(len(LENGTHS)):
-            bag.odometry('/odom', (k + 1) * 10**9, [k, 0.0, 0.3 * k], [1.0, 0.3], [0.01, 0.01])
-    with Bag(path) as bag:
-        odometry = bag.odometry()
-        assert bag.counts['/odom'].skipped == {
-            'quaternion is zero': 1, 'quaternion is not finite': 1,
-        }  # fmt: skip
-    return dict(zip(odometry.stamps_ns.tolist(), odometry.poses, strict=True))
-
-
-def test_bags_and_topics_take_and_refuse_the_same_quaternions(tmp_path):
-    pytest.importorskip('rclpy')
-    from sfa_localization.nodes.conversions import read_odometry, to_odometry
-
-    recorded, live = bag_poses(tmp_path / 'bag'), {}
-    for k, length in enumerate(LENGTHS):
-        stamp_ns, pose = (k + 1) * 10**9, [k, 0.0, 0.3 * k]
-        frames = ('odom', 'base_link')
-        message = to_odometry(pose, np.eye(3), [1.0, 0.3], np.eye(2), stamp_ns, frames)
-        try:
-            live[stamp_ns] = read_odometry(scaled(message, length)).pose
-        except MessageError:
-            continue
-    assert sorted(live) == sorted(recorded) and len(live) == 5
-    for stamp_ns, pose in live.items():
-        assert np.allclose(pose, recorded[stamp_ns], atol=1e-12)
 
 
 def test_of_a_camera_of_few_bits_inspect_training_and_nodes_see_the_same(tmp_path):

@@ -21,7 +21,8 @@ import sfa_localization
 from sfa_localization.bags import writer as bag_writer
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.cli import main
-from sfa_localization.data.errors import BagError, DataError
+from sfa_localization.commands import demo
+from sfa_localization.data.errors import BagError, DataError, LocalizationError
 from sfa_localization.data.files import atomic_write
 
 BAGS = Path(__file__).parents[1] / 'bags'
@@ -251,3 +252,31 @@ def test_a_report_replaces_its_own_files_only(tmp_path, capsys):
 
 def interrupt(*_):
     raise KeyboardInterrupt
+
+
+# The folder of the demo.
+
+
+def test_a_folder_of_anything_else_is_not_changed(tmp_path):
+    (tmp_path / 'thesis').mkdir()
+    (tmp_path / 'thesis/thesis.tex').write_text('ten years of work')
+    demo.prepare_folder(tmp_path / 'other', 3)
+    for name, world in {'thesis': 1, 'other': 4}.items():
+        before = sorted((tmp_path / name).iterdir())
+        with pytest.raises(LocalizationError, match=f'{name}: not a folder of this demo.*--out'):
+            demo.prepare_folder(tmp_path / name, world)
+        assert sorted((tmp_path / name).iterdir()) == before
+    (tmp_path / 'file').touch()
+    for name in ('file', 'file/demo'):
+        with pytest.raises(LocalizationError, match='cannot be written'):
+            demo.prepare_folder(tmp_path / name, 1)
+
+
+def test_bags_of_the_same_settings_are_reused_and_old_results_are_not(tmp_path):
+    out = tmp_path / 'new' / 'demo'
+    demo.prepare_folder(out, 3)
+    (out / 'coverage').mkdir()
+    for name in ('model.npz', 'results.json', 'my_notes.txt'):
+        (out / name).write_text('old')
+    demo.prepare_folder(out, 3)
+    assert {path.name for path in out.iterdir()} == {'coverage', demo.MARKER, 'my_notes.txt'}

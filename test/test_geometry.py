@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid alignment recovers what was moved."""
+"""Rigid alignment recovers what was moved; paths, and the twists along them."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import align, align_complex
+from sfa_localization.data.geometry import align, align_complex, wrap_angle
+from sfa_localization.data.run import Odometry, Trajectory, integrate
 
 
 @given(st.integers(0, 1000), st.floats(-3.1, 3.1), st.floats(-50, 50), st.floats(-50, 50))
@@ -39,3 +40,17 @@ def test_points_that_show_no_direction_are_not_turned():
 def test_one_point_cannot_be_aligned():
     with pytest.raises(DataError, match='cannot align'):
         align(np.zeros((1, 2)), np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize('v', [0.7, -0.4])
+@pytest.mark.parametrize('omega', [0.0, 0.3, -2.9])
+def test_exact_odometry_of_a_path_integrates_to_it(v, omega):
+    rng = np.random.default_rng(0)
+    stamps = np.cumsum(rng.integers(40_000_000, 60_000_000, 200))
+    twists = np.column_stack([v * rng.uniform(0.5, 1.5, 200), omega * rng.uniform(0.5, 1.5, 200)])
+    poses = integrate(stamps, twists, np.array([3.0, -2.0, 3.1]))
+    exact = Odometry.along(Trajectory(stamps, poses))
+    assert np.allclose(exact.twists[1:], twists[1:], atol=1e-9)
+    again = integrate(stamps, exact.twists, poses[0]) - poses
+    assert np.abs(again[:, :2]).max() < 1e-9 and np.abs(wrap_angle(again[:, 2])).max() < 1e-9
+    assert not exact.variances.any()

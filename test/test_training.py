@@ -21,8 +21,10 @@ from cylinder_worlds import (
 )
 
 from sfa_localization import training
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
+from sfa_localization.evaluation import evaluate
 from sfa_localization.features import checkpoint as checkpoints
 from sfa_localization.features import image_features
 from sfa_localization.features.network_training import ImageSequence, train_network
@@ -31,6 +33,8 @@ from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
+from sfa_localization.simulation.drive import simulate
+from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import learn_place, train
 
 
@@ -204,3 +208,18 @@ def test_pauses_and_jumps_of_a_drive_are_breaks_between_its_images():
     odometry = Odometry(stamps, np.column_stack([x_m, none]), none, none)
     run = Run('run', images, odometry, counts={'images': Count()})
     assert ImageSequence.of(run).joined.tolist() == [True, True, False, False, True]
+
+
+DRIVE = SimulationConfig(area=(6.0, 6.0), length=20.0, images='panorama', images_every=0.4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('size', [(120, 25), (720, 150)])
+def test_a_drive_with_panoramas_of_any_size_trains_and_is_judged(size, tmp_path):
+    """The network fits itself to them."""
+    simulate(DRIVE, tmp_path / 'bag', PanoramaConfig(width=size[0], height=size[1]))
+    train([tmp_path / 'bag'], tmp_path / 'model.npz')
+    model = PlaceModel.load(tmp_path / 'model.npz')
+    assert (model.panorama.width, model.panorama.height) == size
+    scores = evaluate(model, tmp_path / 'bag').scores
+    assert scores['sfa']['mean'] < 0.5
