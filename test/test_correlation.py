@@ -9,7 +9,6 @@ import pytest
 
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.fusion.pose_filter import PoseFilter
 
 
 def made(share, distance, seed=0, step=0.1, stretches=60, length=80):
@@ -36,39 +35,26 @@ def test_share_and_distance_are_found_again(share, distance):
     assert np.median([f.distance_m for f in found]) == pytest.approx(distance, rel=0.3)
 
 
-def test_white_errors_have_nothing_in_common():
+def test_white_errors_have_nothing_in_common_and_outliers_do_not_rule():
     assert ErrorCorrelation.fit(*made(0.0, 1.0)).share < 0.05
-
-
-def test_outliers_do_not_rule():
     errors, variances, way, owner = made(0.7, 1.0)
     errors[::25] += np.random.default_rng(1).uniform(-20, 20, (len(errors[::25]), 2))
     assert ErrorCorrelation.fit(errors, variances, way, owner).share == pytest.approx(0.7, abs=0.15)
 
 
-def test_errors_of_different_stretches_are_not_compared():
+def test_errors_of_different_stretches_are_not_compared_and_too_few_say_nothing():
     errors, variances, way, owner = made(0.8, 0.5, stretches=400, length=4)
     apart = ErrorCorrelation.fit(errors, variances, way, owner)
     mixed = ErrorCorrelation.fit(errors, variances, way, np.zeros_like(owner))
     assert apart.share == pytest.approx(0.8, abs=0.1) and mixed.distance_m < apart.distance_m
+    few = made(0.2, 1.0, stretches=3, length=5)
+    assert ErrorCorrelation.fit(*few) == ErrorCorrelation()
 
 
-def test_too_few_pictures_say_nothing():
-    errors, variances, way, owner = made(0.2, 1.0, stretches=3, length=5)
-    assert ErrorCorrelation.fit(errors, variances, way, owner) == ErrorCorrelation()
-
-
-@pytest.mark.parametrize(('share', 'distance'), [
-    (1.0, 1.0), (-0.1, 1.0), (math.nan, 1.0), (0.5, LEAST_M / 2), (0.5, math.inf), (0.5, math.nan),
-])  # fmt: skip
-def test_numbers_that_cannot_be_are_refused(share, distance):
-    with pytest.raises(DataError, match='share'):
-        ErrorCorrelation(share, distance)
-
-
-def test_the_filter_takes_the_models_value_over_the_default():
-    assert PoseFilter().correlation == ErrorCorrelation(0.7, 1.0)
-    fused = PoseFilter(correlation=ErrorCorrelation(0.4, 2.0))
-    assert fused.correlation == ErrorCorrelation(0.4, 2.0)
-    fused.reconfigure(correlation=ErrorCorrelation(0.1, 3.0))
-    assert fused.correlation == ErrorCorrelation(0.1, 3.0)
+def test_numbers_that_cannot_be_are_refused():
+    for share, distance in (
+        (1.0, 1.0), (-0.1, 1.0), (math.nan, 1.0), (0.5, LEAST_M / 2), (0.5, math.inf),
+        (0.5, math.nan),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match='share'):
+            ErrorCorrelation(share, distance)

@@ -11,14 +11,11 @@ from metric_worlds import criss_cross, drive, garden_features, grid, lanes, mean
 from scipy.ndimage import gaussian_filter1d
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import RigidTransform, align
-from sfa_localization.metric import drive_check, learning, selection
+from sfa_localization.data.geometry import RigidTransform, align, rotation
+from sfa_localization.metric import drive_check, selection
 from sfa_localization.metric.forecast import (
     REACH_M,
-    Forecast,
-    ground_distances,
     importance,
-    nearest_used,
 )
 from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.quadratic_form import Stack
@@ -74,24 +71,14 @@ def judged(name):
     frame = align(result.map.predict(features[images])[0], poses[images, :2])
     places = between(poses[images, :2])
     predicted, covariances = result.map.predict(garden_features(places, noise=0.05, seed=9))
-    turn = np.array(
-        [
-            [np.cos(frame.yaw_rad), -np.sin(frame.yaw_rad)],
-            [np.sin(frame.yaw_rad), np.cos(frame.yaw_rad)],
-        ]
-    )
-    off = (frame.apply(predicted) - places) @ turn
+    off = (frame.apply(predicted) - places) @ rotation(frame.yaw_rad)
     squared = np.einsum('ni,nij,nj->n', off, np.linalg.inv(covariances), off)
     return result.forecast.expected_m / np.hypot(*off.T).mean(), np.mean(squared < 5.991)
 
 
-@pytest.mark.parametrize('name', DRIVES)
-def test_the_forecast_is_about_the_true_error(name):
-    assert 0.7 < judged(name)[0] < 1.5
-
-
-def test_forecasts_and_ellipses_are_right_on_average():
+def test_forecasts_and_ellipses_are_right():
     ratios, shares = np.transpose([judged(name) for name in DRIVES])
+    assert ratios.min() > 0.7 and ratios.max() < 1.5
     assert 0.8 < ratios.mean() < 1.25
     assert 0.91 < shares.mean() < 0.985
 
@@ -108,18 +95,6 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     assert error > 1.5 * result.forecast.expected_m
 
 
-def test_points_lie_near_the_drive():
-    places = legs()[3].forecast.places
-    distances = ground_distances(places, np.random.default_rng(0))
-    assert distances.shape == (1000,) and 0.2 < distances.max() <= REACH_M
-
-
-def test_distances_to_another_part():
-    places = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]])
-    assert nearest_used(places, np.array([0, 0, 1])) == pytest.approx([np.sqrt(5), 2.0, 2.0])
-    assert np.isinf(nearest_used(places, np.zeros(3, int))).all()
-
-
 def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points():
     rng = np.random.default_rng(2)
     wanted, have = rng.uniform(0, 0.5, 4000), rng.uniform(0, 2.0, 4000) ** 1.5
@@ -129,26 +104,6 @@ def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points(
     assert weight @ have == pytest.approx(0.25, abs=0.01)
     far = importance(np.array([5.0, 6.0]), np.array([0.1, 0.2, 0.3, 0.4]))
     assert far == pytest.approx([0.5, 0.5]), 'where none is near enough, all count'
-
-
-def test_keyframes_improve_what_is_left_out_but_not_the_drive():
-    errors = np.array([0.3, 0.0]), np.array([0.4, 0.1])
-    known = Forecast(np.zeros((2, 2)), *errors, np.full(2, 0.5), np.ones(2))
-    assert known.errors == pytest.approx([0.5, 0.1])
-    assert known.improved(0.5).errors == pytest.approx([np.hypot(0.15, 0.4), 0.1])
-
-
-def test_the_drive_is_as_uncertain_as_in_the_map(monkeypatch):
-    """Also where left-out images show that the fit claims too little, as with real wheels."""
-    _, segments, features, _ = legs()
-    quick_and_tolerant(monkeypatch)
-    usual, wider = (
-        monkeypatch.setattr(learning, 'needed_factor', lambda *_, f=factor: f)
-        or learn_metric(features, segments, CONFIG)
-        for factor in (1.0, 4.0)
-    )
-    assert wider.forecast.drive_std == pytest.approx(2.0 * usual.forecast.drive_std)
-    assert wider.common_m == pytest.approx(2.0 * usual.common_m)
 
 
 @pytest.mark.parametrize(('noise', 'yaw_noise'), [(3.0, 0.01), (2.0, 0.1)])
@@ -171,18 +126,9 @@ def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak(
     assert result.explained < 0.6
 
 
-def test_a_forecast_moves_with_its_map():
-    result = legs()[3]
-    frame = RigidTransform(1.0, 2.0, -0.5)
-    moved = result.forecast.moved(frame)
-    x, y, error = result.forecast.worst
-    assert moved.worst[:2] == pytest.approx(frame.apply(np.array([[x, y]]))[0])
-    assert moved.worst[2] == pytest.approx(error)
-
-
-@pytest.mark.parametrize('length', [0.1, 3.0, 10.0, 100.0, 1e4])
+@pytest.mark.parametrize('length', [0.1, 1e4])
 def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length, monkeypatch):
-    _, segments, features, _ = legs()
+    _, segments, features, usual = legs()
     quick_and_tolerant(monkeypatch)
     monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', length)
     stack = Stack.of(segments)
@@ -191,27 +137,19 @@ def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length, monk
     assert sorted(np.concatenate(parts)) == list(range(len(stack.images)))
     result = learn_metric(features, segments, CONFIG)
     assert result.certificate.certified
-    assert np.isfinite(result.left_out_error_m)
     assert np.isfinite(result.map.predict(features)[1]).all()
     assert result.left_out_error_m < 2.0
+    frame = RigidTransform(1.0, 2.0, -0.5)
+    (x, y, error), moved = usual.forecast.worst, usual.forecast.moved(frame).worst
+    assert moved == pytest.approx([*frame.apply(np.array([[x, y]]))[0], error])
 
 
-@pytest.mark.parametrize('many', [2, 3, 5])
-def test_few_segments_are_never_left_out_all_at_once(many, monkeypatch):
-    stack = Stack.of(cut_lanes(many))
-    monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', 1e4)
-    for number in (2, 8):
-        monkeypatch.setattr(selection, 'LEFT_OUT_FOLDS', number)
-        assert len(folds(stack, 0)) >= 2
-
-
-def cut_lanes(many):
-    """The first segments of a drive."""
+def test_few_segments_are_never_left_out_all_at_once_and_one_is_refused(monkeypatch):
     run = drive(lanes(8.0, 1.0, 4))
     segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    return replace(segments, items=segments.items[:many])
-
-
-def test_a_single_segment_is_refused():
+    monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', 1e4)
+    for many, number in ((2, 2), (3, 8), (5, 2)):
+        monkeypatch.setattr(selection, 'LEFT_OUT_FOLDS', number)
+        assert len(folds(Stack.of(replace(segments, items=segments.items[:many])), 0)) >= 2
     with pytest.raises(DataError, match='drive farther'):
-        folds(Stack.of(cut_lanes(1)), 0)
+        folds(Stack.of(replace(segments, items=segments.items[:1])), 0)

@@ -3,6 +3,7 @@
 """Odometry that is worse than it says is noticed, and bends the map less."""
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -30,9 +31,13 @@ def worse(segments, factor, seed=0):
     return dataclasses.replace(segments, items=tuple(wrong(item) for item in segments))
 
 
-def recorded(seed):
-    twists, start = meander(250.0, seed=seed)
-    return drive(twists, start=start, yaw_noise=0.01, speed_noise=0.03, seed=seed)
+@cache
+def recorded():
+    """A drive, its segments, and features of its images."""
+    twists, start = meander(250.0, seed=2)
+    run = drive(twists, start=start, yaw_noise=0.01, speed_noise=0.03, seed=2)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    return run, segments, garden_features(run.poses[:, :2], noise=0.05)
 
 
 def solved(segments, features):
@@ -51,44 +56,30 @@ def factors(fit):
     )
 
 
-def test_links_that_err_by_more_than_they_say_weigh_less():
-    run = recorded(seed=2)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    features = garden_features(run.poses[:, :2], noise=0.05)
-    turn, move = factors(solved(worse(segments, 16.0), features))
-    for factor in (turn, move):
+def test_links_weigh_less_where_they_err_by_more_than_they_say():
+    _, segments, features = recorded()
+    for factor in factors(solved(segments, features)):
+        assert 0.8 < np.median(factor) < 1.2 and factor.max() < 3.0
+    for factor in factors(solved(worse(segments, 16.0), features)):
         assert 5.0 < np.median(factor) < 25.0
 
 
-def test_links_that_err_as_they_say_keep_their_weight():
-    run = recorded(seed=2)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    turn, move = factors(solved(segments, garden_features(run.poses[:, :2], noise=0.05)))
-    for factor in (turn, move):
-        assert 0.8 < np.median(factor) < 1.2 and factor.max() < 3.0
-
-
 def test_the_map_is_better_for_it(monkeypatch):
-    run = recorded(seed=2)
-    segments = worse(cut(run.odometry, run.stamps_ns, SegmentConfig()), 16.0)
-    features = garden_features(run.poses[:, :2], noise=0.05)
+    run, segments, features = recorded()
 
     def error(fit):
         places = np.column_stack([fit.places.real, fit.places.imag])
         truth = run.poses[fit.stack.images, :2]
         return np.hypot(*(align(places, truth).apply(places) - truth).T).mean()
 
-    learned = error(solved(segments, features))
-    monkeypatch.setattr(
-        'sfa_localization.metric.map_fit.learned', lambda stated, form, solution: stated
-    )
-    assert learned < 0.9 * error(solved(segments, features))
+    learned = error(solved(worse(segments, 16.0), features))
+    name = 'sfa_localization.metric.map_fit.learned'
+    monkeypatch.setattr(name, lambda stated, form, solution: stated)
+    assert learned < 0.9 * error(solved(worse(segments, 16.0), features))
 
 
 def test_a_wheel_that_slips_once_costs_one_link():
-    run = recorded(seed=2)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    features = garden_features(run.poses[:, :2], noise=0.05)
+    _, segments, features = recorded()
     slipped = list(segments)
     for n in (10, 40, 70):
         slipped[n] = dataclasses.replace(slipped[n], displacement=slipped[n].displacement + 0.7)
@@ -100,14 +91,10 @@ def test_a_wheel_that_slips_once_costs_one_link():
     assert np.median(move[~wrong]) < 1.5 * np.median(before)
 
 
-@pytest.mark.parametrize('name', ['turn', 'displacement'])
-def test_links_without_weight_stay_without(name):
-    run = recorded(seed=2)
-    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
-    unused = tuple(dataclasses.replace(item, **{f'{name}_variance': np.inf}) for item in segments)
-    fit = solved(
-        dataclasses.replace(segments, items=unused), garden_features(run.poses[:, :2], noise=0.05)
-    )
-    assert np.isinf(getattr(fit.links, f'{name}_variance')).all()
-    other = {'turn': 'displacement', 'displacement': 'turn'}[name]
-    assert np.isfinite(getattr(fit.links, f'{other}_variance')).all()
+@pytest.mark.parametrize('names', [('turn', 'displacement'), ('displacement', 'turn')])
+def test_links_without_weight_stay_without(names):
+    _, segments, features = recorded()
+    without, other = (f'{name}_variance' for name in names)
+    unused = tuple(dataclasses.replace(item, **{without: np.inf}) for item in segments)
+    links = solved(dataclasses.replace(segments, items=unused), features).links
+    assert np.isinf(getattr(links, without)).all() and np.isfinite(getattr(links, other)).all()

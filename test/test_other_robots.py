@@ -89,26 +89,6 @@ def errors(images, places, headings, truth):
     return off, wrap_angle(laid.apply_yaw(headings) - truth[images, 2])
 
 
-def test_the_odometry_frame_is_nothing_but_the_gauge():
-    """Twenty drives: turned and shifted odometry turns and shifts the map, and nothing else."""
-    for draw in range(20):
-        twists, start = criss_cross(8, seed=draw)
-        run = drive(twists, start=start, bias=0.002, yaw_noise=0.01, seed=draw)
-        robot = Robot.draw(draw, len(twists) / 50)
-        gyro = robot.yaw_rate(run.gyro)
-        elsewhere = replace(run.odometry, poses=compose(robot.frame, run.odometry.poses))
-        here, there = (
-            learn([(odometry, run.stamps_ns, gyro, run.poses)], draw)
-            for odometry in (run.odometry, elsewhere)
-        )
-        assert np.array_equal(here[1], there[1])
-        moved = compose(robot.frame, np.column_stack([here[2], here[3]]))
-        assert np.abs(moved[:, :2] - there[2]).max() < 1e-5
-        assert np.abs(wrap_angle(moved[:, 2] - there[3])).max() < 1e-6
-        missed = (np.hypot(*result[0].residuals.T) for result in (here, there))
-        assert next(missed) == pytest.approx(next(missed), abs=1e-6)
-
-
 def two_drives(draw, others):
     """Two drives through one place, by the simulator's robot or by two unlike it."""
     runs = []

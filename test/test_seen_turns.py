@@ -3,6 +3,7 @@
 """Turns of odometry and images together: loop closures say which of them is right."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -80,18 +81,13 @@ def test_odometry_that_is_as_good_stays_as_it_is():
     assert corrections(headings_of(runs, 0.04), closures_of(runs, 200)) is None
 
 
-def test_few_closures_decide_nothing():
+def test_few_closures_or_such_between_drives_decide_nothing():
     runs = drives(0.04)
     few = closures_of(runs, CLOSURES_MIN // 2 - 1)
-    assert corrections(headings_of(runs, 0.004), few) is None
-
-
-def test_closures_between_drives_do_not_count():
-    runs = drives(0.04)
     rng, first = np.random.default_rng(0), len(runs[0].poses)
     pairs = np.column_stack([rng.integers(0, first, 200), first + rng.integers(0, 500, 200)])
-    between = Closures(pairs, rng.uniform(-3, 3, 200))
-    assert corrections(headings_of(runs, 0.004), between) is None
+    for closures in (few, Closures(pairs, rng.uniform(-3, 3, 200))):
+        assert corrections(headings_of(runs, 0.004), closures) is None
 
 
 def test_a_few_wrong_closures_change_little():
@@ -107,31 +103,26 @@ def test_a_few_wrong_closures_change_little():
     np.testing.assert_allclose(wrong[0].yaw, right[0].yaw, atol=0.02 * np.ptp(right[0].yaw))
 
 
-def test_segments_have_the_corrected_turns_and_their_noise():
+def test_segments_have_the_corrected_turns_and_their_noise_and_are_longer():
+    """Without: what turns may have misplaced uses them up, and links as weak shrink the map."""
     (run, _) = drives(0.04)
     known = np.unwrap(run.poses[:, 2])
     own = OdometryTrack.of(run.odometry, CONFIG, None)
     at = np.searchsorted(own.stamps_ns, run.stamps_ns)
     exact = TurnCorrection(run.stamps_ns, known - own.yaw[at], 0.002)
     segments = cut(run.odometry, run.stamps_ns, CONFIG, turns=exact)
-    for a, b in zip(segments.items[:-1], segments.items[1:], strict=True):
+    for a, b in itertools.pairwise(segments.items):
         true = wrap_angle(known[b.images[0]] - known[a.images[0]])
         assert abs(wrap_angle(a.turn_rad - true)) < 1e-6
         assert a.turn_variance >= 0.002**2 * a.turn_time_s * 0.99
-
-
-def test_pieces_with_known_turns_are_longer():
-    """Without: what turns may have misplaced uses them up, and links as weak shrink the map."""
     (run, _) = drives(0.0)
     nothing = TurnCorrection(run.stamps_ns, np.zeros(len(run.stamps_ns)), CONFIG.yaw_noise)
-    before = cut(run.odometry, run.stamps_ns, CONFIG)
-    after = cut(run.odometry, run.stamps_ns, CONFIG, turns=nothing)
-    assert len(after) < len(before)
-    rates = [
+    parts = [cut(run.odometry, run.stamps_ns, CONFIG, turns=turns) for turns in (None, nothing)]
+    before, after = (
         np.median([s.displacement_variance / s.turn_time_s for s in part if s.linked])
-        for part in (before, after)
-    ]
-    assert rates[1] < rates[0]
+        for part in parts
+    )
+    assert len(parts[1]) < len(parts[0]) and after < before
 
 
 @pytest.mark.parametrize('clockwise', [True, False])

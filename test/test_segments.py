@@ -41,13 +41,14 @@ def check_segments(segments, poses, tolerance=1e-6):
 
 def test_a_square_gives_its_four_sides():
     run = drive(SQUARE)
-    segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
-    assert len(segments) == 4
-    assert [round(s.length_m, 1) for s in segments] == pytest.approx([4.8] * 4, abs=0.25)
-    turns = [s.turn_rad for s in segments.items[:-1]]
-    assert turns == pytest.approx([np.pi / 2] * 3, abs=1e-6)
-    assert not segments[3].linked
-    check_segments(segments, run.poses)
+    silent = dataclasses.replace(run.odometry, twists=np.zeros_like(run.odometry.twists))
+    for odometry in (run.odometry, silent):
+        segments = cut(odometry, run.stamps_ns, STRAIGHT)
+        assert [round(s.length_m, 1) for s in segments] == pytest.approx([4.8] * 4, abs=0.25)
+        turns = [s.turn_rad for s in segments.items[:-1]]
+        assert turns == pytest.approx([np.pi / 2] * 3, abs=1e-6)
+        assert not segments[3].linked
+        check_segments(segments, run.poses)
 
 
 def drive_of(*parts):
@@ -62,6 +63,10 @@ def test_pieces_of_a_curved_drive_follow_the_truth():
     assert all(s.length_m <= PIECE_LENGTH_M + 1e-6 for s in segments)
     assert segments.images.used == len(run.stamps_ns)
     check_segments(segments, run.poses)
+    slow = picked(run.odometry, np.arange(len(run.odometry.stamps_ns)) % 30 == 0)
+    segments = cut(slow, run.stamps_ns, ANY)
+    assert 'pauses' not in segments.odometry.skipped, 'not at each message'
+    assert segments.images.used > 0.8 * len(run.stamps_ns)
 
 
 def test_every_picture_is_used_once_or_counted():
@@ -97,30 +102,18 @@ def picked(odometry, keep):
     return Odometry(*(getattr(odometry, name)[keep] for name in names))
 
 
-def test_pictures_outside_the_odometry_are_counted():
-    run = drive(straight(8.0))
-    stamps = np.concatenate([[0], run.stamps_ns, [10**12, 2 * 10**12]])
-    segments = cut(run.odometry, stamps, ANY)
-    assert segments.images.skipped == {'without odometry': 3}
-    assert segments[0].images[0] == 1
-
-
-def test_broken_messages_are_left_out_and_counted():
+def test_broken_messages_and_pictures_outside_the_odometry_are_left_out_and_counted():
     run = drive(straight(8.0))
     poses, stamps = run.odometry.poses.copy(), run.odometry.stamps_ns.copy()
-    poses[100] = np.nan
-    stamps[200] = stamps[150]
-    segments = cut(
-        dataclasses.replace(run.odometry, poses=poses, stamps_ns=stamps), run.stamps_ns, ANY
-    )
+    poses[100], stamps[200] = np.nan, stamps[150]
+    broken = dataclasses.replace(run.odometry, poses=poses, stamps_ns=stamps)
+    segments = cut(broken, run.stamps_ns, ANY)
     assert segments.odometry.skipped == {'not finite': 1, 'out of order': 1}
     check_segments(segments, run.poses)
-
-
-def test_odometry_without_twists_is_cut_all_the_same():
-    run = drive(SQUARE)
-    silent = dataclasses.replace(run.odometry, twists=np.zeros_like(run.odometry.twists))
-    assert len(cut(silent, run.stamps_ns, STRAIGHT)) == 4
+    outside = np.concatenate([[0], run.stamps_ns, [10**12, 2 * 10**12]])
+    segments = cut(run.odometry, outside, ANY)
+    assert segments.images.skipped == {'without odometry': 3}
+    assert segments[0].images[0] == 1
 
 
 def test_the_gyro_replaces_the_wheels_yaw():
@@ -172,22 +165,13 @@ def test_joined_runs_keep_their_pictures_apart():
     assert (owner == -1).sum() == 2 * len(run.stamps_ns) - both.images.used
 
 
-@pytest.mark.parametrize(
-    ('parts', 'config', 'remedy'),
-    [
-        ([stand(10.0)], ANY, 'robot drives'),
-        ([turn(6.0)], STRAIGHT, 'straight lines'),
-    ],
-)
-def test_a_drive_without_segments_says_what_to_do(parts, config, remedy):
-    with pytest.raises(DataError, match=remedy):
-        cut(*drive_of(*parts), config)
-
-
-def turned_frame(run, yaw, shift=(0.0, 0.0)):
-    """The same recording of a robot that was switched on elsewhere."""
-    poses = compose(np.array([*shift, yaw]), run.odometry.poses)
-    return dataclasses.replace(run.odometry, poses=poses)
+def test_a_drive_without_segments_says_what_to_do():
+    for part, config, remedy in (
+        (stand(10.0), ANY, 'robot drives'),
+        (turn(6.0), STRAIGHT, 'straight lines'),
+    ):
+        with pytest.raises(DataError, match=remedy):
+            cut(*drive_of(part), config)
 
 
 @pytest.mark.parametrize(('config', 'gyro'), [(ANY, True), (STRAIGHT, False)])
@@ -196,7 +180,9 @@ def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyr
     run = drive(twists, start=start)
     rate = run.gyro if gyro else None
     one = cut(run.odometry, run.stamps_ns, config, rate)
-    other = cut(turned_frame(run, 2.5, (30.0, -7.0)), run.stamps_ns, config, rate)
+    elsewhere = compose(np.array([30.0, -7.0, 2.5]), run.odometry.poses)
+    there = dataclasses.replace(run.odometry, poses=elsewhere)
+    other = cut(there, run.stamps_ns, config, rate)
     assert len(one) == len(other)
     for a, b in zip(one, other, strict=True):
         moved = compose(np.array([30.0, -7.0, 2.5]), a.start)
@@ -207,16 +193,13 @@ def test_the_frame_of_the_odometry_turns_the_starts_and_nothing_else(config, gyr
             assert a.displacement == pytest.approx(b.displacement)
 
 
-def pieces_of_gyro(gyro, keep):
-    return YawRate(gyro.stamps_ns[keep], gyro.omega[keep], gyro.variance[keep])
-
-
 @pytest.mark.parametrize('gap', [(2.0, 10.0), (15.0, 1e9)])
 def test_where_the_gyro_pauses_the_wheels_go_on(gap, bias=0.02):
     run = drive(np.vstack([SQUARE, SQUARE]))
     seconds = (run.gyro.stamps_ns - run.gyro.stamps_ns[0]) * 1e-9
     biased = dataclasses.replace(run.gyro, omega=run.gyro.omega + bias)
-    kept = pieces_of_gyro(biased, (seconds < gap[0]) | (seconds > gap[1]))
+    keep = (seconds < gap[0]) | (seconds > gap[1])
+    kept = YawRate(*(part[keep] for part in (biased.stamps_ns, biased.omega, biased.variance)))
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT, kept)
     assert segments.odometry.skipped['in a gap of the gyroscope'] > 0
     turns = [s.turn_rad - bias * s.turn_time_s for s in segments.items[:-1]]
@@ -229,11 +212,3 @@ def test_a_gyro_on_another_clock_is_as_good_as_none():
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT, other)
     assert segments.odometry.skipped['without a usable gyroscope'] > 0
     check_segments(segments, run.poses)
-
-
-def test_odometry_that_is_always_slow_does_not_pause_at_each_message():
-    run = drive(np.vstack([SQUARE, SQUARE]))
-    slow = picked(run.odometry, np.arange(len(run.odometry.stamps_ns)) % 30 == 0)
-    segments = cut(slow, run.stamps_ns, ANY)
-    assert 'pauses' not in segments.odometry.skipped
-    assert segments.images.used > 0.8 * len(run.stamps_ns)

