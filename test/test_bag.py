@@ -6,27 +6,10 @@ import os
 import shutil
 import tracemalloc
 
+import bag_formats as formats
 import numpy as np
 import pytest
-from bag_formats import (
-    COUNTS,
-    DELAY,
-    FORMATS,
-    IMAGES,
-    PER_IMAGE,
-    PERIOD,
-    Message,
-    image,
-    metadata,
-    pose,
-    stamp,
-    write_database,
-    write_mcap,
-    write_pictures,
-    write_ros1,
-    write_split,
-    write_version,
-)
+from bag_formats import COUNTS, DELAY, FORMATS, IMAGES, PER_IMAGE, PERIOD, image, pose, stamp
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -102,17 +85,19 @@ def test_ros_1_topics_written_one_after_the_other_are_read_whole(tmp_path):
             writer.image('/image', stamp(index), picture, 'camera')
             writer.odometry('/odom', stamp(index), (0.5 * index, 0, 0), (5.0, 0), (0, 0))
     with Reader(tmp_path / 'drive') as reader:
-        recorded = [Message(c.topic, c.msgtype, at, data) for c, at, data in reader.messages()]
+        recorded = [formats.Message(c.topic, c.msgtype, *r) for c, *r in reader.messages()]
     by_topic = sorted(recorded, key=lambda message: message.topic)
-    path = write_ros1(tmp_path / 'a.bag', by_topic, 'lz4')
+    path = formats.write_ros1(tmp_path / 'a.bag', by_topic, 'lz4')
     run = read_drive(path, tmp_path / 'cache', strict=True)
     assert run.panoramas.stamps_ns.tolist() == [stamp(index) for index in range(427)]
 
 
 WRITERS = {
-    'mcap': lambda p, m: write_mcap(p / 'a.mcap', m, chunk_size=1 << 18),
-    'mcap, no chunks': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None, index=False),
-    'sqlite3': lambda p, m: write_database(p / 'a.db3', m),
+    'mcap': lambda p, m: formats.write_mcap(p / 'a.mcap', m, chunk_size=1 << 18),
+    'mcap, no chunks': lambda p, m: formats.write_mcap(
+        p / 'a.mcap', m, compression=None, index=False
+    ),
+    'sqlite3': lambda p, m: formats.write_database(p / 'a.db3', m),
 }
 
 
@@ -134,7 +119,7 @@ def test_memory_does_not_grow_with_a_bag(name, tmp_path, messages):
 
 
 def test_stamps_of_reception_can_be_chosen(tmp_path, messages):
-    path = write_version(tmp_path / 'bag', messages, 5)
+    path = formats.write_version(tmp_path / 'bag', messages, 5)
     with Bag(path, config=BagConfig(stamp_source='receive')) as bag:
         assert [at for at, _ in bag.images()] == [stamp(i) + DELAY for i in range(IMAGES)]
 
@@ -162,8 +147,8 @@ def test_silence_of_a_library_is_an_error(tmp_path, messages, monkeypatch):
 
 def test_fewer_messages_than_declared_are_counted_as_lost(tmp_path, messages):
     path, total = tmp_path / 'bag', COUNTS['/odom']
-    write_database(path / 'bag_0.db3', messages[:70])
-    (path / 'metadata.yaml').write_text(metadata(5, ['bag_0.db3'], messages))
+    formats.write_database(path / 'bag_0.db3', messages[:70])
+    (path / 'metadata.yaml').write_text(formats.metadata(5, ['bag_0.db3'], messages))
     with Bag(path) as bag:
         read = len(bag.odometry().stamps_ns)
         assert bag.counts['/odom'].skipped == {'lost in a damaged bag': total - read}
@@ -190,11 +175,11 @@ def salvaged(path):
 
 
 CUT_OFF = {
-    'mcap': lambda p, m: write_mcap(p / 'a.mcap', m),
-    'mcap zstd': lambda p, m: write_mcap(p / 'a.mcap', m, compression='zstd'),
-    'mcap lz4': lambda p, m: write_mcap(p / 'a.mcap', m, compression='lz4'),
-    'mcap, no chunks': lambda p, m: write_mcap(p / 'a.mcap', m, compression=None),
-    'sqlite3': lambda p, m: write_database(p / 'a.db3', m),
+    'mcap': lambda p, m: formats.write_mcap(p / 'a.mcap', m),
+    'mcap zstd': lambda p, m: formats.write_mcap(p / 'a.mcap', m, compression='zstd'),
+    'mcap lz4': lambda p, m: formats.write_mcap(p / 'a.mcap', m, compression='lz4'),
+    'mcap, no chunks': lambda p, m: formats.write_mcap(p / 'a.mcap', m, compression=None),
+    'sqlite3': lambda p, m: formats.write_database(p / 'a.db3', m),
 }
 
 
@@ -219,7 +204,7 @@ def test_a_cut_off_bag_counts_what_is_lost(name, tmp_path, messages):
 
 
 def test_a_damaged_part_costs_itself_alone(tmp_path, messages):
-    path = write_mcap(tmp_path / 'bag.mcap', messages, compression='zstd')
+    path = formats.write_mcap(tmp_path / 'bag.mcap', messages, compression='zstd')
     data = bytearray(path.read_bytes())
     start = data.index(b'\x28\xb5\x2f\xfd', len(data) // 2)
     data[start : start + 40] = b'\xff' * 40
@@ -233,13 +218,13 @@ def test_a_damaged_part_costs_itself_alone(tmp_path, messages):
 def test_a_damaged_message_costs_itself(data, tmp_path, messages):
     first = next(i for i, m in enumerate(messages) if m.topic == '/odom')
     messages = [*messages[:first], messages[first]._replace(data=data), *messages[first + 1 :]]
-    with Bag(write_mcap(tmp_path / 'a.mcap', messages)) as bag:
+    with Bag(formats.write_mcap(tmp_path / 'a.mcap', messages)) as bag:
         assert len(bag.odometry().stamps_ns) == COUNTS['/odom'] - 1
         assert sum(bag.counts['/odom'].skipped.values()) == 1
 
 
 def test_a_missing_file_of_several_is_counted(tmp_path, messages):
-    path = write_split(tmp_path / 'bag', messages)
+    path = formats.write_split(tmp_path / 'bag', messages)
     (path / 'bag_3.mcap').unlink()
     with Bag(path) as bag:
         (problem,) = bag.problems
@@ -259,7 +244,7 @@ def test_a_missing_file_of_several_is_counted(tmp_path, messages):
         (b'\x89MCAP0\r\n', 'holds no readable message'),
         (b'#ROSBAG V2.0\n', 'no readable bag .*`rosbag reindex`'),
         (b'\x28\xb5\x2f\xfd', 'cut-off zstd data'),
-        (None, 'neither metadata.yaml nor'),
+        (None, 'neither formats.metadata.yaml nor'),
     ],
 )
 def test_what_holds_no_bag_is_one_error(content, complaint, tmp_path):
@@ -271,7 +256,7 @@ def test_what_holds_no_bag_is_one_error(content, complaint, tmp_path):
 
 
 def test_damaged_metadata_is_rebuilt(tmp_path, messages):
-    path = write_version(tmp_path / 'bag', messages, 5)
+    path = formats.write_version(tmp_path / 'bag', messages, 5)
     for text in ('', 'a: [', '[1, 2]', 'a: 3', 'rosbag2_bagfile_information: {}', '[' * 30_000):
         (path / 'metadata.yaml').write_text(text)
         with Bag(path) as bag:
@@ -282,7 +267,7 @@ def test_damaged_metadata_is_rebuilt(tmp_path, messages):
 
 
 def test_messages_that_are_left_in_a_log_are_told_of(tmp_path, messages):
-    path = write_database(tmp_path / 'bag.db3', messages)
+    path = formats.write_database(tmp_path / 'bag.db3', messages)
     (tmp_path / 'bag.db3-wal').write_bytes(b'some')
     with Bag(path) as bag:
         assert 'bag.db3-wal: holds more messages' in bag.problems[0]
@@ -304,7 +289,7 @@ def test_odd_names_are_opened_and_a_pipe_is_no_bag(tmp_path, messages):
 def test_images_without_odometry_are_skipped_and_counted(tmp_path, messages):
     late, early = stamp(2), stamp(9)
     kept = [m for m in messages if m.topic != '/odom' or late <= m.receive_ns - DELAY <= early]
-    run = read_drive(write_version(tmp_path / 'bag', kept, 5), tmp_path)
+    run = read_drive(formats.write_version(tmp_path / 'bag', kept, 5), tmp_path)
     assert run.panoramas.stamps_ns.tolist() == [stamp(i) for i in range(2, 10)]
     (batch,) = run.panoramas.batches(99)
     assert np.array_equal(batch, [image(i) for i in range(2, 10)])
@@ -315,7 +300,7 @@ def test_images_without_odometry_are_skipped_and_counted(tmp_path, messages):
 @pytest.mark.parametrize(('distinct', 'used'), [(False, [0, 1, 2, 3, 4, 5]), (True, [0, 3, 5])])
 def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, tmp_path):
     """A driver that was late sends an old image with a new stamp: it shows another place."""
-    write_pictures(tmp_path / 'bag', [image(shown) for shown in (0, 0, 0, 3, 3, 0)])
+    formats.write_pictures(tmp_path / 'bag', [image(shown) for shown in (0, 0, 0, 3, 3, 0)])
     run = read_drive(tmp_path / 'bag', tmp_path / 'cache', ReadingRecipe(distinct=distinct))
     assert run.panoramas.stamps_ns.tolist() == [stamp(i) for i in used]
     skipped = {'image repeats the one before': 3} if distinct else {}
@@ -324,7 +309,7 @@ def test_learning_leaves_out_images_that_repeat_the_one_before(distinct, used, t
 
 def test_truth_is_read_only_when_wanted(tmp_path, messages):
     broken = [m._replace(data=b'\xff') if m.topic == '/ground_truth' else m for m in messages]
-    path = write_version(tmp_path / 'bag', broken, 5)
+    path = formats.write_version(tmp_path / 'bag', broken, 5)
     read_drive(path, tmp_path, strict=True)
     with pytest.raises(BagError, match='/ground_truth: no usable message'):
         read_drive(path, tmp_path, want_truth=True)
@@ -336,14 +321,14 @@ def test_truth_is_read_only_when_wanted(tmp_path, messages):
 
 
 def test_images_are_unwrapped_when_they_are_no_panoramas(tmp_path):
-    write_pictures(tmp_path / 'bag', [np.full((20, 40, 3), k, np.uint8) for k in range(3)])
+    formats.write_pictures(tmp_path / 'bag', [np.full((20, 40, 3), k, np.uint8) for k in range(3)])
     camera = CameraConfig(camera_model='equirectangular')
     run = read_drive(tmp_path / 'bag', tmp_path, ReadingRecipe(camera=camera))
     assert run.panoramas.shape == (60, 600, 3) and len(run.panoramas) == 3
 
 
 def test_nothing_is_left_behind_after_an_error(tmp_path):
-    write_pictures(tmp_path / 'bag', [image(k) for k in range(3)], later=36_000)
+    formats.write_pictures(tmp_path / 'bag', [image(k) for k in range(3)], later=36_000)
     with pytest.raises(BagError, match=r'none of 3 images of /image has odometry within 0\.5 s'):
         read_drive(tmp_path / 'bag', tmp_path / 'cache')
     assert list((tmp_path / 'cache').iterdir()) == []

@@ -17,13 +17,12 @@ import pytest
 import yaml
 from test_calibration import scene
 
-from sfa_localization import cli, training, tuning, updating
+from sfa_localization import cli, training, tuning
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import DataError, NodeError
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
-from sfa_localization.updating import Additions
 
 parser_of = cli.command_parser
 pytestmark = pytest.mark.usefixtures('gardens', 'small_network')
@@ -400,20 +399,6 @@ def test_each_option_alone_has_its_effect(name, data, tmp_path):
         if changed.code not in (0, 1) or not case.differs(plain, changed):
             failed.append(f'{plain.text}\n-- with {words}:\n{changed.text}')
     assert not failed, '\n'.join(failed)
-
-
-def test_where_nothing_is_new_an_update_writes_the_same_bytes(data, tmp_path, monkeypatch):
-    shape = PlaceModel.load(data / 'model.npz').keyframes.textures.shape[1:]
-    nothing = Additions(np.zeros((0, *shape), np.int8), np.zeros((0, 3)))
-    monkeypatch.setattr(updating, 'new_views', lambda *_args, **_named: nothing)
-    words = '{data}/bag --update {data}/model.npz --output {out}/same.npz'
-    done = run('train', words, tmp_path, data=data)
-    assert done.code == 0 and 'no image of these drives is both new' in done.text
-    assert (tmp_path / 'same.npz').read_bytes() == (data / 'model.npz').read_bytes()
-    for option in ('--resume', '--report {out}/r', '--segments straight'):
-        done = run('train', f'{words.replace("same", "no")} {option}', tmp_path, data=data)
-        assert done.code == 1 and f'{option.split()[0]} has no effect' in done.text
-    assert [path.name for path in tmp_path.iterdir()] == ['same.npz']
 
 
 @pytest.mark.parametrize(('size', 'model'), [

@@ -67,17 +67,6 @@ def test_shadows_fall_away_from_the_sun_and_walls_toward_it_are_lit():
     assert sunshine(scene, ring) == pytest.approx(np.zeros(24), abs=1e-6)
 
 
-def test_every_light_has_its_own_sun_and_looks_different():
-    """In the morning and evening it stands lower than by day."""
-    suns = {name: garden_in(name).scene.sun for name in SUNNY}
-    pictures = {name: garden_in(name).render_panorama(np.zeros(3), SMALL) for name in LIGHTS}
-    assert suns['day'][2] > suns['morning'][2] > suns['evening'][2] > 0
-    for one, other in itertools.combinations(SUNNY, 2):
-        assert np.degrees(np.arccos(suns[one] @ suns[other])) > 40
-    for one, other in itertools.combinations(LIGHTS, 2):
-        assert np.abs(pictures[one].astype(float) - pictures[other]).mean() > 5
-
-
 def test_the_camera_meters_in_all_lights_but_the_day():
     rng = np.random.default_rng(0)
     for name in LIGHTS.keys() - {'day'}:

@@ -32,14 +32,8 @@ from sfa_localization.data.geometry import compose
 from sfa_localization.data.messages import read_planar, read_stamp, read_yaw
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes import ekf_node, lifecycle
-from sfa_localization.nodes.conversions import (
-    to_error_correlation,
-    to_odometry,
-    to_pose_with_covariance,
-    to_stamp,
-    to_turned,
-)
 from sfa_localization.nodes.ekf_node import EkfNode
 from sfa_localization.nodes.lifecycle import latched_qos
 
@@ -53,12 +47,14 @@ NOISY = {'position_std': 0.1, 'yaw_std': 0.03, 'v_std': 0.02, 'omega_std': 0.01}
 def odometry(drive, i):
     spread, stamp_ns = np.diag(drive.variances()), int(drive.stamps_ns[i])
     frames = ('odom', 'base_link')
-    return to_odometry(drive.reckoned[i], np.eye(3), drive.read[i], spread, stamp_ns, frames)
+    return convert.to_odometry(
+        drive.reckoned[i], np.eye(3), drive.read[i], spread, stamp_ns, frames
+    )
 
 
 def picture(drive, k, spread=SPREAD, frame='map'):
     stamp_ns = int(drive.stamps_ns[drive.pictures[k]])
-    return to_pose_with_covariance(drive.seen[k], spread, stamp_ns, frame)
+    return convert.to_pose_with_covariance(drive.seen[k], spread, stamp_ns, frame)
 
 
 def play(bench, node, drive, begin=0.0, end=math.inf, kinds=(0, 1)):
@@ -198,13 +194,13 @@ def test_initialpose_and_set_pose_set_the_pose(bench):
     drive = Drive(seconds=1)
     node = bench.run(EkfNode, silence_timeout=0.1, lost_std=0.5, degraded_std=0.4)
     for topic, x in (('initialpose', 7.0), ('ekf_node/set_pose', -3.0)):
-        message = to_pose_with_covariance([x, 1.0, math.pi], SPREAD, 1, 'map')
+        message = convert.to_pose_with_covariance([x, 1.0, math.pi], SPREAD, 1, 'map')
         message.header.stamp = Stamp()
         bench.publish(topic, message)
         assert until(lambda x=x: node.filter.state and node.filter.state.pose[0] == x)
     # It waits for the first message, however long.
     assert not until(lambda: node.status().level.name != 'DEGRADED', 1.0)
-    bench.publish('initialpose', to_pose_with_covariance([1, 1, 0], SPREAD, 5, 'odom'))
+    bench.publish('initialpose', convert.to_pose_with_covariance([1, 1, 0], SPREAD, 5, 'odom'))
     assert until(lambda: "frame is 'odom', not 'map'" in node.monitor('initialpose').refused)
     play(bench, node, drive, kinds=[0])
     assert abs(node.filter.state.pose[0] - (-3.0 - drive.poses[-1, 0])) < 0.1
@@ -326,7 +322,7 @@ def test_silence_is_reported_without_any_clock_moving(bench):
 def test_simulated_time_that_steps_back_starts_anew(bench):
     node = bench.run(EkfNode, use_sim_time=True, initial_pose=AT_ORIGIN)
     for stamp_ns in (START_NS, START_NS - 10**10):
-        bench.publish('/clock', Clock(clock=to_stamp(stamp_ns)))
+        bench.publish('/clock', Clock(clock=convert.to_stamp(stamp_ns)))
         assert until(lambda s=stamp_ns: node.get_clock().now().nanoseconds == s)
         if stamp_ns == START_NS:
             play(bench, node, Drive(seconds=0.5))
@@ -378,7 +374,7 @@ def test_what_the_model_knows_and_what_is_set_live_reaches_the_filter(bench, mon
     monkeypatch.setattr(PoseFilter, 'add_turned', lambda _, *turned: taken.append(turned))
     node.trigger_configure()
     topic = 'sfa/error_correlation'
-    bench.publish(topic, to_error_correlation(ErrorCorrelation(0.1, 3.0)), latched_qos())
+    bench.publish(topic, convert.to_error_correlation(ErrorCorrelation(0.1, 3.0)), latched_qos())
     assert until(lambda: node.monitor(topic).used == 1)
     for numbers in ([], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]):
         count = node.monitor(topic).received
@@ -392,7 +388,7 @@ def test_what_the_model_knows_and_what_is_set_live_reaches_the_filter(bench, mon
     assert node.set_parameters([Parameter('measurement_factor', value=4.0)])[0].successful
     assert node.filter.config.measurement_factor == 4.0
     assert np.array_equal(before, node.filter.state.pose)
-    bench.publish('sfa/turned', to_turned(0.5, START_NS, 'first_image'))
+    bench.publish('sfa/turned', convert.to_turned(0.5, START_NS, 'first_image'))
     assert until(lambda: taken == [(START_NS, pytest.approx(0.5))])
 
 

@@ -13,15 +13,7 @@ import yaml
 from real_cameras import desk_mirror, fisheye, ordinary, street
 
 from sfa_localization.bags.writer import BagWriter
-from sfa_localization.camera.kinds import (
-    DUAL_FISHEYE,
-    EQUIRECTANGULAR,
-    FISHEYE,
-    MIRROR,
-    ORDINARY,
-    PANORAMA,
-    guess_geometry,
-)
+from sfa_localization.camera import kinds
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.cli import main
 from sfa_localization.inspection import (
@@ -250,18 +242,18 @@ def test_the_kind_of_a_camera_is_guessed_from_its_images():
 
     narrow, square = (240, 320), (240, 240)
     for pictures, kind in (
-        (views((60, 600)), PANORAMA), (views((200, 400)), ORDINARY),
-        (street(6), EQUIRECTANGULAR), (street(1), EQUIRECTANGULAR),
-        ((picture[60:240] for picture in street(6)), PANORAMA),
-        ((picture[:, :400] for picture in street(6)), ORDINARY),
-        *((views(size), ORDINARY) for size in (narrow, square)),
-        *((ordinary(6, size=size), ORDINARY) for size in (narrow, square, (200, 400))),
-        *((seen(s, ((120, s[1] / 2), 115)), FISHEYE) for s in (narrow, square)),
-        *((fisheye(size, 0.05, count=6), FISHEYE) for size in (narrow, square)),
-        (seen(square, ((120, 120), 115), hole=((120, 120), 25)), MIRROR),
-        (seen((200, 400), ((100, 100), 95), ((100, 300), 95)), DUAL_FISHEYE),
+        (views((60, 600)), kinds.PANORAMA), (views((200, 400)), kinds.ORDINARY),
+        (street(6), kinds.EQUIRECTANGULAR), (street(1), kinds.EQUIRECTANGULAR),
+        ((picture[60:240] for picture in street(6)), kinds.PANORAMA),
+        ((picture[:, :400] for picture in street(6)), kinds.ORDINARY),
+        *((views(size), kinds.ORDINARY) for size in (narrow, square)),
+        *((ordinary(6, size=size), kinds.ORDINARY) for size in (narrow, square, (200, 400))),
+        *((seen(s, ((120, s[1] / 2), 115)), kinds.FISHEYE) for s in (narrow, square)),
+        *((fisheye(size, 0.05, count=6), kinds.FISHEYE) for size in (narrow, square)),
+        (seen(square, ((120, 120), 115), hole=((120, 120), 25)), kinds.MIRROR),
+        (seen((200, 400), ((100, 100), 95), ((100, 300), 95)), kinds.DUAL_FISHEYE),
     ):  # fmt: skip
-        assert guess_geometry(list(pictures))[0] == kind
+        assert kinds.guess_geometry(list(pictures))[0] == kind
 
 
 @pytest.mark.parametrize(

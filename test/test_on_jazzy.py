@@ -122,21 +122,22 @@ def launch(start, *arguments):
     return start('launch', 'sfa_localization', 'localization.launch.py', *arguments)
 
 
-def test_a_node_of_ros2_run_ends_at_ctrl_c(bench, start):
-    process = start('run', 'sfa_localization', 'ekf_node')
-    assert states(bench)[0].data.startswith('UNINITIALISED')
-    code, told = interrupted(process)
-    assert code == 0 and 'Traceback' not in told, told
-    assert until(lambda: 'ekf_node' not in bench.node.get_node_names())
-
-
-def test_a_parameter_dump_can_be_read_back(bench, start, tmp_path):
+def test_a_node_of_ros2_run_obeys_the_command_line_and_ends_at_ctrl_c(bench, start, tmp_path):
+    """Its life cycle and parameters; a dump of them can be read back."""
     first = start('run', 'sfa_localization', 'ekf_node', '--ros-args', '-p', 'lost_std:=1.25')
-    states(bench)
+    assert states(bench)[0].data.startswith('UNINITIALISED')
+    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('active')
+    for transition, state in (('deactivate', 'inactive'), ('activate', 'active')):
+        ros2('lifecycle', 'set', '/ekf_node', transition, *DIRECT)
+        assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith(state)
+    for name, value in (('lost_std', '1.5'), ('speed_std', '1')):
+        assert 'successful' in ros2('param', 'set', '/ekf_node', name, value, *DIRECT)
+    ros2('param', 'set', '/ekf_node', 'lost_std', '-1.5', *DIRECT, refused=True)
     dumped = ros2('param', 'dump', '/ekf_node', *DIRECT)
     values = yaml.safe_load(dumped)['/ekf_node']['ros__parameters']
-    assert values['lost_std'] == 1.25 and values['initial_pose'] == []
-    interrupted(first)
+    assert values['lost_std'] == 1.5 and values['initial_pose'] == []
+    code, told = interrupted(first)
+    assert code == 0 and 'Traceback' not in told, told
     assert until(lambda: 'ekf_node' not in bench.node.get_node_names())
     path = tmp_path / 'dumped.yaml'
     path.write_text(dumped)
@@ -144,25 +145,6 @@ def test_a_parameter_dump_can_be_read_back(bench, start, tmp_path):
     states(bench)
     assert yaml.safe_load(ros2('param', 'dump', '/ekf_node', *DIRECT)) == yaml.safe_load(dumped)
     assert 'double array' in ros2('param', 'describe', '/ekf_node', 'initial_pose', *DIRECT)
-
-
-def test_a_live_parameter_is_set_and_a_wrong_value_is_refused(bench, start):
-    start('run', 'sfa_localization', 'ekf_node')
-    states(bench)
-    assert 'successful' in ros2('param', 'set', '/ekf_node', 'lost_std', '1.5', *DIRECT)
-    assert 'successful' in ros2('param', 'set', '/ekf_node', 'speed_std', '1', *DIRECT)
-    ros2('param', 'set', '/ekf_node', 'lost_std', '-1.5', *DIRECT, refused=True)
-    assert '1.5' in ros2('param', 'get', '/ekf_node', 'lost_std', *DIRECT).split()
-
-
-def test_the_life_cycle_is_driven_from_the_command_line(bench, start):
-    start('run', 'sfa_localization', 'ekf_node')
-    states(bench)
-    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('active')
-    ros2('lifecycle', 'set', '/ekf_node', 'deactivate', *DIRECT)
-    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('inactive')
-    ros2('lifecycle', 'set', '/ekf_node', 'activate', *DIRECT)
-    assert ros2('lifecycle', 'get', '/ekf_node', *DIRECT).startswith('active')
 
 
 class Corrector:

@@ -26,13 +26,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from sfa_localization.data.messages import read_stamp, read_yaw
-from sfa_localization.nodes.conversions import (
-    read_error_correlation,
-    read_pose,
-    to_compressed,
-    to_image,
-    to_info,
-)
+from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.sfa_node import SfaNode
 
@@ -71,7 +65,7 @@ def models(monkeypatch):
 
 
 def message(seed=1, stamp_ns=5_000_000_001, image=None):
-    return to_image(panorama(seed) if image is None else image, stamp_ns, 'omnicam')
+    return convert.to_image(panorama(seed) if image is None else image, stamp_ns, 'omnicam')
 
 
 def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, models):
@@ -93,7 +87,7 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
         assert stamped.header.frame_id == 'garden'
         assert (pose.position.x, pose.position.y) == (sent[0, 0, 0], sent[0, 0, 1])
         assert read_yaw(pose.orientation) == pytest.approx(0.25)
-    assert np.allclose(read_pose(uncertain[0])[2], np.diag([0.04, 0.09, 0.01]))
+    assert np.allclose(convert.read_pose(uncertain[0])[2], np.diag([0.04, 0.09, 0.01]))
     models['a.npz'].novelty = NOVELTY_WARNING + 0.1
     bench.publish('panorama', message(seed=2))
     assert until(lambda: 'unlike' in node.health()[1])
@@ -145,7 +139,7 @@ def test_malformed_images_are_counted_and_end_nothing(bench, models, transport):
     topic, bad, good = 'panorama', [Image(), stampless, cut], message()
     if transport == 'compressed':
         topic, bad = 'panorama/compressed', [CompressedImage(), compressed]
-        good = to_compressed(panorama(), 7, 'omnicam', 90)
+        good = convert.to_compressed(panorama(), 7, 'omnicam', 90)
     node = bench.run(SfaNode, model='a.npz', image_transport=transport)
     heard, refused = bench.listen(PoseStamped, 'sfa/pose'), node.monitor(topic).refused
     for count, broken in enumerate(bad, 1):
@@ -162,7 +156,7 @@ def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     bench.publish('panorama', message())
     assert until(lambda: node.monitor('panorama').refused and heard)
-    _, pose, covariance = read_pose(heard[0])
+    _, pose, covariance = convert.read_pose(heard[0])
     assert np.array_equal(pose, np.zeros(3)) and covariance[0, 0] == UNKNOWN_VARIANCE
     assert 'no finite estimate' in next(iter(node.monitor('panorama').refused))
 
@@ -173,11 +167,11 @@ def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models,
     node = bench.run(SfaNode, model='a.npz')
     heard = bench.listen(PoseStamped, 'sfa/pose')
     told = bench.listen(Float64MultiArray, 'sfa/error_correlation', latched_qos())
-    assert until(lambda: told) and read_error_correlation(told[0]) == KNOWN
+    assert until(lambda: told) and convert.read_error_correlation(told[0]) == KNOWN
     assert told[0].layout.dim[0].label == 'share, distance_m'
     assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
     assert until(lambda: len(told) == 2)
-    assert read_error_correlation(told[1]) == ErrorCorrelation(0.5, 3.0)
+    assert convert.read_error_correlation(told[1]) == ErrorCorrelation(0.5, 3.0)
     bench.publish('panorama', message(seed=1))
     assert until(lambda: heard) and heard[0].pose.position.x >= 100
     (tmp_path / 'damaged.npz').write_bytes(b'PK damaged')
@@ -228,7 +222,7 @@ def test_panoramas_declared_to_show_something_else_are_rejected(bench, models):
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     other = dataclasses.replace(SIZE, clockwise=False)
     for count, declared in enumerate((other, SIZE), 1):
-        bench.publish('panorama/info', to_info(declared), latched_qos())
+        bench.publish('panorama/info', convert.to_info(declared), latched_qos())
         assert until(lambda n=count: node.monitor('panorama/info').used == n)
         bench.publish('panorama', message(seed=count))
         if declared is SIZE:

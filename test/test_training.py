@@ -214,7 +214,7 @@ DRIVE = SimulationConfig(area=(6.0, 6.0), length=20.0, images='panorama', images
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('size', [(120, 25), (720, 150)])
+@pytest.mark.parametrize('size', [(120, 25), (480, 100)])
 def test_a_drive_with_panoramas_of_any_size_trains_and_is_judged(size, tmp_path):
     """The network fits itself to them."""
     simulate(DRIVE, tmp_path / 'bag', PanoramaConfig(width=size[0], height=size[1]))
