@@ -151,7 +151,7 @@ def new_views(
 def familiar_score(model: PlaceModel) -> float:
     """The correlation with its likest neighbor that 19 of 20 keyframes of the training reach."""
     first = np.flatnonzero(model.keyframes.first)
-    spectra, columns = model.keyframes.spectra[first], model.keyframes.textures.shape[2]
+    spectra, columns = model.keyframes.spectra(first), model.keyframes.textures.shape[2]
     best = list[float]()
     for row in np.unique(np.linspace(0, len(first) - 1, _SAMPLE).round()).astype(int).tolist():
         scores = correlate(spectra[row][None], spectra, columns)[0][0]

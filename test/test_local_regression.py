@@ -5,8 +5,9 @@
 import numpy as np
 import pytest
 
+from sfa_localization.features import local_regression
 from sfa_localization.features.keyframes import normalized, spectrum
-from sfa_localization.features.local_regression import averaged, place_among, turned
+from sfa_localization.features.local_regression import averaged, turned, weights
 from sfa_localization.features.observation import Match
 
 ROWS = 8
@@ -35,6 +36,11 @@ def scene(columns: int):
     strange = smooth(rng, columns).ravel()
     strange -= np.linalg.lstsq(basis.T, strange, rcond=None)[0] @ basis
     return seen, rng.uniform(-0.5, 0.5, (64, 2)), normalized(strange.reshape(base.shape))
+
+
+def place_among(image, keyframes, places, columns, *more, **others):
+    held = keyframes * weights(keyframes.shape[-1], columns)
+    return local_regression.place_among(image, held, places, columns, *more, **others)
 
 
 @SIZES

@@ -95,16 +95,16 @@ def _of_light(keyframes: Keyframes, rows: NDArray[np.int64], light: int) -> floa
     everywhere: 0 in the same light, more in another; 1 where they do not meet.
     """
     others = np.flatnonzero(keyframes.drives == light)
-    left = []
+    left, spectra = [], keyframes.spectra()
     for row in rows[np.linspace(0, len(rows) - 1, min(_COMPARED, len(rows))).astype(int)].tolist():
-        match = keyframes.match_among(keyframes.spectra[row], others)
+        match = keyframes.match_among(spectra[row], others)
         if match.score >= LOWEST and match.left is not None and not match.at_border:
             left.append(match.left)
     if len(left) < _FEWEST:
         return 1.0
     # Two halves, so that the errors of single images are not alike by being the same.
     one, other = np.mean(left[::2], axis=0), np.mean(left[1::2], axis=0)
-    whole = np.square(np.abs(keyframes.spectra[rows])).sum(axis=(1, 2)).mean()
+    whole = np.square(np.abs(spectra[rows])).sum(axis=(1, 2)).mean()
     return float((one * other.conj()).sum().real / whole)
 
 
@@ -112,12 +112,12 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     """Some keyframes, each correlated with those of other stretches: index, (K,) correlations,
     -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance driven until each.
     """
-    count = len(keyframes.poses)
+    count, spectra = len(keyframes.poses), keyframes.spectra()
     sample = np.unique(np.linspace(0, count - 1, min(_TRIALS, count)).round().astype(np.int64))
     for start in range(0, len(sample), _AT_ONCE):
         rows = sample[start : start + _AT_ONCE]
         columns = keyframes.textures.shape[2]
-        found = correlate(keyframes.spectra[rows], keyframes.spectra, columns)
+        found = correlate(spectra[rows], spectra, columns)
         for row, scores, shifts in zip(rows.tolist(), *found, strict=True):
             scores[np.abs(path_m - path_m[row]) < _STRETCH_M] = -np.inf
             if np.isfinite(scores).sum() >= NEIGHBORS and scores.max() >= LOWEST:
@@ -145,7 +145,7 @@ class _Trial:
         scores: NDArray[np.float32],
         shifts: NDArray[np.float32],
     ) -> _Trial:
-        match = keyframes.located(keyframes.spectra[row], scores, shifts)
+        match = keyframes.located(keyframes.spectra([row])[0], scores, shifts)
         error = match.pose - keyframes.poses[row]
         reach = keyframes.reach(int(scores.argmax()))
         squares = (keyframes.elsewhere(scores, match.pose[:2], reach) ** 2).sum(1)
@@ -194,7 +194,7 @@ def _away(keyframes: Keyframes, lowest: float) -> float:
         rows = np.flatnonzero((places - places[row]) @ outward < -distance)
         if len(rows) < NEIGHBORS:
             continue
-        match = keyframes.match_among(keyframes.spectra[row], rows)
+        match = keyframes.match_among(keyframes.spectra([row])[0], rows)
         if match.score >= lowest and match.at_border:
             unlike = max(math.log1p(match.unlike), _LEAST_UNLIKE)
             shown.append(math.dist(match.pose[:2], places[row]) / unlike)

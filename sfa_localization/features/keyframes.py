@@ -22,13 +22,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.spatial import cKDTree
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.local_regression import averaged, place_among, turned
+from sfa_localization.features.local_regression import averaged, place_among, turned, weights
 from sfa_localization.features.observation import (
     Leveled,
     Match,
@@ -140,13 +139,24 @@ def correlate(
     shift of columns, to a part of one of so many, at which it is reached.
     """
     products = keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0)
-    curves = fft.irfft(products.transpose(2, 1, 0), columns, axis=2)
-    top = curves.argmax(2)
-    t, k = np.ogrid[: len(spectra), : len(keyframes)]
-    left, middle, right = (curves[t, k, (top + step) % columns] for step in (-1, 0, 1))
+    return _peaks(products.transpose(2, 1, 0), columns)
+
+
+def _peaks(products: Spectra, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The same, (...), by products (..., F) over the rows."""
+    curves = fft.irfft(products, columns)
+    top = curves.argmax(-1)[..., None]
+    around = np.take_along_axis(curves, (top + np.arange(-1, 2)) % columns, -1)
+    left, middle, right = np.moveaxis(around, -1, 0)
     bend = left - 2 * middle + right
     part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
-    return middle, np.asarray(top + part, np.float32)
+    return middle, np.asarray(top[..., 0] + part, np.float32)
+
+
+def _least(values: Array, number: int) -> NDArray[np.int64]:
+    """Where so many values (K,) are least, in no order."""
+    number = min(number, len(values))
+    return np.argpartition(values, number - 1)[:number] if number else np.arange(0)
 
 
 def coarse(spectra: Spectra) -> Spectra:
@@ -174,7 +184,9 @@ class Keyframes:
     """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
     `drives` (K,) are the numbers of their drives, of which the first `trained` were those of the
-    training; drives of the training in one light have one number.
+    training; drives of the training in one light have one number. To be matched they are held as
+    `aligned` spectra (K, rows, F), of images with yaw 0 and times `weights`, with the `phases`
+    (K, F) that turn these to their own yaws, and `coarse`.
     """
 
     textures: NDArray[np.int8]
@@ -183,9 +195,9 @@ class Keyframes:
     sphere: Sphere
     drives: NDArray[np.int32]
     trained: int
-    spectra: Spectra
+    aligned: Spectra
+    phases: Spectra
     coarse: Spectra
-    tree: cKDTree
 
     @classmethod
     def of(
@@ -205,9 +217,15 @@ class Keyframes:
         first = np.count_nonzero(drives < trained)
         if first < _FEWEST:
             raise DataError(f'{first} images are too few for keyframes')
-        spectra, tree = spectra_of(textures), cKDTree(poses[:, :2])
-        matched = spectra, coarse(spectra), tree
+        spectra, yaws = spectra_of(textures), poses[:, 2] * (1 if sphere.clockwise else -1)
+        phases = np.exp(-1j * np.multiply.outer(yaws, np.arange(spectra.shape[2])))
+        aligned = turned(spectra, yaws) * weights(spectra.shape[2], textures.shape[2])
+        matched = aligned, phases.astype(np.complex64), coarse(spectra)
         return cls(textures, poses, noise, sphere, drives, trained, *matched)
+
+    def spectra(self, rows: Any = slice(None)) -> Spectra:
+        """The spectra (M, rows, F) of the textures of some keyframes, by default of all."""
+        return spectra_of(self.textures[rows])
 
     @property
     def first(self) -> NDArray[np.bool_]:
@@ -263,9 +281,11 @@ class Keyframes:
         likely = np.argsort(-known.scores, kind='stable')[:_LEVELED]
         likely = likely[np.isfinite(known.scores[likely])]
         apart = np.asarray(known.shifts[likely], float) * (2 * np.pi / self._columns)
-        others = fft.irfft(turned(self.spectra[likely], apart), self._columns)
-        image = fft.irfft(known.spectrum, self._columns)
-        tilts, scores = find_tilt(image, others, self._channels, self.sphere)
+        apart -= self._sign * self.poses[likely, 2]
+        others = turned(self.aligned[likely], apart)
+        others /= weights(others.shape[2], self._columns)
+        image, level = (fft.irfft(each, self._columns) for each in (known.spectrum, others))
+        tilts, scores = find_tilt(image, level, self._channels, self.sphere)
         return self._leveled(known, tilts[int(scores.argmax())])
 
     def _leveled(self, known: Leveled, tilt: Array) -> Leveled:
@@ -300,7 +320,7 @@ class Keyframes:
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
         """Find the spectrum (rows, F) of an image with some keyframes alone."""
         scores, shifts = self._unmatched()
-        scores[rows], shifts[rows] = self._correlated(spectrum, rows)
+        self._correlate(spectrum, scores, shifts, rows)
         return self.located(spectrum, scores, shifts)
 
     def _unmatched(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -308,19 +328,24 @@ class Keyframes:
         count = len(self.poses)
         return np.full(count, -np.inf, np.float32), np.zeros(count, np.float32)
 
-    def _correlated(
-        self, spectrum: Spectra, rows: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Correlations (M,) of the spectrum (rows, F) of an image with M keyframes, and shifts."""
-        found, shift = correlate(spectrum[None], self.spectra[rows], self._columns)
-        return found[0], shift[0]
+    def _correlate(
+        self,
+        spectrum: Spectra,
+        scores: NDArray[np.float32],
+        shifts: NDArray[np.float32],
+        rows: NDArray[np.int64],
+    ) -> None:
+        """Fill in the correlations (K,) of the spectrum (rows, F) of an image with some keyframes,
+        and shifts (K,).
+        """
+        image = np.conj(spectrum / weights(spectrum.shape[1], self._columns))
+        products = (self.aligned[rows].transpose(2, 0, 1) @ image.T[:, :, None])[..., 0].T
+        scores[rows], shifts[rows] = _peaks(products * self.phases[rows], self._columns)
 
     def _add(self, known: Leveled, wanted: NDArray[np.int64]) -> None:
         """Fill in what is still missing of the wanted keyframes' correlations."""
         wanted = wanted[np.isneginf(known.scores[wanted])]
-        if len(wanted):
-            found = self._correlated(known.visible, wanted)
-            known.scores[wanted], known.shifts[wanted] = found
+        self._correlate(known.visible, known.scores, known.shifts, wanted)
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
         """The keyframes that are likeliest by the coarse structure of the image."""
@@ -330,7 +355,8 @@ class Keyframes:
 
     def nearest(self, place: Array, number: int = NEIGHBORS) -> NDArray[np.int64]:
         """So many keyframes nearest to a place (2,) m."""
-        return np.asarray(self.tree.query(place, min(number, len(self.poses)))[1], np.int64)
+        apart = np.hypot(*(self.poses[:, :2] - place).T)
+        return _least(apart, number)
 
     def _likeliest_drives(self, scores: NDArray[np.float32]) -> list[int]:
         """The drives of the training that the likeliest keyframes are of, by correlations (K,)."""
@@ -345,9 +371,9 @@ class Keyframes:
         """
         apart = np.hypot(*(self.poses[:, :2] - place).T)
         own, added = np.flatnonzero(self.drives == drive), np.flatnonzero(~self.first)
-        own = own[np.argsort(apart[own])[:_REGRESSED]]
+        own = own[_least(apart[own], _REGRESSED)]
         added = added[apart[added] <= apart[own].max(initial=0.0)]
-        return np.concatenate([own, added[np.argsort(apart[added])[:_REGRESSED]]])
+        return np.concatenate([own, added[_least(apart[added], _REGRESSED)]])
 
     def located(
         self,
@@ -404,8 +430,9 @@ class Keyframes:
         """
         best, known = int(scores.argmax()), np.isfinite(scores)
         start = np.append(self.poses[best, :2], yaws[best])
+        seen = np.concatenate([spectrum[None], self._by_tilt(spectrum)])
         by_drive = [
-            self._among(drive, spectrum, start, known, reach, pattern)
+            self._among(drive, seen, start, known, reach, pattern)
             for drive in self._likeliest_drives(scores)
         ]
         parts = [one for one in by_drive if one is not None]
@@ -416,24 +443,25 @@ class Keyframes:
     def _among(
         self,
         drive: int,
-        spectrum: Spectra,
+        seen: Spectra,
         start: Array,
         known: NDArray[np.bool_],
         reach: float,
         pattern: Spectra | None,
     ) -> Match | None:
-        """The same among the `known` (K,) keyframes of one drive, from a pose (3,) on; None where
-        they are too few.
+        """The same of a spectrum with its derivatives by tilt (3, rows, F) among the `known` (K,)
+        keyframes of one drive, from a pose (3,) on; None where they are too few.
         """
         found, pose, limit = None, start.copy(), 2 * np.pi / self._columns
-        tilts = self._by_tilt(spectrum)
         for _ in range(_REPEATED):
             near = self._around(pose[:2], drive)
             near = near[known[near]]
             if len(near) < _FEWEST:
                 break
-            here = spectrum if pattern is None else spectrum - self._as_seen(pattern, pose[2])
-            found = self._placed(np.concatenate([here[None], tilts]), float(pose[2]), near)
+            here = seen
+            if pattern is not None:
+                here = np.concatenate([seen[:1] - turned(pattern, -self._sign * pose[2]), seen[1:]])
+            found = self._placed(here, float(pose[2]), near)
             step = found.pose[:2] - start[:2]
             apart = float(np.hypot(*step))
             pose[:2] = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
@@ -451,9 +479,15 @@ class Keyframes:
 
     def _placed(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
         """The same with the derivatives of the image, (3, rows, F)."""
-        around = turned(self.spectra[near], self._sign * (self.poses[near, 2] - yaw))
-        places, drives = self.poses[near, :2], self.drives[near]
-        found = place_among(image, around, places, self._columns, self._channels, drives)
+        found = place_among(
+            image,
+            self.aligned[near],
+            self.poses[near, :2],
+            self._columns,
+            self._channels,
+            self.drives[near],
+            self._sign * yaw,
+        )
         found.pose[2] = yaw + self._sign * found.pose[2]
         return found
 
@@ -462,10 +496,6 @@ class Keyframes:
         texture = fft.irfft(image, self._columns)
         parts = [derivatives(texture[rows], self.sphere) for rows in self._channels]
         return spectrum(np.concatenate(parts, axis=1))
-
-    def _as_seen(self, pattern: Spectra, yaw: float) -> Spectra:
-        """The spectrum (rows, F) at some yaw rad of one as of an image with yaw 0."""
-        return turned(pattern, -self._sign * yaw)
 
     def _variance(self, match: Match) -> float:
         """Variance m^2 along each axis of a place by the keyframes of one drive."""
@@ -510,20 +540,19 @@ class Keyframes:
         """How far, m, the regression may put an image from the best keyframe."""
         own = self.drives == self.drives[best]
         apart = self.poses[own if self.first[best] else self.first, :2] - self.poses[best, :2]
-        farthest = np.sort(np.hypot(*apart.T))[:NEIGHBORS][-1]
+        distances = np.hypot(*apart.T)
+        farthest = distances[_least(distances, NEIGHBORS)].max()
         return _REACH_SHARE * max(float(farthest), 1e-6)
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """Arrays to save, without pickle; drives where there are several."""
-        noise = np.array(dataclasses.astuple(self.noise))
+        """Arrays to save, without pickle."""
         arrays: dict[str, NDArray[Any]] = {
             'textures': self.textures,
             'poses': self.poses,
-            'noise': noise,
+            'noise': np.array(dataclasses.astuple(self.noise)),
+            'drives': self.drives,
+            'trained': np.array(self.trained),
         }
-        if self.drives.any():
-            arrays['drives'] = self.drives
-            arrays['trained'] = np.array(self.trained)
         return arrays
 
     @classmethod
@@ -531,8 +560,5 @@ class Keyframes:
         """Read the arrays of `to_arrays`, of panoramas that show so much of the `sphere`."""
         noise = MatchNoise(*np.asarray(arrays['noise'], float).tolist())
         textures = np.asarray(arrays['textures'], np.int8)
-        poses = np.asarray(arrays['poses'], float)
-        if 'drives' not in arrays:
-            return cls.of(textures, poses, noise, sphere)
-        drives, trained = np.asarray(arrays['drives'], np.int32), int(arrays['trained'])
-        return cls.of(textures, poses, noise, sphere, drives, trained)
+        poses, drives = np.asarray(arrays['poses'], float), np.asarray(arrays['drives'], np.int32)
+        return cls.of(textures, poses, noise, sphere, drives, int(arrays['trained']))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,66 +66,80 @@ class _Regression:
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """A channel and a mean of its N keyframes: the derivative of the mean by the angle, `turning`
-    (D,), the share of its likeness to the mean that the image has kept, `gain`, and the products
-    (N + 2 + T, N + 2 + T) of keyframes, the image and its derivatives, which get back what they
-    lack, and `turning`.
+    """C channels and a mean of their N keyframes: its derivative by the angle, `turning` (D,), the
+    shares of its likeness to the mean that the image has kept, `gains` (C,), and the
+    products (C, N + 2 + T, N + 2 + T) of keyframes, the image and its derivatives, which get back
+    what they lack, and `turning`.
     """
 
     turning: Vectors
-    gain: float
+    gains: Array
     products: Array
 
 
 @dataclass(frozen=True, slots=True)
-class _Channel:
-    """Some rows of N keyframes, an image, and T derivatives of it by what is no matter of its
-    place: their `vectors` (N + 1 + T, D), in that order, and the products (N + 1 + T, N + 1 + T) of
-    these, which are correlations; and the `scale` of the vectors.
+class _Textures:
+    """N keyframes, an image, and T derivatives of it by what is no matter of its place: their
+    `vectors` (N + 1 + T, D), in that order, and the products (C, N + 1 + T, N + 1 + T) of these in
+    C channels, which are correlations; of a channel the vectors are those `parts`.
     """
 
     vectors: Vectors
+    parts: tuple[slice, ...]
     products: Array
-    scale: Vectors
+    frequencies: int
 
     @classmethod
-    def of(cls, keyframes: Spectra, image: Spectra, scale: Vectors) -> _Channel:
-        """Of spectra (N, rows, F) and (1 + T, rows, F)."""
-        vectors = _vectors(np.concatenate([keyframes, image]), scale)
-        return cls(vectors, (vectors @ vectors.T).astype(np.float64), scale)
+    def of(cls, keyframes: Spectra, image: Spectra, channels: Sequence[slice]) -> _Textures:
+        """Of spectra (N, rows, F) and (1 + T, rows, F), times `weights`."""
+        both = np.concatenate([keyframes, image])
+        count, rows, frequencies = both.shape
+        vectors = both.reshape(count, -1).view(np.float32)
+        bounds = (channel.indices(rows) for channel in channels)
+        parts = tuple(slice(2 * frequencies * a, 2 * frequencies * b) for a, b, _ in bounds)
+        products = [vectors[:, part] @ vectors[:, part].T for part in parts]
+        return cls(vectors, parts, np.array(products, np.float64), frequencies)
 
     def about(self, mean: Array) -> _Compared:
         """With a mean by shares (N,) of the keyframes."""
-        count = len(mean)
-        turning = _turning(mean.astype(np.float32) @ self.vectors[:count], len(self.scale))
-        products = np.zeros((len(self.vectors) + 1, len(self.vectors) + 1))
-        products[:-1, :-1] = self.products
-        products[-1, :-1] = products[:-1, -1] = self.vectors @ turning
-        products[-1, -1] = turning @ turning
-        kept = float(self.products[count, :count] @ mean)
-        whole = float(mean @ self.products[:count, :count] @ mean)
-        gain = max(kept / max(whole, 1e-12), _LEAST_GAIN)
-        products[count:-1] /= gain
-        products[:, count:-1] /= gain
-        return _Compared(turning, gain, products)
+        count, size = len(mean), len(self.vectors)
+        spectra = (mean.astype(np.float32) @ self.vectors[:count]).view(np.complex64)
+        by_angle = np.tile(1j * np.arange(self.frequencies), len(spectra) // self.frequencies)
+        turning = (spectra * by_angle.astype(np.complex64)).view(np.float32)
+        products = np.zeros((len(self.parts), size + 1, size + 1))
+        products[:, :-1, :-1] = self.products
+        for product, part in zip(products, self.parts, strict=True):
+            product[-1, :-1] = product[:-1, -1] = self.vectors[:, part] @ turning[part]
+            product[-1, -1] = turning[part] @ turning[part]
+        kept, whole = self.products[:, count, :count] @ mean, self.products[:, :count, :count]
+        gains = np.maximum(kept / np.maximum(whole @ mean @ mean, 1e-12), _LEAST_GAIN)
+        products[:, count:-1] /= gains[:, None, None]
+        products[:, :, count:-1] /= gains[:, None, None]
+        return _Compared(turning, gains, products)
 
     def remainder(
-        self, found: _Regression, compared: _Compared, columns: int
+        self, found: _Regression, compared: _Compared, angle: float, columns: int
     ) -> tuple[Spectra, Array]:
-        """What is left of the channel, (rows, F), and by how much, m, it moves the place in each
-        sector of the panorama, (2, sectors): light and what hides the view are alike within one,
-        not in all.
+        """What is left of the image, turned by an angle, (rows, F), and by how much, m, each
+        channel moves the place in each sector of the panorama, (2, C, sectors): light and what
+        hides the view are alike within one, not in all.
         """
         combine, changes = found.combine.astype(np.float32), len(found.changed)
-        combine[:, -1 - changes : -1] /= np.float32(compared.gain)
-        vectors = combine[:, :-1] @ self.vectors + combine[:, -1:] * compared.turning
-        spectra = vectors.view(np.complex64).reshape(3, -1, len(self.scale)) / self.scale
-        left, along_x, along_y = fft.irfft(spectra, columns)
-        pull = np.stack([(along_x * left).sum(axis=0), (along_y * left).sum(axis=0)])
+        vectors = combine[:, -1:] * compared.turning
+        for part, gain in zip(self.parts, compared.gains.tolist(), strict=True):
+            own = combine[:, :-1].copy()
+            own[:, -changes:] /= gain
+            vectors[:, part] += own @ self.vectors[:, part]
+        spectra = vectors.view(np.complex64).reshape(3, -1, self.frequencies)
+        spectra = turned(spectra / weights(self.frequencies, columns), angle)
+        left, *along = fft.irfft(spectra, columns)
+        rows = [part.start // (2 * self.frequencies) for part in self.parts]
         sectors = min(_SECTORS, columns)
         starts = np.arange(sectors) * columns // sectors
-        moved = np.add.reduceat(pull, starts, axis=1).astype(np.float64)
-        return np.asarray(spectra[0] * np.float32(compared.gain), np.complex64), moved
+        pull = np.add.reduceat(along * left, rows, axis=1)
+        moved = np.add.reduceat(pull, starts, axis=2).astype(np.float64)
+        gains = np.repeat(compared.gains, np.diff([*rows, len(left)])).astype(np.float32)
+        return spectra[0] * gains[:, None], moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,37 +190,38 @@ def place_among(
     columns: int,
     channels: Sequence[slice] = (slice(None),),
     drives: NDArray[np.int32] | None = None,
+    angle: float = 0.0,
 ) -> Match:
     """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
-    F) of keyframes at places (N, 2) m, all turned to the heading of the image; it may be followed
-    by its derivatives (1 + 2, rows, F) by roll and pitch, which then are found too. The yaw of the
-    match is the angle rad by which `turned` would still turn the image to them.
+    F) of keyframes, times `weights`, at places (N, 2) m, all at the heading of the image when it is
+    `turned` by an angle rad; it may be followed by its derivatives (1 + 2, rows, F) by roll and
+    pitch, which then are found too. The yaw of the match is the angle rad by which `turned` would
+    still turn the image to them.
 
-    `channels` are rows that may be unlike for reasons of their own: each counts by how well the
-    keyframes explain it. Keyframes of different `drives` (N,) may differ by their light.
+    `channels` are rows, all in their order, that may be unlike for reasons of their own: each
+    counts by how well the keyframes explain it. Keyframes of different `drives` (N,) may differ by
+    their light.
     """
-    scale = _scale(image.shape[-1], columns)
     image, count = image if image.ndim == 3 else image[None], len(places)
-    parts = [_Channel.of(keyframes[:, rows], image[:, rows], scale) for rows in channels]
-    scores = np.sum([part.products[count, :count] for part in parts], axis=0)
-    drives = np.zeros(len(places), np.int32) if drives is None else drives
+    seen = turned(image, angle) * weights(image.shape[-1], columns)
+    textures = _Textures.of(keyframes, seen, channels)
+    scores = textures.products[:, count, :count].sum(axis=0)
+    drives = np.zeros(count, np.int32) if drives is None else drives
     basis = _Basis.of(scores, drives, places)
-    compared = [part.about(basis.mean) for part in parts]
-    trust = _trust(compared, basis)
-    found = _found(compared, trust, basis)
+    compared = textures.about(basis.mean)
+    trust = _trust(textures, compared, basis)
+    found = _regressed(np.tensordot(trust, compared.products, 1), basis)
     for _ in range(_WEIGHED if len(basis.means) > 1 else 0):
         basis = basis.about(found.place)
-        compared = [part.about(basis.mean) for part in parts]
-        found = _found(compared, trust, basis)
-    both = zip(parts, compared, strict=True)
-    left, moves = zip(*(part.remainder(found, one, columns) for part, one in both), strict=True)
-    moved = np.tensordot(trust, moves, 1)
+        compared = textures.about(basis.mean)
+        found = _regressed(np.tensordot(trust, compared.products, 1), basis)
+    left, moves = textures.remainder(found, compared, -angle, columns)
+    moved = np.tensordot(moves, trust, (1, 0))
     offset = places - found.place
     aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
     *tilt, turning = found.changed
     pose, noise = np.append(found.place, -turning), moved @ moved.T
-    made = Match(pose, found.unlike, found.variation, aside, noise, left=np.concatenate(left))
-    made = replace(made, shares=found.shares)
+    made = Match(pose, found.unlike, found.variation, aside, noise, left=left, shares=found.shares)
     return replace(made, tilt=np.array(tilt)) if tilt else made
 
 
@@ -213,6 +229,8 @@ def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
     """The mean of what several drives say of one image, all with what is left of it, by weights
     (N,); `Match.apart` is how far apart they put it.
     """
+    if len(parts) == 1:
+        return parts[0]
     share = np.array(weights) / np.sum(weights)
 
     def mean(values: Sequence[Array | float]) -> Array:
@@ -233,28 +251,14 @@ def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
     )
 
 
-def _trust(compared: Sequence[_Compared], basis: _Basis) -> Array:
+def _trust(textures: _Textures, compared: _Compared, basis: _Basis) -> Array:
     """How much each channel counts, 1 at most: by how well the keyframes explain it there."""
-    products = np.array([one.products for one in compared])
-    gains = np.array([one.gain for one in compared])
-    left = _regressed(np.tensordot(np.square(gains), products, 1), basis).combine[0]
-    sizes = [len(one.turning) for one in compared]
-    errors = np.einsum('i,cij,j->c', left, products, left) / sizes
+    products = np.tensordot(np.square(compared.gains), compared.products, 1)
+    left = _regressed(products, basis).combine[0]
+    sizes = [part.stop - part.start for part in textures.parts]
+    errors = (compared.products @ left) @ left / sizes
     trust = 1 / (errors + errors.min() + 1e-12)
     return np.asarray(trust / trust.max())
-
-
-def _found(compared: Sequence[_Compared], trust: Array, basis: _Basis) -> _Regression:
-    """The regression of the image by all channels."""
-    products = np.array([one.products for one in compared])
-    return _regressed(np.tensordot(trust, products, 1), basis)
-
-
-def _turning(mean: Vectors, frequencies: int) -> Vectors:
-    """The derivative by the angle of a vector (D,), (D,)."""
-    by_angle = 1j * np.arange(frequencies, dtype=np.float32)
-    spectra = mean.view(np.complex64).reshape(-1, frequencies) * by_angle
-    return spectra.astype(np.complex64).view(np.float32).ravel()
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,16 +326,8 @@ def _regressed(products: Array, basis: _Basis) -> _Regression:
     )
 
 
-def _scale(frequencies: int, columns: int) -> Vectors:
-    """Of the spectra of so many columns, so that products are those of the textures."""
-    weight = np.full(frequencies, 2.0 / columns, np.float32)
-    weight[0] = 1 / columns
-    if columns % 2 == 0:
-        weight[-1] = 1 / columns
-    return np.asarray(np.sqrt(weight), np.float32)
-
-
-def _vectors(spectra: Spectra, scale: Vectors) -> Vectors:
-    """Vectors (N, D) whose products are the correlations of the textures of spectra."""
-    scaled = np.ascontiguousarray(spectra * scale, np.complex64)
-    return scaled.reshape(len(spectra), -1).view(np.float32)
+@cache
+def weights(frequencies: int, columns: int) -> Vectors:
+    """Of spectra (..., rows, F), so that their products over rows and F are those of textures."""
+    once = 2 * np.arange(frequencies) % columns == 0
+    return np.asarray(np.sqrt(np.where(once, 1, 2) / columns), np.float32)

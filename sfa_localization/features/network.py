@@ -271,9 +271,8 @@ NORMALIZATIONS = tuple(_NORMALIZATIONS)
 def linear_stage(below: Map, receptive: Field, linear: Weights, offset: Weights) -> Map:
     """First half of a layer: reduced signals (L, rows, R) of one map (rows, R, channels)."""
     fields = unfold(below[None], receptive)[0]
-    reduced = linear.T @ fields.reshape(-1, fields.shape[-1]).T
-    reduced -= offset[:, None]
-    return np.asarray(reduced.reshape(-1, *fields.shape[:2]))
+    reduced = fields.reshape(-1, fields.shape[-1]) @ linear - offset
+    return np.ascontiguousarray(reduced.T).reshape(-1, *fields.shape[:2])
 
 
 def slow_stage(reduced: Map, node: Node, clip: float, out: Map) -> None:

@@ -64,7 +64,7 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
         near = near[~own][:_AMONG]
         if len(near) < _FEWEST:
             continue
-        match = among.place(among.spectra[row], among.poses[row, 2], near)
+        match = among.place(among.spectra([row])[0], among.poses[row, 2], near)
         if match.unlike < _UNLIKE:
             shares, turn = np.zeros((2, _AMONG))
             others = np.full(_AMONG, near[0])

@@ -97,7 +97,7 @@ def _judged(
         row, place, error = rows[k], keyframes.poses[k, :2], result.left_out[rows[k]]
         spread = np.diag([variance[row], variance[row], UNKNOWN_YAW_VARIANCE])
         slow = Observation(np.append(place + error, 0.0), spread, np.zeros(0))
-        match = keyframes.located(keyframes.spectra[k], scores, shifts, slow.position)
+        match = keyframes.located(keyframes.spectra([k])[0], scores, shifts, slow.position)
         pose, covariance = combine(slow, match, keyframes.noise)
         errors.append(pose[:2] - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)

@@ -221,7 +221,7 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
     keyframes = model.keyframes
     frequencies, _, rows = keyframes.coarse.shape
     made.append(_product(keyframes.coarse, np.ones((frequencies, rows, 1), np.complex64)))
-    close = keyframes.spectra[:CLOSE].transpose(2, 0, 1)
+    close = keyframes.aligned[:CLOSE].transpose(2, 0, 1)
     made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
     maps = model.network.maps(image[None])
     made += bare_process(model.metric, np.ones((1, model.metric.features)))
