@@ -155,8 +155,8 @@ def _peaks(products: Spectra, columns: int) -> tuple[NDArray[np.float32], NDArra
 
 def _least(values: Array, number: int) -> NDArray[np.int64]:
     """Where so many values (K,) are least, in no order."""
-    number = min(number, len(values))
-    return np.argpartition(values, number - 1)[:number] if number else np.arange(0)
+    every = np.arange(len(values))
+    return np.argpartition(values, number)[:number] if number < len(values) else every
 
 
 def coarse(spectra: Spectra) -> Spectra:
@@ -335,9 +335,7 @@ class Keyframes:
         shifts: NDArray[np.float32],
         rows: NDArray[np.int64],
     ) -> None:
-        """Fill in the correlations (K,) of the spectrum (rows, F) of an image with some keyframes,
-        and shifts (K,).
-        """
+        """Fill in some correlations (K,) of the spectrum (rows, F) of an image, and shifts (K,)."""
         image = np.conj(spectrum / weights(spectrum.shape[1], self._columns))
         products = (self.aligned[rows].transpose(2, 0, 1) @ image.T[:, :, None])[..., 0].T
         scores[rows], shifts[rows] = _peaks(products * self.phases[rows], self._columns)
@@ -355,8 +353,7 @@ class Keyframes:
 
     def nearest(self, place: Array, number: int = NEIGHBORS) -> NDArray[np.int64]:
         """So many keyframes nearest to a place (2,) m."""
-        apart = np.hypot(*(self.poses[:, :2] - place).T)
-        return _least(apart, number)
+        return _least(np.hypot(*(self.poses[:, :2] - place).T), number)
 
     def _likeliest_drives(self, scores: NDArray[np.float32]) -> list[int]:
         """The drives of the training that the likeliest keyframes are of, by correlations (K,)."""
@@ -540,20 +537,18 @@ class Keyframes:
         """How far, m, the regression may put an image from the best keyframe."""
         own = self.drives == self.drives[best]
         apart = self.poses[own if self.first[best] else self.first, :2] - self.poses[best, :2]
-        distances = np.hypot(*apart.T)
-        farthest = distances[_least(distances, NEIGHBORS)].max()
+        farthest = np.sort(np.hypot(*apart.T))[:NEIGHBORS][-1]
         return _REACH_SHARE * max(float(farthest), 1e-6)
 
-    def to_arrays(self) -> dict[str, NDArray[np.generic]]:
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
-        arrays: dict[str, NDArray[Any]] = {
+        return {
             'textures': self.textures,
             'poses': self.poses,
             'noise': np.array(dataclasses.astuple(self.noise)),
             'drives': self.drives,
             'trained': np.array(self.trained),
         }
-        return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], sphere: Sphere) -> Keyframes:
