@@ -38,6 +38,7 @@ from sfa_localization.features.observation import (
 from sfa_localization.features.tilt import derivatives, find_tilt, leveled, visible
 
 Texture = NDArray[np.float32]
+Scores = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 _COLUMNS, _ROWS, _COLOR_ROWS = 80, 16, 8
 # Standard deviation of the blur that takes light and its slow changes out, of the columns: 10 deg.
@@ -132,9 +133,7 @@ def spectra_of(textures: NDArray[np.int8]) -> Spectra:
     return spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
 
 
-def correlate(
-    spectra: Spectra, keyframes: Spectra, columns: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def correlate(spectra: Spectra, keyframes: Spectra, columns: int) -> Scores:
     """Largest correlation of T spectra (T, rows, F) with each of K (K, rows, F), (T, K), and the
     shift of columns, to a part of one of so many, at which it is reached.
     """
@@ -142,7 +141,7 @@ def correlate(
     return _peaks(products.transpose(2, 1, 0), columns)
 
 
-def _peaks(products: Spectra, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _peaks(products: Spectra, columns: int) -> Scores:
     """The same, (...), by products (..., F) over the rows."""
     curves = fft.irfft(products, columns)
     top = curves.argmax(-1)[..., None]
@@ -154,9 +153,10 @@ def _peaks(products: Spectra, columns: int) -> tuple[NDArray[np.float32], NDArra
 
 
 def _least(values: Array, number: int) -> NDArray[np.int64]:
-    """Where so many values (K,) are least, in no order."""
-    every = np.arange(len(values))
-    return np.argpartition(values, number)[:number] if number < len(values) else every
+    """Where so many values (K,) are least, in their order."""
+    few = len(values) <= number
+    found = np.arange(len(values)) if few else np.argpartition(values, number)[:number]
+    return found[np.argsort(values[found])]
 
 
 def coarse(spectra: Spectra) -> Spectra:
@@ -319,31 +319,25 @@ class Keyframes:
 
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
         """Find the spectrum (rows, F) of an image with some keyframes alone."""
-        scores, shifts = self._unmatched()
-        self._correlate(spectrum, scores, shifts, rows)
-        return self.located(spectrum, scores, shifts)
+        found = self._unmatched()
+        self._correlate(spectrum, found, rows)
+        return self.located(spectrum, *found)
 
-    def _unmatched(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _unmatched(self) -> Scores:
         """Correlations (K,) that are all unknown, and shifts (K,)."""
         count = len(self.poses)
         return np.full(count, -np.inf, np.float32), np.zeros(count, np.float32)
 
-    def _correlate(
-        self,
-        spectrum: Spectra,
-        scores: NDArray[np.float32],
-        shifts: NDArray[np.float32],
-        rows: NDArray[np.int64],
-    ) -> None:
+    def _correlate(self, spectrum: Spectra, found: Scores, rows: NDArray[np.int64]) -> None:
         """Fill in some correlations (K,) of the spectrum (rows, F) of an image, and shifts (K,)."""
         image = np.conj(spectrum / weights(spectrum.shape[1], self._columns))
         products = (self.aligned[rows].transpose(2, 0, 1) @ image.T[:, :, None])[..., 0].T
-        scores[rows], shifts[rows] = _peaks(products * self.phases[rows], self._columns)
+        found[0][rows], found[1][rows] = _peaks(products * self.phases[rows], self._columns)
 
     def _add(self, known: Leveled, wanted: NDArray[np.int64]) -> None:
         """Fill in what is still missing of the wanted keyframes' correlations."""
         wanted = wanted[np.isneginf(known.scores[wanted])]
-        self._correlate(known.visible, known.scores, known.shifts, wanted)
+        self._correlate(known.visible, (known.scores, known.shifts), wanted)
 
     def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
         """The keyframes that are likeliest by the coarse structure of the image."""
@@ -476,15 +470,8 @@ class Keyframes:
 
     def _placed(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
         """The same with the derivatives of the image, (3, rows, F)."""
-        found = place_among(
-            image,
-            self.aligned[near],
-            self.poses[near, :2],
-            self._columns,
-            self._channels,
-            self.drives[near],
-            self._sign * yaw,
-        )
+        among = image, self.aligned[near], self.poses[near, :2], self._columns
+        found = place_among(*among, self._channels, self.drives[near], self._sign * yaw)
         found.pose[2] = yaw + self._sign * found.pose[2]
         return found
 

@@ -95,8 +95,8 @@ class _Textures:
         both = np.concatenate([keyframes, image])
         count, rows, frequencies = both.shape
         vectors = both.reshape(count, -1).view(np.float32)
-        bounds = (channel.indices(rows) for channel in channels)
-        parts = tuple(slice(2 * frequencies * a, 2 * frequencies * b) for a, b, _ in bounds)
+        size = 2 * frequencies
+        parts = tuple(slice(*(size * end for end in one.indices(rows)[:2])) for one in channels)
         products = [vectors[:, part] @ vectors[:, part].T for part in parts]
         return cls(vectors, parts, np.array(products, np.float64), frequencies)
 
