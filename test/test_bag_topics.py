@@ -279,27 +279,25 @@ def test_a_gyroscope_that_is_silent_is_warned_of_and_done_without(tmp_path, capl
         )
 
 
-def drive_bag(path, pose, twist, count=100):
-    with BagWriter(path) as bag:
-        for k in range(count):
-            bag.odometry('/odom', stamp(k), np.array(pose(k)), np.array(twist(k)), np.zeros(2))
-    return path
-
-
 def test_odometry_whose_pose_and_twist_contradict_each_other(tmp_path):
-    step = PERIOD * 1e-9
-    with Bag(drive_bag(tmp_path / '0', lambda k: (0.0, 0.0, 0.0), lambda k: (1.0, 0.0))) as bag:
-        assert bag.odometry().poses[:, 0] == pytest.approx(np.arange(100) * step)
+    """A pose that is never kept, and poses that are not in meters."""
+    for name, step_m, speed in (('constant', 0.0, 1.0), ('millimeters', 100.0, 10.0)):
+        with BagWriter(tmp_path / name) as bag:
+            for k in range(100):
+                bag.odometry('/odom', stamp(k), (k * step_m, 0.0, 0.0), (speed, 0.0), (0, 0))
+    with Bag(tmp_path / 'constant') as bag:
+        assert bag.odometry().poses[:, 0] == pytest.approx(np.arange(100) * PERIOD * 1e-9)
         assert bag.problems == ['/odom: the pose is constant; the twist is integrated instead']
-    path = drive_bag(tmp_path / 'cm', lambda k: (k * step * 1000, 0.0, 0.0), lambda k: (10.0, 0.0))
     refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* meters')
-    with refusal, Bag(path) as bag:
+    with refusal, Bag(tmp_path / 'millimeters') as bag:
         bag.odometry()
 
 
-@pytest.mark.parametrize(
-    ('twist', 'turns', 'askew', 'axle', 'found'),
-    [
+def test_other_units_are_named(tmp_path):
+    """A circle of 2 m at 1 m/s, headed `askew` off the motion, seen `axle` m ahead of the axle;
+    then the robot stands, with a flickering twist.
+    """
+    for number, (twist, turns, askew, axle, found) in enumerate((
         ((1.0, 0.5), 1.0, 0.0, 0.0, ''),
         ((1.2, 0.4), 1.0, 0.0, 0.0, ''),
         ((0.0, 0.0), 1.0, 0.0, 0.0, ''),  # a twist that is never set claims nothing
@@ -308,25 +306,19 @@ def test_odometry_whose_pose_and_twist_contradict_each_other(tmp_path):
         ((1000.0, 0.5), 1.0, 0.0, 0.0, r'drive 1[0-9.]+ m, twists 1[.0-9]+e\+04 m: are'),
         ((1.0, 28.6), 1.0, 0.0, 0.0, r'turn 7[0-9.]* rad, twists 4[0-9]+ rad: are both'),
         ((1.0, 0.5), 0.0, 0.0, 0.0, r'turn 0 rad, twists 7[0-9.]* rad: are both in'),
-    ],
-)
-def test_other_units_are_named(twist, turns, askew, axle, found, tmp_path):
-    """A circle of 2 m at 1 m/s, headed `askew` off the motion, seen `axle` m ahead of the axle;
-    then the robot stands, with a flickering twist.
-    """
-
-    def pose(k):
-        yaw = 0.5 * min(k, 150) * PERIOD * 1e-9
-        x, y = 2 * math.sin(yaw), 2 * (1 - math.cos(yaw))
-        return x + axle * math.cos(yaw), y + axle * math.sin(yaw), yaw * turns + askew
-
-    def told(k):
-        return twist if k <= 150 else (0.0, 0.04 * any(twist))
-
-    with Bag(drive_bag(tmp_path / 'bag', pose, told, 300)) as bag:
-        bag.odometry()
-        assert len(bag.problems) == bool(found)
-        assert re.search(found, ''.join(bag.problems))
+    )):  # fmt: skip
+        path = tmp_path / str(number)
+        with BagWriter(path) as bag:
+            for k in range(300):
+                yaw = 0.5 * min(k, 150) * PERIOD * 1e-9
+                x, y = 2 * math.sin(yaw), 2 * (1 - math.cos(yaw))
+                pose = x + axle * math.cos(yaw), y + axle * math.sin(yaw), yaw * turns + askew
+                told = twist if k <= 150 else (0.0, 0.04 * any(twist))
+                bag.odometry('/odom', stamp(k), pose, told, (0, 0))
+        with Bag(path) as bag:
+            bag.odometry()
+            assert len(bag.problems) == bool(found), twist
+            assert re.search(found, ''.join(bag.problems))
 
 
 # The writer.

@@ -19,7 +19,6 @@ from test_calibration import scene
 
 from sfa_localization import cli, training, tuning
 from sfa_localization.bags.reader import Bag
-from sfa_localization.bags.writer import BagWriter
 from sfa_localization.data.errors import DataError, NodeError
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation import drive as simulation
@@ -399,24 +398,3 @@ def test_each_option_alone_has_its_effect(name, data, tmp_path):
         if changed.code not in (0, 1) or not case.differs(plain, changed):
             failed.append(f'{plain.text}\n-- with {words}:\n{changed.text}')
     assert not failed, '\n'.join(failed)
-
-
-@pytest.mark.parametrize(('size', 'model'), [
-    ((98, 98), ''), ((48, 96), 'equirectangular'), ((48, 96), ''),
-])  # fmt: skip
-def test_raw_images_are_trained_on_only_with_a_description(tmp_path, capsys, size, model):
-    """What train asks for is what helps: square images of any camera, and equirectangular ones."""
-    rng = np.random.default_rng(0)
-    with BagWriter(tmp_path / 'bag') as bag:
-        for k in range(1, 4):
-            picture = rng.integers(0, 256, (*size, 3), np.uint8)
-            bag.image('/image_raw', k * 10**9, picture, 'camera')
-            bag.odometry('/odom', k * 10**9, [0.2 * k, 0.0, 0.0], [0.2, 0.0], [0.01, 0.01])
-    own = tmp_path / 'own.yaml'
-    own.write_text(f'omnicam_node: {{ros__parameters: {{camera_model: "{model}"}}}}')
-    words = ['train', str(tmp_path / 'bag'), '--config', str(own)]
-    assert cli.main([*words, '--output', str(tmp_path / 'model.npz')]) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
-    asked = 'no camera is described: in the parameter file set calibration_file' in error
-    assert asked == (model == '') and ('equirectangular' in error) == asked, error
-    assert not (tmp_path / 'model.npz').exists()

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ekf_node and sfa_node as processes: signals, bad parameters and arguments, exit codes."""
 
-import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ import yaml
 
 pytest.importorskip('rclpy')
 
-from ros_bench import DEADLINE_S, DOMAIN, until
+from ros_bench import DEADLINE_S, start_process, until
 from std_msgs.msg import String
 
 from sfa_localization.nodes.entry import CANNOT_START, DIED
@@ -25,22 +23,17 @@ RUN = 'import sys; from sfa_localization.nodes import entry; sys.exit(entry.{}()
 
 
 @pytest.fixture
-def start(tmp_path):
+def start():
     """Start a node's process; all are ended with the test."""
     processes = []
-    environment = {**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_LOG_DIR': str(tmp_path)}
-    environment['PYTHONPATH'] = str(START.parents[1])
 
     def begin(node, *arguments, before=None):
         """Its start script; or the same in Python, after other code."""
-        command = [sys.executable, str(START / node)]
-        if before is not None:
-            command[1:] = ['-c', f'{before}\n{RUN.format(node)}']
-        command += ['--ros-args', *arguments] if arguments else []
-        processes.append(
-            subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-        )
-        return processes[-1]
+        script = [START / node] if before is None else ['-c', f'{before}\n{RUN.format(node)}']
+        words = ['--ros-args', *arguments] if arguments else []
+        process = start_process(*script, *words, stderr=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process
 
     yield begin
     for process in processes:
