@@ -49,7 +49,7 @@ def ended(process):
 
 
 def test_a_signal_ends_the_node_with_exit_code_0(bench, start):
-    """Active and unconfigured; while it is active, any moment below gets a SIGTERM."""
+    """Active by SIGINT, unconfigured by SIGTERM."""
     heard, active = [], start('ekf_node')
     unconfigured = start('ekf_node', '-p', 'autostart:=false', '-r', '__node:=other')
     bench.node.create_subscription(String, 'ekf/state', heard.append, latched_qos())

@@ -77,7 +77,10 @@ def run_feed():
 
     def start(script, reject=lambda reason: None, wanted=lambda: True, **values):
         received = queue.Queue()
-        take = lambda image: received.put(int(image[0, 0, 0]))  # noqa: E731
+
+        def take(image):
+            received.put(int(image[0, 0, 0]))
+
         feed = Feed(script, take, config(**values), reject, wanted=wanted)
         feeds.append(feed)
         feed.start()
