@@ -179,44 +179,35 @@ def test_a_bias_that_changes_every_minute_is_found():
     assert spreads[1] < 0.7 * spreads[0]
 
 
-def noisy_inputs():
-    _, segments, features, _ = noisy_result()
-    return features, segments
-
-
-def test_the_map_is_the_odometry_frame_at_the_start():
-    run, segments, _, result = noisy_result()
+def test_the_map_is_the_odometry_frame_at_the_start_and_an_anchor_moves_it():
+    run, segments, features, result = noisy_result()
     images, places = positions(result, segments)
     _, yaw = headings(result, segments)
     truth = in_odometry_frame(run)[images]
     start = images < 40
     assert errors(places[start], truth[start, :2]).mean() < 0.15
     assert np.abs(wrap_angle(yaw - truth[:, 2])[start]).mean() < np.deg2rad(1.5)
-
-
-def test_an_anchor_moves_the_start_of_the_map():
-    _, segments, features, result = noisy_result()
-    anchored = learn_metric(
-        features,
-        segments,
-        dataclasses.replace(GP, anchor=(5.0, -2.0, 2.0)),
-    )
-    expected = RigidTransform(5.0, -2.0, 2.0).apply(result.map.predict(features)[0])
+    frame = RigidTransform(5.0, -2.0, 2.0)
+    anchored = learn_metric(features, segments, dataclasses.replace(GP, anchor=(5.0, -2.0, 2.0)))
+    expected = frame.apply(result.map.predict(features)[0])
     assert np.allclose(anchored.map.predict(features)[0], expected, atol=1e-6)
-    assert np.allclose(anchored.origins, RigidTransform(5.0, -2.0, 2.0).apply(result.origins))
+    assert np.allclose(anchored.origins, frame.apply(result.origins))
+    for anchor in ((1.0,), (1.0, 2.0, 3.0, 4.0)):
+        with pytest.raises(ConfigError, match='x, y, yaw'):
+            MetricConfig(anchor=anchor)
 
 
-def test_covariances_are_honest_about_unseen_places():
-    _, _, _, result = noisy_result()
-    run = noisy_result()[0]
+def test_covariances_are_honest_about_unseen_places_and_large_for_strange_features():
+    run, _, features, result = noisy_result()
     unseen = another_drive(run.poses[:, :2])
     predicted, covariances = result.map.predict(garden_features(unseen, noise=0.05, seed=9))
-    first = run.poses[0]
-    truth = RigidTransform(*invert(first)).apply(unseen)
-    off = predicted - truth
+    off = predicted - RigidTransform(*invert(run.poses[0])).apply(unseen)
     squared = np.einsum('ni,nij,nj->n', off, np.linalg.inv(covariances), off)
     assert 0.35 < np.mean(squared < 1.386) < 0.9
     assert np.mean(squared < 5.99) > 0.85
+    usual = result.map.predict(features)[1][:, 0, 0]
+    strange = result.map.predict(features[:5] * 4 + 3)[1][:, 0, 0]
+    assert strange.min() > 20 * np.median(usual)
 
 
 def test_the_maps_sway_is_about_as_large_as_the_errors_of_the_positions_it_learns_from():
@@ -237,13 +228,6 @@ def test_the_maps_sway_is_about_as_large_as_the_errors_of_the_positions_it_learn
     assert 0.55 < np.sqrt(np.mean(claimed) / np.mean(true)) < 1.3
 
 
-def test_strange_features_have_a_large_variance():
-    _, _, features, result = noisy_result()
-    usual = result.map.predict(features)[1][:, 0, 0]
-    strange = result.map.predict(features[:5] * 4 + 3)[1][:, 0, 0]
-    assert strange.min() > 20 * np.median(usual)
-
-
 def test_left_out_segments_calibrate_the_covariance():
     result = noisy_result()[3]
     ratio = (result.left_out**2).sum(1) / result.left_out_variance
@@ -253,7 +237,8 @@ def test_left_out_segments_calibrate_the_covariance():
 
 def test_the_same_seed_gives_the_same_bytes():
     _, _, _, result = noisy_result()
-    again = learn_metric(*noisy_inputs(), GP)
+    _, segments, features, _ = noisy_result()
+    again = learn_metric(features, segments, GP)
     arrays = again.map.to_arrays()
     for name, array in result.map.to_arrays().items():
         assert array.tobytes() == arrays[name].tobytes(), name
@@ -296,14 +281,11 @@ def test_lanes_that_nothing_crosses_are_one_route():
     assert errors(found.map.predict(features)[0], in_odometry_frame(run)[:, :2]).max() < 1e-6
 
 
-def test_too_few_segments_are_refused():
+def test_too_few_segments_and_features_that_say_nothing_are_refused():
     run = drive(np.vstack([straight(5.0), turn(1.0), straight(5.0)]))
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='only 2 segments'):
         learn_metric(exact_features(run.poses), segments, EXACT)
-
-
-def test_features_that_say_nothing_are_refused():
     run = curved_drive()
     segments = cut(run.odometry, run.stamps_ns, ANY)
     noise = np.random.default_rng(0).standard_normal((len(run.poses), 5))
@@ -311,23 +293,18 @@ def test_features_that_say_nothing_are_refused():
         learn_metric(noise, without(segments, *LINKS), EXACT)
 
 
-@pytest.mark.parametrize(
-    ('spoil', 'message'),
-    [
-        (lambda f: f[:10], 'one row per image'),
-        (
-            lambda f: np.where(np.arange(len(f))[:, None] == 60, np.nan, f),
-            'of 1 images are not finite',
-        ),
-        (lambda f: np.ones_like(f), 'constant'),
-        (lambda f: f[:, :3], 'only 3'),
-    ],
-)
-def test_unusable_features_are_named(spoil, message):
+def test_unusable_features_are_named():
     run = lines_drive()
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
-    with pytest.raises(DataError, match=message):
-        learn_metric(spoil(exact_features(run.poses)), segments, EXACT)
+    features = exact_features(run.poses)
+    holed = features.copy()
+    holed[60] = np.nan
+    for spoilt, message in (
+        (features[:10], 'one row per image'), (holed, 'of 1 images are not finite'),
+        (np.ones_like(features), 'constant'), (features[:, :3], 'only 3'),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match=message):
+            learn_metric(spoilt, segments, EXACT)
 
 
 def test_an_unproven_map_is_rejected(monkeypatch):
@@ -345,12 +322,6 @@ def test_an_unproven_map_is_rejected(monkeypatch):
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='not proven to be optimal'):
         learn_metric(exact_features(run.poses), segments, EXACT)
-
-
-@pytest.mark.parametrize('anchor', [(1.0,), (1.0, 2.0, 3.0, 4.0)])
-def test_an_anchor_is_a_pose_or_nothing(anchor):
-    with pytest.raises(ConfigError, match='x, y, yaw'):
-        MetricConfig(anchor=anchor)
 
 
 # --- the paper's solver through the same door ------------------------------------------------

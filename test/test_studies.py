@@ -4,12 +4,13 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 from study import __main__ as studies
-from study import comparisons, light, paper, results, year
+from study import comparisons, light, paper, results, sites, year
 from study.comparisons import BASELINES, VARIANTS
 from study.half_real import given_drive
 from study.paper_report import PAPER, paper_table
@@ -27,7 +28,7 @@ from sfa_localization.simulation.drive import START_NS
 from sfa_localization.simulation.settings import SimulationConfig
 
 MINUTES = dict.fromkeys(NAMES, 1)
-PLAN = Plan((6.0, 6.0), (160, 16), {'coverage': 100, 'lines': 80, 'mower': 140}, MINUTES)
+PLAN = Plan((6.0, 6.0), (160, 16), {'coverage': 100, 'lines': 80, 'mower': 200}, MINUTES)
 LIGHTS = light.Plan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), (), 1)
 MONTHS = (('July', 'day', 'summer'), ('August', 'evening', 'summer'))
 
@@ -52,6 +53,10 @@ def made(tmp_path_factory, gardens, small_network):
         patch.setattr(light, 'QUICK', LIGHTS)
         patch.setattr(year, 'MONTHS', MONTHS)
         patch.setattr(year, 'QUICK_YEAR', year.YearPlan((6.0, 6.0), (160, 16), (2,), 1))
+        # Few messages are enough, and quicker to write and read.
+        slow = partial(SimulationConfig, odometry_rate=20.0)
+        for module in (sites, light, year):
+            patch.setattr(module, 'SimulationConfig', slow)
         for name in ('all', 'year'):
             assert studies.main([name, '--quick', '--out', str(out / name)]) == 0
         yield out
@@ -59,7 +64,7 @@ def made(tmp_path_factory, gardens, small_network):
 
 @pytest.mark.slow
 def test_an_experiment_judges_every_recipe(made):
-    for name, images, figures in (('simulator', 100, (4, 5, 6)), ('robot', 140, (7, 8, 9))):
+    for name, images, figures in (('simulator', 100, (4, 5, 6)), ('robot', 200, (7, 8, 9))):
         (cell,) = cells(made / 'all' / f'{name}.json')
         assert cell['images'][0] == images and cell['odometry'] == pytest.approx(0.31, abs=0.03)
         assert set(cell['columns']) >= {'paper', 'certified', 'ours'}
