@@ -19,6 +19,7 @@ from sfa_localization.data.run import Run
 from sfa_localization.features import mdp_engine
 from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.closures import Views, find_closures, views_of
+from sfa_localization.features.leveling import leveled_runs
 from sfa_localization.features.network import Architecture, Network, standard_architecture
 from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.features.settings import NetworkConfig
@@ -60,8 +61,9 @@ class TrainingInput:
     def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
         """Step 2: what images show before anything is learned, also in different lights."""
         total = sum(len(run.panoramas) for run in runs)
-        title = titled(2, 'find loop closures')
+        title = titled(2, 'level the images, and find loop closures')
         with progress_bar(title, total, shown=progress) as bar:
+            runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         drives = Drives(tuple(map(drive_of, runs)), closures, recipe.segments)

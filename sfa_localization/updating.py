@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sfa_localization.bags.drives import ReadingRecipe, as_live, image_folder, read_drive
+from sfa_localization.camera.leveling import LeveledPanoramas
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Run, Trajectory
+from sfa_localization.data.run import Panoramas, Run, Trajectory
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.keyframes import Keyframes, correlate, quantized, texture
 from sfa_localization.fusion.camera_clock import camera_clock
@@ -145,7 +146,9 @@ def new_views(
     agree = np.array([_agrees(one, pose) for one, pose in zip(seen, poses, strict=True)], bool)
     chosen = np.flatnonzero(np.array(sure, bool) & certain & novel & agree)
     chosen = chosen[_spread(poses[chosen])]
-    return Additions(_textures(run, chosen, model.keyframes), poses[chosen])
+    tilts = np.reshape([one.tilt for one in seen], (-1, 2))
+    level = LeveledPanoramas(run.panoramas, tilts, model.keyframes.sphere)
+    return Additions(_textures(level, chosen, model.keyframes), poses[chosen])
 
 
 def familiar_score(model: PlaceModel) -> float:
@@ -196,12 +199,12 @@ def _spread(poses: Array) -> NDArray[np.int64]:
         cell_m *= _COARSER
 
 
-def _textures(run: Run, chosen: NDArray[np.int64], like: Keyframes) -> NDArray[np.int8]:
-    """Textures (M, rows, columns) of the chosen images (M,) of a run, as keyframes hold them."""
+def _textures(images: Panoramas, chosen: NDArray[np.int64], like: Keyframes) -> NDArray[np.int8]:
+    """Textures (M, rows, columns) of the chosen images (M,), as keyframes hold them."""
     if not len(chosen):
         return np.zeros((0, *like.textures.shape[1:]), np.int8)
-    images = (run.panoramas.read(i, i + 1)[0] for i in chosen.tolist())
-    return quantized(np.stack([texture(image) for image in images]))
+    read = (images.read(i, i + 1)[0] for i in chosen.tolist())
+    return quantized(np.stack([texture(image) for image in read]))
 
 
 def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:

@@ -40,7 +40,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__main__': ({'cli'}, set()),
     'data': (set(), {'numpy', 'threadpoolctl', 'tqdm', 'yaml'}),
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
-    'features': ({'data'}, NUMERIC | {'cv2', 'mdp'}),
+    'features': ({'data', 'camera'}, NUMERIC | {'cv2', 'mdp'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
     'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard'}),
     'metric': ({'data', 'features'}, NUMERIC),

@@ -2,24 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uneven ground: roll and pitch of the robot are found in the image and change no estimate."""
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from cylinder_worlds import Spheres
+from cylinder_worlds import Spheres, recipe, run_in, wander
 
+from sfa_localization.camera.leveling import NEAR_NS, leveled, tilted, tilts_at
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.sphere import Sphere, rotation
+from sfa_localization.features.closures import views_of
 from sfa_localization.features.keyframe_training import fit_keyframes
 from sfa_localization.features.keyframes import Keyframes, quantized, texture
-from sfa_localization.features.tilt import (
-    derivatives,
-    find_tilt,
-    leveled,
-    tilted,
-)
+from sfa_localization.features.leveling import leveled_runs, links_between
+from sfa_localization.features.tilt import derivatives, find_tilt
 
 BOTH = pytest.mark.parametrize('clockwise', [True, False])
 SPHERE = Sphere(-0.6, 0.6)
@@ -152,3 +152,44 @@ def test_keyframes_of_a_tilted_robot_show_the_place_too():
     for degrees in (0.0, 2.0):
         off, *_ = errors(learnt(2.0), degrees)
         assert off.mean() < 2.0 * flat.mean() + 0.02
+
+
+@BOTH
+def test_drives_are_leveled_before_they_are_learned_from(clockwise):
+    """By the images of a place that were taken at other times; a level drive stays as it is."""
+    panorama = recipe(clockwise).panorama
+    level = run_in(Spheres.about(1), wander(240, 2, hz=4.0), panorama)
+    (same,) = leveled_runs([level], panorama.sphere)
+    assert same is level
+    tilts = np.radians(4.0) * np.random.default_rng(0).normal(size=(240, 2))
+    images = [
+        tilted(image, tilt, panorama.sphere)
+        for image, tilt in zip(level.panoramas.images, tilts, strict=True)
+    ]
+    run = replace(level, panoramas=PanoramaArray(level.panoramas.stamps_ns, np.stack(images)))
+    counted = []
+    (found,) = leveled_runs([run], panorama.sphere, counted.append)
+    assert set(counted) == {1} and np.array_equal(run.panoramas.images, np.stack(images))
+    rest = np.hypot(*(found.panoramas.tilts - tilts).T)
+    assert np.median(rest) < 0.25 * np.median(np.hypot(*tilts.T))
+    before, after = (links_between(views_of([one]), panorama.sphere).usual for one in (run, found))
+    assert after < 0.5 * before
+    batches = np.concatenate(list(found.panoramas.batches(64)))
+    assert np.array_equal(batches, found.panoramas.read(0, 240)) and len(found.panoramas) == 240
+    assert np.array_equal(batches[70:75], found.panoramas.read(70, 75))
+
+
+def test_a_drive_that_comes_by_no_place_twice_is_left_as_it_is():
+    panorama = recipe().panorama
+    run = run_in(Spheres.about(1), wander(3, 2, hz=4.0), panorama)
+    assert leveled_runs([run], panorama.sphere) == (run,)
+
+
+def test_the_orientation_of_an_image_is_the_one_near_its_stamp():
+    known = np.array([0, 1, 3]) * NEAR_NS
+    tilts = np.array([[0.0, 0.1], [0.2, 0.1], [0.2, -0.1]])
+    found = tilts_at(np.array([-2, 0.5, 2, 2.5, 5]) * NEAR_NS, known, tilts)
+    nowhere = [np.nan, np.nan]
+    expected = [nowhere, [0.1, 0.1], [0.2, 0.0], [0.2, -0.05], nowhere]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert np.isnan(tilts_at(known, known[:0], tilts[:0])).all()

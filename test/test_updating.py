@@ -10,6 +10,7 @@ import pytest
 from cylinder_worlds import Spheres, place, recipe, run_in, wander
 
 from sfa_localization import updating
+from sfa_localization.camera.leveling import tilted
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, wrap_angle
@@ -73,6 +74,20 @@ def test_what_a_changed_place_adds_lies_where_it_was_seen():
 def textures_of(run):
     images = run.panoramas.read(0, len(run.panoramas))
     return updating.quantized(np.stack([updating.texture(image) for image in images]))
+
+
+def test_added_keyframes_are_level():
+    """Of a drive over uneven ground they are nearer to the images of level ground."""
+    model, level, sphere = place().model, drive(), recipe().panorama.sphere
+    tilts = np.radians(4.0) * np.random.default_rng(0).normal(size=(len(level.panoramas), 2))
+    images = zip(level.panoramas.images, tilts, strict=True)
+    seen = np.stack([tilted(image, tilt, sphere) for image, tilt in images])
+    run = replace(level, panoramas=replace(level.panoramas, images=seen))
+    new = new_views(model, run)
+    flat, steep = (textures_of(one).astype(float).reshape(len(seen), -1) for one in (level, run))
+    own = new.textures.astype(float).reshape(len(new), -1)
+    like = [np.corrcoef(own, kind)[: len(own), len(own) :].max(1) for kind in (flat, steep)]
+    assert len(own) > 20 and like[0].mean() > like[1].mean()
 
 
 def usable(model, run):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import BATCH, Run
+from sfa_localization.data.run import Run
 from sfa_localization.features.image_features import sample
 from sfa_localization.features.keyframes import (
     coarse,
@@ -75,17 +75,22 @@ class Views:
         return Views(self.textures[own], self.images[own], self.run[own], self.path_m[own])
 
 
-def views_of(runs: Sequence[Run], on_images: Callable[[int], object] = lambda count: None) -> Views:
-    """Of a sample of the images of all runs; `on_images` receives the size of each batch."""
+def views_of(
+    runs: Sequence[Run],
+    on_images: Callable[[int], object] = lambda count: None,
+    chosen: Indices | None = None,
+) -> Views:
+    """Of the `chosen` images of all runs, by default a sample; `on_images` counts the images."""
     counts = [len(run.panoramas) for run in runs]
-    chosen = sample(sum(counts))
+    chosen = sample(sum(counts)) if chosen is None else chosen
     run = np.repeat(np.arange(len(runs)), counts)[chosen]
-    textures, start = [], 0
-    for images in (batch for r in runs for batch in r.panoramas.batches(BATCH)):
-        seen = images[np.isin(np.arange(start, start + len(images)), chosen)]
-        textures += [quantized(texture(image)[None]) for image in seen]
-        start += len(images)
-        on_images(len(images))
+    starts, textures = np.cumsum([0, *counts]), []
+    for image, owner in zip(chosen.tolist(), run.tolist(), strict=True):
+        at = image - int(starts[owner])
+        textures += [
+            quantized(texture(one)[None]) for one in runs[owner].panoramas.read(at, at + 1)
+        ]
+        on_images(1)
     path = np.concatenate([_path(r) for r in runs])[chosen]
     return Views(np.concatenate(textures), chosen, run, path)
 

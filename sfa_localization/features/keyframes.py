@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from sfa_localization.camera.leveling import TILTED_RAD, leveled
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
@@ -35,7 +36,7 @@ from sfa_localization.features.observation import (
     Spectra,
     unlikeness,
 )
-from sfa_localization.features.tilt import derivatives, find_tilt, leveled, visible
+from sfa_localization.features.tilt import derivatives, find_tilt, visible
 
 Texture = NDArray[np.float32]
 Scores = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -62,8 +63,6 @@ _REACH_SHARE = 0.6
 _COARSE, _CANDIDATES = 15, 64
 # The likest keyframes to which an image is leveled: with a tilt the first may be another place.
 _LEVELED = 48
-# Images that are tilted by less are as well as level: what a tilt changes is linear.
-_TILTED_RAD = math.radians(0.7)
 # Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees it is, even of a
 # known place, and each of these makes it like them up to 6 degrees on.
 _STEEP_RAD = math.radians(8.0) * np.array(
@@ -120,6 +119,13 @@ def normalized(image: Texture) -> Texture:
 def spectrum(textures: Texture) -> Spectra:
     """Fourier coefficients of the columns, (..., rows, F)."""
     return np.asarray(fft.rfft(textures, axis=-1), np.complex64)
+
+
+def channels(rows: int) -> tuple[slice, ...]:
+    """Of a texture's rows those of brightness and of both color differences."""
+    few = min(rows // 3, _COLOR_ROWS)
+    light = rows - 2 * few
+    return slice(0, light), slice(light, light + few), slice(light + few, rows)
 
 
 def quantized(textures: Texture) -> NDArray[np.int8]:
@@ -292,7 +298,7 @@ class Keyframes:
         """What is known of an image after a roll and pitch (2,) rad more, if they matter; the
         same keyframes are correlated.
         """
-        if np.hypot(*tilt) < _TILTED_RAD:
+        if np.hypot(*tilt) < TILTED_RAD:
             return known
         new = self._seen(known.seen, known.tilt + tilt)
         self._add(new, np.flatnonzero(np.isfinite(known.scores)))
@@ -514,11 +520,7 @@ class Keyframes:
 
     @property
     def _channels(self) -> tuple[slice, ...]:
-        """Rows of brightness and of both color differences, see `texture`."""
-        rows = self.textures.shape[1]
-        few = min(rows // 3, _COLOR_ROWS)
-        light = rows - 2 * few
-        return slice(0, light), slice(light, light + few), slice(light + few, rows)
+        return channels(self.textures.shape[1])
 
     def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""

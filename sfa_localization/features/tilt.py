@@ -17,13 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import Sphere, rotation
 
 Texture = NDArray[np.float32]
@@ -34,32 +32,6 @@ _EVERY = 2
 """So many columns are one apart where tilts are tried: a tilt is the same in all."""
 _UNLIKELY = 0.01 / np.radians(4.0) ** 2
 """What a correlation with a tilt counts less, per squared rad: few tilts are above 4 degrees."""
-
-
-def tilted(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
-    """What a robot with roll and pitch (2,) rad sees of a panorama (H, W, C) on flat ground; above
-    and below it its edges are repeated.
-    """
-    return _turned(panorama, rotation(*tilt), sphere)
-
-
-def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
-    """What a robot that sees a panorama (H, W, C) with roll and pitch (2,) rad would see level."""
-    return _turned(panorama, rotation(*tilt).T, sphere)
-
-
-def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
-    rows, columns = panorama.shape[:2]
-    x, y, z = np.moveaxis(sphere.rays(rows, columns).astype(np.float32) @ turn.T, -1, 0)
-    azimuth = np.arctan2(y, x) * (-1 if sphere.clockwise else 1)
-    column = (azimuth * (columns / (2 * np.pi)) + (columns / 2 - 0.5)) % columns
-    elevation = np.arcsin(np.clip(z, -1, 1))
-    row = (sphere.high - elevation) * (rows / (sphere.high - sphere.low)) - 0.5
-    wrapped = np.concatenate([panorama, panorama[:, :1]], axis=1)
-    across, down = np.asarray(column, np.float32), np.asarray(row, np.float32)
-    kind, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-    turned = cv2.remap(wrapped, across, down, kind, borderMode=edge)
-    return np.asarray(turned, panorama.dtype).reshape(panorama.shape)
 
 
 def visible(tilt: Array, rows: int, columns: int, sphere: Sphere) -> NDArray[np.bool_]:

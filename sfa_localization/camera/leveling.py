@@ -1,0 +1,99 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Panoramas of a robot that rolls and pitches, and what they would be on level ground.
+
+Where an IMU says how the robot lies, panoramas are leveled by it, live and from bags; else by what
+they show (`features/tilt.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image, Panoramas, Stamps
+from sfa_localization.data.sphere import Sphere, rotation
+
+TILTED_RAD = np.radians(0.7)
+"""Images that are tilted by less are as well as level: what a tilt changes is linear."""
+NEAR_NS = 50_000_000
+"""An orientation this near to an image is that of the image: a robot that sways by 4 degrees with
+a correlation time of 0.7 s sways by one degree meanwhile."""
+
+
+def tilted(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
+    """What a robot with roll and pitch (2,) rad sees of a panorama (H, W, C) on flat ground; above
+    and below it its edges are repeated.
+    """
+    return _turned(panorama, rotation(*tilt), sphere)
+
+
+def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
+    """What a robot that sees a panorama (H, W, C) with roll and pitch (2,) rad would see level."""
+    return _turned(panorama, rotation(*tilt).T, sphere)
+
+
+def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
+    rows, columns = panorama.shape[:2]
+    x, y, z = np.moveaxis(sphere.rays(rows, columns).astype(np.float32) @ turn.T, -1, 0)
+    azimuth = np.arctan2(y, x) * (-1 if sphere.clockwise else 1)
+    column = (azimuth * (columns / (2 * np.pi)) + (columns / 2 - 0.5)) % columns
+    elevation = np.arcsin(np.clip(z, -1, 1))
+    row = (sphere.high - elevation) * (rows / (sphere.high - sphere.low)) - 0.5
+    wrapped = np.concatenate([panorama, panorama[:, :1]], axis=1)
+    across, down = np.asarray(column, np.float32), np.asarray(row, np.float32)
+    kind, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    turned = cv2.remap(wrapped, across, down, kind, borderMode=edge)
+    return np.asarray(turned, panorama.dtype).reshape(panorama.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class LeveledPanoramas:
+    """Panoramas without the `tilts` (N, 2), roll and pitch rad, that they were taken with."""
+
+    panoramas: Panoramas
+    tilts: Array
+    sphere: Sphere
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        return self.panoramas.stamps_ns
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.panoramas.shape
+
+    def __len__(self) -> int:
+        return len(self.panoramas)
+
+    def read(self, start: int, stop: int) -> Image:
+        return self._leveled(self.panoramas.read(start, stop), start)
+
+    def batches(self, size: int) -> Iterator[Image]:
+        for k, images in enumerate(self.panoramas.batches(size)):
+            yield self._leveled(images, k * size)
+
+    def _leveled(self, images: Image, start: int) -> Image:
+        tilts = self.tilts[start : start + len(images)]
+        steep = np.flatnonzero(np.hypot(*tilts.T) >= TILTED_RAD)
+        images = images.copy() if len(steep) else images
+        for k in steep.tolist():
+            images[k] = leveled(images[k], tilts[k], self.sphere)
+        return images
+
+
+def tilts_at(stamps_ns: Stamps, known_ns: Stamps, tilts: Array) -> Array:
+    """Roll and pitch (M, 2) at stamps (M,), of those (N, 2) at increasing stamps (N,): between
+    both neighbors, NaN where none is near.
+    """
+    if not len(known_ns):
+        return np.full((len(stamps_ns), 2), np.nan)
+    after = np.searchsorted(known_ns, stamps_ns).clip(0, len(known_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    apart = np.minimum(*(np.abs(known_ns[side] - stamps_ns) for side in (before, after)))
+    between = [np.interp(stamps_ns, known_ns, tilt) for tilt in tilts.T]
+    return np.where((apart <= NEAR_NS)[:, None], np.column_stack(between), np.nan)
