@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import math
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -240,6 +241,24 @@ def test_of_odometry_that_comes_too_fast_the_newest_is_used(bench):
     assert until(lambda: node.filter.state.stamp_ns == last)
     assert node.monitor('odom').received <= 102, 'older ones were dropped'
     assert math.isfinite(node.filter.state.position_std)
+
+
+def test_odometry_that_piled_up_is_fused_at_once_and_said_to_be_behind(bench):
+    node = bench.run(EkfNode, initial_pose=[0.0, 0.0, 0.0], silence_timeout=1.0)
+    seen, states = bench.listen(Odometry, 'ekf/odometry'), bench.listen(String, 'ekf/state')
+    bench.publish('odom', standing(START_NS))
+    assert until(lambda: len(seen) == 1)
+    with held_up(bench):
+        for number in range(1, 91):
+            bench.publish('odom', standing(START_NS + number * 20_000_000))
+        time.sleep(1.2)
+    last = START_NS + 90 * 20_000_000
+    assert until(lambda: node.filter.state.stamp_ns == last)
+    assert until(lambda: any('behind by 1.' in state.data for state in states))
+    assert 'LOST' not in {state.data.partition(':')[0] for state in states}
+    assert node.monitor('odom').used == 91 and len(seen) < 10
+    bench.publish('odom', standing(last + 20_000_000))
+    assert until(lambda: 'behind' not in states[-1].data)
 
 
 @contextlib.contextmanager

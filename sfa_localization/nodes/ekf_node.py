@@ -49,6 +49,7 @@ PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
 IMAGES_SILENCE = 3.0
 """Images may be silent for so many times silence_timeout: they come less often than odometry."""
 _WATCH_PERIOD_S = 0.2
+_PILED_S = 0.2  # odometry that waits for longer is published so often only
 _REPEAT_STATE_S = 0.9  # between states of the same level, with other reasons
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time: less is jitter
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
@@ -72,6 +73,7 @@ class EkfNode(LocalizationNode):
         self._frames = self._config.odom_frame, self._config.base_frame
         self._told: tuple[Level | None, str, float] = None, '', 0.0
         self._last_moved = 0, 0.0
+        self._published_s = 0.0
         self._sure: State | None = None
 
     def setup(self) -> None:
@@ -152,6 +154,10 @@ class EkfNode(LocalizationNode):
         )
         if reason:
             raise MessageError(reason)
+        now_s = steady_s()
+        if self.monitor(_ODOM).waited_s > _PILED_S > now_s - self._published_s:
+            return  # it has piled up: fused, but not published each
+        self._published_s = now_s
         state = self.filter.at(motion.stamp_ns)
         if state is not None:
             self._publish_odometry(state, motion.stamp_ns)
@@ -299,11 +305,18 @@ class EkfNode(LocalizationNode):
                 added.append(f'nothing on {shown} for {silent:.0f} s')
         if self._paused:
             added.append('paused: images are not fused')
-        lost = []
-        if by_now is not None and (added or status.level is Level.DEGRADED):
+        lost, behind_s = [], self._behind_s()
+        if behind_s > timeout_s:
+            added.append(f'behind by {behind_s:.1f} s: this computer is too busy')
+        elif by_now is not None and (added or status.level is Level.DEGRADED):
             # The filter's time is that of its messages: by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]
         return status.with_reasons(lost, added)
+
+    def _behind_s(self) -> float:
+        """How long the odometry waits for this node, s."""
+        odometry = self.monitor(_ODOM)
+        return odometry.waited_s if odometry.silent_for_s() < self._config.silence_timeout else 0.0
 
     def _by_now(self) -> State | None:
         """The estimate; after a long silence, predicted to the present by the wall clock."""
@@ -336,7 +349,7 @@ class EkfNode(LocalizationNode):
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         status, state = self.status(), self._by_now()
-        values = {'state': status.level.name}
+        values = {'state': status.level.name, 'behind [s]': f'{self._behind_s():.2f}'}
         values.update({name: str(n) for name, n in sorted(self.filter.counts.items())})
         if state is not None:
             values['position std [m]'] = f'{state.position_std:.3f}'

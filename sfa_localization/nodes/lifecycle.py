@@ -8,6 +8,7 @@ A node written on it declares its Settings classes, makes its publishers and sub
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -141,10 +142,17 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         """
         latched = qos.durability is DurabilityPolicy.TRANSIENT_LOCAL
         self.require_input(topic, instead)
+        receive, monitor = self.receiver(topic, callback, latched), self.monitor(topic)
+
+        def take(message: Any, info: dict[str, int]) -> None:
+            came_ns = info['received_timestamp']  # 0 where the middleware has none
+            monitor.waited_s = max(time.time_ns() - came_ns, 0) * 1e-9 if came_ns > 0 else 0.0
+            receive(message)
+
         made = self.create_subscription(
             kind,
             instead or topic,
-            self.receiver(topic, callback, latched),
+            cast(Any, take),
             qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )

@@ -21,10 +21,13 @@ def steady_s() -> float:
 
 
 class Monitor:
-    """Counts of messages received, used, and rejected by reason; latency of the last messages."""
+    """Counts of messages received, used, and rejected by reason; latency of the last messages, and
+    how long, `waited_s`, the last one had waited to be taken.
+    """
 
     def __init__(self) -> None:
         self.received = self.used = 0
+        self.waited_s = 0.0
         self.refused = RejectionCounter()
         self._arrivals_s: deque[float] = deque(maxlen=_WINDOW)
         self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
