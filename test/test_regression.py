@@ -13,7 +13,6 @@ from sfa_localization.metric.basis import (
     matern,
     missing,
     monomials,
-    spread,
 )
 from sfa_localization.metric.saved_map import MetricMap, Weights
 
@@ -77,14 +76,6 @@ def test_fewer_inducing_points_leave_variance_missing_far_from_them():
     assert missing(basis, expand(basis, far))[0] == pytest.approx(100.0, rel=1e-6)
 
 
-def test_spread_points_are_distinct_and_far_apart():
-    chosen = spread(FEATURES, 8)
-    assert len(set(chosen)) == 8
-    apart = np.linalg.norm(FEATURES[chosen][:, None] - FEATURES[chosen][None], axis=-1)
-    random = np.linalg.norm(FEATURES[:8][:, None] - FEATURES[:8][None], axis=-1)
-    assert apart[np.triu_indices(8, 1)].min() > random[np.triu_indices(8, 1)].min()
-
-
 def regressed(basis, noise_m=0.05):
     """Weights as of a regression, so that a variance is a small difference of large numbers."""
     terms, rng = expand(basis, FEATURES), np.random.default_rng(1)
@@ -123,20 +114,14 @@ def test_the_map_is_the_regression_in_closed_form(basis, metric_map):
     assert np.linalg.eigvalsh(covariances).min() >= 2.0 * 0.05**2 * (1 - 1e-9)
 
 
-def test_arrays_bring_back_the_same_map(metric_map):
+def test_saved_maps_and_single_rows_predict_alike_and_what_is_missing_is_named(metric_map):
     again = MetricMap.from_arrays(metric_map.to_arrays())
-    for a, b in zip(metric_map.predict(FEATURES), again.predict(FEATURES), strict=True):
-        assert np.array_equal(a, b)
-
-
-def test_one_row_predicts_as_many_do(metric_map):
     positions, covariances = metric_map.predict(FEATURES)
+    for a, b in zip((positions, covariances), again.predict(FEATURES), strict=True):
+        assert np.array_equal(a, b)
     position, covariance = metric_map.predict(FEATURES[7])
     assert np.allclose(position[0], positions[7], atol=1e-9)
     assert np.allclose(covariance[0], covariances[7], rtol=1e-3)
-
-
-def test_too_few_features_and_a_missing_array_are_named(metric_map):
     with pytest.raises(DataError, match='reads 3 slow features, not 2'):
         metric_map.predict(FEATURES[:, :2])
     for name in ('linear', 'factor'):

@@ -6,7 +6,6 @@ Also holds test/README.md to what it says: which tests show which kind of robust
 """
 
 import contextlib
-import dataclasses
 import itertools
 import math
 import threading
@@ -14,18 +13,14 @@ import time
 
 import numpy as np
 import pytest
-from picture_readers import WithoutKeyframes
+from picture_readers import SIZE, PictureReader, panorama
 from robustness.readme import TABLE, robustness_table
 from ros_domains import free_domain
 
-from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.data.error_correlation import ErrorCorrelation
-from sfa_localization.localizer import Observation
 from sfa_localization.place_model import PlaceModel
 
 DOMAIN = free_domain()
 
-SIZE = PanoramaConfig(width=60, height=12)
 START_NS = 1_700_000_000_000_000_000
 
 
@@ -71,26 +66,22 @@ NODES = {
 }  # fmt: skip
 
 
-@dataclasses.dataclass
-class ReadsPixels(WithoutKeyframes):
-    """A model whose position is the first pixel's blue and green; it can be held up."""
+class Held(PictureReader):
+    """A model that can be held up."""
 
-    panorama: PanoramaConfig = SIZE
-    error_correlation: ErrorCorrelation = dataclasses.field(default_factory=ErrorCorrelation)
-    camera_delay_s: float = 0.0
-    free: threading.Event = dataclasses.field(default_factory=threading.Event)
-    entered: threading.Event = dataclasses.field(default_factory=threading.Event)
+    def __init__(self):
+        super().__init__()
+        self.free, self.entered = threading.Event(), threading.Event()
 
     def locate(self, image):
         self.entered.set()
         assert self.free.wait(DEADLINE_S)
-        spread = np.diag([0.04, 0.04, 0.0025])
-        return Observation(np.append(image[0, 0, :2], 0.25), spread, np.arange(1.0, 9.0), 0.5)
+        return super().locate(image)
 
 
 @pytest.fixture
 def model(monkeypatch):
-    made = ReadsPixels()
+    made = Held()
     made.free.set()
     monkeypatch.setattr(PlaceModel, 'load', staticmethod(lambda path: made))
     return made
@@ -103,10 +94,8 @@ def bench():
     made.close()
 
 
-def picture(number, stamp_ns, pixel=(7, 3, 0)):
-    image = np.random.default_rng(number).integers(40, 215, (SIZE.height, SIZE.width, 3), np.uint8)
-    image[0, 0] = pixel
-    return to_image(image, stamp_ns, 'omnicam')
+def picture(number, stamp_ns):
+    return to_image(panorama((7.0, 3.0, 0.25), seed=number), stamp_ns, 'omnicam')
 
 
 def standing(stamp_ns):

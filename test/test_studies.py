@@ -118,7 +118,7 @@ def test_what_is_finished_is_not_made_again(made, monkeypatch, capsys):
 # What is kept
 
 
-def test_a_foreign_folder_is_not_changed(tmp_path):
+def test_a_foreign_folder_and_results_of_other_settings_are_left_alone(tmp_path):
     (tmp_path / 'thesis.tex').write_text('ten years of work')
     for content in (None, '[]', '{"settings": 1}', '\0'):
         if content is not None:
@@ -126,15 +126,13 @@ def test_a_foreign_folder_is_not_changed(tmp_path):
         before = sorted(path.name for path in tmp_path.iterdir())
         assert studies.main(['year', '--quick', '--out', str(tmp_path)]) == 1
         assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-def test_results_of_other_settings_are_left_alone(tmp_path):
-    first = Results.opened(tmp_path / 'robot.json', {'world': 1})
+    own = tmp_path / 'own'
+    first = Results.opened(own / 'robot.json', {'world': 1})
     first.keep({'seed': 3})
     for name in ('robot.json', 'baselines.json'):
         with pytest.raises(LocalizationError, match='--out'):
-            Results.opened(tmp_path / name, {'world': 2}, ('robot.json',))
-    assert Results.opened(tmp_path / 'robot.json', {'world': 1}).find(seed=3) == {'seed': 3}
+            Results.opened(own / name, {'world': 2}, ('robot.json',))
+    assert Results.opened(own / 'robot.json', {'world': 1}).find(seed=3) == {'seed': 3}
 
 
 # Tables
@@ -212,23 +210,14 @@ def circle(gap=False):
 HALF_REAL = SimulationConfig(area=(6.0, 6.0), images_every=0.2, images_every_turn=90.0)
 
 
-def test_a_given_drive_spaces_its_images_along_the_path():
+def test_a_given_drive_spaces_its_images_along_the_path_and_has_none_where_its_poses_pause():
     truth, odometry = circle()
     found = given_drive(truth, odometry, HALF_REAL)
     steps = np.hypot(*np.diff(found.image_poses[:, :2], axis=0).T)
     assert steps.min() >= 0.2 and steps.max() < 0.24  # jitter of 0.2 mm adds nothing
-    assert np.all(found.truth.stamps_ns - truth.stamps_ns == START_NS)
-    assert found.yaw_rate is None
-
-
-def test_a_given_drive_has_no_image_where_its_poses_pause():
-    found = given_drive(*circle(gap=True), HALF_REAL)
-    times = (found.image_stamps_ns - START_NS) * 1e-9
+    assert np.all(found.truth.stamps_ns - truth.stamps_ns == START_NS) and found.yaw_rate is None
+    times = (given_drive(*circle(gap=True), HALF_REAL).image_stamps_ns - START_NS) * 1e-9
     assert times.max() > 30 and not np.any((times > 9.9) & (times < 20))
-
-
-def test_a_given_drive_outside_of_the_garden_or_of_the_odometry_is_rejected():
-    truth, odometry = circle()
     with pytest.raises(ConfigError, match=r'--area of at least 2[0-9]x5'):
         aside = replace(truth, poses=truth.poses + np.array([9.0, 0.0, 0.0]))
         given_drive(aside, odometry, HALF_REAL)
