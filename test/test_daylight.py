@@ -20,7 +20,7 @@ from sfa_localization.simulation.settings import SimulationConfig
 pytestmark = pytest.mark.slow  # trains, or replays many drives
 
 SMALL = PanoramaConfig(width=300, height=30)
-TINY = SimulationConfig(area=(8.0, 8.0), length=20.0, images='panorama')
+TINY = SimulationConfig(area=(6.0, 6.0), length=20.0, images='panorama')
 SUNNY = [name for name, light in LIGHTS.items() if any(light.sun)]
 EYE = np.array([0.0, 0.0, 30.0])
 
@@ -36,7 +36,7 @@ def block(name, seed=0):
     """
     light, rng = dataclasses.replace(LIGHTS[name], brightness=None), np.random.default_rng(seed)
     sun = light.toward_sun(rng)
-    lawn = panel([-6, -6, 0], [12, 0, 0], [0, 12, 0], 0.1, 'grass', GRASS)
+    lawn = panel([-3, -3, 0], [6, 0, 0], [0, 6, 0], 0.1, 'grass', GRASS)
     block = box(np.zeros(2), np.array([1.0, 1.0, 2.0]), 'plain', WHITE, step=0.1)
     return Scene([lawn, *block], sun, rng, light), sun
 

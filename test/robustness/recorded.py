@@ -26,7 +26,10 @@ from sfa_localization.training import Recipe, train
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
 CACHE = ROOT / 'build/robustness'
-LEARNING = ('bags', 'camera', 'data', 'features', 'metric', 'place_model.py', 'training.py')
+LEARNING = (
+    'bags', 'camera', 'data', 'features', 'metric', 'place_model.py', 'training.py',
+    'training_input.py',
+)  # fmt: skip
 """Rooms that decide what a training gives."""
 RENDERING = ('bags', 'camera', 'data', 'simulation')
 SENSOR_STD = 3.0
@@ -105,13 +108,17 @@ def sources_key(rooms, *more):
 
 
 @functools.cache
+def model_file():
+    """Where the model of bags/sample is kept, while the code of the training stays."""
+    files = sorted((BAGS / 'sample').iterdir())
+    return CACHE / f'model-{sources_key(LEARNING, *files)}.npz'
+
+
 def model_path():
     """A model trained on bags/sample."""
-    bag = BAGS / 'sample'
-    path = CACHE / f'model-{sources_key(LEARNING, *sorted(bag.iterdir()))}.npz'
-    if not path.exists():
-        train([bag], path)
-    return path
+    if not model_file().exists():
+        train([BAGS / 'sample'], model_file())
+    return model_file()
 
 
 class Remembering:
