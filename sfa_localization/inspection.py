@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
@@ -21,15 +24,20 @@ from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera import kinds
+from sfa_localization.camera.panorama import looks_like_panorama
+from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
-from sfa_localization.data.errors import BagError
+from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.messages import read_yaw_rate
+from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.threads import one_core
+from sfa_localization.features.closures import Views
+from sfa_localization.features.keyframes import quantized, texture
+from sfa_localization.features.leveling import links_between
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
@@ -48,6 +56,7 @@ EVEN, EVEN_SHARE = 3.0, 0.9  # a topic keeps time where this share of intervals 
 REPEATED = 0.05  # share of images that repeat the one before that is worth a word
 STANDING_M = 0.02  # images nearer to each other were taken standing
 GRID = 100  # points per axis at which coverage is evaluated: steps of 1 % of the area's extent
+VIEWS, FEWEST_LINKS = 400, 50  # images that show how the ground tilts the camera, and their pairs
 DARK = 12.0  # mean gray level of 255 below which an image is dark
 
 
@@ -125,7 +134,8 @@ class BagReport:
 
     `error` is the reason why it cannot be read at all. `samples` are images from all over the
     drive; `camera` says what took them. `places` (M, 3) are the poses of images with `odometry`,
-    and `motion` compares it with the images and the gyroscope.
+    and `motion` compares it with the images and the gyroscope; `tilt` says how the ground tilts the
+    camera, if anything does.
     """
 
     path: str
@@ -141,6 +151,7 @@ class BagReport:
     odometry: Odometry | None = None
     places: Array = field(default_factory=lambda: np.zeros((0, 3)))
     motion: MotionCheck | None = None
+    tilt: str = ''
 
     @property
     def facts(self) -> dict[str, str]:
@@ -155,6 +166,8 @@ class BagReport:
                 f'{spacing(self.places):.2f} m apart, '
                 f'along {directions(self.places)} of {SECTORS} directions'
             )
+        if self.tilt:
+            facts['ground'] = self.tilt
         return facts
 
     def as_dict(self) -> dict[str, Any]:
@@ -242,7 +255,11 @@ class _Survey:
         self._values: dict[str | None, list[tuple[int, Any]]] = {name: [] for name in bag.topics}
         self._gyro, self._frozen, self._repeats = VisualGyro(clockwise), FrozenWatch(), 0
         self._sizes: Counter[tuple[int, ...]] = Counter()
-        self._every = max(bag.topics[self._image].count // SAMPLES, 1) if self._image else 1
+        count = bag.topics[self._image].count if self._image else 0
+        self._every, self._looked = max(count // SAMPLES, 1), -(-count // VIEWS) or 1
+        self._sphere = PanoramaConfig(clockwise=clockwise).sphere
+        self._textures: list[tuple[int, NDArray[np.int8]]] = []
+        self._leaning: list[tuple[float, float]] = []
 
     def fill(self) -> None:
         """Read the bag, and fill the report."""
@@ -267,7 +284,7 @@ class _Survey:
         if name == self._image:
             return self._bag.any_stream(name, self._sample)
         if name == self._imu:
-            return self._bag.any_stream(name, read_yaw_rate)
+            return self._bag.any_stream(name, self._turning)
         image = self._bag.topics[name].kind in KINDS['image'].found
         return self._bag.any_stream(name, _checked if image else lambda message: None)
 
@@ -280,8 +297,34 @@ class _Survey:
         self._repeats += not self._frozen.add(image)
         if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:
             samples.append(_small(image))
+        number = self._sizes.total()
+        if number % self._looked == 0 and looks_like_panorama(*image.shape[:2]):
+            self._textures.append((number, quantized(texture(image)[None])))
         self._sizes[image.shape[:2]] += 1
         return self._gyro.add(kinds.unrolled(image))
+
+    def _turning(self, message: Any) -> tuple[float, float]:
+        """The yaw rate of an Imu, and its variance; notes roll and pitch where it has them."""
+        with contextlib.suppress(MessageError):
+            self._leaning.append(read_tilt(message))
+        return read_yaw_rate(message)
+
+    def _tilt(self, stamps: Stamps, odometry: Odometry) -> str:
+        """How the ground tilts the camera, of images with stamps (N,)."""
+        if self._leaning:
+            return f'tilts the robot by {np.degrees(np.std(self._leaning, 0).mean()):.1f} degrees'
+        shape = self._textures[0][1].shape if self._textures else ()
+        known = [(n, one) for n, one in self._textures if n < len(stamps) and one.shape == shape]
+        if not known:
+            return ''
+        rows, textures = np.array([n for n, _ in known]), np.concatenate([one for _, one in known])
+        places = odometry.trajectory.at(stamps)[:, :2]
+        path = np.cumsum(np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T))[rows]
+        links = links_between(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
+        tilts = links.tilts(np.zeros(len(rows), complex))
+        tilt = math.degrees(math.sqrt(float(np.mean(np.abs(tilts) ** 2)) / 2))  # along each axis
+        about = f'tilts the camera by about {tilt:.1f} degrees'
+        return about if len(links.found) >= FEWEST_LINKS else ''
 
     def _topic(self, stream: Stream) -> TopicReport:
         topic = self._bag.topics[stream.topic]
@@ -313,6 +356,7 @@ class _Survey:
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
         report.odometry, report.places = odometry, odometry.trajectory.at(near)
         seen = np.array([yaw for _, yaw in turned], float)
+        report.tilt = self._tilt(stamps, odometry) if len(stamps) else ''
         shown = (stamps, seen) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None

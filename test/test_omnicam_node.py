@@ -13,6 +13,7 @@ import yaml
 from sfa_localization.camera import watch
 from sfa_localization.camera.calibration_files import calibration_text
 from sfa_localization.camera.encodings import decode_compressed
+from sfa_localization.camera.leveling import leveled
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import (
     CameraConfig,
@@ -25,13 +26,20 @@ from sfa_localization.config import load_settings, write_config
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Quaternion
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from ros_bench import until
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, Image, Imu
 from std_msgs.msg import String
 
-from sfa_localization.nodes.conversions import read_image, read_info, to_compressed, to_image
+from sfa_localization.nodes.conversions import (
+    read_image,
+    read_info,
+    to_compressed,
+    to_image,
+    to_stamp,
+)
 from sfa_localization.nodes.lifecycle import latched_qos
 from sfa_localization.nodes.omnicam_node import OmnicamNode
 from sfa_localization.nodes.settings import OmnicamNodeConfig
@@ -88,6 +96,35 @@ def test_frame_and_quality_of_service_by_parameter(bench, tmp_path):
     camera = dataclasses.replace(MIRROR, mount_rpy=turned)
     np.testing.assert_array_equal(pixels(shown), Unwrapper(camera, PANORAMA)(raw_picture()))
     assert node.get_parameter('qos_overrides./image_raw.subscription.depth').value == 1
+
+
+def test_panoramas_are_leveled_by_an_imu(bench):
+    """And where it says nothing of the image, it is told why not."""
+    node, heard = start(bench, level_by_imu=True, silence_timeout=3600.0)
+    plain, told = Unwrapper(MIRROR, PANORAMA)(raw_picture()), node.monitor('imu/data')
+
+    def hears(roll, pitch, after_s=0, known=True):
+        (a, b), (c, d) = np.cos([roll / 2, pitch / 2]), np.sin([roll / 2, pitch / 2])
+        sent = Imu(orientation=Quaternion(w=a * b, x=c * b, y=a * d, z=-c * d))
+        sent.header.stamp = to_stamp(STAMP_NS + after_s * 10**9)
+        sent.orientation_covariance[0] = 0.0 if known else -1.0
+        count = told.received
+        assert bench.publish_until('imu/data', sent, lambda: told.received > count)
+        return pixels(answer(bench, heard, message()))
+
+    np.testing.assert_array_equal(pixels(answer(bench, heard, message())), plain)
+    assert node.health()[:2] == (
+        DiagnosticStatus.WARN, 'no message on /imu/data: panoramas are not leveled'
+    )  # fmt: skip
+    for given, reason in (
+        ({'roll': 0.1, 'pitch': 0.0, 'known': False}, 'no orientation (a node'),
+        ({'roll': 0.1, 'pitch': 0.0, 'after_s': 1}, 'has no orientation near the stamp'),
+    ):
+        np.testing.assert_array_equal(hears(**given), plain)
+        assert reason in node.health()[1]
+    tilt = np.array([0.1, -0.05])
+    off = hears(*tilt).astype(int) - leveled(plain, tilt, PANORAMA.sphere)
+    assert np.abs(off).max() <= 1 and node.health()[1] == 'running'
 
 
 def test_compressed_pictures_in_and_out(bench):

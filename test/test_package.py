@@ -52,7 +52,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
     'tuning': (CORE | {'place_model', 'localizer', 'training', 'evaluation'}, NUMERIC),
     'updating': (CORE - {'metric'} | {'place_model', 'localizer'}, NUMERIC),
-    'inspection': ({'data', 'camera', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
+    'inspection': ({'data', 'camera', 'features', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'metric', 'training'}, {'numpy', 'matplotlib'}),
     'nodes': (

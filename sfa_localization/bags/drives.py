@@ -19,14 +19,16 @@ from sfa_localization.bags.motion_arrays import StampedValues, to_trajectory, to
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
+from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
 from sfa_localization.camera.settings import CameraConfig, PanoramaConfig
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError, DataError, MessageError, ModelError
 from sfa_localization.data.files import replaced_mode
-from sfa_localization.data.messages import read_yaw_rate
+from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Image, PanoramaArray, Run, Stamps
+from sfa_localization.data.run import Image, PanoramaArray, Panoramas, Run, Stamps
+from sfa_localization.data.sphere import Sphere
 
 ODOMETRY_TOLERANCE_S = 0.5
 """An image is used when odometry lies this near on both sides (s): interpolating over a longer
@@ -142,14 +144,17 @@ def read_drive(
         try:
             stored = _Images(Path(cache), recipe)
             streams = {'images': bag.stream(name, stored.panorama)}
-            streams |= _other_streams(bag, recipe.topics, want_truth)
+            streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
             stamps_ns = np.array(stored.stamps, np.int64)
             near_ns = int(recipe.odometry_tolerance_s * 1e9)
             covered = odometry.trajectory.covers(stamps_ns, near_ns)
             _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
-            panoramas = stored.finish(stamps_ns, covered)
+            panoramas: Panoramas = stored.finish(stamps_ns, covered)
+            if recipe.camera.level_by_imu:
+                by, tilts = streams['orientation'], values['orientation']
+                panoramas = _leveled(panoramas, by, tilts, recipe.panorama.sphere)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         for problem in bag.problems:
@@ -200,8 +205,9 @@ class _Images:
         return PanoramaArray(stamps_ns[kept], images[: len(kept)], self._file)
 
 
-def _other_streams(bag: Bag, topics: TopicNames, want_truth: bool) -> dict[str, Stream]:
+def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[str, Stream]:
     """The topics beside the images that make a run, by their use."""
+    topics = recipe.topics
     name = bag.find('odometry', topics.odometry)
     streams = {'odometry': bag.stream(name, decoding.odometry_of)}
     gyroscopes = [topic for topic in bag.topics.values() if topic.kind == decoding.IMU]
@@ -211,6 +217,8 @@ def _other_streams(bag: Bag, topics: TopicNames, want_truth: bool) -> dict[str, 
     elif gyroscopes:
         names = ', '.join(topic.name for topic in gyroscopes)
         logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
+    if recipe.camera.level_by_imu:
+        streams['orientation'] = bag.stream(bag.find('imu', topics.imu), read_tilt)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
         streams['ground_truth'] = bag.stream(name, decoding.pose_of)
@@ -232,6 +240,19 @@ def _read(
             else:
                 values[uses[id(stream)]].append((stamp_ns, value))
     return values
+
+
+def _leveled(panoramas: Panoramas, by: Stream, tilts: StampedValues, sphere: Sphere) -> Panoramas:
+    """The panoramas as omnicam_node levels them. Raises BagError where none can be leveled."""
+    stamps, known = (np.array(part) for part in zip(*sorted(tilts), strict=True))
+    found = tilts_at(panoramas.stamps_ns, stamps, known)
+    lost = int(np.isnan(found).any(axis=1).sum())
+    missing = f'{by.bag}: {by.topic} has no orientation near {lost} of {len(panoramas)} images'
+    if lost == len(panoramas):
+        raise BagError(f'{missing}: are both stamped by one clock (stamp_source: receive)?')
+    if lost:
+        logger.warning('%s: they are not leveled by it', missing)
+    return LeveledPanoramas(panoramas, np.nan_to_num(found), sphere)
 
 
 def _require_covered(images: Stream, covered: NDArray[np.bool_], near_s: float) -> None:

@@ -118,6 +118,10 @@ class CameraConfig(Settings):
         high=360.0,
         live=True,
     )
+    level_by_imu: bool = setting(
+        False,
+        'level panoramas by the orientation in Imu messages (imu/data), of the axes of the robot',
+    )
     mask_file: str = setting(
         '', 'mask of the camera image, black where it shows the robot; empty: none', live=True
     )

@@ -25,6 +25,9 @@ LARGEST_TWIST_VARIANCE = 1e2
 _SHORTEST_QUATERNION = 1e-3
 """A shorter quaternion has no direction; normalized ones have length 1."""
 
+_STEEPEST = math.radians(45.0)
+"""No robot on wheels rolls or pitches so much: the IMU has other axes, as z down."""
+
 
 def read_stamp(stamp: Any) -> int:
     """Nanoseconds of a builtin_interfaces/Time."""
@@ -38,10 +41,7 @@ def read_stamp(stamp: Any) -> int:
 
 def read_yaw(q: Any) -> float:
     """Heading of a Quaternion of any length above _SHORTEST_QUATERNION."""
-    norm = math.hypot(q.x, q.y, q.z, q.w)
-    require_sane('quaternion', norm)
-    if norm < _SHORTEST_QUATERNION:
-        raise MessageError('quaternion is zero')
+    norm = _length(q)
     sine, cosine = q.w * q.z + q.x * q.y, norm * norm / 2 - (q.y * q.y + q.z * q.z)
     return math.atan2(sine, cosine)
 
@@ -68,6 +68,28 @@ def read_yaw_rate(message: Any) -> tuple[float, float]:
     omega = float(message.angular_velocity.z)
     require_sane('yaw rate', omega)
     return omega, _variance(message.angular_velocity_covariance[8])
+
+
+def read_tilt(message: Any) -> tuple[float, float]:
+    """Roll and pitch rad of an Imu whose axes are the robot's: x forward, y left, z up."""
+    if message.orientation_covariance[0] == -1.0:
+        raise MessageError('no orientation (a node such as imu_filter_madgwick estimates it)')
+    q = message.orientation
+    norm = _length(q)
+    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
+    if max(abs(roll), abs(pitch)) > _STEEPEST:
+        raise MessageError('on its side: are the axes of the IMU those of the robot?')
+    return roll, pitch
+
+
+def _length(q: Any) -> float:
+    norm = math.hypot(q.x, q.y, q.z, q.w)
+    require_sane('quaternion', norm)
+    if norm < _SHORTEST_QUATERNION:
+        raise MessageError('quaternion is zero')
+    return norm
 
 
 def require_sane(name: str, *numbers: float) -> None:

@@ -11,16 +11,19 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, cast
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import String
 
 from sfa_localization.camera.capture import Feed, FeedStatus, opener
+from sfa_localization.camera.leveling import leveled, tilts_at
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, CaptureConfig, PanoramaConfig
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import MessageError
+from sfa_localization.data.messages import read_stamp, read_tilt
 from sfa_localization.data.run import Image
 from sfa_localization.data.settings import Settings
 from sfa_localization.nodes import conversions as convert
@@ -32,6 +35,7 @@ from sfa_localization.nodes.settings import OmnicamNodeConfig
 
 _DEMAND_PERIOD_S = 0.1  # between looks for subscribers: a new one waits no longer for images
 _LITTLE_VISIBLE = 0.5  # share of the panorama below which a warning is given
+_IMU, _ORIENTATIONS = 'imu/data', 500  # of these the last are kept: a second or more
 _JPEG_QUALITY = 90  # percent; no visible artifacts, about a tenth of the raw size
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -52,6 +56,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._feed: Feed | None = None
         self._arrival: Any = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
+        self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
+        self._level = True
 
     # Life cycle.
 
@@ -74,6 +80,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self.discovery = Discovery(self, self._input, self._kinds, arguments, self._take)
         else:
             self._set_up_feed(self.settings(CaptureConfig))
+        if self.settings(CameraConfig).level_by_imu:
+            self.subscribe(Imu, _IMU, self._take_orientation, lifecycle.sensor_qos(20))
         self.every(_DEMAND_PERIOD_S, self._follow_demand)
 
     def _set_up_feed(self, source: CaptureConfig) -> None:
@@ -94,6 +102,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
             self.destroy_guard_condition(self._arrival)
         self._feed = self._arrival = self._listening_since_s = None
         self._newest.clear()
+        self._tilts.clear()
+        self._level = True
 
     # Demand: without subscribers there is no subscription, and files wait.
 
@@ -143,8 +153,26 @@ class OmnicamNode(lifecycle.LocalizationNode):
                 raise MessageError('the clock has not started')
             self._publish(image, stamp_ns, self._config.frame_id)
 
+    def _take_orientation(self, message: Imu) -> None:
+        stamp_ns, tilt = read_stamp(message.header.stamp), read_tilt(message)
+        if self._tilts and stamp_ns <= self._tilts[-1][0]:
+            self._tilts.clear()  # time has stepped back
+        self._tilts.append((stamp_ns, *tilt))
+
+    def _leveled(self, panorama: Image, stamp_ns: int) -> Image:
+        """The panorama by the orientation near its stamp; as it is where there is none."""
+        if not self.settings(CameraConfig).level_by_imu:
+            return panorama
+        known = np.array([stamp for stamp, *_ in self._tilts], np.int64)
+        tilts = np.reshape([tilt for _, *tilt in self._tilts], (-1, 2))
+        (tilt,) = tilts_at(np.array([stamp_ns]), known, tilts)
+        self._level = bool(np.isfinite(tilt).all())
+        if not self._level:
+            return panorama
+        return leveled(panorama, tilt, self.settings(PanoramaConfig).sphere)
+
     def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
-        panorama, frame = self._unwrapper(image), frame or 'omnicam'
+        panorama, frame = self._leveled(self._unwrapper(image), stamp_ns), frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
         if self._panoramas.get_subscription_count():
             self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
@@ -215,7 +243,18 @@ class OmnicamNode(lifecycle.LocalizationNode):
         details['panorama visible [%]'] = f'{100 * visible:.0f}'
         if visible < _LITTLE_VISIBLE:
             return _WARN, f'the camera sees only {100 * visible:.0f} % of the panorama'
-        return _OK, ''
+        return (
+            (_OK, '') if self._level else (_WARN, f'{self._why_not()}: panoramas are not leveled')
+        )
+
+    def _why_not(self) -> str:
+        """Why the last image had no orientation of the robot."""
+        heard, topic = self.monitor(_IMU), self.shown(_IMU)
+        if heard.silent_for_s() > self.settings(CaptureConfig).silence_timeout:
+            return f'no message on {topic}'
+        if not heard.used:
+            return f'{topic}: {max(heard.refused, key=heard.refused.__getitem__)}'
+        return f'{topic} has no orientation near the stamp of the last image'
 
 
 def _judge_feed(status: FeedStatus, details: dict[str, str]) -> tuple[int, str]:
