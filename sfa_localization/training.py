@@ -37,10 +37,10 @@ from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
     left_out_agreement,
+    with_turned,
 )
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.turned_maps import with_turned
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe

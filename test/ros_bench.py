@@ -54,11 +54,11 @@ def start_process(*words, **options):
     return subprocess.Popen([sys.executable, *map(str, words)], env=environment, **options)
 
 
-def start_node(name, *parameters, namespace='/'):
+def start_node(name, *parameters, namespace='/', **options):
     """The process of a node."""
     words = [word for value in parameters for word in ('-p', value)]
     command = '-m', 'sfa_localization', name, '--ros-args', '-r', f'__ns:={namespace}'
-    return start_process(*command, *words)
+    return start_process(*command, *words, **options)
 
 
 def end_process(process):

@@ -28,7 +28,7 @@ from sfa_localization.evaluation import evaluate
 from sfa_localization.features import checkpoint as checkpoints
 from sfa_localization.features import image_features
 from sfa_localization.features.network_training import ImageSequence, train_network
-from sfa_localization.metric import turned_maps
+from sfa_localization.metric import learning
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
@@ -86,7 +86,7 @@ def test_without_headings_or_turned_maps_it_learns_without(trained, tmp_path, mo
     shallow = replace(SMALL_RECIPE, architecture=two)
     for module, name, value, by, said in (
         (image_features, 'SAMPLES', 15, SMALL_RECIPE, 'too few to learn a compass'),
-        (turned_maps, 'learn_metric', _fail, SMALL_RECIPE, 'not turned maps: the drive'),
+        (learning, 'learn_metric', _fail, SMALL_RECIPE, 'not turned maps: the drive'),
         (training, 'STEPS', training.STEPS, shallow, ''),
     ):
         caplog.clear()

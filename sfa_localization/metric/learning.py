@@ -8,6 +8,7 @@ descent is in paper_solver.py. Complex numbers are x + i y in meters.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, wrap_angle
+from sfa_localization.features.image_features import Spectrum, evenly
 from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
@@ -30,7 +32,9 @@ from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import LeftOut, choose, leave_out, part_of
 from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.metric.turned_maps import TurnedMaps
 
+logger = logging.getLogger(__name__)
 Indices = NDArray[np.int64]
 
 LITTLE, OVERFIT = 0.9, 4.0
@@ -40,6 +44,10 @@ drive as it likes. Weighted by what is left out, it leaves the drive the shape t
 loop closures give it."""
 _LARGEST_SHARE = 0.8
 """Of the error of an image that its neighbors have too."""
+# Images that the components are found from, evenly along the drives: they are smooth statistics.
+_COMPONENT_IMAGES = 1500
+# Images turned at a time: memory.
+_BATCH = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,3 +259,41 @@ def left_out_agreement(disagreement: Array, result: MetricResult) -> Agreement:
         axes=2,
         weight=result.forecast.weight,
     )
+
+
+def learn_turned(
+    spectra: Spectrum, segments: Segments, first: MetricResult, sign: float, seed: int = 0
+) -> tuple[TurnedMaps, MetricResult]:
+    """Learn a map of the spectra (N, H, J) of all images, turned by the certified headings of the
+    first map of the same segments, and in its frame. Raises DataError as ``learn_metric``.
+    """
+    images, yaw = headings(first, segments)
+    rows = evenly(len(images), _COMPONENT_IMAGES)
+    turned = TurnedMaps.fit(spectra[images[rows]], yaw[rows], sign)
+    features = np.zeros((len(spectra), turned.axes.shape[1]))
+    for start in range(0, len(images), _BATCH):
+        part = slice(start, start + _BATCH)
+        features[images[part]] = turned.features(spectra[images[part]], yaw[part])
+    # They count by their own size, as principal components do.
+    scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
+    return turned, learn_metric(features, segments, MetricConfig(), seed, scale, first)
+
+
+def with_turned(
+    spectra: Spectrum | None,
+    segments: Segments,
+    first: MetricResult,
+    sign: float,
+    config: MetricConfig,
+    seed: int = 0,
+) -> tuple[TurnedMaps | None, MetricResult]:
+    """As `learn_turned`; the first map alone without a layer to turn, where no other can be
+    learned, and for the paper's descent and its monomials, which are there for comparison.
+    """
+    if spectra is None or config.solver == 'paper' or config.metric_map == 'monomials':
+        return None, first
+    try:
+        return learn_turned(spectra, segments, first, sign, seed)
+    except DataError as error:
+        logger.warning('the map reads slow features, not turned maps: %s', error)
+        return None, first

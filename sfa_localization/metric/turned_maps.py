@@ -15,7 +15,6 @@ back is exact also by fractions of a column.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,21 +25,13 @@ from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.features.image_features import Spectrum, evenly
-from sfa_localization.metric.learning import MetricResult, headings, learn_metric
+from sfa_localization.features.image_features import Spectrum
 from sfa_localization.metric.saved_map import MetricMap
-from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.settings import MetricConfig
 
-logger = logging.getLogger(__name__)
 Vectors = NDArray[np.float32]
 
 DIMENSIONS = 32
 """Principal components that the map reads."""
-# Images that the components are found from, evenly along the drives: they are smooth statistics.
-_COMPONENT_IMAGES = 1500
-# Images turned at a time: memory.
-_BATCH = 1000
 # Three headings with the mean and the variance of an uncertain one, in standard deviations, and
 # their weights: of one of which nothing is known, they are a third of a turn apart.
 _APART, _WEIGHTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3), np.array([2.0, 3.0, 3.0]) / 8
@@ -111,41 +102,3 @@ class TurnedMaps:
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> TurnedMaps:
         """Raises KeyError or ValueError for arrays of something else."""
         return cls(arrays['mean'], arrays['axes'], float(arrays['sign']))
-
-
-def learn_turned(
-    spectra: Spectrum, segments: Segments, first: MetricResult, sign: float, seed: int = 0
-) -> tuple[TurnedMaps, MetricResult]:
-    """Learn a map of the spectra (N, H, J) of all images, turned by the certified headings of the
-    first map of the same segments, and in its frame. Raises DataError as ``learn_metric``.
-    """
-    images, yaw = headings(first, segments)
-    rows = evenly(len(images), _COMPONENT_IMAGES)
-    turned = TurnedMaps.fit(spectra[images[rows]], yaw[rows], sign)
-    features = np.zeros((len(spectra), turned.axes.shape[1]))
-    for start in range(0, len(images), _BATCH):
-        part = slice(start, start + _BATCH)
-        features[images[part]] = turned.features(spectra[images[part]], yaw[part])
-    # They count by their own size, as principal components do.
-    scale = np.full(features.shape[1], 1.0 / np.sqrt(features[images].var(0).sum()))
-    return turned, learn_metric(features, segments, MetricConfig(), seed, scale, first)
-
-
-def with_turned(
-    spectra: Spectrum | None,
-    segments: Segments,
-    first: MetricResult,
-    sign: float,
-    config: MetricConfig,
-    seed: int = 0,
-) -> tuple[TurnedMaps | None, MetricResult]:
-    """As `learn_turned`; the first map alone without a layer to turn, where no other can be
-    learned, and for the paper's descent and its monomials, which are there for comparison.
-    """
-    if spectra is None or config.solver == 'paper' or config.metric_map == 'monomials':
-        return None, first
-    try:
-        return learn_turned(spectra, segments, first, sign, seed)
-    except DataError as error:
-        logger.warning('the map reads slow features, not turned maps: %s', error)
-        return None, first

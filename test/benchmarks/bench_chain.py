@@ -1,17 +1,20 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The three nodes as processes, for one, two and four robots on this machine: `bench_chain.py`
-MODEL.npz. Latency from an image to its pose, and CPU of each node.
+"""The three nodes as processes over three relays that only pass messages on: `bench_chain.py`
+MODEL.npz. Latency from an image to its pose, CPU, and what a node takes until it is active.
 
-Images come 10 and 30 times a second, odometry 50 times. The images are panoramas already.
+Images come 10 and 30 times a second, odometry 50 times. The images are panoramas already. With
+`--robots` nodes alone, of one, two and four robots.
 """
 
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,18 +24,28 @@ import psutil
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from ros_bench import DEADLINE_S, DOMAIN, Spinner, end_process, start_node
+from ros_bench import DEADLINE_S, DOMAIN, Spinner, end_process, start_node, start_process
 
 from sfa_localization.data.messages import read_stamp
 from sfa_localization.nodes.conversions import to_image, to_odometry
+from sfa_localization.nodes.lifecycle import sensor_qos
 from sfa_localization.place_model import PlaceModel
 
 ODOMETRY_HZ, LAST_S = 50.0, 1.0
 ROBOTS, RATES_HZ = (1, 2, 4), (10.0, 30.0)
+_SEEN = 'sfa/pose_with_covariance'
+_POSE = PoseWithCovarianceStamped
+RELAYS = {
+    'omnicam_node': [(Image, 'image_raw', Image, 'panorama')],
+    'sfa_node': [(Image, 'panorama', _POSE, _SEEN)],
+    'ekf_node': [(_POSE, _SEEN, _POSE, 'ekf/pose'), (Odometry, 'odom', Odometry, 'ekf/odometry')],
+}
+"""What each node receives and publishes."""
 
 
 class Driver:
@@ -112,23 +125,51 @@ def parameters_of(model: PlaceModel, path: Path | str) -> dict[str, list[str]]:
     }  # fmt: skip
 
 
-@contextmanager
-def driven(model_path: Path | str, names: list[str]):
-    """The driver, once each robot has answered, and the processes of each node."""
-    model = PlaceModel.load(model_path)
-    driver, parameters = Driver(model, names), parameters_of(model, model_path)
+def relay(node: str, namespace: str) -> None:
+    """In the place of a node: pass on each message, or an empty one with its header."""
+    rclpy.init()
+    here = rclpy.create_node(f'relay_{node}', namespace=namespace)
+
+    def passing(given: type, topic: str, made: type, onward: str) -> None:
+        publisher = here.create_publisher(made, onward, 10)
+
+        def take(message: Any) -> None:
+            publisher.publish(message if given is made else made(header=message.header))
+
+        here.create_subscription(given, topic, take, sensor_qos(20))
+
+    for topics in RELAYS[node]:
+        passing(*topics)
+    with suppress(ExternalShutdownException):
+        rclpy.spin(here)
+
+
+def nodes_of(model: PlaceModel, path: Path | str, names: list[str]) -> dict[str, list[Any]]:
+    """The processes of the nodes of robots of these names."""
+    parameters = parameters_of(model, path)
     parameters['ekf_node'] = ['initial_pose:=[0.0, 0.0, 0.0]']  # no image is of the place
-    running = {
+    return {
         node: [start_node(node, *given, namespace=f'/{name}') for name in names]
         for node, given in parameters.items()
     }
+
+
+def relays_of(name: str) -> dict[str, list[Any]]:
+    """The processes of relays in the place of the nodes."""
+    return {node: [start_process(__file__, '--relay', node, f'/{name}')] for node in RELAYS}
+
+
+@contextmanager
+def driven(model: PlaceModel, names: list[str], running: dict[str, list[Any]]) -> Iterator[Driver]:
+    """A driver of robots whose processes are running, once each has answered; it ends them."""
+    driver = Driver(model, names)
     try:
         end = time.monotonic() + DEADLINE_S
         while not all(driver.latencies.values()):
             if time.monotonic() > end:
                 raise RuntimeError(f'robots do not answer: {driver.latencies}')
             driver.run(10.0, 0.5)
-        yield driver, running
+        yield driver
     finally:
         driver.close()
         for processes in running.values():
@@ -142,31 +183,80 @@ def cpu_s(processes: list[Any]) -> float:
     return float(np.mean([spent.user + spent.system for spent in times]))
 
 
-def bench_chain(model_path: Path | str, seconds: float = 8.0) -> dict[str, float]:
-    """By robots and rate of images: CPU shares of each node (1: one core), the mean of the robots,
-    percentiles of latency in ms, and the share of images that were answered.
+def measured(
+    driver: Driver, running: dict[str, list[Any]], rate_hz: float, seconds: float
+) -> dict[str, float]:
+    """CPU shares of each node (1: one core), the mean of the robots, percentiles of latency in ms,
+    and the share of images that were answered.
     """
-    found: dict[str, float] = {}
+    for each in driver.latencies.values():
+        each.clear()
+    before = {node: cpu_s(processes) for node, processes in running.items()}
+    images = driver.run(rate_hz, seconds)
+    spent = {node: cpu_s(processes) - before[node] for node, processes in running.items()}
+    found = {f'cpu_{node}': used / (seconds + LAST_S) for node, used in spent.items()}
+    found['cpu'] = sum(found.values())
+    taken = [latency for each in driver.latencies.values() for latency in each]
+    found['answered'] = len(taken) / (images * len(driver.latencies))
+    for percent in (50, 99):
+        found[f'latency_p{percent}_ms'] = float(np.percentile(taken or [np.nan], percent) * 1e3)
+    return found
+
+
+def bench_robots(path: Path | str, seconds: float = 8.0) -> dict[str, float]:
+    """Nodes alone, by robots and rate of images."""
+    model, found = PlaceModel.load(path), {}
     for count in ROBOTS:
-        with driven(model_path, [f'robot{k + 1}' for k in range(count)]) as (driver, running):
+        names = [f'robot{k + 1}' for k in range(count)]
+        running = nodes_of(model, path, names)
+        with driven(model, names, running) as driver:
             for rate_hz in RATES_HZ:
-                for each in driver.latencies.values():
-                    each.clear()
-                before = {node: cpu_s(processes) for node, processes in running.items()}
-                images, prefix = driver.run(rate_hz, seconds), f'robots_{count}_at_{rate_hz:.0f}_hz'
-                for node, processes in running.items():
-                    share = (cpu_s(processes) - before[node]) / (seconds + LAST_S)
-                    found[f'{prefix}_cpu_{node}'] = share
-                taken = [latency for each in driver.latencies.values() for latency in each]
-                found[f'{prefix}_answered'] = len(taken) / (images * count)
-                for percent in (50, 99):
-                    latency_ms = float(np.percentile(taken or [np.nan], percent) * 1e3)
-                    found[f'{prefix}_latency_p{percent}_ms'] = latency_ms
-    alone = f'robots_1_at_{RATES_HZ[-1]:.0f}_hz'
-    found['chain_cpu_share'] = sum(v for k, v in found.items() if k.startswith(f'{alone}_cpu'))
-    found['chain_latency_p99_ms'] = found[f'{alone}_latency_p99_ms']
+                one = measured(driver, running, rate_hz, seconds)
+                prefix = f'robots_{count}_at_{rate_hz:.0f}_hz'
+                found |= {f'{prefix}_{name}': value for name, value in one.items()}
+    return found
+
+
+def bench_chain(path: Path | str, seconds: float = 8.0) -> dict[str, float]:
+    """Nodes over relays at the higher rate, in turns: of each figure the least of three."""
+    model, rate_hz = PlaceModel.load(path), RATES_HZ[-1]
+    nodes, relays = nodes_of(model, path, ['robot']), relays_of('relays')
+    rounds: list[list[dict[str, float]]] = []
+    with driven(model, ['robot'], nodes) as robot, driven(model, ['relays'], relays) as passing:
+        for _ in range(3):
+            sides = (robot, nodes), (passing, relays)
+            rounds.append([measured(*side, rate_hz, seconds) for side in sides])
+    ours, bare = (
+        {name: min(one[k][name] for one in rounds) for name in rounds[0][k]} for k in (0, 1)
+    )
+    found = {f'chain_{name}': value for name, value in ours.items()}
+    for name in ('latency_p50_ms', 'latency_p99_ms', 'cpu'):
+        found[f'chain_{name.removesuffix("_ms")}_over_relays'] = ours[name] / bare[name]
+    return {**found, **bench_start(model, path)}
+
+
+def bench_start(model: PlaceModel, path: Path | str) -> dict[str, float]:
+    """CPU s from exec to active, and resident MiB then, of each node: the least of three."""
+    found: dict[str, float] = {}
+    for node, given in parameters_of(model, path).items():
+        pairs = []
+        for _ in range(3):
+            pipe = {'stdout': subprocess.PIPE, 'stderr': subprocess.STDOUT, 'text': True}
+            process = start_node(node, *given, **pipe)
+            try:
+                next(line for line in process.stdout if line.rstrip().endswith(': active'))
+                state = psutil.Process(process.pid)
+                spent = state.cpu_times()
+                pairs.append((spent.user + spent.system, state.memory_info().rss / 2**20))
+            finally:
+                end_process(process)
+        found[f'start_{node}_cpu_s'], found[f'start_{node}_mib'] = np.min(pairs, axis=0).tolist()
     return found
 
 
 if __name__ == '__main__':
-    sys.stdout.write(json.dumps(bench_chain(sys.argv[1]), indent=2) + '\n')
+    if '--relay' in sys.argv:
+        relay(*sys.argv[2:])
+    else:
+        bench = bench_robots if '--robots' in sys.argv else bench_chain
+        sys.stdout.write(json.dumps(bench(sys.argv[1]), indent=2) + '\n')
