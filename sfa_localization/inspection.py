@@ -473,8 +473,9 @@ def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
         return
     if share < MIN_COVERED:
         yield (
-            f'{share:.0%} of the area lie within {config.reach:g} m of an image: '
-            'cross the remaining area'
+            f'{share:.0%} of the area lie within {config.reach:g} m of an image, as by lanes '
+            f'{2 * config.reach / max(share, 0.01):.1f} m apart, and between lanes one image errs '
+            f'by about a tenth of that: drive lanes {2 * config.reach:g} m apart'
         )
     if directions(places) < MIN_DIRECTIONS:
         yield (

@@ -109,6 +109,14 @@ def test_stages_resumed_give_the_same_bytes():
         assert resumed.nodes[-1].slow.tobytes() == whole.nodes[-1].slow.tobytes()
 
 
+def test_of_a_long_drive_some_images_all_along_it_are_used(monkeypatch):
+    monkeypatch.setattr(hierarchy, 'MOST', 20)
+    shards = shards_of([drive(160), drive(2)], 0)
+    assert [(s.start, s.stop, s.end) for s in shards] == [
+        (0, 8, 64), (64, 72, 128), (128, 136, 160), (0, 2, 2),
+    ]  # fmt: skip
+
+
 def test_the_random_light_of_a_picture_is_the_same_in_every_shard_and_pass():
     def lit(start: int, std: float = 0.3, seed: int = 5) -> np.ndarray:
         shard = replace(shards_of([drive(12)], seed, std)[0], start=start, stop=12)

@@ -13,7 +13,7 @@ from cylinder_worlds import Spheres
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.features.keyframe_training import fit_keyframes
+from sfa_localization.features.keyframe_training import fit_keyframes, spread
 from sfa_localization.features.keyframes import (
     Keyframes,
     quantized,
@@ -237,6 +237,16 @@ def test_many_images_are_thinned_evenly_and_too_few_rejected():
     assert counts.min() > 50
     with pytest.raises(DataError, match='too few'):
         fit_keyframes(np.zeros((3, 4, 8), np.int8), np.zeros((3, 3)), np.arange(3.0), CONFIG.sphere)
+
+
+def test_large_places_have_keyframes_on_each_square_meter():
+    rng = np.random.default_rng(0)
+    often, all_over = rng.uniform(0, 8, (9000, 2)), rng.uniform(0, 40, (16000, 2))
+    poses = np.column_stack([np.concatenate([often, all_over]), np.zeros(25000)])
+    kept = poses[spread(poses)]
+    assert len(kept) == 2 * 1600
+    counts, _, _ = np.histogram2d(*kept[:, :2].T, bins=np.arange(41))
+    assert counts.min() >= 1 and counts.max() <= 3
 
 
 def posts(sun: float) -> np.ndarray:

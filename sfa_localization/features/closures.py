@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,10 +70,9 @@ class Views:
     run: Indices
     path_m: Array
 
-    def of(self, run: int) -> Views:
-        """Those of one drive."""
-        own = self.run == run
-        return Views(self.textures[own], self.images[own], self.run[own], self.path_m[own])
+    def take(self, rows: NDArray[Any]) -> Views:
+        """Some of them, by a mask (S,) or indices."""
+        return Views(self.textures[rows], self.images[rows], self.run[rows], self.path_m[rows])
 
 
 def views_of(
@@ -80,9 +80,9 @@ def views_of(
     on_images: Callable[[int], object] = lambda count: None,
     chosen: Indices | None = None,
 ) -> Views:
-    """Of the `chosen` images of all runs, by default a sample; `on_images` counts the images."""
+    """Of the `chosen` images of all runs, by default of all; `on_images` counts the images."""
     counts = [len(run.panoramas) for run in runs]
-    chosen = sample(sum(counts)) if chosen is None else chosen
+    chosen = np.arange(sum(counts)) if chosen is None else chosen
     run = np.repeat(np.arange(len(runs)), counts)[chosen]
     starts, textures = np.cumsum([0, *counts]), []
     for image, owner in zip(chosen.tolist(), run.tolist(), strict=True):
@@ -118,9 +118,11 @@ class _Drive:
 
 def find_closures(views: Views, clockwise: bool) -> Closures:
     """Images of two drives, or of a drive with itself, each of which is the likest of the other,
-    if they are like enough. `clockwise`: whether columns grow clockwise seen from above.
+    if they are like enough; of an even sample, for each is compared with all. `clockwise`: whether
+    columns grow clockwise seen from above.
     """
-    drives = [_Drive.of(views.of(run)) for run in np.unique(views.run).tolist()]
+    views = views.take(sample(len(views.images)))
+    drives = [_Drive.of(views.take(views.run == run)) for run in np.unique(views.run).tolist()]
     images, turns = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
     step = (2 if clockwise else -2) * np.pi / views.textures.shape[2]
     for number, one in enumerate(drives):

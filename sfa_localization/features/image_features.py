@@ -28,7 +28,7 @@ TURNED_LAYER = 1
 """Layer (0-based), below the top, whose map is turned to locate by: it still holds the heading."""
 HARMONICS = 13
 """Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
-# Images whose maps and textures are kept for compass and keyframes, however long the drives.
+# Images whose maps the compass reads, and that are compared for closures, however long the drives.
 SAMPLES = 3000
 
 

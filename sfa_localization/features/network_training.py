@@ -9,6 +9,7 @@ the shards, so the result does not depend on how many cores there are.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -35,6 +36,9 @@ from sfa_localization.features.sfa import Solution, Statistics, solve
 
 SHARD = 64
 """Images whose sums are computed by one task: enough for its products, few enough to balance."""
+MOST = 3500
+"""Images that the network is trained on, of longer drives some of each shard: with more the network
+is no better, and the time grows."""
 BREAK_TIME_S = 5.0
 BREAK_DISTANCE_M = 2.0
 """Consecutive images farther apart than either are no neighbors: the drive was interrupted."""
@@ -67,14 +71,14 @@ class ImageSequence:
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Images start .. stop - 1 of a sequence, with the pair that leads into them.
-
-    The light of each image is changed at random, by `seed` and the image's number.
+    """Images start .. stop - 1 of a sequence, with the pair that leads into them, for those until
+    `end`. The light of each image is changed at random, by `seed` and the image's number.
     """
 
     sequence: ImageSequence
     start: int
     stop: int
+    end: int
     light_std: float = 0.0
     seed: tuple[int, int] = (0, 0)
 
@@ -109,7 +113,7 @@ def _summed(partial: Partial, shards: Sequence[Shard], on_shard: Callable[[int],
     total = _sums(partial)
     for part, shard in zip(_in_threads(partial, shards), shards, strict=True):
         total.merge(part)
-        on_shard(shard.stop - shard.start)
+        on_shard(shard.end - shard.start)
     return total
 
 
@@ -238,12 +242,16 @@ def _below(network: Network, images: Image) -> Map:
 def shards_of(
     sequences: Sequence[ImageSequence], seed: int, light_std: float = LIGHT_STD
 ) -> list[Shard]:
-    """All sequences cut into shards of equal length."""
-    return [
-        Shard(s, start, min(start + SHARD, len(s.panoramas)), light_std, (seed, number))
-        for number, s in enumerate(sequences)
-        for start in range(0, len(s.panoramas), SHARD)
-    ]
+    """All sequences cut into shards of equal length, of which at most `MOST` images are used."""
+    images = sum(len(s.panoramas) for s in sequences)
+    used = max(math.ceil(SHARD * MOST / max(images, MOST)), 2)  # at least a pair
+    shards = []
+    for number, s in enumerate(sequences):
+        count = len(s.panoramas)
+        for start in range(0, count, SHARD):
+            stop, end = min(start + used, count), min(start + SHARD, count)
+            shards.append(Shard(s, start, stop, end, light_std, (seed, number)))
+    return shards
 
 
 def require_pairs(sequences: Sequence[ImageSequence]) -> None:
