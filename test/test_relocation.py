@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from sfa_localization.fusion.relocation import relocate
 from sfa_localization.fusion.track import CAPACITY, SPACING_M, Image, remembered
@@ -13,9 +14,9 @@ from sfa_localization.fusion.track import CAPACITY, SPACING_M, Image, remembered
 STD_M, STD_RAD = 0.1, 0.05
 
 
-def along(count, step_m=0.2, heading=True, wrong=(), noise=0.0, turn=1.2):
+def along(count, step_m=0.2, heading=True, wrong=(), noise=0.0, turn=1.2, seed=0):
     """Images of a robot that dead reckoning moves along x, in a map that is turned by `turn`."""
-    rng, images = np.random.default_rng(0), []
+    rng, images = np.random.default_rng(seed), []
     for k in range(count):
         way_m = k * step_m
         place = way_m * np.exp(1j * turn) + (5 - 3j) + noise * complex(*rng.standard_normal(2))
@@ -42,11 +43,17 @@ def test_a_place_without_heading_or_motion_shows_no_pose():
 
 
 def test_errors_are_as_large_as_claimed_and_neighbors_that_err_alike_count_as_fewer():
-    white, alike = (relocate(along(41, noise=STD_M), length_m) for length_m in (1e-3, 2.0))
-    place = 8.0 * np.exp(1.2j) + (5 - 3j)
-    miss = white.pose - [place.real, place.imag, 1.2]
-    assert miss @ np.linalg.solve(white.covariance, miss) < 16.3  # chi-square of 3, 99.9 %
-    assert np.allclose(alike.covariance, white.covariance * 41 / (1 + 8.0 / 2.0))
+    place, squared = 8.0 * np.exp(1.2j) + (5 - 3j), []
+    for seed in range(50):
+        seen = along(41, noise=STD_M, heading=False, seed=seed)
+        found = relocate(seen, 1e-3)
+        miss = found.pose - [place.real, place.imag, 1.2]
+        squared.append(miss @ np.linalg.solve(found.covariance, miss))
+    low = chi2.ppf(0.0005, 150)
+    # Dead reckoning has no error here, but is expected to drift: the claim is rather too modest.
+    assert low / 2 < sum(squared) < low
+    alike = relocate(seen, 2.0)
+    assert np.allclose(alike.covariance, found.covariance * 41 / (1 + 8.0 / 2.0))
 
 
 def test_of_what_is_remembered_the_newer_half_is_complete_and_the_older_reaches_far():

@@ -28,7 +28,7 @@ from sfa_localization.simulation.drive import START_NS
 from sfa_localization.simulation.settings import SimulationConfig
 
 MINUTES = dict.fromkeys(NAMES, 1)
-PLAN = Plan((6.0, 6.0), (160, 16), {'coverage': 100, 'lines': 80, 'mower': 200}, MINUTES)
+PLAN = Plan((6.0, 6.0), (160, 16), {'coverage': 150, 'lines': 120, 'mower': 200}, MINUTES)
 LIGHTS = light.Plan((6.0, 6.0), (160, 16), (('day', 'summer'), ('evening', 'summer')), (), 1)
 MONTHS = (('July', 'day', 'summer'), ('August', 'evening', 'summer'))
 
@@ -64,7 +64,7 @@ def made(tmp_path_factory, gardens, small_network):
 
 @pytest.mark.slow
 def test_an_experiment_judges_every_recipe(made):
-    for name, images, figures in (('simulator', 100, (4, 5, 6)), ('robot', 200, (7, 8, 9))):
+    for name, images, figures in (('simulator', 150, (4, 5, 6)), ('robot', 200, (7, 8, 9))):
         (cell,) = cells(made / 'all' / f'{name}.json')
         assert cell['images'][0] == images and cell['odometry'] == pytest.approx(0.31, abs=0.03)
         assert set(cell['columns']) >= {'paper', 'certified', 'ours'}
