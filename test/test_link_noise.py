@@ -98,3 +98,17 @@ def test_links_without_weight_stay_without(names):
     unused = tuple(dataclasses.replace(item, **{without: np.inf}) for item in segments)
     links = solved(dataclasses.replace(segments, items=unused), features).links
     assert np.isinf(getattr(links, without)).all() and np.isfinite(getattr(links, other)).all()
+
+
+def test_a_yaw_rate_bias_turns_the_paths_of_the_form():
+    """x^H F x is the cost of paths at the bias b: y^H G y of y = [o, z, -b z]."""
+    _, segments, features = recorded()
+    none = {'turn_variance': np.inf, 'displacement_variance': np.inf}
+    unlinked = tuple(dataclasses.replace(item, **none) for item in segments)
+    fit = solved(dataclasses.replace(segments, items=unlinked), features)
+    form, rng = fit.form(fit.elimination), np.random.default_rng(0)
+    x, bias = rng.normal(size=(2, 2 * len(form.period))), rng.normal(size=form.period[-1] + 1)
+    x, system = x[0] + 1j * x[1], form.system(bias)
+    y = np.concatenate([x, -bias[form.period] * x[len(form.period) :]])
+    assert np.allclose(system, system.conj().T)
+    assert np.vdot(x, system @ x).real == pytest.approx(np.vdot(y, form.gram @ y).real)

@@ -152,6 +152,20 @@ def test_message_variances_rule_over_the_configured_noise(monkeypatch):
     assert ours < theirs / 100
 
 
+def test_links_err_as_they_say(monkeypatch):
+    """Straight ahead, with noise of the yaw rate alone."""
+    monkeypatch.setattr(segments_module, 'PIECE_STD_M', 10.0)
+    config, squared = dataclasses.replace(ANY, yaw_noise=0.05), []
+    for seed in range(20):
+        run = drive(straight(30.0), yaw_noise=0.05 * np.sqrt(50), seed=seed)
+        squared += [
+            (s.turn_rad**2 / s.turn_variance, s.displacement.imag**2 / s.displacement_variance)
+            for s in cut(run.odometry, run.stamps_ns, config)
+            if s.linked
+        ]
+    assert np.mean(squared, axis=0) == pytest.approx([1.0, 1.0], abs=0.25)
+
+
 def test_joined_runs_keep_their_pictures_apart():
     run = drive(SQUARE)
     one = cut(run.odometry, run.stamps_ns, STRAIGHT)
