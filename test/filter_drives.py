@@ -60,11 +60,6 @@ def from_rest(twists, rate_hz=50.0, standing_s=0.6, faster_s=0.4):
     return twists * np.clip((t - standing_s) / faster_s, 0.0, 1.0)[:, None]
 
 
-def true_path(stamps_ns, twists, start=(0.0, 0.0, 0.0)):
-    """Poses (N, 3): each twist has been held since the stamp before."""
-    return integrate(stamps_ns, twists, np.array(start, float))
-
-
 @dataclass
 class Drive:
     """A drive to be fed to a filter: odometry in order, pictures every `every` samples; they claim
@@ -94,7 +89,8 @@ class Drive:
         rng = np.random.default_rng(self.seed)
         count = len(self.twists)
         self.stamps_ns = stamps(count, self.rate_hz)
-        self.poses = true_path(self.stamps_ns, self.twists, self.start)
+        # Each twist has been held since the stamp before.
+        self.poses = integrate(self.stamps_ns, self.twists, np.array(self.start, float))
         self.read = self.twists / [self.scale, 1.0] + [0.0, self.bias]
         self.read = self.read + rng.standard_normal((count, 2)) * [self.v_std, self.omega_std]
         # The robot was switched on somewhere else, and its odometry's pose drifts as its twist.

@@ -15,7 +15,6 @@ from sfa_localization.data.geometry import RigidTransform, align, rotation
 from sfa_localization.metric import drive_check, selection
 from sfa_localization.metric.forecast import (
     REACH_M,
-    importance,
 )
 from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.quadratic_form import Stack
@@ -93,17 +92,6 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     x, y, error = result.forecast.worst
     assert poses[images[np.hypot(*(places - [x, y]).T).argmin()], 0] > 2.0
     assert error > 1.5 * result.forecast.expected_m
-
-
-def test_importance_brings_the_distances_of_the_left_out_to_those_of_the_points():
-    rng = np.random.default_rng(2)
-    wanted, have = rng.uniform(0, 0.5, 4000), rng.uniform(0, 2.0, 4000) ** 1.5
-    weight = importance(have, wanted)
-    assert weight.sum() == pytest.approx(1.0)
-    assert np.all(weight[have > 0.5] == 0.0)
-    assert weight @ have == pytest.approx(0.25, abs=0.01)
-    far = importance(np.array([5.0, 6.0]), np.array([0.1, 0.2, 0.3, 0.4]))
-    assert far == pytest.approx([0.5, 0.5]), 'where none is near enough, all count'
 
 
 @pytest.mark.parametrize(('noise', 'yaw_noise'), [(3.0, 0.01), (2.0, 0.1)])

@@ -115,11 +115,3 @@ def test_too_few_labels_are_refused(count, folds):
     features, harmonic, yaw = (part[:count] for part in scene())
     with pytest.raises(DataError, match='too few to learn a compass'):
         fit_compass(features, harmonic, yaw, np.arange(count) % folds, -1.0)
-
-
-def test_no_features_still_tell_heading(monkeypatch):
-    """Of one place only, the harmonics alone suffice."""
-    monkeypatch.setattr(compass_training, 'PLACE_FEATURES', 0)
-    fit = fitted()
-    assert np.isfinite(fit.error).all()
-    assert np.degrees(np.median(np.abs(fit.error))) < 30

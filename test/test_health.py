@@ -8,9 +8,10 @@ import warnings
 
 import numpy as np
 import pytest
-from filter_drives import stamps, true_path, winding
+from filter_drives import stamps, winding
 
 from sfa_localization.data.geometry import wrap_angle
+from sfa_localization.data.run import integrate
 from sfa_localization.fusion.health import LIKELY, health_of
 from sfa_localization.fusion.track import Image, Track, remembered
 
@@ -48,7 +49,7 @@ def drive(
     """
     twists = winding(seconds, RATE_HZ, 1.0, turn)
     at_ns = stamps(len(twists), RATE_HZ).tolist()
-    poses = true_path(np.array(at_ns), twists)
+    poses = integrate(np.array(at_ns), twists, np.zeros(3))
     shown, rng, way_m = shown or shows(), np.random.default_rng(seed), 0.0
     track, images = Track(since_m=0.0), ()
     for i, (x, y, yaw) in enumerate(poses.tolist()):

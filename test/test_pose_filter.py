@@ -465,17 +465,6 @@ def test_images_alone_carry_it_through_an_outage_of_the_odometry():
     assert 'stamp' not in reasons[2] + reasons[3]
 
 
-def test_after_a_long_gap_the_heading_is_lost_and_found_again():
-    drive, fused = Drive(seconds=60, **NOISY), known()
-    for event in drive.events():
-        if event[1] or not 20 < seconds_of(event) < 40:
-            drive.give(fused, event)
-        if event[1] and 30 < seconds_of(event) < 40:
-            assert fused.status.level is Level.LOST
-    assert drive.error(fused, -1)[0] < 0.4 and abs(drive.error(fused, -1)[1]) < 0.2
-    assert fused.status.level is Level.LOCALISED
-
-
 def through_a_gap(pose=None):
     """Straight on at 0.5 m/s; unseen for 1 s, after which the odometry is at a pose; the state."""
     fused = known(std=0.02)
