@@ -214,12 +214,10 @@ DRIVE = SimulationConfig(area=(6.0, 6.0), length=20.0, images='panorama', images
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('size', [(120, 25), (480, 100)])
-def test_a_drive_with_panoramas_of_any_size_trains_and_is_judged(size, tmp_path):
-    """The network fits itself to them."""
-    simulate(DRIVE, tmp_path / 'bag', PanoramaConfig(width=size[0], height=size[1]))
+def test_a_drive_with_panoramas_of_another_size_trains_and_is_judged(tmp_path):
+    """The network fits itself to them: test_network.py shows it for more."""
+    simulate(DRIVE, tmp_path / 'bag', PanoramaConfig(width=120, height=25))
     train([tmp_path / 'bag'], tmp_path / 'model.npz')
     model = PlaceModel.load(tmp_path / 'model.npz')
-    assert (model.panorama.width, model.panorama.height) == size
-    scores = evaluate(model, tmp_path / 'bag').scores
-    assert scores['sfa']['mean'] < 0.5
+    assert (model.panorama.width, model.panorama.height) == (120, 25)
+    assert evaluate(model, tmp_path / 'bag').scores['sfa']['mean'] < 0.5
