@@ -169,6 +169,7 @@ CASES: dict[str, dict[str, Check | Case]] = {
         '--storage sqlite3': lambda a, b: bool([*b.folder.glob('bag/*.db3')]),
         '--image-noise 0': PICTURES,
         '--illumination 1': PICTURES,
+        '--terrain 3': PICTURES,
         '--speed 0.5': more(lambda bag: np.ptp(bag['stamps']), 2e9),
         '--odometry-rate 20': lambda a, b: len(b.bag()['turns']) < 0.5 * len(a.bag()['turns']),
         '--odometry-frame start': WHEELS,

@@ -9,12 +9,20 @@ import numpy as np
 import pytest
 
 from sfa_localization.camera.lenses import make_camera
+from sfa_localization.camera.leveling import tilted
 from sfa_localization.camera.panorama import Unwrapper
 from sfa_localization.camera.settings import CameraConfig, LensCalibration, PanoramaConfig
 from sfa_localization.data.geometry import compose, relative, wrap_angle
 from sfa_localization.data.run import differences, integrate
 from sfa_localization.fusion.pose_filter import PoseFilter
-from sfa_localization.simulation.drive import START_NS, drive, lights, render_images, simulate
+from sfa_localization.simulation.drive import (
+    START_NS,
+    drive,
+    lights,
+    render_images,
+    roll_and_pitch,
+    simulate,
+)
 from sfa_localization.simulation.garden import Garden, panel
 from sfa_localization.simulation.rendering import Dome, Light, Scene, panorama_view
 from sfa_localization.simulation.routes import CLEARANCE_M, Lawn
@@ -109,6 +117,22 @@ def test_pictures_differ_by_place_world_light_and_noise(tiny):
         assert (picture - clean)[inside].std() == pytest.approx(1.5, rel=0.06)
     strong = lights(recorded.image_stamps_ns, replace(config, illumination=1.0))
     assert np.ptp([light.sun for light in strong]) > 0.02
+
+
+def test_uneven_ground_tilts_the_camera_by_place_and_heading(tiny):
+    """The other way where the robot drives the other way, and a little anew in each image."""
+    config, rng = replace(TINY, terrain=3.0), np.random.default_rng(0)
+    poses = np.column_stack([rng.uniform(-4, 4, (200, 2)), rng.uniform(-3, 3, 200)])
+    there = np.degrees([roll_and_pitch(pose, config, k) for k, pose in enumerate(poses)])
+    back = np.degrees([roll_and_pitch(np.add(p, [0, 0, np.pi]), config, 500) for p in poses])
+    assert there.std(0) == pytest.approx([3.0, 3.0], rel=0.25)
+    assert np.corrcoef(there.ravel(), back.ravel())[0, 1] < -0.9
+    flat = tiny.render_panorama(tiny.dock, SMALL)
+    for tilt in np.radians([[5.0, 0.0], [-2.0, 4.0]]):
+        seen = tiny.image(np.append(tiny.dock, tilt), panorama_view(SMALL))
+        expected = tilted(flat, tilt, SMALL.sphere)
+        inner, off = slice(SMALL.height // 4, -SMALL.height // 4), np.abs(seen - flat).mean()
+        assert np.abs(seen - expected)[inner].mean() < 0.5 * off
 
 
 # Routes

@@ -48,9 +48,13 @@ _DRIFT_ERRORS = ('scale_error', 'slip', 'gyro_bias')
 _DRIFT_ITERATIONS = 3  # the drift grows almost linearly with the errors, so a few are enough
 _DRIFT_FACTOR_MAX = 5.0  # in each iteration, so that a drive lucky to drift little stays sane
 _NO_DRIFT_M = 0.01  # below it no factor is meaningful
-ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM = range(5)
+ROUTE_STREAM, SENSOR_STREAM, LIGHT_STREAM, PIXEL_STREAM, FRAME_STREAM, GROUND_STREAM = range(6)
 # The robot may have been switched on this far from where the recording starts.
 _FRAME_REACH_M = 50.0
+WAVES, WAVES_M = 12, (1.5, 6.0)
+"""Of the ground, and their lengths: shorter ones a robot bridges."""
+SWAY = 0.25
+"""Of the slopes, what is new in each image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,10 +243,23 @@ def render_images(
 def _take(
     garden: Garden, config: SimulationConfig, view: View, index: int, pose: Array, light: Light
 ) -> Image:
+    if config.terrain:
+        pose = np.append(pose, roll_and_pitch(pose, config, index))
     image = garden.image(pose, view, light)
     rng = random_stream(config, PIXEL_STREAM, index)
     noise = rng.standard_normal(image.shape, dtype=np.float32)
     return rounded(image + np.float32(config.image_noise) * noise)
+
+
+def roll_and_pitch(pose: Array, config: SimulationConfig, index: int) -> Array:
+    """Roll and pitch (2,) rad at a pose (3,), by waves of the ground of the garden, and bounce."""
+    rng = np.random.default_rng([config.world, GROUND_STREAM])
+    toward, phase = rng.uniform(0, 2 * np.pi, (2, WAVES))
+    along = np.cos(toward) * pose[0] + np.sin(toward) * pose[1]
+    slope = np.cos(2 * np.pi * along / rng.uniform(*WAVES_M, WAVES) + phase) * 2 / np.sqrt(WAVES)
+    uphill = (slope * np.exp(1j * (toward - pose[2]))).sum()  # ahead + j left
+    sway = SWAY * random_stream(config, GROUND_STREAM, index).standard_normal(2)
+    return np.asarray(np.radians(config.terrain) * (sway + np.array([uphill.imag, -uphill.real])))
 
 
 def _ahead(pool: ThreadPoolExecutor, jobs: Iterator[Callable[[], Image]]) -> Iterator[Image]:

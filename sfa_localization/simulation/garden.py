@@ -382,10 +382,12 @@ class Garden:
         return rounded(self.image(pose, raw_view(camera.unproject, camera.size)))
 
     def image(self, pose: Array, view: View, light: Light | None = None) -> Floats:
-        """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose (3,)."""
+        """Brightness (H, W, 3) BGR, 0..255 and beyond, of a view from a pose: x m, y m, yaw rad,
+        and perhaps roll and pitch rad.
+        """
         light = light or Light()
         position = np.array([pose[0], pose[1], CAMERA_HEIGHT_M])
-        return view.image(self.scene.look(position, float(pose[2]), view.dome, light), light.gain)
+        return view.image(self.scene.look(position, pose[2:], view.dome, light), light.gain)
 
 
 def rounded(image: Floats) -> Image:

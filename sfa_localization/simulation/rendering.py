@@ -16,10 +16,11 @@ import cv2
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.sphere import rotation
 from sfa_localization.simulation.daylight import LIGHTS, Daylight
 from sfa_localization.simulation.textures import (
     SKY_COLUMNS,
@@ -88,11 +89,9 @@ class Dome:
         rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], -1)
         return cls(elevations_rad, columns, rays.astype(np.float32))
 
-    def turned(self, yaw_rad: float) -> Floats:
-        """The rays (rows, columns, 3) of a robot turned counterclockwise."""
-        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-        matrix = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
-        return np.asarray(self.rays @ matrix, np.float32)
+    def turned(self, yaw: float, roll: float = 0.0, pitch: float = 0.0) -> Floats:
+        """The rays (rows, columns, 3) of a robot that is turned, rolls and pitches, rad."""
+        return np.asarray(self.rays @ rotation(roll, pitch, yaw).T.astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,14 +238,16 @@ class Scene:
         rows = [[*shape.tint, SURFACE_INDEX[shape.surface]] for shape in shapes]
         return np.repeat(rows, [len(shape.faces) for shape in shapes], 0).astype(np.float32)
 
-    def look(self, position: Array, yaw_rad: float, dome: Dome, light: Light) -> Floats:
-        """Brightness 0..255 (rows, columns, 3) BGR of a dome about `position` (3,) m."""
-        rays = dome.turned(yaw_rad)
+    def look(self, position: Array, turn: ArrayLike, dome: Dome, light: Light) -> Floats:
+        """Brightness 0..255 (rows, columns, 3) BGR of a dome about `position` (3,) m, of a robot
+        with yaw, or yaw, roll and pitch `turn` rad.
+        """
+        rays = dome.turned(*np.ravel(turn).tolist())
         start = np.broadcast_to(position, (rays.shape[0] * rays.shape[1], 3)).astype(np.float32)
         hits = self._embree.run(start, rays.reshape(-1, 3), output=True)
         surfaces = self._surfaces(hits, rays, 2 * np.pi / dome.columns, light)
         missed = (hits['primID'] < 0).reshape(rays.shape[:2])
-        seen = np.asarray(np.where(missed[..., None], self._sky_at(dome, yaw_rad), surfaces))
+        seen = np.asarray(np.where(missed[..., None], self._sky_at(rays), surfaces))
         target = self._daylight.brightness
         return seen if target is None else metered(seen * self._daylight.balance, dome, target)
 
@@ -269,13 +270,12 @@ class Scene:
         lit = values[:, 2:3] * (sun * light.sun) + values[:, 3:4] * ambient
         return np.asarray(texture * np.sqrt(np.maximum(lit * rows[:, 12:15], 0)).reshape(*shape, 3))
 
-    def _sky_at(self, dome: Dome, yaw_rad: float) -> Floats:
-        """The sky (rows, columns, 3) behind the dome."""
-        column = -(np.arange(dome.columns) + 0.5 - dome.columns / 2) * 2 * np.pi / dome.columns
-        x = np.mod((column + yaw_rad) / (2 * np.pi), 1) * SKY_COLUMNS
-        degrees = np.degrees(dome.elevations_rad)
+    def _sky_at(self, rays: Floats) -> Floats:
+        """The sky (rows, columns, 3) along rays."""
+        x = np.mod(np.arctan2(rays[..., 1], rays[..., 0]) / (2 * np.pi), 1) * SKY_COLUMNS
+        degrees = np.degrees(np.arcsin(np.clip(rays[..., 2], -1, 1)))
         y = (SKY_HIGHEST_DEG - degrees) / (SKY_HIGHEST_DEG - SKY_LOWEST_DEG) * (SKY_ROWS - 1)
-        grid = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        grid = np.asarray(x, np.float32), np.asarray(y, np.float32)
         return np.asarray(cv2.remap(self._sky, *grid, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 

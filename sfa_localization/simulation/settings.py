@@ -54,6 +54,9 @@ class SimulationConfig(Settings):
     illumination: float = setting(
         0.1, 'change of light: 0 none, 1 clouds and exposure at their worst', low=0.0, high=1.0
     )
+    terrain: float = setting(
+        0.0, 'standard deviation of the slope along each axis', unit='deg', low=0.0, high=10.0
+    )
     speed: float = setting(1.0, 'driving speed', unit='m/s', low=0.05, high=3.0)
     odometry_rate: float = setting(
         50.0, 'rate of odometry, gyroscope and ground truth', unit='Hz', low=5.0, high=500.0
