@@ -30,7 +30,7 @@ from sfa_localization.features.observation import Observation as Observation
 from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.place_model import PlaceModel, require_panorama
+from sfa_localization.place_model import PlaceModel, View, require_panorama
 
 UNKNOWN_VARIANCE = LARGEST_VARIANCE
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
@@ -69,7 +69,7 @@ class Observer:
         if len(panoramas):
             self._require_size(panoramas[0])
         judged = list(map(self._judge, panoramas))
-        located = map(self._locate, panoramas, self.model.slow_poses(panoramas))
+        located = map(self._locate, self.model.views(panoramas))
         return [
             self._usable(replace(found, stamp_ns=stamp_ns, problem=problem, turned=turned))
             for stamp_ns, (problem, turned), found in zip(
@@ -89,12 +89,13 @@ class Observer:
         problem = self.watch.judge(panorama)
         return problem, math.nan if problem else self._gyro.add(panorama)
 
-    def _locate(self, panorama: Image, slow: Observation) -> Observation:
+    def _locate(self, view: View) -> Observation:
         """Slow features and keyframes together. Where they have lately been farther apart than
         their covariances allow, the light is another one, and slow features lose their weight.
         """
         noise = self.model.keyframes.noise
-        match = self.model.match(panorama, slow, self._light.pattern)
+        match = self.model.match(view, self._light.pattern)
+        slow = self.model.slow_pose(view, match)
         if match.known:
             self._light.add(match, noise)
         light = self._light.unlike

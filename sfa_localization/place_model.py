@@ -24,7 +24,7 @@ from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.image_features import (
     TURNED_LAYER,
-    layer_harmonics,
+    Spectrum,
     slow_features,
     spectrum,
 )
@@ -39,19 +39,18 @@ from sfa_localization.features.network import (
 )
 from sfa_localization.features.observation import (
     UNKNOWN_YAW_VARIANCE,
+    Leveled,
     Match,
     Observation,
     Spectra,
     combine,
 )
-from sfa_localization.features.rotation import Map
 from sfa_localization.features.rotation_spread import Agreement, disagreement
-from sfa_localization.metric.compass import Compass
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 FORMAT = 'sfa_localization place model'
-VERSION = 11
+VERSION = 12
 SCALE_STD = 0.01
 """Of the scale of a map: its meters are those of wheels, seldom known better."""
 _LONGEST_DELAY_S = 10.0
@@ -59,8 +58,20 @@ _LONGEST_DELAY_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """What an image shows before its heading is known: itself `leveled`, its slow features (K,),
+    the `spread` of its views about them, and the `spectrum` (H, J) of the layer that is turned.
+    """
+
+    leveled: Leveled
+    slow_features: Array
+    spread: float
+    spectrum: Spectrum
+
+
+@dataclass(frozen=True, slots=True)
 class PlaceModel:
-    """Network, metric map, compass and keyframes, learned from one place.
+    """Network, metric map and keyframes, learned from one place.
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
@@ -73,9 +84,6 @@ class PlaceModel:
     keyframes: Keyframes
     agreement: Agreement
     turned: TurnedMaps | None = None
-    compass: Compass | None = None
-    yaw_agreement: Agreement | None = None
-    heading_layers: tuple[int, ...] = ()
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
 
@@ -96,48 +104,40 @@ class PlaceModel:
     @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
         """What panoramas (T, H, W, 3) show."""
-        slow = self.slow_poses(panoramas)
-        return [
-            self.combined(one, self.match(panorama, one))
-            for one, panorama in zip(slow, panoramas, strict=True)
-        ]
+        seen = [(view, self.match(view)) for view in self.views(panoramas)]
+        return [self.combined(self.slow_pose(view, match), match) for view, match in seen]
 
-    def slow_poses(self, panoramas: Image) -> list[Observation]:
-        """What panoramas (T, H, W, 3) show by slow features alone, leveled by keyframes."""
+    def views(self, panoramas: Image) -> list[View]:
+        """What the network makes of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
         level = list(map(self.keyframes.level, panoramas))
         maps = self.network.maps(np.stack([image.panorama for image in level]))
-        slow = slow_features(maps)
-        spread = disagreement(maps[-1])
-        yaw, yaw_variance = self.headings(maps, slow)
-        if self.yaw_agreement is not None:
-            yaw_variance = yaw_variance * self.yaw_agreement.factor(spread)
-        yaw_variance = np.minimum(yaw_variance, UNKNOWN_YAW_VARIANCE)
+        slow, spread = slow_features(maps), disagreement(maps[-1])
+        spectra = spectrum(maps[min(TURNED_LAYER, len(maps) - 1)])
+        return list(map(View, level, slow, spread, spectra))
+
+    def match(self, view: View, pattern: Spectra | None = None) -> Match:
+        """What keyframes show of an image without the `pattern` that the light adds, see
+        `OtherLight`.
+        """
+        return self.keyframes.match_level(view.leveled, pattern)
+
+    def slow_pose(self, view: View, match: Match) -> Observation:
+        """Where the map puts an image, at the heading that keyframes show; that is not known by it.
+
+        Turned by a heading that is uncertain, or unknown, the place is so, too.
+        """
         by_yaw: Array | float = 0.0
         if self.turned is None:
-            positions, own = self.metric.predict(slow)
+            (position,), (own,) = self.metric.predict(view.slow_features)
         else:
-            spectra = spectrum(maps[TURNED_LAYER])
-            positions, own, by_yaw = self.turned.predict(self.metric, spectra, yaw, yaw_variance)
-        own = own * self.agreement.factor(spread)[:, None, None] + by_yaw
-        covariances = np.zeros((len(slow), 3, 3))
-        covariances[:, :2, :2] = own
-        covariances[:, 2, 2] = yaw_variance
-        poses = np.column_stack([positions, yaw])
-        return [
-            Observation(pose, covariance, features, leveled=image)
-            for pose, covariance, features, image in zip(
-                poses, covariances, slow, level, strict=True
-            )
-        ]
-
-    def match(self, panorama: Image, slow: Observation, pattern: Spectra | None = None) -> Match:
-        """What keyframes show of a panorama (H, W, 3) without the `pattern` that the light adds,
-        see `OtherLight`; they are looked for also where its slow features put it.
-        """
-        guess = slow.position if np.isfinite(slow.position).all() else None
-        level = slow.leveled or self.keyframes.level(panorama)
-        return self.keyframes.match_level(level, guess, pattern)
+            variance = self.keyframes.noise.covariance(match)[2, 2] if match.known else np.inf
+            yaw = match.pose[2:], np.array([min(variance, UNKNOWN_YAW_VARIANCE)])
+            found = self.turned.predict(self.metric, view.spectrum[None], *yaw)
+            (position,), (own,), (by_yaw,) = found
+        covariance = np.diag([0.0, 0.0, UNKNOWN_YAW_VARIANCE])
+        covariance[:2, :2] = own * self.agreement.factor(np.array([view.spread])) + by_yaw
+        return Observation(np.append(position, 0.0), covariance, view.slow_features)
 
     def combined(
         self, slow: Observation, match: Match, light: float = 0.0, doubt: float = 1.0
@@ -154,14 +154,6 @@ class PlaceModel:
         covariance[:2, :2] += noise.beyond(match, light) ** 2 * np.eye(2)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
         return Observation(pose, covariance, slow.slow_features, novelty, tilt=match.tilt)
-
-    def headings(self, maps: list[Map], slow: Array) -> tuple[Array, Array]:
-        """Yaw (T,) rad in the map and its variance (T,), from the maps of all layers and the slow
-        features (T, K); without a compass it is 0 and unknown.
-        """
-        if self.compass is None:
-            return np.zeros(len(slow)), np.full(len(slow), UNKNOWN_YAW_VARIANCE)
-        return self.compass.predict(slow, layer_harmonics(maps, self.heading_layers))
 
     def save(self, path: Path) -> None:
         """Write to `path` completely or not at all; the same model gives the same bytes."""
@@ -188,8 +180,7 @@ class PlaceModel:
         Raises ModelError where the results are not finite, or certain beyond reason.
         """
         check_weights(self.network)
-        turned = [part for part in (self.compass, self.turned) if part is not None]
-        if any(abs(part.sign) != 1.0 for part in turned):
+        if self.turned is not None and abs(self.turned.sign) != 1.0:
             raise ModelError('it turns neither way')
         height, width = self.network.architecture.size
         if (height, width) != (self.panorama.height, self.panorama.width):
@@ -213,7 +204,6 @@ class PlaceModel:
             'architecture': architecture,
             'ranks': self.network.ranks,
             'panorama': dataclasses.asdict(self.panorama),
-            'heading_layers': self.heading_layers,
             'quality': self.quality,
             'error_correlation': dataclasses.asdict(self.error_correlation),
         }
@@ -226,17 +216,13 @@ class PlaceModel:
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
         arrays |= _prefixed('agreement/', self.agreement.to_arrays())
-        for name in ('compass', 'yaw_agreement', 'turned'):
-            part = getattr(self, name)
-            if part is not None:
-                arrays |= _prefixed(f'{name}/', part.to_arrays())
+        if self.turned is not None:
+            arrays |= _prefixed('turned/', self.turned.to_arrays())
         return arrays
 
     @classmethod
     def _from_arrays(cls, arrays: Arrays, header: dict[str, Any]) -> PlaceModel:
-        turned, compass, yaw_agreement = (
-            _under(arrays, name) for name in ('turned/', 'compass/', 'yaw_agreement/')
-        )
+        turned = _under(arrays, 'turned/')
         panorama = PanoramaConfig.from_mapping(header['panorama'], 'panorama')
         return cls(
             network_from(arrays, header),
@@ -245,9 +231,6 @@ class PlaceModel:
             Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
             Agreement.from_arrays(_under(arrays, 'agreement/')),
             TurnedMaps.from_arrays(turned) if turned else None,
-            Compass.from_arrays(compass) if compass else None,
-            Agreement.from_arrays(yaw_agreement) if yaw_agreement else None,
-            tuple(header['heading_layers']),
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
         )

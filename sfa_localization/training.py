@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a place model from recorded drives: the paper in nine steps; ground truth is never read.
+"""Learn a place model from recorded drives: the paper in eight steps; ground truth is never read.
 
 1  read the drives                                       bags/drives.py
 2  find loop closures, and measure their offsets         features/closures.py, offsets.py
@@ -9,10 +9,9 @@
 5  cut the odometry into segments (section 3.1)          metric/segments.py
 6  learn the certified map (section 3, eq. 1 and eq. 5)  metric/learning.py
 7  learn it again, from maps turned by its headings      metric/turned_maps.py
-8  learn the heading                                     metric/compass_training.py
-9  keyframes, and the model for section 5                metric/keyframe_map.py, place_model.py
+8  keyframes, and the model for section 5                metric/keyframe_map.py, place_model.py
 
-Steps 2, 7, 8 and keyframes go beyond the paper.
+Steps 2, 7 and keyframes go beyond the paper.
 """
 
 from __future__ import annotations
@@ -30,7 +29,6 @@ from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.image_features import features_of_runs
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
-from sfa_localization.metric.compass_training import LearnedHeading, compass_layers, learn_heading
 from sfa_localization.metric.drives import compare_with_map, learn_map
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import (
@@ -59,7 +57,6 @@ class Trained:
     features: Array
     segments: Segments
     metric: MetricResult
-    heading: LearnedHeading | None
     checks: tuple[MotionCheck, ...] = ()
     """Of each drive: what its sources of motion tell of each other."""
 
@@ -92,7 +89,7 @@ def train(
         checkpoint.remove()
     given = TrainingInput.of(runs, recipe, progress)  # step 2
     network = train_hierarchy(given, checkpoint)  # step 3
-    trained = _learn(network, given, strict)  # steps 4 to 9
+    trained = _learn(network, given, strict)  # steps 4 to 8
     compare_with_map(checks, given.drives, trained.segments, trained.metric)
     trained.model.save(output)
     checkpoint.remove()
@@ -102,7 +99,7 @@ def train(
 def learn_place(
     network: Network, runs: Sequence[Run], recipe: Recipe, strict: bool = False
 ) -> Trained:
-    """Steps 4 to 9 for a trained network.
+    """Steps 4 to 8 for a trained network.
 
     Raises DataError; `strict` also for a single route, of which else a warning says so.
     """
@@ -111,19 +108,14 @@ def learn_place(
 
 def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
     config, seed = given.recipe.metric, given.recipe.network.seed
-    layers = compass_layers(len(network.nodes))
     with given.bar(4, 'compute the slow features of all images') as bar:
-        images = features_of_runs(network, given.runs, layers, bar.update)
+        images = features_of_runs(network, given.runs, bar.update)
     given.say(6, 'cut the odometry, and learn the map')  # steps 5 and 6
     segments, first = learn_map(given.drives, images.slow, config, seed, strict)
     given.say(7, 'learn the map again, from turned maps')
     sign = -1.0 if given.panorama.clockwise else 1.0
     turned, result = with_turned(images.spectra, segments, first, sign, config, seed)
-    given.say(8, 'learn the heading')
-    heading = learn_heading(images, segments, result, sign)
-    if heading is None:
-        turned, result = None, first
-    given.say(9, 'choose keyframes, and check the map')
+    given.say(8, 'choose keyframes, and check the map')
     agreement = left_out_agreement(images.disagreement, result)
     known = learn_keyframes(
         given.views, images.disagreement, segments, result, agreement, given.recipe.panorama.sphere
@@ -141,10 +133,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         known.keyframes,
         agreement,
         turned,
-        heading.compass if heading else None,
-        heading.agreement if heading else None,
-        layers if heading else (),
-        {**quality, **(heading.quality if heading else {})},
+        quality,
         correlation_along_drive(result, segments, TURN_RADIUS_M),
     )
-    return Trained(model, given.runs, images.slow, segments, result, heading)
+    return Trained(model, given.runs, images.slow, segments, result)

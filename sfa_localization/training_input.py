@@ -31,7 +31,7 @@ from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 logger = logging.getLogger(__name__)
 
-STEPS = 9
+STEPS = 8
 """Of a training, see training.py."""
 
 

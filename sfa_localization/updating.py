@@ -4,7 +4,7 @@
 
 A drive is replayed and smoothed. Where the robot was LOCALISED and its smoothed pose is certain, an
 image that the keyframes recognize less well than each other shows a place between them, or in
-another light or season: it becomes a keyframe with the smoothed pose. Network, maps, compass and
+another light or season: it becomes a keyframe with the smoothed pose. Network, map and
 first keyframes stay.
 """
 

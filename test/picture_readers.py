@@ -38,11 +38,14 @@ class WithoutKeyframes:
 
     keyframes = SimpleNamespace(noise=MatchNoise())
 
-    def slow_poses(self, images):
-        return [self.locate(image) for image in images]
+    def views(self, images):
+        return images
 
-    def match(self, image, slow, pattern=None):
+    def match(self, view, pattern=None):
         return Match(np.zeros(3), 0.0, 0.0, 0.0)
+
+    def slow_pose(self, view, match):
+        return self.locate(view)
 
     def combined(self, slow, match, light=0.0, doubt=1.0):
         return slow

@@ -139,7 +139,6 @@ def test_the_farther_apart_the_less_sure_and_where_they_contradict_keyframes_cou
     assert far == pytest.approx(near * 0.4**2 / 0.02 / 2, rel=1e-3)
     for slow, match, doubt in (
         (slow_at(0.6, 0.1), match_at(0.1), 1.0),
-        (slow_at(0.1, 0.1), match_at(0.1, support=-5.0), 1.0),
         (slow_at(0.1, 0.1), match_at(0.1), 1.1),
         (slow_at(math.nan, 0.1), match_at(0.1), 1.0),
     ):
@@ -179,11 +178,11 @@ class Matched(PictureReader):
         self.slow, self.found = slow, match
         self.keyframes = SimpleNamespace(noise=noise, poses=np.array([[*center, 0.0]]))
 
-    def slow_poses(self, images):
-        return [self.slow] * len(images)
-
-    def match(self, image, slow, pattern=None):
+    def match(self, view, pattern=None):
         return self.found
+
+    def slow_pose(self, view, match):
+        return self.slow
 
     combined = PlaceModel.combined
 

@@ -97,10 +97,6 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
         assert abs(wrap_angle(other.yaw - one.yaw - turn)) < np.radians(2)
         assert np.abs(other.position - one.position).max() < 0.1
         assert other.novelty == pytest.approx(one.novelty, abs=0.1)
-        slow, turned = model.slow_poses(np.stack([picture, np.roll(picture, columns, axis=1)]))
-        assert abs(wrap_angle(turned.yaw - slow.yaw - turn)) < 1e-4
-        assert np.abs(turned.position - slow.position).max() < 1e-4
-        assert np.allclose(turned.covariance, slow.covariance, rtol=1e-2)
 
 
 def test_covariances_are_positive_definite(model, pictures):
@@ -116,15 +112,24 @@ def test_covariances_are_positive_definite(model, pictures):
     assert foreign > 10 * familiar
 
 
-def test_without_a_compass_the_keyframes_show_the_yaw(model, pictures):
-    blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
-    (slow,) = blind.slow_poses(pictures[:1])
-    assert np.isnan(slow.yaw) and slow.covariance[2, 2] == UNKNOWN_YAW_VARIANCE
-    known = model.slow_poses(pictures[:1])[0]
-    assert np.trace(slow.covariance[:2, :2]) > 10 * np.trace(known.covariance[:2, :2])
-    estimate = blind.locate(pictures[0])
-    assert abs(wrap_angle(estimate.yaw - model.locate(pictures[0]).yaw)) < np.radians(5)
-    assert np.allclose(estimate.position, model.locate(pictures[0]).position, atol=0.05)
+def test_of_an_image_without_a_known_heading_the_map_knows_little(model, pictures):
+    (view,) = model.views(pictures[:1])
+    match = model.match(view)
+    sure, unsure = (model.slow_pose(view, m) for m in (match, replace(match, known=False)))
+    assert np.isnan(sure.yaw) and sure.covariance[2, 2] == UNKNOWN_YAW_VARIANCE
+    assert np.trace(unsure.covariance[:2, :2]) > 10 * np.trace(sure.covariance[:2, :2])
+    assert np.allclose(model.combined(sure, match).yaw, match.pose[2])
+
+
+def test_symmetric_panoramas_raise_the_variance(model, pictures):
+    """Scenes that look alike in several directions do not tell them."""
+    turned = np.roll(pictures, pictures.shape[2] // 2, axis=2)
+    symmetric = np.mean([pictures, turned], axis=0).round().astype(np.uint8)
+    known, lost = (
+        np.median([e.covariance[2, 2] for e in model.locate_all(p)]) for p in (pictures, symmetric)
+    )
+    assert lost > 20 * known
+    assert np.sqrt(lost) > np.radians(30)
 
 
 @pytest.mark.parametrize(
@@ -156,10 +161,6 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
     again.save(tmp_path / 'loaded.npz')
     assert (tmp_path / 'again.npz').read_bytes() == saved.read_bytes()
     assert (tmp_path / 'loaded.npz').read_bytes() == saved.read_bytes()
-    blind = replace(model, compass=None, heading_layers=(), yaw_agreement=None)
-    blind.save(tmp_path / 'blind.npz')
-    again = PlaceModel.load(tmp_path / 'blind.npz')
-    assert again.compass is None and again.locate(pictures[0]).yaw == blind.locate(pictures[0]).yaw
 
 
 def test_a_failed_write_leaves_the_old_model_and_nothing_else(model, saved, monkeypatch):
@@ -200,12 +201,12 @@ def test_a_damaged_model_is_refused_with_the_remedy(saved):
     for cut in (0.1, 0.99):
         saved.write_bytes(whole[: int(len(whole) * cut)])
         refused(saved, 'not a sfa_localization place model')
-    for name in ('metric/linear', 'keyframes/textures', 'compass/weights'):
+    for name in ('metric/linear', 'keyframes/textures', 'turned/axes'):
         data = bytearray(whole)
         data[whole.index(arrays[name].tobytes()) + 9] ^= 16
         saved.write_bytes(data)
         refused(saved, 'damaged.*: copy it again, or train it')
-    names = ('network/1/slow', 'metric/linear', 'keyframes/noise', 'compass/weights')
+    names = ('network/1/slow', 'metric/linear', 'keyframes/noise')
     for name in (*names, 'turned/axes'):
         saved.write_bytes(whole)
         rewrite(saved, without=name)

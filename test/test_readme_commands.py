@@ -104,7 +104,7 @@ def test_nodes_run_as_described(folder, monkeypatch):
     size = PlaceModel.load(folder / 'model.npz').panorama
     extra = {
         'omnicam_node': ['-p', f'width:={size.width}', '-p', f'height:={size.height}'],
-        'play': ['--rate', '3'],
+        'play': ['--rate', '4'],
     }
     programs = {words[0]: program(words + extra.get(words[0], [])) for words in commands('live')}
     live = live_nodes.run_live(programs, folder / 'logs')

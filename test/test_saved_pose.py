@@ -13,6 +13,7 @@ from sfa_localization.nodes.saved_pose import SavedPose, load_pose, save_pose
 SAVED = SavedPose(7, 'map', np.array([1.0, -2.0, 3.0]), np.diag([0.04, 0.01, 0.0025]))
 GOOD = {'version': 1, 'stamp_ns': 7, 'frame': 'map', 'pose': [0, 0, 0],
         'covariance': np.eye(3).tolist()}  # fmt: skip
+OTHER_FILES = ['\x00\x80', '[1, 2]', '{"stamp_ns": 7}']
 OTHER_POSES = [
     {'version': 2}, {'frame': 'hall'}, {'pose': [0, 0]}, {'pose': ['a', 'b', 'c']},
     {'covariance': [[1], [1, 2], 3]}, {'pose': [float('nan'), 0, 0]},
@@ -34,8 +35,7 @@ def test_what_is_written_is_read_back(tmp_path):
     assert np.sqrt(read.moved()[2, 2]) == pytest.approx(np.hypot(0.05, 0.3))
 
 
-def test_another_file_is_rejected_by_name_and_only_another_pose_is_written_over(tmp_path):
-    """Not the model, which the parameter may name by mistake."""
+def test_another_pose_is_rejected_by_name_and_written_over(tmp_path):
     path = tmp_path / 'pose.json'
     for change in OTHER_POSES:
         path.write_text(json.dumps({**GOOD, **change}))
@@ -43,9 +43,16 @@ def test_another_file_is_rejected_by_name_and_only_another_pose_is_written_over(
             load_pose(path, 'map')
         save_pose(path, SAVED)
         assert load_pose(path, 'map').stamp_ns == 7
-    for text in ('\x00\x80', '[1, 2]', '{"stamp_ns": 7}'):
+
+
+def test_a_file_of_something_else_is_rejected_by_name_and_stays(tmp_path):
+    """Not the model, which the parameter may name by mistake."""
+    path = tmp_path / 'model.npz'
+    for text in OTHER_FILES:
         path.write_text(text)
         for attempt in (lambda: load_pose(path, 'map'), lambda: save_pose(path, SAVED)):
-            with pytest.raises(DataError, match=r'pose\.json: holds no saved pose, and stays'):
+            with pytest.raises(DataError, match=r'model\.npz: holds no saved pose, and stays'):
                 attempt()
         assert path.read_text() == text
+    with pytest.raises(DataError, match='holds no saved pose'):
+        load_pose(tmp_path, 'map')

@@ -112,7 +112,7 @@ def test_an_updated_model_still_knows_the_place_when_the_season_goes_on():
 def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     model, new, newer = updated()
     assert newer.network is model.network and newer.metric is model.metric
-    assert newer.compass is model.compass and newer.keyframes.noise == model.keyframes.noise
+    assert newer.turned is model.turned and newer.keyframes.noise == model.keyframes.noise
     first = len(model.keyframes.poses)
     np.testing.assert_array_equal(newer.keyframes.textures[:first], model.keyframes.textures)
     np.testing.assert_array_equal(newer.keyframes.poses[first:], new.poses)

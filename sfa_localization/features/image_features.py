@@ -21,33 +21,19 @@ from sfa_localization.features.network import Network
 from sfa_localization.features.rotation import Map
 from sfa_localization.features.rotation_spread import disagreement
 
-Complex = NDArray[np.complex128]
 Spectrum = NDArray[np.complex64]
 
 TURNED_LAYER = 1
 """Layer (0-based), below the top, whose map is turned to locate by: it still holds the heading."""
 HARMONICS = 13
 """Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
-# Images whose maps the compass reads, and that are compared for closures, however long the drives.
+# Images that are compared for closures, however long the drives.
 SAMPLES = 3000
 
 
 def slow_features(maps: list[Map]) -> Array:
     """Slow features (T, K) s_j of section 2.2: the top node, averaged over all rotations."""
     return np.asarray(maps[-1].mean((1, 2), dtype=np.float64))
-
-
-def harmonics(maps: Map) -> Complex:
-    """First harmonic over the columns of maps (T, rows, R, channels): (T, rows * channels)."""
-    columns = maps.shape[2]
-    wave = np.exp(-2j * np.pi * np.arange(columns) / columns).astype(np.complex64)
-    parts = wave @ maps
-    return np.asarray(parts.reshape(len(maps), -1), np.complex128)
-
-
-def layer_harmonics(maps: list[Map], layers: tuple[int, ...]) -> Complex:
-    """Harmonics of the maps of some layers (0-based) side by side, (T, J)."""
-    return np.concatenate([harmonics(maps[layer]) for layer in layers], axis=1)
 
 
 def spectrum(maps: Map, count: int = HARMONICS) -> Spectrum:
@@ -66,16 +52,12 @@ def spectrum(maps: Map, count: int = HARMONICS) -> Spectrum:
 
 @dataclass(frozen=True, slots=True)
 class ImageFeatures:
-    """Network outputs for all N images, run after run, and more for a sample of S of them."""
+    """Network outputs for all N images, run after run."""
 
     slow: Array
     """(N, K) slow features."""
     disagreement: Array
     """(N,) of the rotated views of each image."""
-    sampled: NDArray[np.int64]
-    """(S,) indices of the sample."""
-    harmonic: Complex
-    """(S, J) of the layers that the compass reads."""
     spectra: Spectrum | None
     """(N, H, J) of the layer that is turned; None in a network without it."""
     variance_shares: dict[str, list[float]]
@@ -93,42 +75,31 @@ def evenly(count: int, most: int) -> NDArray[np.int64]:
 
 
 def sample(total: int) -> NDArray[np.int64]:
-    """Those of so many images whose maps and textures are kept."""
+    """Those of so many images whose textures are kept."""
     return evenly(total, SAMPLES)
 
 
 def features_of_runs(
     network: Network,
     runs: Sequence[Run],
-    compass_layers: tuple[int, ...],
     on_images: Callable[[int], object] = lambda count: None,
 ) -> ImageFeatures:
     """Run all images through the network once; `on_images` receives the size of each batch."""
-    total = sum(len(run.panoramas) for run in runs)
-    sampled = sample(total)
-    in_sample = np.zeros(total, bool)
-    in_sample[sampled] = True
-    slow, spread, harmonic = [], [], []
+    slow, spread = [], []
     spectra: list[Spectrum] = []
     shares = _VarianceShares(network.architecture.outputs)
-    start = 0
     for images in (batch for run in runs for batch in run.panoramas.batches(BATCH)):
         maps = network.maps(images)
-        keep = in_sample[start : start + len(images)]
         slow.append(slow_features(maps))
         spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
-        harmonic.append(layer_harmonics([m[keep] for m in maps], compass_layers))
         # The top's own maps hardly show the heading.
         if len(maps) > TURNED_LAYER + 1:
             spectra.append(spectrum(maps[TURNED_LAYER]))
-        start += len(images)
         on_images(len(images))
     return ImageFeatures(
         np.concatenate(slow),
         np.concatenate(spread),
-        sampled,
-        np.concatenate(harmonic),
         np.concatenate(spectra) if spectra else None,
         shares.result(),
     )

@@ -238,17 +238,13 @@ class Keyframes:
         """Which keyframes are of the training (K,)."""
         return self.drives < self.trained
 
-    def match(
-        self, panorama: Image, guess: Array | None = None, pattern: Spectra | None = None
-    ) -> Match:
-        """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `guess` (2,) m is another
-        estimate of its place, and `pattern` (rows, F) what the light adds to images, see
-        `OtherLight`.
+    def match(self, panorama: Image, pattern: Spectra | None = None) -> Match:
+        """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `pattern` (rows, F) is what the
+        light adds to images, see `OtherLight`.
 
-        The likeliest by a coarse correlation, their best's neighbors and those of the guess are
-        correlated in full.
+        The likeliest by a coarse correlation and their best's neighbors are correlated in full.
         """
-        return self.match_level(self.level(panorama), guess, pattern)
+        return self.match_level(self.level(panorama), pattern)
 
     def level(self, panorama: Image) -> Leveled:
         """A panorama (H, W, 3) uint8 BGR without the roll and pitch of the robot that make it
@@ -304,24 +300,20 @@ class Keyframes:
         self._add(new, np.flatnonzero(np.isfinite(known.scores)))
         return new
 
-    def match_level(
-        self, known: Leveled, guess: Array | None = None, pattern: Spectra | None = None
-    ) -> Match:
+    def match_level(self, known: Leveled, pattern: Spectra | None = None) -> Match:
         """The same for a leveled panorama; what is left of its tilt is taken out."""
         known = replace(known, scores=known.scores.copy(), shifts=known.shifts.copy())
-        if guess is not None:
-            self._add(known, self.nearest(guess))
-        match = self._match_around(known, guess, pattern)
+        match = self._match_around(known, pattern)
         finer = self._leveled(known, match.tilt)
         if finer is not known:
-            match = self._match_around(finer, guess, pattern)
+            match = self._match_around(finer, pattern)
         return replace(match, tilt=finer.tilt + match.tilt)
 
-    def _match_around(self, known: Leveled, guess: Array | None, pattern: Spectra | None) -> Match:
+    def _match_around(self, known: Leveled, pattern: Spectra | None) -> Match:
         best = self.poses[int(known.scores.argmax()), :2]
         around = [self._around(best, drive) for drive in self._likeliest_drives(known.scores)]
         self._add(known, np.unique(np.concatenate(around)))
-        return self.located(known.spectrum, known.scores, known.shifts, guess, pattern)
+        return self.located(known.spectrum, known.scores, known.shifts, pattern)
 
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
         """Find the spectrum (rows, F) of an image with some keyframes alone."""
@@ -377,7 +369,6 @@ class Keyframes:
         spectrum: Spectra,
         scores: NDArray[np.float32],
         shifts: NDArray[np.float32],
-        guess: Array | None = None,
         pattern: Spectra | None = None,
     ) -> Match:
         """The match of the spectrum (rows, F) of an image, by its correlations (K,), -inf where
@@ -403,14 +394,7 @@ class Keyframes:
             left=None if found.left is None else turned(found.left, self._sign * yaw),
             score=float(scores[best]),
             known=bool(scores[best] >= self.noise.lowest),
-            support=self._support(scores, guess),
         )
-
-    def _support(self, scores: NDArray[np.float32], guess: Array | None) -> float:
-        """`Match.support` of a guess (2,) m by the correlations (K,)."""
-        near = scores[self.nearest(guess)] if guess is not None else scores[:0]
-        near = near[np.isfinite(near)]
-        return float(near.max() - scores.max()) / self.noise.temperature if len(near) else 0.0
 
     def _regressed(
         self,

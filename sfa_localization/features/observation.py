@@ -27,8 +27,6 @@ UNKNOWN_YAW_VARIANCE = float(np.pi**2 / 3)
 LOWEST = 0.42
 # Above this `Match.aside` a place is at the border of the keyframes: a straight one has 0.64.
 _BORDER = 0.6
-# Keyframes near a guess that correlate worse than the best by so many temperatures contradict it.
-_DOUBT = 4.0
 # Slow features extrapolate from the same image: they lack so much of what its place adds to the
 # standard deviation of a match. (Between keyframes, where it adds little, this changes little.)
 _SLOW_SHARE = 0.5
@@ -51,10 +49,9 @@ class Match:
     (3, 3) the scatter of [x, y, yaw] about it of other keyframes that are as like the image. The
     place is that of the keyframes by `shares` (N,) of sum 1; None where several drives say so.
 
-    `score` is the correlation with the best keyframe, 1 for the same image, `known` whether it is
-    high enough for a known place, and `support` the correlation with the keyframes near a guess
-    minus `score`, in temperatures: 0 where the best is among them. `tilt` (2,) rad is the roll and
-    pitch of the robot that the image shows against the keyframes.
+    `score` is the correlation with the best keyframe, 1 for the same image, and `known` whether it
+    is high enough for a known place. `tilt` (2,) rad is the roll and pitch of the robot that the
+    image shows against the keyframes.
     """
 
     pose: Array
@@ -68,7 +65,6 @@ class Match:
     shares: Array | None = None
     score: float = 0.0
     known: bool = False
-    support: float = 0.0
     tilt: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
@@ -186,7 +182,7 @@ class Observation:
     is usable: the covariance then means that nothing is known. `turned` is the heading (rad, from
     any start) that the shifts between the images of a drive add up to, NaN for an unusable one: it
     needs no map, and shows the camera's delay. `tilt` (2,) rad is the roll and pitch of the robot,
-    against those of the training; `leveled` is the image that slow features see without it.
+    against those of the training.
     """
 
     pose: Array
@@ -197,7 +193,6 @@ class Observation:
     problem: str = ''
     turned: float = math.nan
     tilt: Array = field(default_factory=lambda: np.zeros(2))
-    leveled: Leveled | None = None
 
     @property
     def position(self) -> Array:
@@ -236,15 +231,14 @@ def combine(
 
     The yaw is combined in the same way by itself (n = 1, j = 1). Slow features count alone at a
     place that the keyframes do not know; keyframes alone where slow features give no position,
-    contradict them (d^2 > 12, or the keyframes near p_s are unlike), or lately did (`doubt` > 1).
+    contradict them (d^2 > 12), or lately did (`doubt` > 1).
     """
     mine, its = noise.covariance(match, light), _slow_covariance(slow, match, noise, light, doubt)
     if not match.known:
         return slow.pose, its
     apart, pose = slow.pose - match.pose, match.pose.copy()
     apart[2] = wrap_angle(apart[2])
-    usable = doubt <= 1 and match.support >= -_DOUBT
-    if not (usable and np.isfinite(apart[:2]).all() and np.isfinite(its).all()):
+    if doubt > 1 or not (np.isfinite(apart[:2]).all() and np.isfinite(its).all()):
         return pose, mine
     found = _weighted(apart[:2], mine[:2, :2], its[:2, :2])
     if found is None:

@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import Views
 from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
@@ -29,17 +30,22 @@ _ENOUGH = 50
 class KeyframeMap:
     """Keyframes of a map; from parts of the drive that both were learned without:
     `improvement`, the mean error of slow features and keyframes together over that of slow
-    features alone, and `within_95`, the share of errors in the ellipses of 95 %.
+    features alone, `within_95`, the share of errors in the ellipses of 95 %, and `yaw_error`, the
+    mean error of headings, rad.
     """
 
     keyframes: Keyframes
     improvement: float = 1.0
     within_95: float = 0.95
+    yaw_error: float | None = None
 
     @property
     def quality(self) -> dict[str, float]:
         """Figures that are stored in the model."""
-        return {'keyframes': len(self.keyframes.poses), 'left_out_within_95': self.within_95}
+        figures = {'keyframes': len(self.keyframes.poses), 'left_out_within_95': self.within_95}
+        if self.yaw_error is None:
+            return figures
+        return {**figures, 'expected_yaw_error_deg': math.degrees(self.yaw_error)}
 
 
 def learn_keyframes(
@@ -60,7 +66,7 @@ def learn_keyframes(
     drives = views.run[seen].astype(np.int32)
     own = fit_keyframes(views.textures[seen], poses, path, sphere, drives)
     turn_std = usual_turn_std(result.angle_covariance)
-    keyframes = replace(own, noise=own.noise.with_map(result.common_m, turn_std))
+    keyframes = replace(own, noise=own.noise.with_map(result.map.common_m, turn_std))
     kept = spread(poses)
     variance = result.left_out_variance * agreement.factor(disagreement[labeled])
     return _judged(keyframes, path[kept], row[kept], result, variance)
@@ -92,15 +98,16 @@ def _judged(
     variance: Array,
 ) -> KeyframeMap:
     """Errors of both together where both were left out; keyframe k is row `rows[k]` (K,)."""
-    errors, variances, alone, weights = [], [], [], []
+    errors, variances, alone, weights, turned = [], [], [], [], []
     for k, scores, shifts in left_out(keyframes, path_m):
         row, place, error = rows[k], keyframes.poses[k, :2], result.left_out[rows[k]]
         spread = np.diag([variance[row], variance[row], UNKNOWN_YAW_VARIANCE])
         slow = Observation(np.append(place + error, 0.0), spread, np.zeros(0))
-        match = keyframes.located(keyframes.spectra([k])[0], scores, shifts, slow.position)
+        match = keyframes.located(keyframes.spectra([k])[0], scores, shifts)
         pose, covariance = combine(slow, match, keyframes.noise)
         errors.append(pose[:2] - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)
+        turned.append(abs(wrap_angle(pose[2] - keyframes.poses[k, 2])))
         alone.append(error)
         weights.append(result.forecast.weight[row])
     if len(errors) < _ENOUGH or not sum(weights) > 0:
@@ -112,4 +119,5 @@ def _judged(
         replace(keyframes, noise=replace(keyframes.noise, joint_factor=factor)),
         float(joint / max(single, 1e-9)),
         share_within(ratio / factor, 2, 0.95, weight),
+        float(np.average(turned, weights=weight)),
     )

@@ -23,7 +23,12 @@ from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
 from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
-from sfa_localization.metric.map_covariance import angle_covariance, metric_map, plane, sway
+from sfa_localization.metric.map_covariance import (
+    angle_covariance,
+    metric_map,
+    place_variance,
+    plane,
+)
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
@@ -69,8 +74,6 @@ class MetricResult:
     """(M,) images of the segments, in order."""
     residuals: Array
     """(M, 2) m: where the segments put an image minus where the map does."""
-    common_m: float
-    """m: standard deviation along each axis of what the drive's positions have in common errors."""
     left_out: Array
     """(M, 2) m: as `residuals`, of a map learned without that stretch of the drive."""
     left_out_variance: Array
@@ -167,18 +170,17 @@ class _Left:
 
     images: LeftOut
     forecast: Forecast
-    sway: NDArray[np.complex128]
     spread: float
     """Mean square distance (m^2) of the images from their middle."""
 
     @classmethod
     def of(cls, fit: MapFit) -> _Left:
-        images, weights_sway, places = leave_out(fit), sway(fit), plane(fit.places)
-        drive_std = np.sqrt((np.abs(fit.expanded @ weights_sway) ** 2).sum(1))
+        images, places = leave_out(fit), plane(fit.places)
+        drive_std = np.sqrt(place_variance(fit))
         distances = ground_distances(places, np.random.default_rng(fit.problem.seed))
         weight = importance(nearest_used(places, part_of(fit.stack, fit.problem.seed)), distances)
         expected = Forecast(places, np.abs(images.errors), drive_std, weight, distances)
-        return cls(images, expected, weights_sway, float(places.var(0).sum()))
+        return cls(images, expected, float(places.var(0).sum()))
 
     @property
     def variance(self) -> float:
@@ -196,9 +198,10 @@ def _result(
 ) -> MetricResult:
     inflation = max(needed_factor(left.images.ratio, 2, left.forecast.weight), 1.0)
     expected = left.forecast.widened(inflation)
+    common_m = float(np.sqrt((expected.drive_std**2).mean() / 2))
     turn = np.exp(1j * frame.yaw_rad)
     return MetricResult(
-        map=metric_map(fit, left.sway, frame, inflation),
+        map=metric_map(fit, frame, inflation, common_m),
         angles=wrap_angle(np.angle(fit.solution.z) + frame.yaw_rad),
         origins=plane(fit.solution.o * turn + frame.x_m + 1j * frame.y_m),
         angle_covariance=angle_covariance(fit),
@@ -206,7 +209,6 @@ def _result(
         certificate=fit.solution.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
-        common_m=float(np.sqrt((expected.drive_std**2).mean() / 2)),
         left_out=plane(left.images.errors * turn),
         left_out_variance=left.images.variances * inflation,
         explained=left.explained,

@@ -16,9 +16,6 @@ from sfa_localization.metric.saved_map import MetricMap, Weights
 
 Complex = NDArray[np.complex128]
 
-# Joint changes of the drive's positions that a map keeps: later ones are smaller than its noise.
-_SWAYS = 24
-
 
 def plane(points: Complex) -> Array:
     """Points (M, 2) of complex x + i y (M,)."""
@@ -30,25 +27,17 @@ def angle_covariance(fit: MapFit) -> Array:
     return np.asarray(fit.link_variance * phases.angle_covariance(fit.solution.h, fit.solution.z))
 
 
-def sway(fit: MapFit) -> Complex:
-    """Changes (m, r) of the map's weights per standard deviation of the r most uncertain joint
-    changes of the segments' origins and directions, without a motion of the whole map, which is
-    a matter of its frame."""
-    stack, solution, places = fit.stack, fit.solution, fit.places
+def place_variance(fit: MapFit) -> Array:
+    """How uncertain the segments' origins and directions leave the place of each image, (M,) m^2
+    over both axes, without a motion of the whole map, which is a matter of its frame."""
+    stack, places = fit.stack, fit.places
     origins, directions = _uncertain_segments(fit)
-    path = stack.corrected(solution.bias)
+    path = stack.corrected(fit.solution.bias)
     moved = origins[stack.owner] + directions[stack.owner] * path[:, None]
     around_center = 1j * (places - places.mean())
     turn = np.real(np.conj(around_center) @ moved) / np.sum(np.abs(around_center) ** 2)
     moved = moved - moved.mean(0) - around_center[:, None] * turn
-    values, vectors = np.linalg.eigh(np.real(moved.conj().T @ moved))
-    keep = vectors[:, np.argsort(values)[::-1][:_SWAYS]]
-    bias = solution.bias[stack.period][:, None]
-    directions = directions @ keep
-    changes = np.vstack([origins @ keep, directions, -bias * directions])
-    weights = fit.elimination.weights(changes) - 1j * np.outer(fit.map_weights, turn @ keep)
-    weights[-1] -= fit.expanded.mean(0) @ weights
-    return np.asarray(weights)
+    return np.asarray((np.abs(moved) ** 2).sum(1))
 
 
 def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
@@ -71,18 +60,12 @@ def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
     return origins, np.hstack([turned, np.zeros((n, 2 * n))])
 
 
-def metric_map(
-    fit: MapFit, weights_sway: Complex, frame: RigidTransform, inflation: float
-) -> MetricMap:
-    """The map of a fit in the map frame, with the covariance of its weights and their sway."""
-    turn = np.exp(1j * frame.yaw_rad)
-    weights = turn * fit.map_weights
+def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: float) -> MetricMap:
+    """The map of a fit in the map frame, with the covariance of its weights."""
+    weights = np.exp(1j * frame.yaw_rad) * fit.map_weights
     weights[-1] += frame.x_m + 1j * frame.y_m
     factor = fit.elimination.factor
     inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
-    turned = turn * weights_sway
-    std = np.sqrt(fit.variance)
-    spread = np.ascontiguousarray(std * inverse.T)
-    in_plane = np.stack([turned.real, turned.imag], axis=-1)
-    learned = Weights(plane(weights), spread, in_plane, float(std))
-    return MetricMap.of(fit.basis, learned, inflation)
+    std = float(np.sqrt(fit.variance))
+    learned = Weights(plane(weights), np.ascontiguousarray(std * inverse.T), std)
+    return MetricMap.of(fit.basis, learned, inflation, common_m)

@@ -1,12 +1,11 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""The map from slow features to positions as models save it: few products for one image.
+"""The map from features to positions as models save it: few products for one image.
 
 With k the kernel of an image (see basis.py), phi = [k W, 1] its expansion, and w the weights that
 are learned, everything that is predicted is linear or quadratic in k:
 
-    position  k W w + w_0,    sway  k W v + v_0,
-    variance  c + k a - |k C|^2,    C C^T = W (p I - Q) W^T
+    position  k W w + w_0,    variance  c + k a - |k C|^2,    C C^T = W (p I - Q) W^T
 
 with Q the weights' posterior covariance, below its prior p I. Without a prior, C C^T = W Q W^T is
 added instead. So two m x m products become one triangular one, which reads a quarter of the memory.
@@ -17,24 +16,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import linalg
 
 from sfa_localization.data.array_files import Arrays, packed, unpacked
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import Basis, basis_from
-from sfa_localization.metric.lower_factor import lower_root, squares
 
 
 @dataclass(frozen=True, slots=True)
 class Weights:
     """What is learned of a basis of m functions: `mean` (m, 2) m; `spread` (m, m), a square root of
-    their posterior covariance; `sway` (m, r, 2), their change per standard deviation of the joint
-    errors of the segments, m; and `noise_m`, an image's residual per axis, standard deviation.
+    their posterior covariance; and `noise_m`, an image's residual per axis, standard deviation.
     """
 
     mean: Array
     spread: Array
-    sway: Array
     noise_m: float
 
 
@@ -42,10 +39,10 @@ class Weights:
 class MetricMap:
     """From slow features to meters in the map frame, with covariance.
 
-    `linear` (k, 3 + 2 r) and `constant` (3 + 2 r,) give the position, the linear part of the
-    variance and r sways; `factor` (k, k) is C, lower triangular in Fortran order; `floor` is a
-    point's variance, m^2, and `inflation` a factor on the covariance that makes left-out segments
-    consistent.
+    `linear` (k, 3) and `constant` (3,) give the position and the linear part of the variance;
+    `factor` (k, k) is C, lower triangular in Fortran order; `floor` is a point's variance, m^2,
+    `inflation` a factor on the covariance that makes left-out segments consistent, and `common_m`
+    the standard deviation along each axis of what the drive's positions have in common errors.
     """
 
     basis: Basis
@@ -54,9 +51,10 @@ class MetricMap:
     factor: Array
     floor: float
     inflation: float
+    common_m: float
 
     @classmethod
-    def of(cls, basis: Basis, weights: Weights, inflation: float) -> MetricMap:
+    def of(cls, basis: Basis, weights: Weights, inflation: float, common_m: float) -> MetricMap:
         """Compile a map."""
         floor = weights.noise_m**2
         prior = floor * basis.prior
@@ -65,11 +63,12 @@ class MetricMap:
         quadratic = basis.turn @ inner @ basis.turn.T
         # Rounded as model files hold it: standard deviations change by 0.5 % at most.
         factor = lower_root((quadratic + quadratic.T) / 2).astype(np.float32)
-        rows = np.column_stack([weights.mean, 2 * q[:, -1], weights.sway.reshape(len(q), -1)])
+        rows = np.column_stack([weights.mean, 2 * q[:, -1]])
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + floor + prior
+        rounded = np.asfortranarray(factor, float)
         linear = basis.turn @ rows[:-1]
-        return cls(basis, linear, constant, np.asfortranarray(factor, float), floor, inflation)
+        return cls(basis, linear, constant, rounded, floor, inflation, common_m)
 
     @property
     def features(self) -> int:
@@ -88,11 +87,8 @@ class MetricMap:
         combined = kernel @ self.linear + self.constant
         quadratic = _sign(self.basis) * squares(kernel, self.factor)
         own = np.maximum(combined[:, 2] + quadratic, self.floor)
-        sway = combined[:, 3:].reshape(len(combined), -1, 2)
-        joint = sway.transpose(0, 2, 1) @ sway
-        return combined[:, :2], np.asarray(
-            self.inflation * (joint + own[:, None, None] * np.eye(2))
-        )
+        variance = self.inflation * own + self.common_m**2
+        return combined[:, :2], variance[:, None, None] * np.eye(2)
 
     def to_arrays(self) -> Arrays:
         """Plain arrays, the factor packed."""
@@ -101,16 +97,16 @@ class MetricMap:
             'linear': self.linear,
             'constant': self.constant,
             'factor': packed(self.factor.astype(np.float32)),
-            'scalars': np.array([self.floor, self.inflation]),
+            'scalars': np.array([self.floor, self.inflation, self.common_m]),
         }
 
     @classmethod
     def from_arrays(cls, arrays: Arrays) -> MetricMap:
         """The map of saved arrays. Raises ModelError where one is missing."""
         try:
-            floor, inflation = (float(value) for value in arrays['scalars'])
+            scalars = np.asarray(arrays['scalars'], float).tolist()
             factor, basis = unpacked(arrays['factor']).astype(float), basis_from(arrays)
-            return cls(basis, arrays['linear'], arrays['constant'], factor, floor, inflation)
+            return cls(basis, arrays['linear'], arrays['constant'], factor, *scalars)
         except KeyError as error:
             raise ModelError(f'the metric map lacks {error}') from None
 
@@ -118,3 +114,26 @@ class MetricMap:
 def _sign(basis: Basis) -> float:
     """Of the quadratic part of the variance."""
     return -1.0 if basis.prior else 1.0
+
+
+def lower_root(symmetric: Array) -> Array:
+    """Lower triangular L with L L^T = a matrix (N, N), its negative part (rounding) left out."""
+    try:
+        return np.asarray(linalg.cholesky(symmetric, lower=True))
+    except linalg.LinAlgError:
+        values, axes = linalg.eigh(symmetric)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(linalg.qr(root.T, mode='r')[0].T)
+
+
+def squares(rows: Array, factor: Array) -> Array:
+    """|k L|^2 (M,) of rows k (M, N), reading only the lower triangle for a single one.
+
+    `factor` (N, N) is in Fortran order.
+    """
+    if len(rows) > 1:
+        product = rows @ factor
+    else:
+        multiply = linalg.get_blas_funcs('trmv', (factor,))
+        product = multiply(factor, rows[0], lower=1, trans=1)[None]
+    return np.asarray((product**2).sum(1))

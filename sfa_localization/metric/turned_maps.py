@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the map of a model reads: a lower layer's map, turned to the heading of the compass.
+"""What the map of a model reads: a lower layer's map, turned by the heading of keyframes.
 
 Slow features are the same at every heading, and so lose whatever depends on the heading. Once the
 heading is known, a lower layer's map can be turned until its columns point in fixed directions of
@@ -9,8 +9,8 @@ the slow features do. So metric learning runs twice: on slow features, for certi
 on maps turned by these, certified in the same way, for the map that the model holds.
 
 A layer's map is kept as its harmonics over the columns, F_k = sum_c Z[c] exp(-2 pi i k c / R). The
-robot's turn by phi multiplies F_k by exp(i k sign phi), sign as the compass has it, so turning
-back is exact also by fractions of a column.
+robot's turn by phi multiplies F_k by exp(i k sign phi), sign -1 where columns grow clockwise,
+so turning back is exact also by fractions of a column.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _APART, _WEIGHTS = np.array([0.0, 1.0, -1.0]) * 2 / np.sqrt(3), np.array([2.0, 3
 def turned_back(spectra: Spectrum, yaw: Array, sign: float) -> Vectors:
     """Spectra (T, H, J), seen at headings yaw (T,) rad, as they would be at heading 0.
 
-    As real vectors (T, (2 H - 1) J); `sign` as in the compass: -1 where columns grow clockwise.
+    As real vectors (T, (2 H - 1) J); `sign` is -1 where columns grow clockwise.
     """
     phase = -1j * sign * np.outer(yaw, np.arange(spectra.shape[1]))
     at_zero = spectra * np.exp(phase).astype(np.complex64)[:, :, None]

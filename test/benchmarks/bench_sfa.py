@@ -28,9 +28,6 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
-from sfa_localization.features.image_features import (
-    harmonics,
-)
 from sfa_localization.features.network import input_map, standard_architecture
 from sfa_localization.features.network_training import (
     ImageSequence,
@@ -162,16 +159,13 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
     """Locating one picture against the matrix products of its equations, on one core."""
     height, width = model.network.architecture.size
     image = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
-    blind = replace(model, compass=None, yaw_agreement=None)
     products, network_only = bare_products(model, image), bare_network(model)
-    nowhere = np.zeros(2)
     with one_core():
-        whole, bare, without, matched, maps, bare_maps = in_turns(
+        whole, bare, matched, maps, bare_maps = in_turns(
             [
                 lambda: model.locate(image),
                 lambda: [product() for product in products],
-                lambda: blind.locate(image),
-                lambda: model.keyframes.match(image, nowhere),
+                lambda: model.keyframes.match(image),
                 lambda: model.network.maps(image[None]),
                 lambda: [product() for product in network_only],
             ],
@@ -186,7 +180,6 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
         'locate_p99_ms': float(np.percentile(whole, 99)) * 1e3,
         'matmul_ms': median * 1e3,
         'network_over_matmul': float(np.median(maps) / np.median(bare_maps)),
-        'locate_heading_cost': float(np.median(whole) / np.median(without)) - 1,
         'locate_keyframes_cost': float(
             np.median(matched) / (np.median(whole) - np.median(matched))
         ),
@@ -223,20 +216,10 @@ def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], obj
     made.append(_product(keyframes.coarse, np.ones((frequencies, rows, 1), np.complex64)))
     close = keyframes.aligned[:CLOSE].transpose(2, 0, 1)
     made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
-    maps = model.network.maps(image[None])
     made += bare_process(model.metric, np.ones((1, model.metric.features)))
     if model.turned is not None:
         axes = model.turned.axes
         made.append(_product(np.ones((1, len(axes)), np.float32), axes))
-    if model.compass is not None:
-        compass = model.compass
-        for layer in model.heading_layers:
-            wave = np.ones(maps[layer].shape[2], np.complex64)
-            made.append(_product(wave, maps[layer].astype(np.complex64)))
-        f = np.concatenate([harmonics(maps[layer]) for layer in model.heading_layers], axis=1)
-        made.append(_product(f.astype(np.complex64), compass._adjoint))
-        made.append(_triangular(compass.factor))
-        made.append(_product(np.ones((1, len(compass.weights)), complex), compass.weights))
     return made
 
 

@@ -125,19 +125,19 @@ class Remembering:
     """A model that looks at each picture once: most faults leave most pictures as they are."""
 
     def __init__(self, model):
-        self._model, self._slow = model, {}
+        self._model, self._seen = model, {}
 
     def __getattr__(self, name):
         return getattr(self._model, name)
 
-    def slow_poses(self, panoramas):
-        return [self._slow_pose(panorama) for panorama in panoramas]
+    def views(self, panoramas):
+        return [self._view(panorama) for panorama in panoramas]
 
-    def _slow_pose(self, panorama):
+    def _view(self, panorama):
         key = hashlib.sha1(panorama.tobytes(), usedforsecurity=False).digest()
-        if key not in self._slow:
-            (self._slow[key],) = self._model.slow_poses(panorama[None])
-        return self._slow[key]
+        if key not in self._seen:
+            (self._seen[key],) = self._model.views(panorama[None])
+        return self._seen[key]
 
 
 @functools.cache

@@ -235,8 +235,9 @@ def _summary(scores: Mapping[str, Any]) -> Cell:
 
 
 def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
-    """Scores of slow features without the keyframes, which verify and replace their estimates."""
-    slow = [one for batch in run.panoramas.batches(BATCH) for one in model.slow_poses(batch)]
+    """Scores of the map without the keyframes, but for the headings that these show."""
+    views = (view for batch in run.panoramas.batches(BATCH) for view in model.views(batch))
+    slow = [model.slow_pose(view, model.match(view)) for view in views]
     poses = np.array([[*one.position, one.yaw] for one in slow])
     truth = _truth(run)
     return _summary(score(truth, moved(Trajectory(truth.stamps_ns, poses), transform)))

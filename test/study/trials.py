@@ -23,7 +23,7 @@ from sfa_localization.data.geometry import Array, RigidTransform, align, compose
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import known, score
 from sfa_localization.features.closures import Closures
-from sfa_localization.features.image_features import TURNED_LAYER, slow_features, spectrum
+from sfa_localization.features.image_features import slow_features
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
@@ -132,15 +132,15 @@ def slow_of(network: Network) -> Features:
 
 
 def turned_of(model: PlaceModel) -> Features:
-    """What a model's map reads: maps turned by the compass, reduced, or else slow features."""
+    """What a model's map reads: maps turned by keyframes, reduced, or else slow features."""
     turned = model.turned
     if turned is None:
         return slow_of(model.network)
 
     def components(images: Image) -> Array:
-        maps = model.network.maps(images)
-        yaw, _ = model.headings(maps, slow_features(maps))
-        return turned.features(spectrum(maps[TURNED_LAYER]), yaw)
+        views = model.views(images)
+        yaw = np.array([model.match(view).pose[2] for view in views])
+        return turned.features(np.stack([view.spectrum for view in views]), yaw)
 
     return components
 
