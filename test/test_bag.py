@@ -244,7 +244,7 @@ def test_a_missing_file_of_several_is_counted(tmp_path, messages):
         (b'\x89MCAP0\r\n', 'holds no readable message'),
         (b'#ROSBAG V2.0\n', 'no readable bag .*`rosbag reindex`'),
         (b'\x28\xb5\x2f\xfd', 'cut-off zstd data'),
-        (None, 'neither formats.metadata.yaml nor'),
+        (None, 'neither metadata.yaml nor'),
     ],
 )
 def test_what_holds_no_bag_is_one_error(content, complaint, tmp_path):
