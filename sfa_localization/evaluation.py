@@ -141,8 +141,8 @@ def evaluate(
     trained = [_driven(*one, progress) for one in given]
     kind = Smoother if smooth else PoseFilter
     drive = _driven(bag, Localizer(model, config, watch, kind), recipe, progress)
-    earlier, bags = 'an earlier evaluation', ', '.join(map(str, align_bags or [bag]))
-    aligned_on = earlier if transform else bags
+    bags = ', '.join(map(str, align_bags or [bag]))
+    aligned_on = 'nothing: the transform was given' if transform else bags
     transform = transform or fit_transform(*((one.truth, one.images) for one in trained or [drive]))
     estimates = _in_truth(drive, transform)
     return Evaluation(

@@ -41,6 +41,7 @@ from sfa_localization.features.leveling import links_between
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late
+from sfa_localization.metric.points import stops
 from sfa_localization.metric.segments import PIECE_LENGTH_M
 
 SAMPLES, SAMPLE_SIDE = 16, 640
@@ -166,6 +167,9 @@ class BagReport:
                 f'{spacing(self.places):.2f} m apart, '
                 f'along {directions(self.places)} of {SECTORS} directions'
             )
+            since_s = (stops(self.odometry) - self.odometry.stamps_ns[0]) * 1e-9
+            stood = [f'stop {k} at {a:.1f} to {b:.1f} s' for k, (a, b) in enumerate(since_s, 1)]
+            facts |= {'stood': ', '.join(stood)} if stood else {}
         if self.tilt:
             facts['ground'] = self.tilt
         return facts

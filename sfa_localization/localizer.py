@@ -151,6 +151,7 @@ class Localizer:
         self.observer = Observer(model, watch)
         self.filter = kind(config, model.error_correlation)
         self.filter.expect_delay(model.camera_delay_s)
+        self.filter.expect_scale(model.odometry_scale)
 
     def add_odometry(
         self,

@@ -19,6 +19,7 @@ from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
@@ -93,6 +94,11 @@ class PlaceModel:
         known = [delay for delay in self.quality.get('camera_delay_s', ()) if delay is not None]
         return float(np.median(known)) if known else 0.0
 
+    @property
+    def odometry_scale(self) -> float:
+        """By how much to multiply the way that the wheels count, by measured points."""
+        return float(self.quality.get('odometry_scale', 1.0))
+
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
 
@@ -148,7 +154,7 @@ class PlaceModel:
         noise, center = self.keyframes.noise, self.keyframes.poses[:, :2].mean(0)
         pose, covariance = combine(slow, match, noise, light, doubt)
         novelty = noise.novelty(match.score)
-        by_scale = SCALE_STD * (pose[:2] - center)
+        by_scale = self.quality.get('scale_std', SCALE_STD) * (pose[:2] - center)
         covariance = covariance * max(novelty, 1.0) ** 2
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         covariance[:2, :2] += noise.beyond(match, light) ** 2 * np.eye(2)
@@ -193,6 +199,8 @@ class PlaceModel:
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
                 raise ModelError('its covariances are not positive')
+        if not 1 / LARGEST_SCALE <= self.odometry_scale <= LARGEST_SCALE:
+            raise ModelError('its scale of odometry is not that of wheels')
         if not abs(self.camera_delay_s) <= _LONGEST_DELAY_S:
             raise ModelError('its camera delay is not that of a camera')
 

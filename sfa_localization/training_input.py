@@ -27,6 +27,7 @@ from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
+from sfa_localization.metric.points import points_of
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
 logger = logging.getLogger(__name__)
@@ -66,7 +67,8 @@ class TrainingInput:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
-        drives = Drives(tuple(map(drive_of, runs)), closures, recipe.segments)
+        points = points_of(runs, recipe.metric.anchors)
+        drives = Drives(tuple(map(drive_of, runs)), closures, recipe.segments, points=points)
         drives = drives.measured(views, recipe.panorama.sphere)
         return cls(drives, views, recipe, progress)
 

@@ -50,7 +50,7 @@ _TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
 class TuningDrive:
     """One drive: odometry, and stamps (N,), poses (N, 3), covariances (N, 3, 3) of usable images.
 
-    `truth` is for the grid search only; `correlation` is the model's.
+    `truth` is for the grid search only; `correlation` and the odometry's `scale` are the model's.
     """
 
     odometry: Odometry
@@ -59,10 +59,12 @@ class TuningDrive:
     covariances: Array
     truth: Trajectory | None = None
     correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
+    scale: float = 1.0
 
     def fuse(self, fused: PoseFilter) -> Iterator[Update]:
         """Feed the drive in the order of time; yields an update for each image."""
         odometry = self.odometry
+        fused.expect_scale(self.scale)
         for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, self.stamps_ns):
             if kind == ODOMETRY:
                 v, omega = odometry.twists[i]
@@ -92,6 +94,7 @@ def read_drive(
         np.array([one.covariance for one in usable]),
         run.ground_truth,
         model.error_correlation,
+        model.odometry_scale,
     )
 
 

@@ -59,6 +59,7 @@ class PictureReader(WithoutKeyframes):
     heading: bool = True
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
     camera_delay_s: float = 0.0
+    odometry_scale: float = 1.0
 
     def locate(self, image):
         a, b, novelty = image[0, :3].astype(int)

@@ -194,6 +194,8 @@ CASES: dict[str, dict[str, Check | Case]] = {
         '--image-topic /nothing': refuses('/nothing'),
         '--odom-topic /ground_truth': QUALITY,
         '--imu-topic /nothing': refuses('/nothing'),
+        '--anchor-topic /nothing': refuses('/nothing'),
+        '--anchors {data}/fewer.yaml': refuses('is no point'),
         '--segments straight': QUALITY,
         '--solver paper': refuses('needs straight lines'),
         '--metric-map monomials': QUALITY,

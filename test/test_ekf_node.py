@@ -23,7 +23,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_bench import until
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from transform_buffer import AsText, TransformBuffer
 
@@ -90,6 +90,9 @@ def test_live_is_offline_and_stamps_are_the_inputs(bench):
     poses = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
     transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
     offline = PoseFilter(FilterConfig(initial_pose=(0.0, 0.0, 0.0)))
+    bench.publish('sfa/odometry_scale', Float64(data=1.02), latched_qos())
+    assert until(lambda: node.monitor('sfa/odometry_scale').used == 1)
+    offline.expect_scale(1.02)
     play(bench, node, drive)
     assert until(lambda: len(transforms) == len(heard) == len(drive.stamps_ns))
     assert until(lambda: len(poses) == len(drive.pictures))

@@ -111,6 +111,7 @@ def test_a_good_drive_is_enough(tmp_path):
         'problems': [],
     }
     assert told['facts']['images'] == '60x8, panorama: 7.5 times as wide as high'
+    assert 'stood' not in told['facts']
     assert len(report.samples) == SAMPLES
     assert 'enough to train on' in report.as_text()
     assert 'not enough' not in report.as_text()

@@ -22,7 +22,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.parameter import Parameter
 from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from sfa_localization.data.messages import read_stamp, read_yaw
@@ -49,6 +49,7 @@ class FakeModel(WithoutKeyframes):
     panorama: PanoramaConfig = SIZE
     error_correlation: ErrorCorrelation = KNOWN
     camera_delay_s: float = 0.0
+    odometry_scale: float = 1.0
 
     def locate(self, image):
         pose = np.append(image[0, 0, :2] + self.shift, 0.25)
@@ -164,13 +165,15 @@ def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
 def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models, tmp_path):
     """What a model knows of its errors reaches those who come later, too."""
     models['b.npz'].error_correlation = ErrorCorrelation(0.5, 3.0)
+    models['b.npz'].odometry_scale = 1.02
     node = bench.run(SfaNode, model='a.npz')
     heard = bench.listen(PoseStamped, 'sfa/pose')
     told = bench.listen(Float64MultiArray, 'sfa/error_correlation', latched_qos())
     assert until(lambda: told) and convert.read_error_correlation(told[0]) == KNOWN
     assert told[0].layout.dim[0].label == 'share, distance_m'
     assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
-    assert until(lambda: len(told) == 2)
+    scales = bench.listen(Float64, 'sfa/odometry_scale', latched_qos())
+    assert until(lambda: len(told) == 2 and scales and scales[-1].data == 1.02)
     assert convert.read_error_correlation(told[1]) == ErrorCorrelation(0.5, 3.0)
     bench.publish('panorama', message(seed=1))
     assert until(lambda: heard) and heard[0].pose.position.x >= 100

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
@@ -12,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from sfa_localization.bags.files import Topic
 from sfa_localization.camera.encodings import read_compressed, read_raw
 from sfa_localization.data.errors import BagError, MessageError
-from sfa_localization.data.messages import read_planar, read_stamp, read_twist
+from sfa_localization.data.messages import read_planar, read_stamp, read_twist, require_sane
 from sfa_localization.data.run import Image
 
 IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
@@ -24,6 +25,8 @@ STAMPED_POSES = (
 )
 POSES = (ODOMETRY, *STAMPED_POSES, TF)
 """Types that hold a pose of the robot."""
+PLACES = (*STAMPED_POSES[:2], 'geometry_msgs/msg/PointStamped')
+"""Types that hold a place."""
 SERIALIZATIONS = {'cdr': Stores.ROS2_JAZZY, 'ros1': Stores.ROS1_NOETIC}
 """The standard types of each wire format."""
 typestore = functools.cache(get_typestore)
@@ -73,6 +76,20 @@ def pose_of(message: Any) -> tuple[float, float, float]:
         return read_planar(message.transform.translation, message.transform.rotation)
     pose = message.pose if kind == 'geometry_msgs/msg/PoseStamped' else message.pose.pose
     return read_planar(pose.position, pose.orientation)
+
+
+def place_of(message: Any) -> tuple[float, float, float]:
+    """Place x m, y m and its standard deviation, 0 where unknown. Raises MessageError."""
+    kind, variance = message.__msgtype__, 0.0
+    if kind == 'geometry_msgs/msg/PointStamped':
+        point = message.point
+    elif kind == 'geometry_msgs/msg/PoseStamped':
+        point = message.pose.position
+    else:
+        point, spread = message.pose.pose.position, message.pose.covariance
+        variance = max(float(spread[0]), float(spread[7]), 0.0)
+    require_sane('place', point.x, point.y, variance)
+    return float(point.x), float(point.y), math.sqrt(variance)
 
 
 def odometry_of(message: Any) -> tuple[tuple[float, ...], tuple[float, ...] | None]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.bags import decoding
-from sfa_localization.bags.motion_arrays import StampedValues, to_trajectory, to_yaw_rate
+from sfa_localization.bags.motion_arrays import StampedValues, to_points, to_trajectory, to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
@@ -60,7 +60,8 @@ def as_live(recipe: R, panorama: PanoramaConfig) -> R:
     """The recipe to read a drive with a model's panorama, as the nodes do: the filter also fuses
     images far from any odometry.
     """
-    return replace(recipe, panorama=panorama, odometry_tolerance_s=0.0)
+    topics = replace(recipe.topics, measured_places='')
+    return replace(recipe, topics=topics, panorama=panorama, odometry_tolerance_s=0.0)
 
 
 def image_folder(output: Path) -> Path:
@@ -162,7 +163,8 @@ def read_drive(
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
-    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, counts)
+    points = to_points(values['points']) if values.get('points') else None
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts)
 
 
 class _Images:
@@ -219,6 +221,9 @@ def _other_streams(bag: Bag, recipe: ReadingRecipe, want_truth: bool) -> dict[st
         logger.warning('%s: no message on %s: continuing without gyroscope', bag.path, names)
     if recipe.camera.level_by_imu:
         streams['orientation'] = bag.stream(bag.find('imu', topics.imu), read_tilt)
+    if topics.measured_places:
+        name = bag.find('measured_places', topics.measured_places)
+        streams['points'] = bag.stream(name, decoding.place_of)
     if want_truth:
         name = bag.find('ground_truth', topics.ground_truth)
         streams['ground_truth'] = bag.stream(name, decoding.pose_of)

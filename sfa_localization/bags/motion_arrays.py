@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, compose, invert, relative, wrap_angle
-from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, differences, integrate
+from sfa_localization.data.run import (
+    POINT_STD_M,
+    Odometry,
+    Points,
+    Stamps,
+    Trajectory,
+    YawRate,
+    differences,
+    integrate,
+)
 
 StampedValues = list[tuple[int, Any]]
 """Stamps in ns, each with the value that was read from its message."""
@@ -41,6 +50,14 @@ def to_yaw_rate(values: StampedValues) -> YawRate:
     """Yaw rates at stamps; the values are omega and its variance."""
     rates = np.array([rate for _, rate in values], float).reshape(-1, 2)
     return YawRate(_stamps(values), rates[:, 0], rates[:, 1])
+
+
+def to_points(values: StampedValues) -> Points:
+    """Measured places; the values are x, y and a standard deviation, POINT_STD_M where it is 0."""
+    return Points.of([
+        (f'point of {stamp_ns * 1e-9:.1f} s', stamp_ns, complex(x, y), std or POINT_STD_M)
+        for stamp_ns, (x, y, std) in values
+    ])  # fmt: skip
 
 
 def to_odometry(values: StampedValues) -> tuple[Odometry, int, str]:

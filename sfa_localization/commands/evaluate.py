@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands import options
+from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.fusion.settings import FilterConfig
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ tables on standard output; with --report index.html (one page for a browser) and
   with --json the errors"""
 EXAMPLES = """\
   evaluate garden.npz bags/test --align bags/coverage
+  evaluate garden.npz bags/test --align none
   evaluate garden.npz bags/test --align bags/coverage --report report --json results.json"""
 
 
@@ -35,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar='TRAIN_BAG',
         help='drive that aligns the map with the truth; of several training drives, give each one '
-        'with --align',
+        'with --align; none: compare in the coordinates of the map, as measured points gave them',
     )
     parser.add_argument('--config', type=Path, help='parameter file')
     parser.add_argument(
@@ -45,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--report', type=Path, metavar='DIR', help='write figures and the table')
     parser.add_argument('--json', type=Path, metavar='FILE', help='write the errors as JSON')
-    options.add_topics(parser, *options.TOPIC_OPTIONS)
+    options.add_topics(parser, 'image', 'odometry', 'imu', 'ground_truth')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -54,7 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
     from sfa_localization.place_model import PlaceModel
     from sfa_localization.reports.evaluation import heading_table, table, trust_lines
 
-    read = arguments.model, arguments.bag, *arguments.align, arguments.config
+    none = [str(path) for path in arguments.align] == ['none']
+    align = [] if none else arguments.align
+    read = arguments.model, arguments.bag, *align, arguments.config
     if arguments.json:
         options.require_output(arguments.json, read, '.json')
     options.require_report(arguments.report, arguments.json)
@@ -63,12 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
     result = evaluation.evaluate(
         model,
         arguments.bag,
-        align_bags=arguments.align,
+        align_bags=align,
         recipe=options.recipe(arguments),
         config=options.settings(FilterConfig, arguments),
         watch=options.settings(WatchConfig, arguments),
         progress=True,
         smooth=arguments.smooth,
+        transform=RigidTransform(0.0, 0.0, 0.0) if none else None,
     )
     print(table(result.scores), heading_table(result.scores), sep='\n\n')
     print(*trust_lines(result.scores), sep='\n')

@@ -25,6 +25,7 @@ TOPIC_OPTIONS = {
     'image': '--image-topic',
     'odometry': '--odom-topic',
     'imu': '--imu-topic',
+    'measured_places': '--anchor-topic',
     'ground_truth': '--ground-truth-topic',
 }
 

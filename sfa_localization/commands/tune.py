@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--config', type=Path, help='parameter file to start from')
     parser.add_argument('--output', type=Path, required=True, help='parameter file to write')
     parser.add_argument('--method', choices=('likelihood', 'grid'), default='likelihood')
-    options.add_topics(parser, *options.TOPIC_OPTIONS)
+    options.add_topics(parser, 'image', 'odometry', 'imu', 'ground_truth')
 
 
 def run(arguments: argparse.Namespace) -> int:

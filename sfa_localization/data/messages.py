@@ -22,6 +22,8 @@ LARGEST_VARIANCE = 1e6
 """Drivers mark an unknown variance by numbers as large as this (SI units); so do the nodes."""
 LARGEST_TWIST_VARIANCE = 1e2
 """The same of speeds and turn rates: nothing is known of one that may be off by 10 m/s or rad/s."""
+LARGEST_SCALE = 1.5
+"""A larger factor on the way of odometry is none of wheels, but of another unit."""
 _SHORTEST_QUATERNION = 1e-3
 """A shorter quaternion has no direction; normalized ones have length 1."""
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any, Protocol
 
@@ -16,6 +16,8 @@ from sfa_localization.data.geometry import Array, compose, relative, wrap_angle
 
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
+POINT_STD_M = 0.02
+"""Of a measured place whose error is not stated: of a robot that was put on a mark by eye."""
 BATCH = 16
 """Images that are read and processed together."""
 
@@ -107,6 +109,32 @@ class YawRate:
 
 
 @dataclass(frozen=True, slots=True)
+class Points:
+    """Measured places of the robot, in the frame that a map is wanted in: `names` (K,), `stamps_ns`
+    (K,), `places` (K,) x + i y m, `std` (K,) m along each axis.
+    """
+
+    names: tuple[str, ...]
+    stamps_ns: Stamps
+    places: NDArray[np.complex128]
+    std: Array
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[str, int, complex, float]]) -> Points:
+        """From the name, stamp, place and standard deviation of each."""
+        names, stamps, places, std = zip(*rows, strict=True)
+        return cls(names, np.array(stamps, np.int64), np.array(places, complex), np.array(std))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def rows(self) -> list[tuple[str, int, complex, float]]:
+        """Name, stamp, place and standard deviation of each."""
+        columns = self.stamps_ns.tolist(), self.places.tolist(), self.std.tolist()
+        return list(zip(self.names, *columns, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
 class Count:
     """Messages of a stream: the number used, and the numbers skipped by reason."""
 
@@ -172,7 +200,8 @@ class PanoramaArray:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One drive: images, odometry, and, for evaluation only, the ground truth.
+    """One drive: images, odometry, points that were measured, and, for evaluation only, the ground
+    truth.
 
     `counts` holds the used and skipped messages per stream ('images', 'odometry', ...).
     """
@@ -182,6 +211,7 @@ class Run:
     odometry: Odometry
     yaw_rate: YawRate | None = None
     ground_truth: Trajectory | None = None
+    points: Points | None = None
     counts: dict[str, Count] = field(default_factory=dict)
 
 

@@ -21,6 +21,7 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.ekf import Ekf, measurement_event
@@ -39,7 +40,7 @@ from sfa_localization.fusion.timeline import (
     ClockWentBack,
     Timeline,
 )
-from sfa_localization.fusion.track import newest_new
+from sfa_localization.fusion.track import Pose, newest_new
 
 __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
@@ -63,6 +64,7 @@ class PoseFilter:
         self.correlation = correlation or ErrorCorrelation()
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
+        self.scale, self._shift, self._counted = self.config.odometry_scale, (0.0, 0.0), (0.0, 0.0)
         self._camera = CameraClockFinder(_CLOCK_MEMORY)
         self._ekf = Ekf(self.config, self.correlation)
         self._history = self._fresh(self._ekf.blank(0))
@@ -140,16 +142,15 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         try:
-            twist = read_twist(v, omega, variances, self.config, self._open_loop.found)
+            v, commands = self.scale * v, self._open_loop.found
+            twist = read_twist(v, omega, variances, self.config, commands)
             self._require_place(stamp_ns, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
         self._open_loop.add(twist.v, twist.omega)
-        known = pose is not None and all(map(math.isfinite, pose))
-        at = tuple(map(float, pose)) if pose is not None and known else None
-        event = OdometryEvent(stamp_ns, twist, at)  # type: ignore[arg-type]
+        event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
         driven = self._history.add((stamp_ns, ODOMETRY), event)
         self._camera.add_odometry(stamp_ns, driven.omega)
         return ''
@@ -190,6 +191,24 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+
+    def expect_scale(self, scale: float) -> None:
+        """Multiply the way of all odometry from now on by the factor of a model, and by that of the
+        settings. The pose of odometry goes on from where it is.
+        """
+        if not 1 / LARGEST_SCALE <= scale <= LARGEST_SCALE:
+            return
+        scale *= self.config.odometry_scale
+        (x, y), (dx, dy), change = self._counted, self._shift, self.scale - scale
+        self.scale, self._shift = scale, (dx + change * x, dy + change * y)
+
+    def _scaled(self, pose: Sequence[float] | Array | None) -> Pose | None:
+        """The pose of odometry by the way that was driven; None where there is none."""
+        if pose is None or not all(map(math.isfinite, pose)):
+            return None
+        x, y, yaw = map(float, pose)
+        self._counted = x, y
+        return self.scale * x + self._shift[0], self.scale * y + self._shift[1], yaw
 
     def _taken(self, stamp_ns: int) -> int:
         """When an image was taken, on the clock of the odometry. Where that shows far more motion

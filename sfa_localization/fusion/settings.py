@@ -29,6 +29,9 @@ class FilterConfig(Settings):
     rate_std: float = setting(
         0.02, 'standard deviation of a turn rate whose message has no covariance', unit='rad/s',
         low=1e-4, high=10.0, live=True)
+    odometry_scale: float = setting(
+        1.0, 'factor on the way of odometry, beside that of a model with measured points',
+        low=0.5, high=2.0)
     odometry_factor: float = setting(
         1.0, 'factor on the variances in odometry messages', low=1e-3, high=1e4, live=True)
     slip_per_metre: float = setting(

@@ -9,17 +9,18 @@ how much of the way was lost in turns (turn_loss.py).
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Run, Stamps
+from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import Closures, Views
 from sfa_localization.features.offsets import Offsets, find_offsets
+from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
@@ -32,8 +33,11 @@ from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import with_closures
 from sfa_localization.metric.turn_loss import Shown, way_of
 
+_Learn = Callable[[Segments], tuple[Segments, MetricResult]]
 logger = logging.getLogger(__name__)
 
+_POINT_ROUNDS = 3
+"""Points that bend the map straight may show other ones to be right, which bend it again."""
 _LOSS_ROUNDS = 2
 """The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
 
@@ -60,13 +64,14 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Drives:
-    """All drives, whose images are numbered drive after drive, and their loop closures, with
-    and without offsets."""
+    """All drives, whose images are numbered drive after drive, their loop closures, with and
+    without offsets, and points that were measured."""
 
     items: tuple[Drive, ...]
     closures: Closures
     config: SegmentConfig
     offsets: Offsets = field(default_factory=Offsets.none)
+    points: Points | None = None
 
     @property
     def starts(self) -> list[int]:
@@ -86,8 +91,9 @@ class Drives:
         ]
         return corrections(seen, self.closures) or [None] * len(self.items)
 
-    def cut(self, ways: Sequence[Way | None] = ()) -> Segments:
-        """The segments of section 3.1, of all drives; `ways` correct what wheels counted.
+    def cut(self, ways: Sequence[Way | None] = (), settled: Settled | None = None) -> Segments:
+        """The segments of section 3.1, of all drives; `ways` correct what wheels counted, and the
+        points are those that `settled` found right.
 
         Raises DataError.
         """
@@ -98,7 +104,12 @@ class Drives:
             )
         ]
         joined = replace(join(parts, self.starts), offsets=self.offsets)
-        return with_closures(joined, self.closures)
+        segments = with_closures(joined, self.closures)
+        if self.points is None:
+            return segments
+        drives = [(drive.run.odometry, drive.stamps_ns) for drive in self.items]
+        images = np.concatenate([one.images for one in segments])
+        return replace(segments, anchors=Anchors.of(self.points, drives, images, settled))
 
     def measured(self, views: Views, sphere: Sphere) -> Drives:
         """With the offsets of `views`, which the graph of odometry and closures leads to."""
@@ -149,20 +160,49 @@ def learn_map(
     Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
     DataError; `strict` also for a single route, of which else a warning says so.
     """
-    segments = drives.cut()
-    result = learn_metric(features, segments, config, seed)
+
+    def learned(segments: Segments) -> tuple[Segments, MetricResult]:
+        return segments, learn_metric(features, segments, config, seed)
+
+    segments, result = learned(drives.cut())
     for _ in range(_LOSS_ROUNDS if config.solver == 'certified' else 0):
         ways = drives.ways(segments, result)
         if not any(ways):
             break
         try:
-            shorter = drives.cut(ways)
-            segments, result = shorter, learn_metric(features, shorter, config, seed)
+            segments, result = learned(drives.cut(ways))
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break
+    if segments.anchors is not None:
+        segments, result = _anchored(drives, segments, result, learned)
     if result.diagnostics.one_route and strict:
         raise DataError(f'{ROUTE}, or train without --strict')
     if result.diagnostics.one_route:
         logger.warning(ROUTE)
     return segments, result
+
+
+def _anchored(
+    drives: Drives, segments: Segments, result: MetricResult, learned: _Learn
+) -> tuple[Segments, MetricResult]:
+    """Learned once more, in the coordinates and meters of the points, and again where the map that
+    they bend straight shows other ones to be right.
+    """
+    for _ in range(_POINT_ROUNDS):
+        assert segments.anchors is not None
+        before = segments.anchors.settled
+        now = settle(segments.anchors, result.points, result.points_covariance)
+        if (now.used == before.used).all():
+            break
+        ways = [_scaled(way or Way(), now.scale) for way in segments.ways]
+        now = replace(now, scale=before.scale * now.scale)
+        segments, result = learned(drives.cut(ways, now))
+    assert segments.anchors is not None
+    for text in segments.anchors.warnings(result.points):
+        logger.warning(text)
+    return segments, result
+
+
+def _scaled(way: Way, scale: float) -> Way:
+    return Way(way.scale * scale, way.loss * scale)

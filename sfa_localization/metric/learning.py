@@ -27,6 +27,7 @@ from sfa_localization.metric.map_covariance import (
     angle_covariance,
     metric_map,
     place_variance,
+    places_of_points,
     plane,
 )
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
@@ -40,6 +41,7 @@ from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 logger = logging.getLogger(__name__)
+Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
 LITTLE, OVERFIT = 0.9, 4.0
@@ -82,6 +84,10 @@ class MetricResult:
     """Share of the spread of the places that the features explain in images left out."""
     forecast: Forecast
     """Errors to expect on paths between the trained ones."""
+    points: Complex
+    """(K,) x + i y m: where the drive puts the robot at measured points."""
+    points_covariance: Complex
+    """(K, K) m^2 per axis, without a motion of the whole map."""
     diagnostics: Diagnostics
 
     @property
@@ -199,11 +205,12 @@ def _result(
     inflation = max(needed_factor(left.images.ratio, 2, left.forecast.weight), 1.0)
     expected = left.forecast.widened(inflation)
     common_m = float(np.sqrt((expected.drive_std**2).mean() / 2))
-    turn = np.exp(1j * frame.yaw_rad)
+    turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
+    points, points_covariance = places_of_points(fit)
     return MetricResult(
         map=metric_map(fit, frame, inflation, common_m),
         angles=wrap_angle(np.angle(fit.solution.z) + frame.yaw_rad),
-        origins=plane(fit.solution.o * turn + frame.x_m + 1j * frame.y_m),
+        origins=plane(fit.solution.o * turn + shift),
         angle_covariance=angle_covariance(fit),
         yaw_bias=fit.solution.bias,
         certificate=fit.solution.certificate,
@@ -213,6 +220,8 @@ def _result(
         left_out_variance=left.images.variances * inflation,
         explained=left.explained,
         forecast=expected.moved(frame),
+        points=points * turn + shift,
+        points_covariance=points_covariance,
         diagnostics=diagnostics,
     )
 

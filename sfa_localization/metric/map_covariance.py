@@ -60,6 +60,19 @@ def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
     return origins, np.hstack([turned, np.zeros((n, 2 * n))])
 
 
+def places_of_points(fit: MapFit) -> tuple[Complex, Complex]:
+    """Where the drive puts the robot at measured points (K,), and the covariance (K, K) per axis of
+    that, without a motion of the whole map."""
+    anchors, solution, period = fit.problem.segments.anchors, fit.solution, fit.stack.period
+    if anchors is None:
+        return np.zeros(0, complex), np.zeros((0, 0), complex)
+    rows = anchors.rows(fit.stack)
+    origins, directions = _uncertain_segments(fit)
+    bias = solution.bias[period][:, None]
+    moved = rows @ np.vstack([origins, directions, -bias * directions])
+    return rows @ solution.coefficients(period), moved @ moved.conj().T / 2
+
+
 def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: float) -> MetricMap:
     """The map of a fit in the map frame, with the covariance of its weights."""
     weights = np.exp(1j * frame.yaw_rad) * fit.map_weights

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.link_noise import learned
 from sfa_localization.metric.loops import Loops, loops_of
@@ -63,7 +64,8 @@ class MetricProblem:
     segments: Segments
     stack: Stack
     links: Links
-    loops: tuple[Loops, ...]
+    ties: tuple[Loops | Anchors, ...]
+    """Loop closures, and measured points."""
     config: MetricConfig
     seed: int = 0
     """Of the parts that are left out, and of the points that the forecast draws."""
@@ -75,8 +77,9 @@ class MetricProblem:
         """From features (N, K) of all images. Raises DataError when they are unusable."""
         stack = Stack.of(segments)
         rows = _checked_rows(np.asarray(features, float), stack, config)
-        loops = loops_of(segments.closures, segments.offsets, stack)
-        return cls(rows, segments, stack, Links.of(segments), loops, config, seed)
+        ties: list[Loops | Anchors] = [*loops_of(segments.closures, segments.offsets, stack)]
+        ties += [segments.anchors] if segments.anchors else []
+        return cls(rows, segments, stack, Links.of(segments), tuple(ties), config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
         """Alternate solution and noise until the noise settles; a near `start` saves rounds."""
@@ -88,7 +91,7 @@ class MetricProblem:
         links = start.links if start else self.links
         for _ in range(max(rounds, 1)):
             elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
-            loops = np.sum([one.form(self.stack, solution) for one in self.loops], axis=0)
+            loops = np.sum([one.form(self.stack, solution) for one in self.ties], axis=0)
             form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
             bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
             solution = form.solve(solution.z if solution else None, bias)
@@ -141,7 +144,7 @@ class MapFit:
     """How many images count as one beside odometry's links, because residuals of neighbors are
     correlated; times LINK_WEIGHT."""
     loops: Complex
-    """(3N, 3N) form of the loop closures in [o, z, -b z], see loops.py."""
+    """(3N, 3N) form of the loop closures, and of points, in [o, z, -b z], see loops.py."""
     links: Links
     """With the variances that the solution shows, see link_noise.py."""
     elimination: Elimination

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, compose, invert
+from sfa_localization.metric.map_covariance import places_of_points
 from sfa_localization.metric.map_fit import MapFit
 
 
@@ -18,8 +19,15 @@ def map_frame(fit: MapFit) -> RigidTransform:
 
     The certified track is aligned with the odometry of the first run, each image weighted by how
     little the odometry can have drifted until then: the map coincides with the odometry frame at
-    the start of the run. With an anchor, the run starts at the anchor's pose in the map.
+    the start of the run. With an anchor, the run starts at the anchor's pose in the map. Measured
+    points come first.
     """
+    start, anchors = _start_frame(fit), fit.problem.segments.anchors
+    return start if anchors is None else anchors.frame(places_of_points(fit)[0], start)
+
+
+def _start_frame(fit: MapFit) -> RigidTransform:
+    """By the odometry at the start of the first run, or the pose that it is to have."""
     segments, stack, anchor = fit.problem.segments, fit.stack, fit.problem.config.anchor
     poses, variances = _odometry(fit)
     rows = np.flatnonzero(stack.owner < len(poses))

@@ -22,6 +22,7 @@ from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
+from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     MOMENT,
@@ -118,7 +119,8 @@ class Segment:
 @dataclass(frozen=True, slots=True)
 class Segments:
     """Segments in driving order, how many images and odometry messages were used, the loop closures
-    between their images, with and without offsets, and how the way of each run was corrected."""
+    between their images, with and without offsets, how the way of each run was corrected, and
+    measured points beside them."""
 
     items: tuple[Segment, ...]
     images: Count = field(default_factory=Count)
@@ -126,6 +128,7 @@ class Segments:
     closures: Closures = field(default_factory=Closures.none)
     offsets: Offsets = field(default_factory=Offsets.none)
     ways: tuple[Way | None, ...] = (None,)
+    anchors: Anchors | None = None
 
     def __len__(self) -> int:
         return len(self.items)

@@ -56,6 +56,9 @@ class MetricConfig(Settings):
         'pose in the map at the start of the first run: x (m), y (m), yaw (rad); empty: as in the '
         'odometry frame',
     )
+    anchors: str = setting(
+        '', 'file of measured points of the drives, which give the map its place, heading and scale'
+    )
 
     def __post_init__(self) -> None:
         Settings.__post_init__(self)

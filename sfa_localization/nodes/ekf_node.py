@@ -88,6 +88,7 @@ class EkfNode(LocalizationNode):
         self.subscribe(turned, 'sfa/turned', self._receive_turned, sensor_qos(20))
         for kind, topic, receive in (
             (Float64, 'sfa/camera_delay', self._receive_delay),
+            (Float64, 'sfa/odometry_scale', self._receive_scale),
             (Float64MultiArray, 'sfa/error_correlation', self._receive_correlation),
         ):
             self.subscribe(kind, topic, receive, latched_qos())
@@ -185,6 +186,12 @@ class EkfNode(LocalizationNode):
     def _receive_delay(self, message: Float64) -> None:
         require_sane('camera delay', message.data)
         self.filter.expect_delay(float(message.data))
+
+    def _receive_scale(self, message: Float64) -> None:
+        require_sane('odometry scale', message.data)
+        self.filter.expect_scale(float(message.data))
+        if message.data != 1.0:
+            self.get_logger().info(f'{self.shown(_ODOM)}: its way counts {message.data:.4f} times')
 
     def _receive_correlation(self, message: Float64MultiArray) -> None:
         self.filter.reconfigure(correlation=convert.read_error_correlation(message))

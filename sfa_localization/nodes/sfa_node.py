@@ -50,6 +50,7 @@ class SfaNode(LocalizationNode):
         correlation = 'sfa/error_correlation'
         self._correlation = self.publisher(Float64MultiArray, correlation, latched_qos())
         self._delay = self.publisher(Float64, 'sfa/camera_delay', latched_qos())
+        self._scale = self.publisher(Float64, 'sfa/odometry_scale', latched_qos())
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
@@ -109,11 +110,13 @@ class SfaNode(LocalizationNode):
         return response
 
     def _publish_correlation(self) -> None:
-        """Publish how the model's errors correlate and how late images were: ekf_node needs it."""
+        """Publish how the model's errors correlate, how late images were, and the factor on the way
+        of odometry: ekf_node needs them."""
         assert self._observer is not None
         model = self._observer.model
         self._correlation.publish(convert.to_error_correlation(model.error_correlation))
         self._delay.publish(Float64(data=float(model.camera_delay_s)))
+        self._scale.publish(Float64(data=float(model.odometry_scale)))
 
     # Images.
 

@@ -127,6 +127,8 @@ def weak_lines(trained: Trained) -> list[str]:
     even = f'Nowhere is the expected error more than {_WEAK} times the mean.'
     uneven = f'On {share:.0%} of the covered ground it is more than {_WEAK} times the mean.'
     frame = 'x and y are those of the odometry where the first drive starts, or of its anchor.'
+    if trained.segments.anchors is not None:
+        frame = 'x and y are those of the measured points.'
     return [*lines, uneven if lines else even, frame]
 
 
@@ -173,6 +175,13 @@ def coverage_figure(path: Path, trained: Trained, places: Array) -> None:
     axes.scatter(places[:, 0], places[:, 1], s=2, color='black')
     x, y, error = expected.worst
     axes.plot(x, y, 'x', color='red', markersize=10, label=f'worst: {error:.2f} m')
+    for point, at in zip(
+        trained.model.quality.get('points', ()), trained.metric.points, strict=True
+    ):
+        color = 'blue' if point['used'] else 'red'
+        axes.plot([point['x_m'], at.real], [point['y_m'], at.imag], color=color)
+        label = f'{point["name"]}: missed by {point["miss_m"]:.2f} m'
+        axes.plot(point['x_m'], point['y_m'], '+', color=color, markersize=10, label=label)
     axes.legend(loc='upper right')
     figures.in_meters(axes, 'Images in the map, and the expected error between them')
     figures.save(figure, path)

@@ -1,0 +1,78 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Measured points, from a file and from a topic, and the stops of a drive that files name."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.files import read_regular
+from sfa_localization.data.geometry import relative
+from sfa_localization.data.run import POINT_STD_M, Odometry, Points, Run, Stamps
+from sfa_localization.metric.segments import IMAGE_STEP_MIN_M, IMAGE_TURN_MIN_RAD
+
+STOP_S = 2.0
+"""A robot that stands for so long has stopped."""
+MOST = 100
+"""Points that are used of a topic: the errors of a receiver are alike for a while."""
+LARGEST_FILE = 1 << 20
+_USAGE = 'lines are "stamp_s, x_m, y_m" or "stop, number, x_m, y_m", then perhaps std_m'
+
+
+def stops(odometry: Odometry) -> Stamps:
+    """First and last stamp (S, 2) of each time the robot stood for STOP_S or longer."""
+    stamps, track = odometry.stamps_ns, odometry.trajectory
+    later = stamps + round(STOP_S * 1e9)
+    if len(stamps) < 2:
+        return np.zeros((0, 2), np.int64)
+    moved = np.abs(relative(odometry.poses, track.at(later)))
+    stands = (np.hypot(*moved[:, :2].T) < IMAGE_STEP_MIN_M) & (moved[:, 2] < IMAGE_TURN_MIN_RAD)
+    stands &= later <= stamps[-1]
+    change = np.flatnonzero(np.diff(stands, prepend=False, append=False))
+    return np.column_stack([stamps[change[::2]], later[change[1::2] - 1]])
+
+
+def points_of(runs: Sequence[Run], path: str) -> Points | None:
+    """The points of a file, whose stops are those of the first run, and of the runs' topics."""
+    rows = read_points(Path(path), runs[0].odometry).rows() if path else []
+    by_topic = [row for run in runs if run.points is not None for row in run.points.rows()]
+    rows += by_topic[:: len(by_topic) // MOST + 1]
+    return Points.of(rows) if rows else None
+
+
+def read_points(path: Path, odometry: Odometry) -> Points:
+    """Read a file of points. Raises DataError, with the line, for what is none."""
+    try:
+        lines = read_regular(path, LARGEST_FILE).decode('utf-8-sig').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f'{path}: cannot be read: {error}') from None
+    stood, rows = stops(odometry).mean(axis=1).astype(np.int64), []
+    for number, line in enumerate(lines, 1):
+        cells = re.split(r'\s*[,;]\s*|\s+', line.partition('#')[0].strip())
+        if cells == [''] or cells[0] == 'stamp_s':
+            continue
+        try:
+            stop = int(cells.pop(1)) if cells[0] == 'stop' else None
+            stamp_ns = 0 if stop is not None else int(Decimal(cells[0]) * 10**9)
+            x, y, std = map(float, [*cells[1:], str(POINT_STD_M)][:3])
+        except (ArithmeticError, ValueError, IndexError):
+            stamp_ns, x, y, std = 0, math.nan, math.nan, math.nan
+        if not (math.isfinite(x + y) and 0 < std < math.inf and len(cells) <= 4):
+            raise DataError(f'{path}: line {number}: {line.strip()!r} is no point: {_USAGE}')
+        if stop is not None and not 0 < stop <= len(stood):
+            raise DataError(
+                f'{path}: line {number}: no stop {stop}: the first drive stands {len(stood)} times '
+                f'for {STOP_S:g} s; inspect lists them'
+            )
+        name = f'stop {stop}' if stop else f'point of {cells[0]} s'
+        rows.append((name, int(stood[stop - 1]) if stop else stamp_ns, complex(x, y), std))
+    if not rows:
+        raise DataError(f'{path}: holds no points: {_USAGE}')
+    return Points.of(rows)

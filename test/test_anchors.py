@@ -1,0 +1,314 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Measured points give a map its place, heading and scale, and say which of them are wrong."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cylinder_worlds import (
+    PICTURES,
+    PLACE_SIZE,
+    SMALL_RECIPE,
+    Spheres,
+    panorama_config,
+    run_in,
+    wander,
+)
+from filter_drives import Drive as FilterDrive
+from metric_worlds import criss_cross, drive, exact_features, stand, straight, turn
+from rosbags.typesys import Stores
+
+from sfa_localization.bags.decoding import typestore
+from sfa_localization.bags.writer import BagWriter, blank
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import RigidTransform, align
+from sfa_localization.data.run import PanoramaArray, Points, Run
+from sfa_localization.features.closures import Closures
+from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.localizer import Localizer
+from sfa_localization.metric.anchors import Anchors, Settled, settle
+from sfa_localization.metric.drives import Drive, Drives, learn_map
+from sfa_localization.metric.learning import positions
+from sfa_localization.metric.points import read_points, stops
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.reports.summary import summary
+from sfa_localization.reports.training import write_training_report
+from sfa_localization.training import train
+
+STD = 0.01
+CORNERS = np.array([-6 - 7j, 6 + 7j, -6 + 7j, 6 - 7j, 0.5 + 0.5j])
+CONFIG = MetricConfig(metric_map='monomials', slow_features=5)
+WHEELS = 1.02
+"""Wheels count so many meters of one."""
+
+
+def points(places):
+    """Points at places (K,), known to STD."""
+    return Points.of([(f'point {k}', k, complex(at), STD) for k, at in enumerate(places)])
+
+
+def settled(measured, places, std=0.02):
+    """What points say of a map that puts them at places, each as well as `std` says."""
+    count = len(places)
+    beside = Anchors(points(measured), np.arange(count), np.zeros(count, complex), Settled(None))
+    return settle(beside, np.asarray(places), std**2 * np.eye(count, dtype=complex))
+
+
+def counted(places, seed=0, std=0.02):
+    """Places as a drive puts them, in its own frame and the meters of its wheels."""
+    rng = np.random.default_rng(seed)
+    error = std * (rng.standard_normal(len(places)) + 1j * rng.standard_normal(len(places)))
+    return WHEELS * np.exp(0.8j) * places + 3 - 2j + error
+
+
+def test_points_apart_give_heading_and_scale_as_well_as_they_say():
+    for measured in (CORNERS, CORNERS[:2], np.array([-6, 0, 7])):  # these are on a line
+        found = [settled(measured, counted(measured, seed)) for seed in range(50)]
+        assert all(one.used.all() and one.turned for one in found)
+        errors = [(one.scale * WHEELS - 1) / one.scale_std for one in found]
+        assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3
+
+
+@pytest.mark.parametrize('wrong', range(5))
+def test_one_wrong_point_of_five_is_found(wrong):
+    for seed in range(20):
+        away = 2.0 * np.exp(1j * seed)
+        measured = CORNERS + away * (np.arange(5) == wrong)
+        found = settled(measured, counted(CORNERS, seed))
+        assert found.used.tolist() == [k != wrong for k in range(5)]
+        assert found.scale * WHEELS == pytest.approx(1.0, abs=4 * found.scale_std)
+
+
+def test_one_point_and_two_at_one_place_fix_the_place_only():
+    for measured in (CORNERS[:1], CORNERS[[0, 0]], np.array([0.0, 0.02])):
+        found = settled(measured, counted(measured))
+        assert found.used.all() and not found.turned
+        assert found.scale == 1.0
+
+
+def test_points_that_cannot_be_of_the_drive_are_an_error_that_says_why():
+    with pytest.raises(DataError, match='exchange x and y'):
+        settled(CORNERS.conj() * 1j, counted(CORNERS))
+    with pytest.raises(DataError, match='are they in meters'):
+        settled(3.28 * CORNERS, counted(CORNERS))
+    nowhere = Anchors(points(CORNERS), np.full(5, -1), np.zeros(5, complex), Settled(None))
+    with pytest.raises(DataError, match='are their stamps those of the bags'):
+        settle(nowhere, counted(CORNERS), np.eye(5, dtype=complex))
+
+
+def test_a_drive_that_bends_by_more_than_it_claims_keeps_most_points():
+    bent = counted(CORNERS) + 0.02 * counted(CORNERS) ** 2
+    found = settled(CORNERS, bent)
+    assert found.used.sum() >= 3
+    assert found.scale_std > settled(CORNERS, counted(CORNERS)).scale_std
+
+
+# With a map.
+
+
+@functools.cache
+def world():
+    """A drive in a garden: its odometry, features, true poses at the images."""
+    twists, start = criss_cross(12)
+    run = drive(twists, start=start, yaw_noise=0.02, speed_noise=0.05, bias=0.001)
+    odometry = replace(
+        run.odometry,
+        poses=run.odometry.poses * [WHEELS, WHEELS, 1.0],
+        twists=run.odometry.twists * [WHEELS, 1.0],
+    )
+    noise = 0.02 * np.random.default_rng(1).standard_normal((len(run.poses), 5))
+    return odometry, run, exact_features(run.poses[:, :2]) + noise
+
+
+def measured_at(rows, wrong=None):
+    """Points at images of the world, in its owner's coordinates, and one 2 m beside."""
+    _, run, _ = world()
+    rng = np.random.default_rng(7)
+    places = run.poses[rows, 0] + 1j * run.poses[rows, 1]
+    places = places + STD * (rng.standard_normal(len(rows)) + 1j * rng.standard_normal(len(rows)))
+    places[[] if wrong is None else [wrong]] += 2.0
+    stamps = run.stamps_ns[rows].tolist()
+    return Points.of([(f'point {k}', stamps[k], at, STD) for k, at in enumerate(places.tolist())])
+
+
+@functools.cache
+def learned(rows=(), wrong=None):
+    """Segments and the map of the world by points at some images."""
+    odometry, run, features = world()
+    images = PanoramaArray(run.stamps_ns, np.zeros((len(run.stamps_ns), 1, 1, 3), np.uint8))
+    item = Drive(Run('drive', images, odometry), run.poses[:, 2].tolist())
+    given = measured_at(list(rows), wrong) if rows else None
+    drives = Drives((item,), Closures.none(), SegmentConfig(yaw_source='odometry'), points=given)
+    return learn_map(drives, features, CONFIG)
+
+
+def errors(rows=(), wrong=None):
+    """Mean errors (m) in the owner's coordinates, and by the best similarity; its scale."""
+    segments, result = learned(rows, wrong)
+    images, places = positions(result, segments)
+    true = world()[1].poses[images, :2] @ [1, 1j]
+    own = places @ [1, 1j]
+    frame = np.column_stack([own, np.ones(len(own))])
+    best = np.linalg.lstsq(frame, true, rcond=None)[0]
+    return np.abs(own - true).mean(), np.abs(frame @ best - true).mean(), abs(best[0])
+
+
+def far_apart():
+    """Images at the ends of the garden, and one amid it."""
+    places = world()[1].poses[:, :2]
+    ends = [int(np.argmax(places @ way)) for way in ([1, 1], [-1, -1], [1, -1], [-1, 1])]
+    return (*ends, int(np.argmin(np.hypot(*places.T))))
+
+
+def test_a_map_lies_in_the_coordinates_of_its_points():
+    rows = far_apart()
+    before, rest, _ = errors()
+    assert before > 1.0
+    for chosen, wrong in ((rows[:2], None), (rows, None), (rows, 2)):
+        error, by_similarity, scale = errors(chosen, wrong)
+        anchors = learned(chosen, wrong)[0].anchors
+        assert error < 1.25 * max(by_similarity, rest)
+        assert abs(scale - 1.0) < 3 * anchors.settled.scale_std
+        assert learned(chosen, wrong)[1].certificate.certified
+
+
+def test_the_wrong_point_is_named_and_missed_by_what_it_is_wrong():
+    segments, result = learned(far_apart(), 2)
+    quality = segments.anchors.quality(result.points)
+    assert [one['used'] for one in quality['points']] == [True, True, False, True, True]
+    assert quality['points'][2]['miss_m'] == pytest.approx(2.0, abs=0.1)
+    assert max(one['miss_m'] for one in quality['points'] if one['used']) < 0.1
+    (said,) = segments.anchors.warnings(result.points)
+    assert said.startswith('point 2: ')
+
+
+def test_one_point_moves_the_map_of_the_odometry():
+    plain, (segments, result) = learned()[1], learned(far_apart()[:1])
+    turned = align(plain.origins, result.origins)
+    assert turned.yaw_rad == pytest.approx(0.0, abs=1e-3)
+    assert np.abs(turned.apply(plain.origins) - result.origins).max() < 1e-2
+    assert segments.anchors.quality(result.points)['points'][0]['miss_m'] < 1e-9
+    assert segments.anchors.settled.scale == 1.0
+
+
+def test_points_bend_a_route_straight():
+    """Odometry that turns by more than it says leaves a route as bent; points do not."""
+    legs = [straight(40), turn(np.pi / 2), straight(25), turn(np.pi / 2), straight(20)]
+    run = drive(np.vstack(legs), yaw_noise=0.05, bias=0.001)
+    features = exact_features(run.poses[:, :2] / 4)
+    images = PanoramaArray(run.stamps_ns, np.zeros((len(run.stamps_ns), 1, 1, 3), np.uint8))
+    item = Drive(Run('drive', images, run.odometry), run.poses[:, 2].tolist())
+    rows, config = np.linspace(5, len(run.poses) - 6, 8).astype(int), SegmentConfig()
+    given = Points.of([
+        (str(k), int(run.stamps_ns[row]), complex(*run.poses[row, :2]), STD)
+        for k, row in enumerate(rows.tolist())
+    ])  # fmt: skip
+    missed = []
+    for measured in (None, given):
+        drives = Drives((item,), Closures.none(), config, points=measured)
+        segments, result = learn_map(drives, features, CONFIG)
+        images, places = positions(result, segments)
+        true = run.poses[images, :2]
+        to_truth = align(places, true) if measured is None else RigidTransform(0.0, 0.0, 0.0)
+        missed.append(np.hypot(*(to_truth.apply(places) - true).T).mean())
+    assert missed[1] < missed[0] / 3
+
+
+# Files, topics and stops.
+
+
+def standing():
+    """Odometry that stands for 3 s at 0 m and at 4 m, and for 1 s at 2 m."""
+    parts = stand(3), straight(2), stand(1), straight(2), turn(1.0), stand(3), straight(1)
+    return drive(np.vstack(parts)).odometry
+
+
+def test_stops_are_found_and_named_by_their_number(tmp_path):
+    odometry = standing()
+    found = (stops(odometry) - odometry.stamps_ns[0]) * 1e-9
+    assert found == pytest.approx(np.array([[0.0, 3.0], [8.0 + 1 / 0.6, 11.0 + 1 / 0.6]]), abs=0.1)
+    file = tmp_path / 'points.csv'
+    file.write_text('stamp_s,x_m,y_m,std_m\n# a mark\nstop, 2, 4.0, 1.5\n12.5, 3, -1, 0.05\n')
+    read = read_points(file, odometry)
+    assert read.names == ('stop 2', 'point of 12.5 s')
+    assert read.stamps_ns[0] == pytest.approx(stops(odometry)[1].mean(), abs=1)
+    assert read.stamps_ns[1] == 12_500_000_000
+    assert read.places.tolist() == [4 + 1.5j, 3 - 1j]
+    assert read.std.tolist() == [0.02, 0.05]
+
+
+@pytest.mark.parametrize(
+    ('line', 'said'),
+    [
+        ('stop, 3, 1, 1', 'stands 2 times'),
+        ('stop, 0, 1, 1', 'no stop 0'),
+        ('12.5, 1', 'is no point'),
+        ('12.5, one, 2', 'is no point'),
+        ('12.5, 1, 2, 0', 'is no point'),
+        ('12.5, nan, 2', 'is no point'),
+        ('1, 2, 3, 4, 5', 'is no point'),
+        ('# nothing', 'holds no points'),
+    ],
+)
+def test_a_line_that_is_no_point_is_an_error_that_names_it(tmp_path, line, said):
+    file = tmp_path / 'points.csv'
+    file.write_text(line)
+    with pytest.raises(DataError, match=said):
+        read_points(file, standing())
+
+
+def clicked(stamp_ns, place):
+    """What RViz publishes for a click on the map."""
+    message = blank(typestore(Stores.ROS2_JAZZY), 'geometry_msgs/msg/PointStamped')
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    message.header.frame_id, message.point.x, message.point.y = 'map', place.real, place.imag
+    return message
+
+
+def test_points_clicked_on_the_map_of_a_lidar_give_a_model_its_coordinates(tmp_path):
+    """The demo of config/nav2.md; here the map counts from the equator."""
+    run = run_in(Spheres.about(1), wander(PICTURES, 2, hz=4.0), panorama_config(PLACE_SIZE))
+    odometry, images = run.odometry, run.panoramas.read(0, PICTURES)
+    in_lidar_map = RigidTransform(452_020.0, 5_411_005.0, 2.5).apply(odometry.poses[:, :2])
+    with BagWriter(tmp_path / 'drive') as bag:
+        for k, stamp in enumerate(odometry.stamps_ns.tolist()):
+            counted = odometry.poses[k] * [WHEELS, WHEELS, 1.0], odometry.twists[k] * [WHEELS, 1.0]
+            bag.odometry('/odom', stamp, *counted, (1e-4, 1e-4))
+            bag.image('/panorama', stamp, images[k], 'base_link')
+            if k % 20 == 10:
+                bag.message('/clicked_point', stamp, clicked(stamp, complex(*in_lidar_map[k])))
+    topics = replace(SMALL_RECIPE.topics, measured_places='/clicked_point')
+    trained = train([tmp_path / 'drive'], tmp_path / 'm.npz', replace(SMALL_RECIPE, topics=topics))
+    model = PlaceModel.load(tmp_path / 'm.npz')
+    found = np.array([model.locate(image).position for image in images[::5]])
+    assert np.hypot(*(found - in_lidar_map[::5]).T).mean() < 0.15
+    assert model.odometry_scale * WHEELS == pytest.approx(1.0, abs=3 * model.quality['scale_std'])
+    assert Localizer(model).filter.scale == model.odometry_scale
+    assert 'scale: the way of wheels counts 0.9' in summary(trained)
+    write_training_report(tmp_path / 'report', trained)
+    assert 'missed by' in (tmp_path / 'report' / 'index.html').read_text('utf-8')
+
+
+@pytest.mark.parametrize('told', [0, 200])
+def test_the_filter_drives_in_the_meters_of_the_model(told):
+    """Told at once, or on the way, where the pose of odometry goes on without a jump."""
+    trip = FilterDrive(seconds=20.0)
+    plain = PoseFilter(FilterConfig(initial_pose=(0.0, 0.0, 0.0)))
+    scaled = PoseFilter(FilterConfig(initial_pose=(0.0, 0.0, 0.0)))
+    counted = trip.reckoned.copy()
+    counted[told:, :2] += (WHEELS - 1) * (counted[told:, :2] - counted[max(told - 1, 0), :2])
+    for k, stamp in enumerate(trip.stamps_ns.tolist()):
+        (v, omega), factor = trip.read[k], 1.0 if k < told else WHEELS
+        plain.add_odometry(stamp, v, omega, trip.variances(), trip.reckoned[k])
+        if k == told:
+            scaled.expect_scale(1 / WHEELS)
+        scaled.add_odometry(stamp, factor * v, omega, trip.variances(), counted[k])
+        assert scaled.at(stamp).pose == pytest.approx(plain.at(stamp).pose, abs=1e-6)
+    before = scaled.scale
+    for absurd in (np.nan, np.inf, 0.0, -1.0, 10.0):
+        scaled.expect_scale(absurd)
+    assert scaled.scale == before
