@@ -322,7 +322,7 @@ class QuadraticForm:
         return np.asarray(form)
 
     def link_squares(self, bias: Array) -> tuple[Squares, Squares]:
-        """The turns' and the displacements' costs, of [o, z]."""
+        """The turns' and the displacements' costs, of [o, z], at biases (R,) rad/s."""
         links, n, own = self.links, len(self.period), bias[self.links.period]
         ones = np.ones(len(links.at))
         turns = -np.exp(1j * (links.turn - own * links.turn_time))
