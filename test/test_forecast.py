@@ -27,7 +27,6 @@ DRIVES = {
     'straight legs': criss_cross(30, half=(5.0, 5.0), seed=1, shortest=5.0),
     'other legs': criss_cross(40, half=(6.0, 4.0), seed=2, shortest=5.0),
     'wandering': meander(250.0, seed=3),
-    'wandering more': meander(400.0, seed=4),
     'lanes along and across': (grid(10.0, 1.0, 9), (-5.0, -5.0, 0.0)),
 }
 

@@ -207,8 +207,8 @@ def test_drives_in_one_light_are_one_and_those_in_another_are_not():
 
 
 def test_drives_that_do_not_meet_are_kept_apart():
-    poses = [drive(), drive() + np.array([50.0, 0.0, 0.0])]
-    parts = [Spheres.about(n).panoramas(drive(), CONFIG) for n in (0, 1)]
+    poses = [drive(0.5), drive(0.5) + np.array([50.0, 0.0, 0.0])]
+    parts = [Spheres.about(n).panoramas(drive(0.5), CONFIG) for n in (0, 1)]
     keyframes = fitted(parts, poses, [0, 1])
     assert set(keyframes.drives.tolist()) == {0, 1} and keyframes.first.all()
     off, turned, _ = errors(keyframes, Spheres.about(0).panoramas(unseen(), CONFIG), unseen())
