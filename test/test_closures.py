@@ -270,8 +270,9 @@ def test_doors_of_a_corridor_that_look_alike_close_no_loop():
 def test_what_is_left_out_is_left_out_of_every_drive_along_the_track():
     _, segments = twice_along_one_track()
     stack, track = Stack.of(segments), tracks(segments)
-    for rows in selection.folds(stack, 0):
-        inside = np.isin(np.arange(len(segments)), stack.owner[rows])
+    part = selection.folds(stack, 0)
+    for number in np.unique(part):
+        inside = np.isin(np.arange(len(segments)), stack.owner[part == number])
         assert (inside == inside[track]).all()
 
 

@@ -119,9 +119,7 @@ def test_a_drive_shorter_than_what_is_left_out_is_left_out_in_parts(length, monk
     quick_and_tolerant(monkeypatch)
     monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', length)
     stack = Stack.of(segments)
-    parts = folds(stack, 0)
-    assert 2 <= len(parts) <= selection.LEFT_OUT_FOLDS
-    assert sorted(np.concatenate(parts)) == list(range(len(stack.images)))
+    assert 2 <= len(np.unique(folds(stack, 0))) <= selection.LEFT_OUT_FOLDS
     result = learn_metric(features, segments, CONFIG)
     assert result.certificate.certified
     assert np.isfinite(result.map.predict(features)[1]).all()
@@ -137,6 +135,7 @@ def test_few_segments_are_never_left_out_all_at_once_and_one_is_refused(monkeypa
     monkeypatch.setattr(selection, 'LEFT_OUT_LENGTH_M', 1e4)
     for many, number in ((2, 2), (3, 8), (5, 2)):
         monkeypatch.setattr(selection, 'LEFT_OUT_FOLDS', number)
-        assert len(folds(Stack.of(replace(segments, items=segments.items[:many])), 0)) >= 2
+        few = Stack.of(replace(segments, items=segments.items[:many]))
+        assert len(np.unique(folds(few, 0))) >= 2
     with pytest.raises(DataError, match='drive farther'):
         folds(Stack.of(replace(segments, items=segments.items[:1])), 0)

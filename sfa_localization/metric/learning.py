@@ -36,7 +36,7 @@ from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import LeftOut, choose, leave_out, part_of
+from sfa_localization.metric.selection import LeftOut, choose, folds, leave_out
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.turned_maps import TurnedMaps
 
@@ -184,7 +184,7 @@ class _Left:
         images, places = leave_out(fit), plane(fit.places)
         drive_std = np.sqrt(place_variance(fit))
         distances = ground_distances(places, np.random.default_rng(fit.problem.seed))
-        weight = importance(nearest_used(places, part_of(fit.stack, fit.problem.seed)), distances)
+        weight = importance(nearest_used(places, folds(fit.stack, fit.problem.seed)), distances)
         expected = Forecast(places, np.abs(images.errors), drive_std, weight, distances)
         return cls(images, expected, float(places.var(0).sum()))
 

@@ -89,19 +89,17 @@ class MetricProblem:
         variance = start.variance if start else _FIRST_VARIANCE
         correlation = start.correlation if start else LINK_WEIGHT
         links = start.links if start else self.links
+        elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
+        freedom = _freedom(elimination, basis, self.stack)
         for _ in range(max(rounds, 1)):
-            elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
             loops = np.sum([one.form(self.stack, solution) for one in self.ties], axis=0)
             form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
             bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
             solution = form.solve(solution.z if solution else None, bias)
             links, links_before = learned(self.links, form, solution), links
-            weights = elimination.weights(solution.coefficients(self.stack.period))
-            predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
-            residuals = solution.places(self.stack) - predicted
+            weights, residuals = _fitted(elimination, expanded, solution, self.stack)
             before = variance
             correlation = LINK_WEIGHT * _correlation(residuals, self.stack)
-            freedom = _freedom(elimination, basis, self.stack)
             variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
             steady = links.alike(links_before, _LINKS_SETTLED)
             if steady and abs(variance - before) < _SETTLED * variance:
@@ -109,7 +107,7 @@ class MetricProblem:
         assert solution is not None
         return MapFit(
             self, basis, expanded, noise_ratio, variance, correlation, loops, links,
-            elimination, solution, np.asarray(residuals), weights,
+            elimination, solution, residuals, weights,
         )  # fmt: skip
 
     def form(
@@ -182,9 +180,7 @@ class MapFit:
         noise = variance * correlation
         form = problem.form(self.elimination, self.loops, problem.links, noise, YAW_BIAS_STD)
         solution = form.solve(None, np.zeros(stack.period[-1] + 1))
-        weights = self.elimination.weights(solution.coefficients(stack.period))
-        predicted = self.expanded @ weights.real + 1j * (self.expanded @ weights.imag)
-        residuals = np.asarray(solution.places(stack) - predicted)
+        weights, residuals = _fitted(self.elimination, self.expanded, solution, stack)
         return replace(
             self, variance=variance, correlation=correlation, links=problem.links,
             solution=solution, residuals=residuals, map_weights=weights,
@@ -214,6 +210,15 @@ def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
             f'slow_features is {config.slow_features}, but there are only {features.shape[1]}'
         )
     return rows
+
+
+def _fitted(
+    elimination: Elimination, expanded: Array, solution: Solution, stack: Stack
+) -> tuple[Complex, Complex]:
+    """The map's weights (m,) for a solution, and the residuals (M,)."""
+    weights = elimination.weights(solution.coefficients(stack.period))
+    predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
+    return weights, np.asarray(solution.places(stack) - predicted)
 
 
 def _freedom(elimination: Elimination, basis: Basis, stack: Stack) -> float:

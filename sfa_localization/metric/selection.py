@@ -61,8 +61,9 @@ class LeftOut:
         return np.asarray(np.abs(self.errors) ** 2 / self.variances)
 
 
-def folds(stack: Stack, seed: int) -> list[Indices]:
-    """Rows of the stack left out in turn: whole segments, in stretches of the drive.
+def folds(stack: Stack, seed: int) -> Indices:
+    """(M,) by which part of the drive each row of the stack is left out: whole segments, in
+    stretches of the drive.
 
     Stretches of a short drive are shorter: there are LEFT_OUT_FOLDS parts, as far as there are
     segments, and always at least two. Segments along one track are left out together. Raises
@@ -84,16 +85,7 @@ def folds(stack: Stack, seed: int) -> list[Indices]:
     order = np.random.default_rng(seed).permutation(len(names))
     fold = np.empty(len(names), int)
     fold[order] = np.arange(len(names)) % parts
-    part = fold[np.searchsorted(names, stretch)][stack.owner]
-    return [np.flatnonzero(part == k) for k in range(parts)]
-
-
-def part_of(stack: Stack, seed: int) -> Indices:
-    """(M,) which of the folds each row of the stack is in."""
-    part = np.empty(len(stack.images), np.int64)
-    for number, rows in enumerate(folds(stack, seed)):
-        part[rows] = number
-    return part
+    return np.asarray(fold[np.searchsorted(names, stretch)][stack.owner])
 
 
 def leave_out(fit: MapFit) -> LeftOut:
@@ -105,7 +97,8 @@ def leave_out(fit: MapFit) -> LeftOut:
     stack, places = fit.stack, fit.places
     errors = np.zeros(len(stack.images), complex)
     variances = np.zeros(len(stack.images))
-    for rows in folds(stack, fit.problem.seed):
+    part = folds(stack, fit.problem.seed)
+    for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
         weights = fit.weights
         weights[rows] = 0.0
         elimination = eliminate(fit.expanded, fit.basis.ridge, weights, stack)
