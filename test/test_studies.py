@@ -13,10 +13,8 @@ from study import __main__ as studies
 from study import comparisons, light, paper, results, sites, year
 from study.comparisons import BASELINES, VARIANTS
 from study.half_real import given_drive
-from study.paper_report import PAPER, paper_table
 from study.results import Results
 from study.retrieval import ImageRetrieval
-from study.signatures import FourierSignature, TurnedComponents
 from study.sites import Plan
 from study.tables import NAMES
 
@@ -135,26 +133,6 @@ def test_a_foreign_folder_and_results_of_other_settings_are_left_alone(tmp_path)
     assert Results.opened(own / 'robot.json', {'world': 1}).find(seed=3) == {'seed': 3}
 
 
-# Tables
-
-
-def rows(table):
-    """The cells of each line of a Markdown table, by the first one."""
-    lines = [[word.strip() for word in line.split('|')[1:-1]] for line in table.splitlines()]
-    assert len({len(line) for line in lines}) == 1
-    return {line[0]: line[1:] for line in lines}
-
-
-def test_the_table_has_the_papers_numbers_and_mean_and_spread_of_ours():
-    columns = {'paper': {'problem': 'a wrong minimum'}, 'ours': {'test': 0.1, 'ekf': 0.062}}
-    seeds = [{'seed': k, 'odometry': 0.31, 'columns': columns} for k in (1, 2)]
-    seeds[1] = {**seeds[1], 'columns': {**columns, 'ours': {'test': 0.2, 'ekf': 0.062}}}
-    table = rows(paper_table('robot', seeds))
-    assert table['test, unsupervised map'] == ['0.14', '-', '0.150 ± 0.071']
-    assert table['EKF against odometry'] == ['-65 %', '-', '-80 ± 0 %']
-    assert round(1 - PAPER['robot']['ekf'] / PAPER['robot']['odometry'], 2) == 0.65
-
-
 # Other features
 
 
@@ -175,20 +153,6 @@ def test_retrieval_finds_the_image_and_the_turn(clockwise):
         x, y, yaw = retrieval.locate(np.roll(darker, columns * (1 if clockwise else -1), axis=1))
         assert (x, y) == (k, -k)
         assert abs(wrap_angle(yaw - poses[k, 2] - 2 * np.pi * columns / 150)) < np.radians(2.5)
-
-
-@pytest.mark.parametrize('kind', [FourierSignature, TurnedComponents])
-def test_signatures_depend_neither_on_heading_nor_on_exposure(kind):
-    images = panoramas(40)
-    signature = kind.fit(lambda: np.split(images, [16, 30]))
-    features = signature.features(images)
-    turned = signature.features(np.roll(images, 37, axis=2))
-    darker = signature.features(np.rint(0.5 * images + 10).astype(np.uint8))
-    assert np.abs(turned - features).max() < 1e-9 * features.std()
-    assert np.abs(darker - features).max() < 0.05 * features.std()
-    assert np.abs(features - np.roll(features, 1, axis=0)).max(1).min() > 0.1 * features.std()
-    with pytest.raises(DataError, match='two images'):
-        kind.fit(lambda: [images[:1]])
 
 
 # Drives of a real robot: its true poses, and the odometry that it measured.

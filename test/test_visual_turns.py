@@ -3,20 +3,17 @@
 """The camera's clock beside the odometry's, in worlds of spheres and on the sample."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres, panorama_config, wander
 
-from sfa_localization.bags.drives import read_drive
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
 from sfa_localization.fusion.camera_clock import CameraClock, camera_clock
 
-BAGS = Path(__file__).parents[1] / 'bags'
 SIZE = (20, 120)
 
 
@@ -103,11 +100,3 @@ def test_where_nothing_shows_the_delay_none_is_claimed():
     for each in (*shown, few, straight, even):
         clock = clock_of(each)
         assert not clock.known and clock.delay_ns == 0
-
-
-@pytest.mark.parametrize('name', ['sample_test'])
-def test_the_sample_is_on_one_clock(name, tmp_path):
-    run = read_drive(BAGS / name, tmp_path)
-    for delay in (0.0, 0.15):
-        clock = clock_of(late(run, delay))
-        assert clock.known and abs(clock.delay_s - delay) < 3 * clock.std_s
