@@ -79,12 +79,12 @@ class Loops:
         """The quadratic form (3N, 3N) in [o, z, -b z], weighted by the closures' variances: by
         their residuals in the solution `before`."""
         turn_std, place_std, doubt = self.turn_std, self.place_std, np.ones(len(self.share))
-        if before is not None:
+        if before is not None and len(doubt):
             x = before.coefficients(stack.period)
             turned = np.abs(self.turns @ x) / turn_std
             apart = np.abs(self.places @ x) / place_std
-            turn_part = max(MEDIAN_TO_STD * _median(turned), _LEAST)
-            place_part = max(LENGTH_TO_STD * _median(apart), _LEAST)
+            turn_part = max(MEDIAN_TO_STD * float(np.median(turned)), _LEAST)
+            place_part = max(LENGTH_TO_STD * float(np.median(apart)), _LEAST)
             turn_std, place_std = turn_part * turn_std, place_part * place_std
             doubt += (turned / (_HALF * turn_part)) ** 2 + (apart / (_HALF * place_part)) ** 2 / 2
         weight = np.sqrt(np.tile(self.share / doubt, 2)) / np.concatenate([turn_std, place_std])
@@ -130,7 +130,3 @@ def _sparse(parts: list[tuple[Indices, Complex]], width: int) -> sparse.csr_arra
     rows = np.repeat(np.arange(len(columns)), columns.shape[1])
     entries = values.astype(complex).ravel(), (rows, columns.ravel())
     return sparse.csr_array(entries, shape=(len(columns), width))
-
-
-def _median(values: Array) -> float:
-    return float(np.median(values)) if len(values) else 0.0

@@ -17,7 +17,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
 from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
-from sfa_localization.metric.phases import certify, phase_cost
+from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.quadratic_form import QuadraticForm, Solution, eliminate, schur
 
 Complex = NDArray[np.complex128]
@@ -160,7 +160,7 @@ def _mirrored(alpha: Array, turns: Array) -> bool:
 
 
 def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProblem) -> MapFit:
-    """The result of the descent as a fit, certificate included."""
+    """The result of the descent as a fit."""
     stack, terms = problem.stack, regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
     expanded = np.column_stack([regressors[:, 1:], np.ones(len(regressors))])
@@ -173,7 +173,7 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     bias = np.zeros(stack.period[-1] + 1)
     form = QuadraticForm(elimination.gram, problem.links, stack.period, variance, 0.0)
     h = schur(form.system(bias))[0]
-    solution = Solution(z, o, bias, certify(h, z), h, phase_cost(h, z))
+    solution = Solution(z, o, bias, h, phase_cost(h, z))
     no_loops = np.zeros_like(elimination.gram)
     return MapFit(
         problem, basis, expanded, ones, variance, 1.0, no_loops, problem.links,

@@ -24,7 +24,6 @@ eq. 2 to eq. 4 are zero, w and o are those of `Elimination.weights` and `schur`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +32,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.phases import Certificate, refine, synchronize
+from sfa_localization.metric.phases import Certificate, certify, refine, synchronize
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.shared_tracks import tracks
 
@@ -197,9 +196,10 @@ def eliminate(expanded: Array, ridge: Array, weights: Array, stack: Stack) -> El
     factor = _cholesky(normal)
     columns = np.column_stack([np.ones(len(weights)), stack.path, stack.drift])
     cross = np.vstack([_products(weighted, column, stack) for column in columns.T]).T
-    white = _whiten(factor, cross)
-    gram = _moments(columns, weights, stack) - white.conj().T @ white
-    return Elimination((gram + gram.conj().T) / 2, factor, cross)
+    real, imag = _whiten(factor, cross)
+    mixed = real.T @ imag
+    own = real.T @ real + imag.T @ imag + 1j * (mixed - mixed.T)
+    return Elimination(_moments(columns, weights, stack) - own, factor, cross)
 
 
 def _cholesky(matrix: NDArray[Any]) -> NDArray[Any]:
@@ -229,12 +229,12 @@ def _moments(columns: Complex, weights: Array, stack: Stack) -> Complex:
     return moments.reshape(3 * n, 3 * n)
 
 
-def _whiten(factor: Array, right: Complex) -> Complex:
-    """factor^-1 right, for complex right."""
+def _whiten(factor: Array, right: Complex) -> tuple[Array, Array]:
+    """Real and imaginary part of factor^-1 right."""
     both = np.hstack([right.real, right.imag])
     both = scipy.linalg.solve_triangular(factor, both, lower=True, overwrite_b=True)
-    n = right.shape[1]
-    return np.asarray(both[:, :n] + 1j * both[:, n:])
+    real, imag = np.hsplit(both, 2)
+    return np.ascontiguousarray(real), np.ascontiguousarray(imag)
 
 
 def _solve(factor: Array, right: Complex) -> Complex:
@@ -244,14 +244,18 @@ def _solve(factor: Array, right: Complex) -> Complex:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods, certificate."""
+    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods."""
 
     z: Complex
     o: Complex
     bias: Array
-    certificate: Certificate
     h: Complex
     cost: float
+
+    @property
+    def certificate(self) -> Certificate:
+        """Of the directions."""
+        return certify(self.h, self.z)
 
     def places(self, stack: Stack) -> Complex:
         """Where the segments put the images (M,), meters."""
@@ -273,12 +277,6 @@ class Squares:
     """(K, L)"""
     weight: Array
     """(L,)"""
-
-    @classmethod
-    def of(cls, terms: Sequence[tuple[Indices, NDArray[Any]]], weight: Array) -> Squares:
-        """From the columns and values (L,) of each term."""
-        columns, values = zip(*terms, strict=True)
-        return cls(np.array(columns), np.array(values, complex), weight)
 
     def roots(self, x: Complex) -> Complex:
         """What is squared (L,), at the unknowns x."""
@@ -324,16 +322,14 @@ class QuadraticForm:
     def link_squares(self, bias: Array) -> tuple[Squares, Squares]:
         """The turns' and the displacements' costs, of [o, z], at biases (R,) rad/s."""
         links, n, own = self.links, len(self.period), bias[self.links.period]
-        ones = np.ones(len(links.at))
+        at, ones = links.at, np.ones(len(links.at))
         turns = -np.exp(1j * (links.turn - own * links.turn_time))
         moves = -(links.displacement - own * links.displacement_drift)
-        at, turned = links.at, n + links.at
+        turned = np.array([n + at + 1, n + at]), np.array([ones, turns])
+        moved = np.array([at + 1, at, n + at]), np.array([ones, -ones, moves])
         return (
-            Squares.of([(turned + 1, ones), (turned, turns)], self.variance / links.turn_variance),
-            Squares.of(
-                [(at + 1, ones), (at, -ones), (turned, moves)],
-                self.variance / links.displacement_variance,
-            ),
+            Squares(*turned, self.variance / links.turn_variance),
+            Squares(*moved, self.variance / links.displacement_variance),
         )
 
     def slope(self, bias: Array, x: Complex) -> Array:
@@ -352,13 +348,13 @@ class QuadraticForm:
     def solve(self, start: Complex | None, bias: Array) -> Solution:
         """The best directions, origins and biases; near `start` (N,), or globally without one."""
         h, origins = schur(self.system(bias))
-        z = refine(h, start) if start is not None else synchronize(h)[0]
+        z = refine(h, start) if start is not None else synchronize(h)
         if self.bias_std > 0:
             bias, z = self._estimate_bias(bias, z)
             h, origins = schur(self.system(bias))
-        z, certificate = synchronize(h, [z])
+        z = synchronize(h, [z])
         cost = float(np.real(np.vdot(z, h @ z))) / 2
-        return Solution(z, origins @ z, bias, certificate, h, cost)
+        return Solution(z, origins @ z, bias, h, cost)
 
     def _refined(self, bias: Array, z: Complex) -> Complex:
         """[o, z] (2N,) at given biases, from directions nearby."""
@@ -376,7 +372,7 @@ class QuadraticForm:
             step = np.clip(step, -self.bias_std, self.bias_std)
             bias = bias + step
             x = self._refined(bias, x[n:])
-            if np.abs(step).max() < 1e-9 * self.bias_std:
+            if np.abs(step).max() < 1e-6 * self.bias_std:
                 break
         return bias, x[n:]
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from sfa_localization.cli import guarded
 from sfa_localization.commands.options import add_settings, settings
 from sfa_localization.data.errors import ConfigError
-from study import half_real, light, light_report, year, year_report
+from study import half_real, large, light, light_report, year, year_report
 from study.results import Progress, StudyConfig
 from study.sites import FULL, QUICK
 from study.tables import NAMES, Work
@@ -31,6 +31,7 @@ STUDIES = {
     'ablations': 'this package without some of its parts',
     'light': 'train in one, two or three lights, test in every light and season',
     'year': 'train once, then a drive a month, with and without updates of the model',
+    'large': 'gardens of 16 m x 18 m to 64 m x 72 m, at one density of drives',
 }
 
 
@@ -60,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser, name: str) -> None:
         type=Path,
         metavar='DIR',
         help='folder to write, or one with the same settings to go on with [study_paper, '
-        'study_light, study_year; with --quick study_quick...]',
+        'study_light, study_year, study_large; with --quick study_quick...]',
     )
     parser.add_argument(
         '--quick', action='store_true', help='a smaller garden, smaller images, fewer seasons'
@@ -96,6 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.out or Path(f'{start}year'), config, months, progress=True
         )
         print(year_report.table(cells))
+    if 'large' in chosen:
+        areas = large.QUICK_AREAS if arguments.quick else large.AREAS
+        print(large.judge_areas(arguments.out or Path(f'{start}large'), config, areas))
     return 0
 
 
