@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 
 Spectra = NDArray[np.complex64]
@@ -224,31 +224,30 @@ def combine(
 
     Both are weighted by their information, and where they are farther apart than that allows, by
     their squared Mahalanobis distance d^2 = (p_s - p_k)^T (C_k + C_s')^-1 (p_s - p_k) over its
-    mean n (2 in the plane), the covariance grows; j is `MatchNoise.joint_factor`:
+    mean, 2 in the plane, the covariance grows; j is `MatchNoise.joint_factor`:
 
         G = C_k (C_k + C_s')^-1,    p = p_k + G (p_s - p_k),
-        C = j max(1, d^2 / n) (G C_s' G^T + (I - G) C_k (I - G)^T)
+        C = j max(1, d^2 / 2) (G C_s' G^T + (I - G) C_k (I - G)^T)
 
-    The yaw is combined in the same way by itself (n = 1, j = 1). Slow features count alone at a
-    place that the keyframes do not know; keyframes alone where slow features give no position,
-    contradict them (d^2 > 12), or lately did (`doubt` > 1).
+    The yaw is that of keyframes. Slow features count alone at a place that the keyframes do not
+    know; keyframes alone where slow features give no position, contradict them (d^2 > 12), or
+    lately did (`doubt` > 1).
     """
     mine, its = noise.covariance(match, light), _slow_covariance(slow, match, noise, light, doubt)
     if not match.known:
         return slow.pose, its
-    apart, pose = slow.pose - match.pose, match.pose.copy()
-    apart[2] = wrap_angle(apart[2])
-    if doubt > 1 or not (np.isfinite(apart[:2]).all() and np.isfinite(its).all()):
-        return pose, mine
-    found = _weighted(apart[:2], mine[:2, :2], its[:2, :2])
-    if found is None:
-        return pose, mine
+    apart, own, other = slow.position - match.pose[:2], mine[:2, :2], its[:2, :2]
+    if doubt > 1 or not (np.isfinite(apart).all() and np.isfinite(other).all()):
+        return match.pose, mine
+    squared = _squared(apart, own + other)
+    if squared > _CONTRADICTS:
+        return match.pose, mine
+    gain = own @ np.linalg.inv(own + other)
+    rest = np.eye(2) - gain
+    both = gain @ other @ gain.T + rest @ own @ rest.T
     covariance = np.diag([0.0, 0.0, mine[2, 2]])
-    pose[:2], covariance[:2, :2] = pose[:2] + found[0], noise.joint_factor * found[1]
-    turn = _weighted(apart[2:], mine[2:, 2:], its[2:, 2:]) if np.isfinite(slow.yaw) else None
-    if turn is not None:
-        pose[2], covariance[2, 2] = wrap_angle(pose[2] + turn[0][0]), turn[1][0, 0]
-    return pose, covariance
+    covariance[:2, :2] = noise.joint_factor * max(1.0, squared / 2) * both
+    return match.pose + np.append(gain @ apart, 0.0), covariance
 
 
 def distance(slow: Observation, match: Match, noise: MatchNoise, light: float = 0.0) -> float:
@@ -270,19 +269,6 @@ def _slow_covariance(
     extrapolated = _SLOW_SHARE * noise.slope_m * noise.by_place(match, light)
     wider[:2, :2] += extrapolated**2 * np.eye(2)
     return wider
-
-
-def _weighted(apart: Array, mine: Array, its: Array) -> tuple[Array, Array] | None:
-    """The step (n,) toward another estimate that is `apart` (n,), and the covariance (n, n) of
-    both together, see `combine`; None where they contradict each other.
-    """
-    squared = _squared(apart, mine + its)
-    if squared > _CONTRADICTS:
-        return None
-    gain = mine @ np.linalg.inv(mine + its)
-    rest = np.eye(len(apart)) - gain
-    both = gain @ its @ gain.T + rest @ mine @ rest.T
-    return gain @ apart, max(1.0, squared / len(apart)) * both
 
 
 def _squared(apart: Array, covariance: Array) -> float:
