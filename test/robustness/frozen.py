@@ -120,6 +120,7 @@ class Frozen:
         known = SimpleNamespace(
             error_correlation=ErrorCorrelation(share, distance_m),
             camera_delay_s=delay_s,
+            odometry_scale=1.0,
             panorama=PanoramaConfig(),
             keyframes=None,
         )
