@@ -26,14 +26,15 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.checkpoint import Checkpoint
-from sfa_localization.features.image_features import features_of_runs
+from sfa_localization.features.image_features import ImageFeatures, features_of_runs
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
-from sfa_localization.metric.drives import compare_with_map, learn_map
+from sfa_localization.metric.drives import Maps, anchored, compare_with_map, learn_map
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
     correlation_along_drive,
+    learn_metric,
     left_out_agreement,
     with_turned,
 )
@@ -106,15 +107,27 @@ def learn_place(
     return _learn(network, TrainingInput.of(runs, recipe), strict)
 
 
-def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
+def _maps(given: TrainingInput, images: ImageFeatures, strict: bool) -> tuple[Segments, Maps]:
+    """Steps 5 to 7, once more where measured points are given."""
     config, seed = given.recipe.metric, given.recipe.network.seed
-    with given.bar(4, 'compute the slow features of all images') as bar:
-        images = features_of_runs(network, given.runs, bar.update)
-    given.say(6, 'cut the odometry, and learn the map')  # steps 5 and 6
+    sign = -1.0 if given.panorama.clockwise else 1.0
+
+    def turned(segments: Segments, first: MetricResult) -> Maps:
+        return first, *with_turned(images.spectra, segments, first, sign, config, seed)
+
+    def again(segments: Segments) -> Maps:
+        return turned(segments, learn_metric(images.slow, segments, config, seed))
+
+    given.say(6, 'cut the odometry, and learn the map')
     segments, first = learn_map(given.drives, images.slow, config, seed, strict)
     given.say(7, 'learn the map again, from turned maps')
-    sign = -1.0 if given.panorama.clockwise else 1.0
-    turned, result = with_turned(images.spectra, segments, first, sign, config, seed)
+    return anchored(given.drives, segments, turned(segments, first), again)
+
+
+def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
+    with given.bar(4, 'compute the slow features of all images') as bar:
+        images = features_of_runs(network, given.runs, bar.update)
+    segments, (first, turned, result) = _maps(given, images, strict)
     given.say(8, 'choose keyframes, and check the map')
     agreement = left_out_agreement(images.disagreement, result)
     known = learn_keyframes(

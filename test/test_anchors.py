@@ -30,8 +30,8 @@ from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.anchors import Anchors, Settled, settle
-from sfa_localization.metric.drives import Drive, Drives, learn_map
-from sfa_localization.metric.learning import positions
+from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map
+from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.points import read_points, stops
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
@@ -143,7 +143,19 @@ def learned(rows=(), wrong=None):
     item = Drive(Run('drive', images, odometry), run.poses[:, 2].tolist())
     given = measured_at(list(rows), wrong) if rows else None
     drives = Drives((item,), Closures.none(), SegmentConfig(yaw_source='odometry'), points=given)
-    return learn_map(drives, features, CONFIG)
+    return in_coordinates(drives, features)
+
+
+def in_coordinates(drives, features):
+    """Segments and the map, without turned maps."""
+
+    def again(segments):
+        result = learn_metric(features, segments, CONFIG)
+        return result, None, result
+
+    segments, first = learn_map(drives, features, CONFIG)
+    segments, maps = anchored(drives, segments, (first, None, first), again)
+    return segments, maps[-1]
 
 
 def errors(rows=(), wrong=None):
@@ -210,7 +222,7 @@ def test_points_bend_a_route_straight():
     missed = []
     for measured in (None, given):
         drives = Drives((item,), Closures.none(), config, points=measured)
-        segments, result = learn_map(drives, features, CONFIG)
+        segments, result = in_coordinates(drives, features)
         images, places = positions(result, segments)
         true = run.poses[images, :2]
         to_truth = align(places, true) if measured is None else RigidTransform(0.0, 0.0, 0.0)

@@ -32,8 +32,10 @@ from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import with_closures
 from sfa_localization.metric.turn_loss import Shown, way_of
+from sfa_localization.metric.turned_maps import TurnedMaps
 
-_Learn = Callable[[Segments], tuple[Segments, MetricResult]]
+Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]
+"""The first map, turned maps, and the map of these, or the first again."""
 logger = logging.getLogger(__name__)
 
 _POINT_ROUNDS = 3
@@ -160,22 +162,18 @@ def learn_map(
     Where the map shows that wheels lose way in turns, it is learned once more without that. Raises
     DataError; `strict` also for a single route, of which else a warning says so.
     """
-
-    def learned(segments: Segments) -> tuple[Segments, MetricResult]:
-        return segments, learn_metric(features, segments, config, seed)
-
-    segments, result = learned(drives.cut())
+    segments = drives.cut()
+    result = learn_metric(features, segments, config, seed)
     for _ in range(_LOSS_ROUNDS if config.solver == 'certified' else 0):
         ways = drives.ways(segments, result)
         if not any(ways):
             break
         try:
-            segments, result = learned(drives.cut(ways))
+            shorter = drives.cut(ways)
+            segments, result = shorter, learn_metric(features, shorter, config, seed)
         except DataError as error:
             logger.warning('the way that wheels lose in turns stays in the map: %s', error)
             break
-    if segments.anchors is not None:
-        segments, result = _anchored(drives, segments, result, learned)
     if result.diagnostics.one_route and strict:
         raise DataError(f'{ROUTE}, or train without --strict')
     if result.diagnostics.one_route:
@@ -183,25 +181,26 @@ def learn_map(
     return segments, result
 
 
-def _anchored(
-    drives: Drives, segments: Segments, result: MetricResult, learned: _Learn
-) -> tuple[Segments, MetricResult]:
-    """Learned once more, in the coordinates and meters of the points, and again where the map that
-    they bend straight shows other ones to be right.
+def anchored(
+    drives: Drives, segments: Segments, maps: Maps, again: Callable[[Segments], Maps]
+) -> tuple[Segments, Maps]:
+    """Segments and maps in the coordinates and meters of the measured points, if there are any: the
+    last map shows what these say, and all are learned `again`; once more where the map that the
+    points bend straight shows other ones to be right.
     """
-    for _ in range(_POINT_ROUNDS):
+    for _ in range(_POINT_ROUNDS if segments.anchors else 0):
         assert segments.anchors is not None
-        before = segments.anchors.settled
+        before, result = segments.anchors.settled, maps[-1]
         now = settle(segments.anchors, result.points, result.points_covariance)
         if (now.used == before.used).all():
             break
         ways = [_scaled(way or Way(), now.scale) for way in segments.ways]
-        now = replace(now, scale=before.scale * now.scale)
-        segments, result = learned(drives.cut(ways, now))
-    assert segments.anchors is not None
-    for text in segments.anchors.warnings(result.points):
-        logger.warning(text)
-    return segments, result
+        segments = drives.cut(ways, replace(now, scale=before.scale * now.scale))
+        maps = again(segments)
+    if segments.anchors is not None:
+        for text in segments.anchors.warnings(maps[-1].points):
+            logger.warning(text)
+    return segments, maps
 
 
 def _scaled(way: Way, scale: float) -> Way:

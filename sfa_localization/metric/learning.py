@@ -126,7 +126,7 @@ def learn_metric(
     """Learn meters from features (N, K), one row per image of the runs, and segments.
 
     `scale` (K,) weights the features, without it their slowness does. The result lies in its own
-    map frame, or in that of `onto`, another result of the same segments.
+    map frame, or in that of `onto`, another result of the same segments, where no points give it.
 
     Raises DataError when the features are unusable, when the drive cannot determine a map (the
     message names what to drive instead), or when optimality is not proven.
@@ -142,7 +142,8 @@ def learn_metric(
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
-    frame = map_frame(fit) if onto is None else _frame_of(onto, fit)
+    by_points = segments.anchors is not None and segments.anchors.settled.used.any()
+    frame = map_frame(fit) if onto is None or by_points else _frame_of(onto, fit)
     return _result(fit, left, frame, diagnostics)
 
 
