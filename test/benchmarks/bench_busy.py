@@ -1,7 +1,7 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
 """Every entry point beside busy processes, with the threads that NumPy takes by default over one:
-`python bench_busy.py MODEL.npz`. It starts the busy processes, twice as many as cores, and ends
+`python bench_busy.py MODEL.npz BAG`. It starts the busy processes, twice as many as cores, and ends
 them.
 """
 
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +27,13 @@ from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.updating import new_views
 
-DRIVE = Path(__file__).parents[2] / 'bags/sample_test'
 IMAGES = 20
 
 
-def drive_of(model: PlaceModel) -> Run:
-    """The drive of the repository, with images as the model reads them."""
+def drive_of(model: PlaceModel, bag: Path) -> Run:
+    """The drive in a bag, with images as the model reads them."""
     with tempfile.TemporaryDirectory() as folder:
-        return read_drive(DRIVE, Path(folder), as_live(ReadingRecipe(), model.panorama), False)
+        return read_drive(bag, Path(folder), as_live(ReadingRecipe(), model.panorama), False)
 
 
 def images_of(run: Run) -> Image:
@@ -57,7 +56,7 @@ def _localizer(model: PlaceModel, run: Run) -> None:
 ENTRIES: dict[str, Callable[[PlaceModel, Run], object]] = {
     'locate': _locate,
     'localizer': _localizer,
-    'evaluate': lambda model, run: evaluate(model, DRIVE),
+    'evaluate': lambda model, run: evaluate(model, Path(sys.argv[2])),
     'update': new_views,
 }
 
@@ -65,8 +64,8 @@ ENTRIES: dict[str, Callable[[PlaceModel, Run], object]] = {
 @contextlib.contextmanager
 def busy() -> Iterator[None]:
     """Twice as many busy processes as cores."""
-    loop = [sys.executable, '-c', 'while True: pass']
-    started = [subprocess.Popen(loop) for _ in range(2 * cores())]
+    loop = f'import os\nwhile os.getppid() == {os.getpid()}: pass'  # ends also with this process
+    started = [subprocess.Popen([sys.executable, '-c', loop]) for _ in range(2 * cores())]
     try:
         yield
     finally:
@@ -75,21 +74,26 @@ def busy() -> Iterator[None]:
             process.wait()
 
 
-def seconds(entry: str, model: Path, **threads: str) -> float:
+def seconds(entry: str, model: Path, drive: Path, **threads: str) -> float:
     """What an entry point takes in a process of its own."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith('_NUM_THREADS')} | threads
-    command = [sys.executable, __file__, str(model), '--entry', entry]
+    command = [sys.executable, __file__, str(model), str(drive), '--entry', entry]
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
     return float(done.stdout)
 
 
-def bench_busy(model: Path, rounds: int = 3) -> dict[str, float]:
+def bench_busy(
+    model: Path, drive: Path, entries: Iterable[str] = ENTRIES, rounds: int = 3
+) -> dict[str, float]:
     """Least time with default threads over the least with one, in turns, and the worst of all."""
     found: dict[str, float] = {}
     with busy():
-        for entry in ENTRIES:
+        for entry in entries:
             pairs = [
-                (seconds(entry, model), seconds(entry, model, OPENBLAS_NUM_THREADS='1'))
+                (
+                    seconds(entry, model, drive),
+                    seconds(entry, model, drive, OPENBLAS_NUM_THREADS='1'),
+                )
                 for _ in range(rounds)
             ]
             default, one = np.min(pairs, axis=0)
@@ -100,9 +104,9 @@ def bench_busy(model: Path, rounds: int = 3) -> dict[str, float]:
 if __name__ == '__main__':
     if '--entry' in sys.argv:
         held = PlaceModel.load(sys.argv[1])
-        recorded = drive_of(held)
+        recorded = drive_of(held, Path(sys.argv[2]))
         start = time.perf_counter()
-        ENTRIES[sys.argv[3]](held, recorded)
+        ENTRIES[sys.argv[4]](held, recorded)
         sys.stdout.write(f'{time.perf_counter() - start}\n')
     else:
-        sys.stdout.write(json.dumps(bench_busy(Path(sys.argv[1])), indent=2) + '\n')
+        sys.stdout.write(json.dumps(bench_busy(*map(Path, sys.argv[1:])), indent=2) + '\n')

@@ -1,7 +1,7 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
 """The three nodes as processes over three relays that only pass messages on: `bench_chain.py`
-MODEL.npz. Latency from an image to its pose, CPU, and what a node takes until it is active.
+MODEL.npz BAG. Latency from an image to its pose, CPU, and what a node takes until it is active.
 
 Images come 10 and 30 times a second, odometry 50 times. The images are panoramas already. With
 `--robots` nodes alone, of one, two and four robots.
@@ -9,6 +9,7 @@ Images come 10 and 30 times a second, odometry 50 times. The images are panorama
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from sensor_msgs.msg import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from bench_busy import drive_of, images_of
 from ros_bench import DEADLINE_S, DOMAIN, Spinner, end_process, start_node, start_process
 
 from sfa_localization.data.messages import read_stamp
@@ -51,14 +53,17 @@ RELAYS = {
 class Driver:
     """Sends images and odometry to robots in namespaces, and notes when the poses come."""
 
-    def __init__(self, model: PlaceModel, names: list[str]) -> None:
+    def __init__(
+        self, model: PlaceModel, names: list[str], pictures: np.ndarray | None = None
+    ) -> None:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=DOMAIN)
         self.node = rclpy.create_node('bench', context=self.context)
         self.executor = Spinner(self.context)
         self.executor.add_node(self.node)
-        size = (model.panorama.height, model.panorama.width, 3)
-        self.panorama = np.random.default_rng(1).integers(40, 215, size, np.uint8)
+        size = (1, model.panorama.height, model.panorama.width, 3)
+        noise = np.random.default_rng(1).integers(40, 215, size, np.uint8)
+        self.panoramas = itertools.cycle(noise if pictures is None else pictures.copy())
         self.sent: dict[int, float] = {}
         self.latencies: dict[str, list[float]] = {name: [] for name in names}
         make = self.node.create_publisher
@@ -83,9 +88,10 @@ class Driver:
                 self.move(time.time_ns(), np.zeros(3), (0.0, 0.0))
                 moves += 1
             elif now >= images / rate_hz:
-                self.panorama[3::6, ::3, 0] ^= 1  # never the same twice
-                self.panorama[0, 0] = time.time_ns() % 251
-                self.show(self.panorama, time.time_ns())
+                panorama = next(self.panoramas)
+                panorama[3::6, ::3, 0] ^= 1  # never the same twice
+                panorama[0, 0] = time.time_ns() % 251
+                self.show(panorama, time.time_ns())
                 images += 1
             else:
                 time.sleep(0.0005)
@@ -160,9 +166,14 @@ def relays_of(name: str) -> dict[str, list[Any]]:
 
 
 @contextmanager
-def driven(model: PlaceModel, names: list[str], running: dict[str, list[Any]]) -> Iterator[Driver]:
+def driven(
+    model: PlaceModel,
+    names: list[str],
+    running: dict[str, list[Any]],
+    pictures: np.ndarray | None = None,
+) -> Iterator[Driver]:
     """A driver of robots whose processes are running, once each has answered; it ends them."""
-    driver = Driver(model, names)
+    driver = Driver(model, names, pictures)
     try:
         end = time.monotonic() + DEADLINE_S
         while not all(driver.latencies.values()):
@@ -217,13 +228,17 @@ def bench_robots(path: Path | str, seconds: float = 8.0) -> dict[str, float]:
     return found
 
 
-def bench_chain(path: Path | str, seconds: float = 8.0) -> dict[str, float]:
-    """Nodes over relays at the higher rate, in turns: of each figure the least of three."""
+def bench_chain(path: Path | str, drive: Path | str, seconds: float = 8.0) -> dict[str, float]:
+    """Nodes over relays at the higher rate, in turns, with images of a drive in the place."""
     model, rate_hz = PlaceModel.load(path), RATES_HZ[-1]
+    pictures = images_of(drive_of(model, Path(drive)))
     nodes, relays = nodes_of(model, path, ['robot']), relays_of('relays')
     rounds: list[list[dict[str, float]]] = []
-    with driven(model, ['robot'], nodes) as robot, driven(model, ['relays'], relays) as passing:
-        for _ in range(3):
+    with (
+        driven(model, ['robot'], nodes, pictures) as robot,
+        driven(model, ['relays'], relays, pictures) as passing,
+    ):
+        for _ in range(2):
             sides = (robot, nodes), (passing, relays)
             rounds.append([measured(*side, rate_hz, seconds) for side in sides])
     ours, bare = (
@@ -236,21 +251,17 @@ def bench_chain(path: Path | str, seconds: float = 8.0) -> dict[str, float]:
 
 
 def bench_start(model: PlaceModel, path: Path | str) -> dict[str, float]:
-    """CPU s from exec to active, and resident MiB then, of each node: the least of three."""
+    """CPU s from exec to active, and resident MiB then, of each node."""
     found: dict[str, float] = {}
     for node, given in parameters_of(model, path).items():
-        pairs = []
-        for _ in range(3):
-            pipe = {'stdout': subprocess.PIPE, 'stderr': subprocess.STDOUT, 'text': True}
-            process = start_node(node, *given, **pipe)
-            try:
-                next(line for line in process.stdout if line.rstrip().endswith(': active'))
-                state = psutil.Process(process.pid)
-                spent = state.cpu_times()
-                pairs.append((spent.user + spent.system, state.memory_info().rss / 2**20))
-            finally:
-                end_process(process)
-        found[f'start_{node}_cpu_s'], found[f'start_{node}_mib'] = np.min(pairs, axis=0).tolist()
+        pipe = {'stdout': subprocess.PIPE, 'stderr': subprocess.STDOUT, 'text': True}
+        process = start_node(node, *given, **pipe)
+        try:
+            next(line for line in process.stdout if line.rstrip().endswith(': active'))
+            found[f'start_{node}_cpu_s'] = cpu_s([process])
+            found[f'start_{node}_mib'] = psutil.Process(process.pid).memory_info().rss / 2**20
+        finally:
+            end_process(process)
     return found
 
 
@@ -259,4 +270,5 @@ if __name__ == '__main__':
         relay(*sys.argv[2:])
     else:
         bench = bench_robots if '--robots' in sys.argv else bench_chain
-        sys.stdout.write(json.dumps(bench(sys.argv[1]), indent=2) + '\n')
+        given = [word for word in sys.argv[1:] if word != '--robots']
+        sys.stdout.write(json.dumps(bench(*given), indent=2) + '\n')

@@ -9,6 +9,7 @@ takes fewer pictures; inference is measured of the trained model that `--model F
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import re
 import subprocess
@@ -22,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import psutil
+from bench_busy import drive_of, images_of
 from scipy import linalg
 
 from sfa_localization.data.errors import ConfigError
@@ -143,27 +145,28 @@ def _extrapolated(sizes: tuple[int, ...], seconds: list[float]) -> np.ndarray:
 
 
 def in_turns(functions: list[Callable[[], object]], rounds: int) -> np.ndarray:
-    """Seconds (functions, rounds) of each function, called in turns."""
+    """Seconds of CPU (functions, rounds) of each function, called in turns."""
     taken = np.zeros((len(functions), rounds))
     for function in functions:
         function()
     for at in range(rounds):
         for row, function in zip(taken, functions, strict=True):
-            start = time.perf_counter()
+            start = time.thread_time()
             function()
-            row[at] = time.perf_counter() - start
+            row[at] = time.thread_time() - start
     return taken
 
 
-def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
-    """Locating one picture against the matrix products of its equations, on one core."""
-    height, width = model.network.architecture.size
-    image = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
+def bench_locate(model: PlaceModel, images: np.ndarray, rounds: int = 300) -> dict[str, float]:
+    """Locating pictures (T, H, W, 3) of the place, in turns, against the matrix products of the
+    equations, on one core.
+    """
+    image, each = images[len(images) // 2], itertools.cycle(images)
     products, network_only = bare_products(model, image), bare_network(model)
     with one_core():
         whole, bare, matched, maps, bare_maps = in_turns(
             [
-                lambda: model.locate(image),
+                lambda: model.locate(next(each)),
                 lambda: [product() for product in products],
                 lambda: model.keyframes.match(image),
                 lambda: model.network.maps(image[None]),
@@ -171,7 +174,7 @@ def bench_locate(model: PlaceModel, rounds: int = 2000) -> dict[str, float]:
             ],
             rounds,
         )
-        grown = _growth(lambda: model.locate(image), 10_000 if rounds >= 1000 else 1000)
+        grown = _growth(lambda: model.locate(image), 500)
     median = float(np.median(bare))
     return {
         'locate_over_matmul': float(np.median(whole)) / median,
@@ -275,13 +278,16 @@ def peak(path: Path, count: int) -> float:
     return float(re.search(r'VmHWM:\s+(\d+) kB', status).group(1)) / 1024
 
 
+def bench_located(path: Path, drive: Path, rounds: int = 300) -> dict[str, float]:
+    """The figures of a model in a file, with images of a drive in its place."""
+    model = PlaceModel.load(path)
+    return bench_locate(model, images_of(drive_of(model, drive)), rounds)
+
+
 def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> dict[str, float]:
-    """All figures, by name."""
+    """All figures of the training, and MDP's execution of a frame over a model's; by name."""
     located = None if model is None else PlaceModel.load(model)
-    figures = bench_memory(folder, quick)
-    if located is not None:
-        figures |= bench_locate(located, 300 if quick else 2000)
-    figures |= bench_training(folder, quick)
+    figures = bench_memory(folder, quick) | bench_training(folder, quick)
     try:
         figures |= bench_engines(folder, quick, located)
     except ConfigError as error:
