@@ -3,8 +3,7 @@
 """The three nodes as processes over three relays that only pass messages on: `bench_chain.py`
 MODEL.npz BAG. Latency from an image to its pose, CPU, and what a node takes until it is active.
 
-Images come 10 and 30 times a second, odometry 50 times. The images are panoramas already. With
-`--robots` nodes alone, of one, two and four robots.
+Images come 30 times a second, odometry 50 times. The images are panoramas already.
 """
 
 from __future__ import annotations
@@ -38,8 +37,7 @@ from sfa_localization.nodes.conversions import to_image, to_odometry
 from sfa_localization.nodes.lifecycle import sensor_qos
 from sfa_localization.place_model import PlaceModel
 
-ODOMETRY_HZ, LAST_S = 50.0, 1.0
-ROBOTS, RATES_HZ = (1, 2, 4), (10.0, 30.0)
+ODOMETRY_HZ, IMAGES_HZ, LAST_S = 50.0, 30.0, 1.0
 _SEEN = 'sfa/pose_with_covariance'
 _POSE = PoseWithCovarianceStamped
 RELAYS = {
@@ -214,23 +212,9 @@ def measured(
     return found
 
 
-def bench_robots(path: Path | str, seconds: float = 8.0) -> dict[str, float]:
-    """Nodes alone, by robots and rate of images."""
-    model, found = PlaceModel.load(path), {}
-    for count in ROBOTS:
-        names = [f'robot{k + 1}' for k in range(count)]
-        running = nodes_of(model, path, names)
-        with driven(model, names, running) as driver:
-            for rate_hz in RATES_HZ:
-                one = measured(driver, running, rate_hz, seconds)
-                prefix = f'robots_{count}_at_{rate_hz:.0f}_hz'
-                found |= {f'{prefix}_{name}': value for name, value in one.items()}
-    return found
-
-
 def bench_chain(path: Path | str, drive: Path | str, seconds: float = 8.0) -> dict[str, float]:
     """Nodes over relays at the higher rate, in turns, with images of a drive in the place."""
-    model, rate_hz = PlaceModel.load(path), RATES_HZ[-1]
+    model = PlaceModel.load(path)
     pictures = images_of(drive_of(model, Path(drive)))
     nodes, relays = nodes_of(model, path, ['robot']), relays_of('relays')
     rounds: list[list[dict[str, float]]] = []
@@ -240,7 +224,7 @@ def bench_chain(path: Path | str, drive: Path | str, seconds: float = 8.0) -> di
     ):
         for _ in range(2):
             sides = (robot, nodes), (passing, relays)
-            rounds.append([measured(*side, rate_hz, seconds) for side in sides])
+            rounds.append([measured(*side, IMAGES_HZ, seconds) for side in sides])
     ours, bare = (
         {name: min(one[k][name] for one in rounds) for name in rounds[0][k]} for k in (0, 1)
     )
@@ -269,6 +253,4 @@ if __name__ == '__main__':
     if '--relay' in sys.argv:
         relay(*sys.argv[2:])
     else:
-        bench = bench_robots if '--robots' in sys.argv else bench_chain
-        given = [word for word in sys.argv[1:] if word != '--robots']
-        sys.stdout.write(json.dumps(bench(*given), indent=2) + '\n')
+        sys.stdout.write(json.dumps(bench_chain(*sys.argv[1:]), indent=2) + '\n')

@@ -3,12 +3,11 @@
 """Training and inference against MDP and against bare matrix products: `python bench_sfa.py`.
 
 Ratios compare two ways of doing the same, measured in turns, in one run, on one core. `--quick`
-takes fewer pictures; inference is measured of the trained model that `--model FILE` names.
+takes fewer pictures; inference is measured by `bench_all.py`.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import re
@@ -30,7 +29,7 @@ from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.threads import one_core
 from sfa_localization.features import mdp_engine
-from sfa_localization.features.network import input_map, standard_architecture
+from sfa_localization.features.network import standard_architecture
 from sfa_localization.features.network_training import (
     ImageSequence,
     cores,
@@ -90,23 +89,19 @@ def bench_training(folder: Path, quick: bool = False) -> dict[str, float]:
     return {f'{name}_s': wall, f'{name}_cpu_s': cpu, 'cores': float(cores())}
 
 
-def bench_engines(
-    folder: Path, quick: bool = False, model: PlaceModel | None = None
-) -> dict[str, float]:
+def bench_engines(folder: Path, quick: bool = False) -> dict[str, float]:
     """Seconds of one core per picture and in all, by MDP on the explicit sequence and by ours.
 
-    Each is measured at two sizes, in turns; time is a + b pictures. MDP's execution of a prepared
-    frame is compared with all that a model does to locate a picture.
+    Each is measured at two sizes, in turns; time is a + b pictures.
     """
     sizes, our_sizes = ((2, 4) if quick else (4, 8)), (64, 320)
     drive = panoramas(folder / 'engines.u8', our_sizes[1])
     seconds: dict[str, list[float]] = {'mdp': [], 'ours': []}
-    flow = None
     for size, our_size in zip(sizes, our_sizes, strict=True):
         part = _first(drive, size)
         with one_core():
             start = time.process_time()
-            flow, _ = mdp_engine.train_flow(ARCHITECTURE, shards_of([part], 0))
+            mdp_engine.train_flow(ARCHITECTURE, shards_of([part], 0))
             seconds['mdp'].append(time.process_time() - start)
             part = _first(drive, our_size)
             start = time.process_time()
@@ -115,22 +110,13 @@ def bench_engines(
     theirs = _extrapolated(sizes, seconds['mdp'])
     ours = _extrapolated(our_sizes, seconds['ours'])
     speedup = float(theirs @ [1, PAPER_PICTURES] / (ours @ [1, PAPER_PICTURES]))
-    figures = {
+    return {
         'train_speedup_vs_mdp': speedup,
         'train_speedup_vs_mdp_per_picture': float(theirs[1] / ours[1]),
         'train_mdp_s_per_picture': float(theirs[1]),
         'train_s_per_picture': float(ours[1]),
         'train_mdp_paper_size_hours': float(theirs @ [1, PAPER_PICTURES]) / 3600,
     }
-    if model is not None:
-        image = drive.panoramas.read(0, 1)
-        flat = input_map(image, ARCHITECTURE).reshape(1, -1).astype(float)
-        image = cv2.resize(image[0], model.network.architecture.size[::-1])
-        with one_core():
-            pair = [lambda: flow.execute(flat), lambda: model.locate(image)]
-            executed, located = np.median(in_turns(pair, 30), axis=1)
-        figures['locate_speedup_vs_mdp'] = float(executed / located)
-    return figures
 
 
 def _first(drive: ImageSequence, count: int) -> ImageSequence:
@@ -248,17 +234,10 @@ def _triangular(factor: np.ndarray) -> Callable[[], object]:
 
 def bench_memory(folder: Path, quick: bool = False) -> dict[str, float]:
     """Peak memory of training on 4 and 16 times the pictures over that of 1 times."""
-    least = 128
-    panoramas(folder / 'memory.u8', least * (4 if quick else 16))
-    peaks = {}
+    least, path, peaks = 128, folder / 'memory.u8', {}
+    panoramas(path, least * (4 if quick else 16))
     for times in (1, 4) if quick else (1, 4, 16):
-        command = [
-            sys.executable,
-            __file__,
-            '--peak',
-            str(folder / 'memory.u8'),
-            str(least * times),
-        ]
+        command = [sys.executable, __file__, '--peak', str(path), str(least * times)]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         peaks[times] = float(done.stdout)
     ratios = {f'train_memory_{n}x_over_1x': peaks[n] / peaks[1] for n in peaks if n > 1}
@@ -284,28 +263,22 @@ def bench_located(path: Path, drive: Path, rounds: int = 300) -> dict[str, float
     return bench_locate(model, images_of(drive_of(model, drive)), rounds)
 
 
-def bench_sfa(folder: Path, quick: bool = False, model: Path | None = None) -> dict[str, float]:
-    """All figures of the training, and MDP's execution of a frame over a model's; by name."""
-    located = None if model is None else PlaceModel.load(model)
+def bench_sfa(folder: Path, quick: bool = False) -> dict[str, float]:
+    """All figures of the training, by name."""
     figures = bench_memory(folder, quick) | bench_training(folder, quick)
     try:
-        figures |= bench_engines(folder, quick, located)
+        figures |= bench_engines(folder, quick)
     except ConfigError as error:
         sys.stderr.write(f'no comparison with MDP: {error}\n')
     return figures
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--quick', action='store_true', help='fewer pictures')
-    parser.add_argument('--model', type=Path, help='trained model to locate with')
-    parser.add_argument('--peak', nargs=2, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.peak:
-        sys.stdout.write(f'{peak(Path(options.peak[0]), int(options.peak[1]))}\n')
+    if sys.argv[1:2] == ['--peak']:
+        sys.stdout.write(f'{peak(Path(sys.argv[2]), int(sys.argv[3]))}\n')
         return
     with tempfile.TemporaryDirectory() as folder:
-        figures = bench_sfa(Path(folder), options.quick, options.model)
+        figures = bench_sfa(Path(folder), '--quick' in sys.argv)
     sys.stdout.write(json.dumps(figures, indent=2) + '\n')
 
 
