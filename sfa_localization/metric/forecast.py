@@ -71,10 +71,6 @@ class Forecast:
         at = int(local.argmax())
         return float(self.places[at, 0]), float(self.places[at, 1]), float(local[at])
 
-    def widened(self, factor: float) -> Forecast:
-        """With the variances of the drive's own positions larger by a factor."""
-        return replace(self, drive_std=np.sqrt(factor) * self.drive_std)
-
     def improved(self, share: float) -> Forecast:
         """With this share of the left-out errors; nothing learned from a drive improves its own."""
         return replace(self, left_out=share * self.left_out)

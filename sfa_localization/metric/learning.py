@@ -9,7 +9,7 @@ descent is in paper_solver.py. Complex numbers are x + i y in meters.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -204,8 +204,8 @@ def _result(
     fit: MapFit, left: _Left, frame: RigidTransform, diagnostics: Diagnostics
 ) -> MetricResult:
     inflation = max(needed_factor(left.images.ratio, 2, left.forecast.weight), 1.0)
-    expected = left.forecast.widened(inflation)
-    common_m = float(np.sqrt((expected.drive_std**2).mean() / 2))
+    drive_std = np.sqrt(inflation) * left.forecast.drive_std
+    common_m = float(np.sqrt((drive_std**2).mean() / 2))
     turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
     points, points_covariance = places_of_points(fit)
     return MetricResult(
@@ -220,7 +220,7 @@ def _result(
         left_out=plane(left.images.errors * turn),
         left_out_variance=left.images.variances * inflation,
         explained=left.explained,
-        forecast=expected.moved(frame),
+        forecast=replace(left.forecast, drive_std=drive_std).moved(frame),
         points=points * turn + shift,
         points_covariance=points_covariance,
         diagnostics=diagnostics,

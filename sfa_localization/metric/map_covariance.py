@@ -17,6 +17,10 @@ from sfa_localization.metric.saved_map import MetricMap, Weights
 Complex = NDArray[np.complex128]
 
 
+# Joint changes of the segments that count: a map averages over smaller ones.
+_JOINT = 24
+
+
 def plane(points: Complex) -> Array:
     """Points (M, 2) of complex x + i y (M,)."""
     return np.column_stack([points.real, points.imag])
@@ -37,7 +41,8 @@ def place_variance(fit: MapFit) -> Array:
     around_center = 1j * (places - places.mean())
     turn = np.real(np.conj(around_center) @ moved) / np.sum(np.abs(around_center) ** 2)
     moved = moved - moved.mean(0) - around_center[:, None] * turn
-    return np.asarray((np.abs(moved) ** 2).sum(1))
+    largest = np.linalg.eigh(np.real(moved.conj().T @ moved))[1][:, -_JOINT:]
+    return np.asarray((np.abs(moved @ largest) ** 2).sum(1))
 
 
 def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
