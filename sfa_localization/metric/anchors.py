@@ -7,11 +7,11 @@ y_k = o_n + z_n q_k. Both are the same place in two frames, up to one heading, s
 
     sum_k |y_k - a p_k - t|^2 / s_k^2
 
-The best complex a and t are linear in y: without them remains a quadratic form of the certified
-problem, beside that of the loop closures, which bends the map straight where there are more than
-two points. Before that, `settle` finds a, t and the points that are wrong, with the covariance C of
-y: the largest set of points that a pair and the wheels' scale explain, then least squares weighted
-by (C + |a|^2 s^2)^-1. The odometry is scaled by 1 / |a|, and the map learned once more.
+First `settle` finds a, t and the points that are wrong, with the covariance C of y: the largest set
+of points that a pair and the wheels' scale explain, then least squares weighted by (C + s^2)^-1.
+The odometry is scaled by 1 / |a|, and the map learned once more. Now |a| = 1, its angle turns with
+the mean of the segments, and the best t is linear in y: the sum is a quadratic form of the
+certified problem, beside that of the loop closures, and bends the map straight.
 """
 
 from __future__ import annotations
@@ -126,13 +126,19 @@ class Anchors:
         return rows
 
     def form(self, stack: Stack, before: Solution | None = None) -> Complex:
-        """The quadratic form (3N, 3N) of the used points in [o, z, -b z], 1 / m^2."""
-        used = self.settled.used & self.settled.turned
-        rows = (self.rows(stack) / self.points.std[:, None])[used]
-        centered = self.points.places - self.points.places.mean()
-        frame = np.column_stack([centered, np.ones(len(used))]) / self.points.std[:, None]
-        free = linalg.orth(frame[used]) if used.any() else np.zeros((0, 0))
-        rows = rows - free @ (free.conj().T @ rows)
+        """The quadratic form (3N, 3N) of the used points in [o, z, -b z], 1 / m^2.
+
+        The heading of the points turns with the mean of the segments from what it is in the
+        solution `before`, without which nothing is tied.
+        """
+        n, used = stack.segments, self.settled.used & self.settled.turned
+        if before is None or not used.any():
+            return np.zeros((3 * n, 3 * n), complex)
+        rows, points, std = self.rows(stack)[used], self.points.places[used], self.points.std[used]
+        points = points - points.mean()
+        turn, _ = align_complex(points, rows @ before.coefficients(stack.period), std**-2)
+        rows[:, n : 2 * n] -= np.outer(turn * points, before.z.conj() / n)
+        rows = (rows - np.average(rows, axis=0, weights=std**-2)) / std[:, None]
         return np.asarray(rows.conj().T @ rows)
 
     def frame(self, places: Complex, start: RigidTransform) -> RigidTransform:

@@ -202,7 +202,7 @@ def eliminate(expanded: Array, ridge: Array, weights: Array, stack: Stack) -> El
     return Elimination(_moments(columns, weights, stack) - own, factor, cross)
 
 
-def _cholesky(matrix: NDArray[Any]) -> NDArray[Any]:
+def _cholesky(matrix: Array) -> Array:
     """Lower factor; a singular matrix gets a weak ridge first."""
     try:
         return np.asarray(scipy.linalg.cholesky(matrix, lower=True))
@@ -437,8 +437,8 @@ def _real_hessian(system: Complex, x: Complex, pull: Complex) -> Array:
 def schur(system: Complex) -> tuple[Complex, Complex]:
     """Minimize over the origins: H (N, N), and the origins (N, N) as a linear map of z."""
     n = len(system) // 2
-    own = system[:n, :n].copy() if system[:n, :n].imag.any() else np.real(system[:n, :n]).copy()
-    level = max(float(np.trace(own).real) / n, 1e-300)
+    own = np.real(system[:n, :n]).copy()
+    level = max(float(np.trace(own)) / n, 1e-300)
     # Moving all origins together costs nothing: fix the mean.
     own += level / n
     origins = -np.asarray(_solve(_cholesky(own), system[:n, n:]))
