@@ -17,7 +17,7 @@ from sfa_localization.features.closures import STRETCH_M, Closures, Views, find_
 from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.features.zero_time_edges import edges_between
-from sfa_localization.metric import selection
+from sfa_localization.metric import learning, selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.loops import Loops, loops_of
 from sfa_localization.metric.pose_graph import graph_poses
@@ -230,6 +230,16 @@ def test_offsets_show_what_closures_leave_open():
         apart = frame.apply(found[stack.images, :2]) - poses[stack.images, :2]
         far.append(np.hypot(*apart.T).mean())
     assert far[1] < 0.5 * far[0], far
+
+
+def test_where_offsets_tie_a_drive_features_bend_it_less(quick, monkeypatch):
+    poses, features, segments, _ = in_two_lights()
+    offsets = mixtures(Stack.of(segments), poses, noise_m=0.02, count=2000)
+    measured, far = dataclasses.replace(segments, offsets=offsets), []
+    for tied in (learning.TIED, 1.0):
+        monkeypatch.setattr(learning, 'TIED', tied)
+        far.append(errors_of(learn_metric(features, measured, GP), measured, poses)[0])
+    assert far[0] < 0.8 * far[1], far
 
 
 def twice_along_one_track(sideways=0.1):

@@ -44,11 +44,12 @@ logger = logging.getLogger(__name__)
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
-LITTLE, OVERFIT = 0.9, 4.0
+LITTLE, OVERFIT, TIED = 0.9, 4.0, 0.5
 """Where features explain less than this share of the places of images left out, whose variance is
 so many times that of the others, a map follows noise: it leaves no residuals, and would bend the
-drive as it likes. Weighted by what is left out, it leaves the drive the shape that odometry and
-loop closures give it."""
+drive as it likes; and where more than this share of the segments have offsets, these know the shape
+of the drive better. Weighted by what is left out, a map leaves it the shape that odometry and loop
+closures give it."""
 _LARGEST_SHARE = 0.8
 """Of the error of an image that its neighbors have too."""
 # Images that the components are found from, evenly along the drives: they are smooth statistics.
@@ -136,6 +137,8 @@ def learn_metric(
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
     left = _Left.of(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
+    tied = fit.stack.owner[np.isin(fit.stack.images, segments.offsets.images)]
+    overfits |= len(np.unique(tied)) > TIED * len(segments)
     if overfits and config.solver == 'certified' and not diagnose(fit).one_route:
         fit = fit.weighted(left.variance, left.images.errors)
         left = _Left.of(fit)

@@ -94,8 +94,7 @@ class Loops:
 
 def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops, Loops]:
     """Offsets, and closures where there are none."""
-    rows = _rows(offsets.images, stack)
-    tied = np.unique(stack.owner[rows[rows >= 0]])
+    tied = stack.owner[np.isin(stack.images, offsets.images)]
     return Loops.of(offsets, stack), Loops.of_closures(closures, stack, tied)
 
 
@@ -114,9 +113,8 @@ def _squares(
     to first order in the biases."""
     rows = np.column_stack([row, others])
     minus = np.column_stack([np.ones(len(row)), -shares])
-    turns = minus * np.exp(
-        1j * (stack.headings[rows] + np.column_stack([np.zeros(len(row)), turn]))
-    )
+    yaw = stack.headings[rows] + np.column_stack([np.zeros(len(row)), turn])
+    turns = minus * np.exp(1j * yaw)
     n, owner = stack.segments, stack.owner[rows]
     directions = [(n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)]
     places = [(owner, minus), (n + owner, minus * stack.path[rows])]
