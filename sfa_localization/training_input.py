@@ -62,9 +62,9 @@ class TrainingInput:
     def of(cls, runs: Sequence[Run], recipe: Recipe, progress: bool = False) -> TrainingInput:
         """Step 2: what images show before anything is learned, also in different lights."""
         total = sum(len(run.panoramas) for run in runs)
-        title = titled(2, 'level the images, and find loop closures')
-        with progress_bar(title, total, shown=progress) as bar:
+        with progress_bar(titled(2, 'level the images'), shown=progress) as bar:
             runs = leveled_runs(runs, recipe.panorama.sphere, bar.update)
+        with progress_bar(titled(2, 'find loop closures'), total, shown=progress) as bar:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         points = points_of(runs, recipe.metric.anchors)
@@ -102,12 +102,10 @@ class TrainingInput:
         """Announce a step."""
         announce(titled(step, text), shown=self.progress)
 
-    def bar(self, step: int, text: str, passes: int = 1, done: int = 0) -> Any:
-        """The progress of a step in so many passes through all images; some may be done."""
+    def bar(self, step: int, text: str) -> Any:
+        """The progress of a step through all images."""
         images = sum(len(one.panoramas) for one in self.runs)
-        return progress_bar(
-            titled(step, text), images * passes, initial=images * done, shown=self.progress
-        )
+        return progress_bar(titled(step, text), images, shown=self.progress)
 
 
 def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
@@ -115,7 +113,10 @@ def train_hierarchy(given: TrainingInput, checkpoint: Checkpoint) -> Network:
     architecture, sequences = given.architecture, given.sequences
     start, seed = checkpoint.read(architecture), given.recipe.network.seed
     passes, done = 2 * len(architecture.layers), start.stages if start else 0
-    with given.bar(3, f'learn slow features in {passes} passes', passes, done) as bar:
+    title = titled(3, f'learn slow features in {passes} passes')
+    images = sum(len(one.panoramas) for one in sequences)
+    total, before = images * passes, images * done
+    with progress_bar(title, total, initial=before, shown=given.progress) as bar:
         if given.recipe.network.engine == 'mdp':
             return mdp_engine.train_network(architecture, sequences, seed, on_shard=bar.update)
         return train_network(

@@ -37,8 +37,8 @@ from sfa_localization.features.sfa import Solution, Statistics, solve
 SHARD = 64
 """Images whose sums are computed by one task: enough for its products, few enough to balance."""
 MOST = 3500
-"""Images that the network is trained on, of longer drives some of each shard: with more the network
-is no better, and the time grows."""
+"""Images that the network is trained on, of longer drives some of each shard, so that its time does
+not grow with the place: 32 m x 36 m are as good with them as 16 m x 18 m are with all of theirs."""
 BREAK_TIME_S = 5.0
 BREAK_DISTANCE_M = 2.0
 """Consecutive images farther apart than either are no neighbors: the drive was interrupted."""
