@@ -327,7 +327,7 @@ class _Survey:
         links = links_between(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
         tilts = links.tilts(np.zeros(len(rows), complex))
         tilt = math.degrees(math.sqrt(float(np.mean(np.abs(tilts) ** 2)) / 2))  # along each axis
-        about = f'tilts the camera by about {tilt:.1f} degrees'
+        about = f'tilts the camera by at least {tilt:.1f} degrees'
         return about if len(links.found) >= FEWEST_LINKS else ''
 
     def _topic(self, stream: Stream) -> TopicReport:

@@ -32,7 +32,7 @@ from sfa_localization.localizer import Localizer
 from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map
 from sfa_localization.metric.learning import learn_metric, positions
-from sfa_localization.metric.points import read_points, stops
+from sfa_localization.metric.points import points_of, read_points, stops
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
@@ -95,6 +95,9 @@ def test_points_that_cannot_be_of_the_drive_are_an_error_that_says_why():
         settled(CORNERS.conj() * 1j, counted(CORNERS))
     with pytest.raises(DataError, match='are they in meters'):
         settled(3.28 * CORNERS, counted(CORNERS))
+    marks = np.array([0, 7 + 1j, 9 + 6j, 2 + 8j, -3 + 4j])
+    with pytest.raises(DataError, match='numbered as inspect'):
+        settled(np.roll(marks, 1), counted(marks))
     nowhere = Anchors(points(CORNERS), np.full(5, -1), np.zeros(5, complex), Settled(None))
     with pytest.raises(DataError, match='are their stamps those of the bags'):
         settle(nowhere, counted(CORNERS), np.eye(5, dtype=complex))
@@ -271,6 +274,14 @@ def test_a_line_that_is_no_point_is_an_error_that_names_it(tmp_path, line, said)
     file.write_text(line)
     with pytest.raises(DataError, match=said):
         read_points(file, standing())
+
+
+def test_a_point_of_no_drive_is_an_error_before_anything_is_learned(tmp_path):
+    file = tmp_path / 'points.csv'
+    file.write_text('Stop, 2, 4.0, 1.5\n12.5, 3, -1\n')
+    run = drive(np.vstack([stand(3), straight(4), stand(3), straight(1)]))
+    with pytest.raises(DataError, match=r'12\.5 s: outside of the drives'):
+        points_of([run], str(file))
 
 
 def clicked(stamp_ns, place):

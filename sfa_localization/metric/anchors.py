@@ -189,7 +189,8 @@ class Anchors:
             )
         if abs(settled.scale - 1.0) > CONTRADICTION:
             yield (
-                f'by the points the wheels count {1 / settled.scale - 1.0:+.1%} of way: check both'
+                f'by the points the wheels count {1 / settled.scale - 1.0:+.1%} of way: check both, '
+                'and that the points are those of base_link, not of an antenna'
             )
 
 
@@ -223,6 +224,11 @@ def settle(anchors: Anchors, places: Complex, covariance: Complex) -> Settled:
         grown *= 4.0
         fit = replace(fit, noise=grown * known + np.diag(std**2))
         found = fit.settled(fit.consensus()[1])
+    if not found.turned:
+        raise DataError(
+            'the measured points lie apart, but not as the drive does: is each stop numbered as '
+            'inspect numbers it, and each point that of base_link, x_m before y_m?'
+        )
     used = placed.copy()
     used[placed] = found.used
     return replace(found, used=used)

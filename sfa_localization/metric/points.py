@@ -23,7 +23,7 @@ STOP_S = 2.0
 MOST = 100
 """Points that are used of a topic: the errors of a receiver are alike for a while."""
 LARGEST_FILE = 1 << 20
-_USAGE = 'lines are "stamp_s, x_m, y_m" or "stop, number, x_m, y_m", then perhaps std_m'
+_USAGE = 'lines are "stamp_s, x_m, y_m" or "stop, number, x_m, y_m", then perhaps std_m, above 0'
 
 
 def stops(odometry: Odometry) -> Stamps:
@@ -40,8 +40,19 @@ def stops(odometry: Odometry) -> Stamps:
 
 
 def points_of(runs: Sequence[Run], path: str) -> Points | None:
-    """The points of a file, whose stops are those of the first run, and of the runs' topics."""
+    """The points of a file, whose stops are those of the first run, and of the runs' topics.
+
+    Raises DataError for a file that cannot be used, or that names a time when no drive was.
+    """
     rows = read_points(Path(path), runs[0].odometry).rows() if path else []
+    drives = [(run.odometry.stamps_ns[0], run.odometry.stamps_ns[-1]) for run in runs]
+    for name, stamp_ns, *_ in rows:
+        if not any(first <= stamp_ns <= last for first, last in drives):
+            times = ', '.join(f'{a * 1e-9:.1f} to {b * 1e-9:.1f} s' for a, b in drives)
+            raise DataError(
+                f'{path}: {name}: outside of the drives ({times}): give the stamp, or '
+                '"stop, number, ..." as inspect numbers them'
+            )
     by_topic = [row for run in runs if run.points is not None for row in run.points.rows()]
     rows += by_topic[:: len(by_topic) // MOST + 1]
     return Points.of(rows) if rows else None
@@ -59,7 +70,7 @@ def read_points(path: Path, odometry: Odometry) -> Points:
         if cells == [''] or cells[0] == 'stamp_s':
             continue
         try:
-            stop = int(cells.pop(1)) if cells[0] == 'stop' else None
+            stop = int(cells.pop(1)) if cells[0].lower() == 'stop' else None
             stamp_ns = 0 if stop is not None else int(Decimal(cells[0]) * 10**9)
             x, y, std = map(float, [*cells[1:], str(POINT_STD_M)][:3])
         except (ArithmeticError, ValueError, IndexError):

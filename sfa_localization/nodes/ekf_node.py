@@ -50,6 +50,7 @@ IMAGES_SILENCE = 3.0
 """Images may be silent for so many times silence_timeout: they come less often than odometry."""
 _WATCH_PERIOD_S = 0.2
 _PILED_S = 0.2  # odometry that waits for longer is published so often only
+_BEHIND_LOG_S = 60.0  # between warnings in the log that this node is behind
 _REPEAT_STATE_S = 0.9  # between states of the same level, with other reasons
 _BACKWARD_JUMP_NS = -500_000_000  # of simulated time: less is jitter
 _ODOM, _IMAGE_POSE = 'odom', 'sfa/pose_with_covariance'
@@ -315,6 +316,7 @@ class EkfNode(LocalizationNode):
         lost, behind_s = [], self._behind_s()
         if behind_s > timeout_s:
             added.append(f'behind by {behind_s:.1f} s: this computer is too busy')
+            self.get_logger().warning(added[-1], throttle_duration_sec=_BEHIND_LOG_S)
         elif by_now is not None and (added or status.level is Level.DEGRADED):
             # The filter's time is that of its messages: by the wall clock it may be lost.
             lost = [f'{reason} by now' for reason in uncertainty(by_now, self.filter.config)]

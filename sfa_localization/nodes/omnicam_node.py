@@ -8,6 +8,7 @@ without a subscriber, and of images that come too fast only the newest is used.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any, cast
 
@@ -57,7 +58,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._arrival: Any = None
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
-        self._level = True
+        self._level, self._newer_s = True, 0.0
 
     # Life cycle.
 
@@ -103,7 +104,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._feed = self._arrival = self._listening_since_s = None
         self._newest.clear()
         self._tilts.clear()
-        self._level = True
+        self._level, self._newer_s = True, 0.0
 
     # Demand: without subscribers there is no subscription, and files wait.
 
@@ -168,6 +169,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         (tilt,) = tilts_at(np.array([stamp_ns]), known, tilts)
         self._level = bool(np.isfinite(tilt).all())
         if not self._level:
+            self._newer_s = (stamp_ns - known[-1]) * 1e-9 if len(known) else math.inf
             return panorama
         return leveled(panorama, tilt, self.settings(PanoramaConfig).sphere)
 
@@ -254,7 +256,9 @@ class OmnicamNode(lifecycle.LocalizationNode):
             return f'no message on {topic}'
         if not heard.used:
             return f'{topic}: {max(heard.refused, key=heard.refused.__getitem__)}'
-        return f'{topic} has no orientation near the stamp of the last image'
+        side = 'after' if self._newer_s > 0 else 'before'
+        apart = f'{abs(self._newer_s):.2f} s {side} the last orientation on {topic}'
+        return f'the last image was stamped {apart}'
 
 
 def _judge_feed(status: FeedStatus, details: dict[str, str]) -> tuple[int, str]:
