@@ -189,7 +189,7 @@ class Anchors:
             )
         if abs(settled.scale - 1.0) > CONTRADICTION:
             yield (
-                f'by the points the wheels count {1 / settled.scale - 1.0:+.1%} of way: check both, '
+                f'by the points the wheels count {1 / settled.scale - 1.0:+.1%} of way: check both '
                 'and that the points are those of base_link, not of an antenna'
             )
 
