@@ -19,21 +19,25 @@ from pathlib import Path
 
 import numpy as np
 
-from sfa_localization.bags.drives import ReadingRecipe, as_live, read_drive
+from sfa_localization.bags.drives import as_live, read_drive
+from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.run import Image, Run
 from sfa_localization.evaluation import evaluate
 from sfa_localization.features.network_training import cores
 from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.training_input import Recipe
 from sfa_localization.updating import new_views
 
 IMAGES = 20
+RECIPE = Recipe(camera=CameraConfig(camera_model='mirror'))
+"""Of drives of the simulator; panoramas need no camera."""
 
 
 def drive_of(model: PlaceModel, bag: Path) -> Run:
     """The drive in a bag, with images as the model reads them."""
     with tempfile.TemporaryDirectory() as folder:
-        return read_drive(bag, Path(folder), as_live(ReadingRecipe(), model.panorama), False)
+        return read_drive(bag, Path(folder), as_live(RECIPE, model.panorama), False)
 
 
 def images_of(run: Run) -> Image:
@@ -56,7 +60,7 @@ def _localizer(model: PlaceModel, run: Run) -> None:
 ENTRIES: dict[str, Callable[[PlaceModel, Run], object]] = {
     'locate': _locate,
     'localizer': _localizer,
-    'evaluate': lambda model, run: evaluate(model, Path(sys.argv[2])),
+    'evaluate': lambda model, run: evaluate(model, Path(sys.argv[2]), recipe=RECIPE),
     'update': new_views,
 }
 
