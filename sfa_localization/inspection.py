@@ -35,7 +35,7 @@ from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.closures import Views
+from sfa_localization.features.closures import Views, driven
 from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.leveling import links_between
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
@@ -322,8 +322,7 @@ class _Survey:
         if not known:
             return ''
         rows, textures = np.array([n for n, _ in known]), np.concatenate([one for _, one in known])
-        places = odometry.trajectory.at(stamps)[:, :2]
-        path = np.cumsum(np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T))[rows]
+        path = driven(odometry, stamps)[rows]
         links = links_between(Views(textures, rows, np.zeros_like(rows), path), self._sphere)
         tilts = links.tilts(np.zeros(len(rows), complex))
         tilt = math.degrees(math.sqrt(float(np.mean(np.abs(tilts) ** 2)) / 2))  # along each axis

@@ -28,6 +28,7 @@ from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Panoramas, Run, Trajectory
 from sfa_localization.data.threads import one_core
+from sfa_localization.features.image_features import evenly
 from sfa_localization.features.keyframes import Keyframes, correlate, quantized, texture
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.settings import FilterConfig
@@ -156,7 +157,7 @@ def familiar_score(model: PlaceModel) -> float:
     first = np.flatnonzero(model.keyframes.first)
     spectra, columns = model.keyframes.spectra(first), model.keyframes.textures.shape[2]
     best = list[float]()
-    for row in np.unique(np.linspace(0, len(first) - 1, _SAMPLE).round()).astype(int).tolist():
+    for row in evenly(len(first), _SAMPLE).tolist():
         scores = correlate(spectra[row][None], spectra, columns)[0][0]
         best.append(float(np.delete(scores, row).max()))
     return float(np.quantile(best, _RARELY))

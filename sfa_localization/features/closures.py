@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Run
+from sfa_localization.data.run import Odometry, Run, Stamps
 from sfa_localization.features.image_features import sample
 from sfa_localization.features.keyframes import (
     coarse,
@@ -91,13 +91,13 @@ def views_of(
             quantized(texture(one)[None]) for one in runs[owner].panoramas.read(at, at + 1)
         ]
         on_images(1)
-    path = np.concatenate([_path(r) for r in runs])[chosen]
+    path = np.concatenate([driven(r.odometry, r.panoramas.stamps_ns) for r in runs])[chosen]
     return Views(np.concatenate(textures), chosen, run, path)
 
 
-def _path(run: Run) -> Array:
-    """Distance (N,) m that odometry had driven at each image."""
-    places = run.odometry.trajectory.at(run.panoramas.stamps_ns)[:, :2]
+def driven(odometry: Odometry, stamps_ns: Stamps) -> Array:
+    """Distance (N,) m that odometry had driven at each of the stamps (N,) of images."""
+    places = odometry.trajectory.at(stamps_ns)[:, :2]
     return np.cumsum(np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T))
 
 

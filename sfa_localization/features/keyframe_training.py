@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.sphere import Sphere
+from sfa_localization.features.image_features import evenly
 from sfa_localization.features.keyframes import NEIGHBORS, Keyframes, correlate
 from sfa_localization.features.observation import LOWEST, Match, MatchNoise
 from sfa_localization.features.rotation_spread import (
@@ -114,7 +115,7 @@ def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance driven until each.
     """
     count, spectra = len(keyframes.poses), keyframes.spectra()
-    sample = np.unique(np.linspace(0, count - 1, min(_TRIALS, count)).round().astype(np.int64))
+    sample = evenly(count, _TRIALS)
     for start in range(0, len(sample), _AT_ONCE):
         rows = sample[start : start + _AT_ONCE]
         columns = keyframes.textures.shape[2]

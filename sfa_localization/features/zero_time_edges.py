@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.run import Image, Panoramas, Stamps
 from sfa_localization.features.closures import Closures, Indices
+from sfa_localization.features.image_features import evenly
 from sfa_localization.features.network_training import ImageSequence
 
 _MOST = 200
@@ -74,15 +75,10 @@ def edges_between(
     between = np.flatnonzero(drive[:, 0] != drive[:, 1])
     if not len(between):
         return []
-    chosen = between[_evenly(len(between))]
+    chosen = between[evenly(len(between), _MOST)]
     width = drives[0].shape[1]
     turned = closures.turn[chosen] * (width / (2 * np.pi if clockwise else -2 * np.pi))
     columns = np.round(width / rotations - turned).astype(np.int64)
     paired = PairedPanoramas(tuple(drives), closures.images[chosen], columns)
     joined: NDArray[np.bool_] = np.arange(len(paired) - 1) % 2 == 0
     return [ImageSequence(paired, joined)]
-
-
-def _evenly(count: int) -> Indices:
-    kept = np.linspace(0, count - 1, min(count, _MOST)).round().astype(np.int64)
-    return np.unique(kept)

@@ -116,8 +116,7 @@ class Anchors:
         points that are near no image.
         """
         n, at = stack.segments, np.flatnonzero(self.placed)
-        order = np.argsort(stack.images, kind='stable')
-        row = order[np.searchsorted(stack.images, self.images[at], sorter=order)]
+        row = stack.rows(self.images[at])
         owner, ahead = stack.owner[row], np.exp(1j * stack.headings[row]) * self.offset[at]
         rows = np.zeros((len(self.points), 3 * n), complex)
         rows[at, owner] = 1.0

@@ -9,7 +9,7 @@ how much of the way was lost in turns (turn_loss.py).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -118,21 +118,29 @@ class Drives:
         poses = graph_poses(self.cut(), int(views.images.max()) + 1)
         return replace(self, offsets=find_offsets(views, poses[views.images], sphere))
 
+    def shown(self, segments: Segments, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
+        """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (3, M)
+        of these by the map."""
+        images, places = positions(result, segments)
+        poses = np.vstack([(places - result.residuals).T, headings(result, segments)[1]])
+        for drive, start in zip(self.items, self.starts, strict=True):
+            rows = images - start
+            own = (rows >= 0) & (rows < len(drive.stamps_ns))
+            yield drive.stamps_ns[rows[own]], poses[:, own]
+
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
         """The way of each drive by the map, where its wheels lose some in turns.
 
         All have the same scale: it is that of the map, and no drive is better known by itself.
         """
-        images, places = positions(result, segments)
-        places, yaw = places - result.residuals, headings(result, segments)[1]
-        shown = places[:, 0] + 1j * places[:, 1]
-        found = []
-        for k, (drive, turns) in enumerate(zip(self.items, self.turns(), strict=True)):
+        found, drives = (
+            [],
+            zip(self.items, self.turns(), self.shown(segments, result), segments.ways, strict=True),
+        )
+        for drive, turns, (stamps_ns, (x, y, yaw)), way in drives:
             track = tracked(drive.run.odometry, self.config, drive.run.yaw_rate, turns)
-            rows = images - self.starts[k]
-            own = (rows >= 0) & (rows < len(drive.stamps_ns))
-            time_s = (drive.stamps_ns[rows[own]] - track.stamps_ns[0]) * 1e-9
-            found.append(way_of(track, Shown(time_s, shown[own], yaw[own]), segments.ways[k]))
+            time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
+            found.append(way_of(track, Shown(time_s, x + 1j * y, yaw), way))
         scales = [way.scale for way in found if way]
         return [way and way._replace(scale=float(np.mean(scales))) for way in found]
 
@@ -141,12 +149,9 @@ def compare_with_map(
     checks: Sequence[MotionCheck], drives: Drives, segments: Segments, result: MetricResult
 ) -> None:
     """Add to what the sources of each drive's motion tell how far the images moved by the map."""
-    images, places = positions(result, segments)
-    poses = np.column_stack([places - result.residuals, headings(result, segments)[1]])
-    for check, drive, start in zip(checks, drives.items, drives.starts, strict=True):
-        rows = images - start
-        own = (rows >= 0) & (rows < len(drive.stamps_ns))
-        pair = compare_map(drive.run.odometry, drive.stamps_ns[rows[own]], poses[own])
+    shown = drives.shown(segments, result)
+    for check, drive, (stamps_ns, poses) in zip(checks, drives.items, shown, strict=True):
+        pair = compare_map(drive.run.odometry, stamps_ns, poses.T)
         check.pairs += [pair] if pair else []
 
 

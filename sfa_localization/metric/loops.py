@@ -55,7 +55,7 @@ class Loops:
     @classmethod
     def of(cls, offsets: Offsets, stack: Stack) -> Loops:
         """Those of images of segments; others count for nothing."""
-        row, others = _rows(offsets.images, stack), _rows(offsets.others, stack)
+        row, others = stack.rows(offsets.images), stack.rows(offsets.others)
         shares = np.where(others >= 0, offsets.shares, 0.0)
         whole = shares.sum(axis=1)
         kept = (row >= 0) & (np.abs(whole - 1.0) < _LEAST)
@@ -67,7 +67,7 @@ class Loops:
     @classmethod
     def of_closures(cls, closures: Closures, stack: Stack, tied: Indices) -> Loops:
         """Those between the images of two segments, unless offsets have `tied` both."""
-        owner = np.where((rows := _rows(closures.images, stack)) < 0, -1, stack.owner[rows])
+        owner = np.where((rows := stack.rows(closures.images)) < 0, -1, stack.owner[rows])
         kept = (rows >= 0).all(1) & (owner[:, 0] != owner[:, 1]) & ~np.isin(owner, tied).all(1)
         images, turn = closures.images[kept], closures.turn[kept, None]
         one, unknown = np.ones_like(turn), np.full(len(turn), _UNKNOWN)
@@ -96,14 +96,6 @@ def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops,
     """Offsets, and closures where there are none."""
     tied = stack.owner[np.isin(stack.images, offsets.images)]
     return Loops.of(offsets, stack), Loops.of_closures(closures, stack, tied)
-
-
-def _rows(images: Indices, stack: Stack) -> Indices:
-    """Rows of the stack of images, -1 for those of no segment."""
-    order = np.argsort(stack.images, kind='stable')
-    at = np.searchsorted(stack.images, images, sorter=order)
-    rows = order[np.minimum(at, len(order) - 1)]
-    return np.where(stack.images[rows] == images, rows, -1)
 
 
 def _squares(

@@ -94,6 +94,13 @@ class Stack:
         """Paths (M,) without the yaw-rate bias of each period (R,)."""
         return np.asarray(self.path - bias[self.period[self.owner]] * self.drift)
 
+    def rows(self, images: Indices) -> Indices:
+        """Rows of images (...) of the drives, -1 for those of no segment."""
+        order = np.argsort(self.images, kind='stable')
+        at = np.searchsorted(self.images, images, sorter=order)
+        rows = order[np.minimum(at, len(order) - 1)]
+        return np.where(self.images[rows] == images, rows, -1)
+
     def sums(self, rows: NDArray[Any]) -> NDArray[Any]:
         """Sum (N, ...) of the rows (M, ...) of each segment."""
         return np.asarray(np.add.reduceat(rows, self.first, axis=0))

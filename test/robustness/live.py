@@ -164,11 +164,16 @@ def picture_message(message):
 
 def played(messages, start_ns, domain=DOMAIN):
     """Outputs of the nodes that hear messages in this order."""
+    return heard(Chain, messages, start_ns, domain).outputs
+
+
+def heard(kind, messages, start_ns, domain=DOMAIN):
+    """A chain of this kind after these messages, ended."""
     to_truth()  # computed once, and not while nodes wait
-    chain = Chain(domain, start_ns)
+    chain = kind(domain, start_ns)
     try:
         for message in messages:
             chain.take(message)
-        return chain.outputs
+        return chain
     finally:
         chain.bench.close()

@@ -45,7 +45,7 @@ class Shot:
 def filmed(messages, start_ns):
     """A shot each STEP_S of what the nodes publish; live, as the tests of robustness run them."""
     live()
-    from robustness.live import DOMAIN, Chain
+    from robustness.live import Chain, heard
 
     class Camera(Chain):
         panorama, shots = None, []
@@ -64,14 +64,7 @@ def filmed(messages, start_ns):
             level = ekf.status().level.name
             self.shots.append(Shot(second, message.true, pose, spread, level, self.panorama))
 
-    to_truth()
-    chain = Camera(DOMAIN, start_ns)
-    try:
-        for message in messages:
-            chain.take(message)
-        return chain.shots
-    finally:
-        chain.bench.close()
+    return heard(Camera, messages, start_ns).shots
 
 
 def in_truth(message):
