@@ -14,7 +14,7 @@ import time
 from unittest import mock
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from ros_domains import free_domain
@@ -71,7 +71,7 @@ def end_process(process):
         process.wait()
 
 
-class Spinner(SingleThreadedExecutor):
+class Spinner(lifecycle.Executor):
     """Spins in a thread of its own, and ends that first: rclpy destroys what it may wait for."""
 
     def __init__(self, context):

@@ -19,6 +19,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterType
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
 from ros_bench import until
 from std_msgs.msg import Float64, String
@@ -26,7 +27,7 @@ from std_srvs.srv import Trigger
 
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.ekf_node import EkfNode
-from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
+from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
 
 pytestmark = pytest.mark.ros
 
@@ -175,6 +176,14 @@ def test_what_fails_in_callbacks_timers_health_and_services_is_counted_and_ends_
         assert not answer.success and answer.message == 'no model; give one'
 
 
+def test_events_of_qos_are_noticed(bench):
+    noticed = []
+    events = PublisherEventCallbacks(incompatible_qos=noticed.append)
+    bench.node.create_publisher(String, 'any', 1, event_callbacks=events)
+    bench.node.create_subscription(String, 'any', print, latched_qos())
+    assert until(lambda: noticed)
+
+
 def test_a_node_starts_itself_unless_told_not_to_and_survives_its_life_cycle_twice(bench):
     waiting = bench.run(Echo, start=False, autostart=False)
     assert waiting.start() and not waiting.active
@@ -206,9 +215,10 @@ def test_messages_survive_the_round_trip():
     assert stamp_ns == 7 and message.header.frame_id == 'map'
     assert np.allclose(pose, [1, -2, 3]) and np.allclose(back, covariance)
     twist, frames = ([0.5, -0.2], np.diag([4e-4, 1e-4])), ('odom', 'base_link')
-    motion = convert.read_odometry(convert.to_odometry([1, 2, 3], covariance, *twist, 5, frames))
-    assert (motion.stamp_ns, motion.frame, motion.child_frame) == (5, *frames)
-    assert motion.twist == (0.5, -0.2) and motion.variances == (4e-4, 1e-4)
+    message = convert.to_odometry([1, 2, 3], covariance, *twist, 5, frames)
+    assert (message.header.frame_id, message.child_frame_id) == frames
+    stamp_ns, motion, pose = convert.read_odometry(message)
+    assert stamp_ns == 5 and motion == (0.5, -0.2, 4e-4, 1e-4) and np.allclose(pose, [1, 2, 3])
     panorama = PanoramaConfig(width=300, elevation_min=-7.25, clockwise=False)
     assert convert.read_info(convert.to_info(panorama)) == panorama
 

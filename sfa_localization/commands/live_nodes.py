@@ -115,8 +115,8 @@ def _pose(message: PoseWithCovarianceStamped) -> tuple[int, Array]:
 
 
 def _odometry(message: Odometry) -> tuple[int, Array]:
-    motion = read_odometry(message)
-    return motion.stamp_ns, motion.pose
+    stamp_ns, _, pose = read_odometry(message)
+    return stamp_ns, np.array(pose)
 
 
 class Processes:

@@ -12,7 +12,6 @@ import array
 import dataclasses
 import json
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,20 +34,9 @@ from sfa_localization.data.run import Image
 
 _FIXED_VARIANCE = 1e-6
 """Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""
+_FIXED = np.diag([_FIXED_VARIANCE] * 6)
 _PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
 _CORRELATION = 'share, distance_m'
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """One odometry message: twist (v m/s, omega rad/s), its variances, and the odometry's pose."""
-
-    stamp_ns: int
-    pose: Array
-    twist: tuple[float, float]
-    variances: tuple[float, float]
-    frame: str
-    child_frame: str
 
 
 def to_stamp(stamp_ns: int) -> Time:
@@ -106,23 +94,22 @@ def read_info(message: String) -> PanoramaConfig:
         raise MessageError(str(error)) from None
 
 
-def read_odometry(message: Odometry) -> Motion:
-    """The planar motion of an odometry message; variances of 0 mean that they are unknown."""
-    v, omega, v_variance, omega_variance = messages.read_twist(message)
-    pose = np.array(messages.read_planar(message.pose.pose.position, message.pose.pose.orientation))
-    frames = message.header.frame_id, message.child_frame_id
-    spread = v_variance, omega_variance
-    return Motion(read_stamp(message.header.stamp), pose, (v, omega), spread, *frames)
+def read_odometry(message: Odometry) -> tuple[int, tuple[float, ...], tuple[float, float, float]]:
+    """Stamp, twist (v m/s, omega rad/s and their variances, 0 where unknown), odometry's pose."""
+    pose = messages.read_planar(message.pose.pose.position, message.pose.pose.orientation)
+    return read_stamp(message.header.stamp), messages.read_twist(message), pose
 
 
 def read_pose(message: geometry.PoseWithCovarianceStamped) -> tuple[int, Array, Array]:
     """Stamp, pose (3,) and covariance (3, 3) of [x, y, yaw]; all zeros where it is unknown."""
     pose = np.array(messages.read_planar(message.pose.pose.position, message.pose.pose.orientation))
     covariance = np.asarray(message.pose.covariance, float).reshape(6, 6)[_PLANAR]
-    require_sane('covariance', *covariance.ravel().tolist())
-    if np.any(np.diag(covariance) < 0):
+    a, b, c, d, e, f, g, h, i = covariance.ravel().tolist()  # floats: arrays this small cost more
+    require_sane('covariance', a, b, c, d, e, f, g, h, i)
+    if min(a, e, i) < 0:
         raise MessageError('negative variance')
-    if np.abs(covariance - covariance.T).max() > 1e-6 * (1 + np.abs(covariance).max()):
+    largest = max(a, e, i, abs(b), abs(c), abs(f))
+    if max(abs(b - d), abs(c - g), abs(f - h)) > 1e-6 * (1 + largest):
         raise MessageError('covariance is not symmetric')
     return read_stamp(message.header.stamp), pose, covariance
 
@@ -159,8 +146,7 @@ def to_odometry(
     _head(message, stamp_ns, frames[0])
     _fill(message.pose.pose, pose)
     message.pose.covariance = _full(covariance, _PLANAR)
-    v, omega = np.asarray(twist, float).tolist()
-    message.twist.twist.linear.x, message.twist.twist.angular.z = v, omega
+    message.twist.twist.linear.x, message.twist.twist.angular.z = np.asarray(twist, float).tolist()
     message.twist.covariance = _full(twist_covariance, _TWIST)
     return message
 
@@ -214,7 +200,7 @@ def read_error_correlation(message: Float64MultiArray) -> ErrorCorrelation:
 
 def _full(covariance: Array, places: Any) -> NDArray[np.float64]:
     """The 36 numbers of a message, of which those at these places are known."""
-    full = np.diag([_FIXED_VARIANCE] * 6)
+    full = _FIXED.copy()
     full[places] = covariance
     return full.ravel()
 

@@ -19,12 +19,14 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.geometry import Array, compose, invert
+from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
+from sfa_localization.fusion.motion import wrap
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
+from sfa_localization.fusion.track import Pose
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.broadcast import Broadcast
 from sfa_localization.nodes.discovery import Discovery
@@ -38,12 +40,8 @@ try:
 except ImportError:  # the pip wheels of ROS have none
     TFMessage = None
 
-_LEVELS = {
-    Level.UNINITIALISED: DiagnosticStatus.WARN,
-    Level.LOCALISED: DiagnosticStatus.OK,
-    Level.DEGRADED: DiagnosticStatus.WARN,
-    Level.LOST: DiagnosticStatus.ERROR,
-}
+_OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+_LEVELS = dict(zip(Level, (_WARN, _OK, _WARN, _ERROR), strict=True))
 PATH_PERIOD_S, PATH_LENGTH = 0.5, 2000
 """Time between the poses of ekf/path, and how many it keeps: those of 17 minutes."""
 IMAGES_SILENCE = 3.0
@@ -149,22 +147,20 @@ class EkfNode(LocalizationNode):
         self.subscribe(Odometry, _ODOM, receive, sensor_qos(100), instead=instead)
 
     def _receive_odometry(self, message: Odometry) -> None:
-        motion, config = convert.read_odometry(message), self._config
-        self._frames = motion.frame or config.odom_frame, motion.child_frame or config.base_frame
-        reason = self.filter.add_odometry(
-            motion.stamp_ns, *motion.twist, motion.variances, motion.pose.tolist()
-        )
+        stamp_ns, (v, omega, *noise), pose = convert.read_odometry(message)
+        frame, child_frame = message.header.frame_id, message.child_frame_id
+        self._frames = frame or self._config.odom_frame, child_frame or self._config.base_frame
+        reason = self.filter.add_odometry(stamp_ns, v, omega, noise, pose)
         if reason:
             raise MessageError(reason)
         now_s = steady_s()
         if self.monitor(_ODOM).waited_s > _PILED_S > now_s - self._published_s:
             return  # it has piled up: fused, but not published each
         self._published_s = now_s
-        state = self.filter.at(motion.stamp_ns)
+        state = self.filter.at(stamp_ns)
         if state is not None:
-            self._publish_odometry(state, motion.stamp_ns)
-            map_to_odom = compose(state.pose, invert(motion.pose))
-            self._publish_transform(motion.stamp_ns, map_to_odom)
+            self.tell(self._odometry, self._odometry_message, state)
+            self._publish_transform(state, pose)
             self._extend_path(state)
 
     def _receive_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
@@ -176,7 +172,7 @@ class EkfNode(LocalizationNode):
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self.filter.add_measurement(stamp_ns, pose, covariance)
-        self._publish_verdict(update)
+        self.tell(self._verdict, self._verdict_message, update)
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
@@ -261,35 +257,39 @@ class EkfNode(LocalizationNode):
 
     # Outputs.
 
-    def _publish_odometry(self, state: State, stamp_ns: int) -> None:
+    def _odometry_message(self, state: State) -> Odometry:
         pose, twist = (state.pose, state.pose_covariance), (state.twist, state.twist_covariance)
         frames = self._config.map_frame, self._frames[1]
-        self._odometry.publish(convert.to_odometry(*pose, *twist, stamp_ns, frames))
+        return convert.to_odometry(*pose, *twist, state.stamp_ns, frames)
 
-    def _publish_transform(self, stamp_ns: int, map_to_odom: Array) -> None:
+    def _publish_transform(self, state: State, odom: Pose) -> None:
         """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
-        frames = self._config.map_frame, self._frames[0]
-        self._transform.publish(convert.to_transform(map_to_odom, stamp_ns, frames))
+        frames, stamp_ns = (self._config.map_frame, self._frames[0]), state.stamp_ns
+        (x, y, yaw), (odom_x, odom_y, odom_yaw) = state.mean[:3].tolist(), odom
+        turn = wrap(yaw - odom_yaw)
+        c, s = math.cos(turn), math.sin(turn)
+        map_to_odom = x - c * odom_x + s * odom_y, y - s * odom_x - c * odom_y, turn
+        self.tell(self._transform, convert.to_transform, map_to_odom, stamp_ns, frames)
         if self._tf is not None:
             ahead_ns = round(self._config.transform_tolerance * 1e9)
             dated = self._broadcast.add(stamp_ns, map_to_odom, ahead_ns)
             transforms = [convert.to_transform(pose, at_ns, frames) for at_ns, pose in dated]
             self._tf.publish(TFMessage(transforms=transforms))
 
-    def _publish_verdict(self, update: Update) -> None:
+    def _verdict_message(self, update: Update) -> DiagnosticArray:
         """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
-        level = DiagnosticStatus.OK if update.accepted else DiagnosticStatus.WARN
+        level = _OK if update.accepted else _WARN
         values = {'accepted': str(update.accepted).lower()}
         for name, value in (('d2', update.d2), ('threshold', update.threshold)):
             values[name] = f'{value:.6g}' if math.isfinite(value) else ''
         stamp = convert.to_stamp(max(update.stamp_ns, 0))
-        self._verdict.publish(self.diagnostic('measurement', level, update.reason, values, stamp))
+        return self.diagnostic('measurement', level, update.reason, values, stamp)
 
     def _publish_pose(self, stamp_ns: int) -> None:
         """Publish the estimate at the stamp of an image."""
-        state, frame = self.filter.at(stamp_ns), self._config.map_frame
+        state = self.filter.at(stamp_ns) if self._pose.get_subscription_count() else None
         if state is not None:
-            pose = state.pose, state.pose_covariance
+            pose, frame = (state.pose, state.pose_covariance), self._config.map_frame
             self._pose.publish(convert.to_pose_with_covariance(*pose, stamp_ns, frame))
 
     def _extend_path(self, state: State) -> None:
@@ -297,8 +297,7 @@ class EkfNode(LocalizationNode):
             return
         self._path_ns, frame = state.stamp_ns, self._config.map_frame
         self._path.append(convert.to_pose(state.pose, state.stamp_ns, frame))
-        if self._trail.get_subscription_count():
-            self._trail.publish(Path(header=self._path[-1].header, poses=list(self._path)))
+        self.tell(self._trail, lambda: Path(header=self._path[-1].header, poses=list(self._path)))
 
     def status(self) -> Status:
         """The filter's status, and what the wall clock adds: inputs that do not arrive."""

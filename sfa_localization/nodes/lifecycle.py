@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar, cast
@@ -17,6 +18,7 @@ from typing import Any, TypeVar, cast
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import EventHandler
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -37,7 +39,7 @@ from sfa_localization.nodes.settings import NodeConfig
 _PACKAGE = 'sfa_localization'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between messages on /diagnostics: diagnostic_aggregator expects about one a second."""
-_AWAKE_S = 0.5  # between looks whether a signal has come
+_AWAKE_S = 0.5  # between looks whether a signal, or an event of QoS, has come
 S = TypeVar('S', bound=Settings)
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -67,7 +69,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
             heard.callback = self._guarded(heard.topic_name, heard.callback)
         self.active = False
         self.failure = ''
-        self.monitors: dict[str, Monitor] = {}
+        self.monitors: defaultdict[str, Monitor] = defaultdict(Monitor)
         self._resolved: dict[str, str] = {}
         self._entities: list[tuple[Callable[[Any], Any], Any]] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -105,7 +107,7 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
 
     def monitor(self, name: str) -> Monitor:
         """The counts of one input, made at its first use."""
-        return self.monitors.setdefault(name, Monitor())
+        return self.monitors[name]
 
     def diagnostic(
         self, part: str, level: Any, text: str, values: dict[str, str], stamp: Any
@@ -126,6 +128,11 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         )
         self._entities.append((self.destroy_lifecycle_publisher, made))
         return made
+
+    def tell(self, publisher: Any, make: Callable[..., Any], *given: Any) -> None:
+        """Publish what `make` fills, which is not made where nobody listens; no latched message."""
+        if publisher.get_subscription_count():
+            publisher.publish(make(*given))
 
     def subscribe(
         self,
@@ -349,6 +356,35 @@ class LocalizationNode(LifecycleNode):  # type: ignore[misc]
         return 'use_sim_time is true, but there is no time on /clock: play bags with --clock'
 
 
+class Executor(SingleThreadedExecutor):  # type: ignore[misc]
+    """rclpy's, which asks all entities of a node twice for each callback, spared most of that.
+
+    Events of QoS, more than all else, may wait until the node is awake; and after a callback, which
+    wakes the executor itself, there is nothing to ask for.
+    """
+
+    _woken, _events_s = False, 0.0
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        super().spin_once(timeout_sec)
+        self._woken = True
+        self.wake()
+
+    def get_nodes(self) -> list[Any]:
+        """Those to wait for next."""
+        woken, self._woken = self._woken, False
+        if woken:
+            return []
+        self._with_events = steady_s() >= self._events_s
+        if self._with_events:
+            self._events_s = steady_s() + _AWAKE_S
+        return list(super().get_nodes())
+
+    def can_execute(self, entity: Any) -> bool:
+        asked = self._with_events or not isinstance(entity, EventHandler)
+        return asked and bool(super().can_execute(entity))
+
+
 def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM, which is exit code 0; or until it dies.
 
@@ -362,7 +398,7 @@ def run_node(make: Callable[[], LocalizationNode], words: list[str]) -> int:
             return entry.CANNOT_START
         entry.leave_to_ros()
         # Made first: after a signal it could not be made any more.
-        executor = SingleThreadedExecutor()
+        executor = Executor()
         node = make()
         parameters.warn_of_ignored_files(node, words)
         if not node.start():

@@ -43,15 +43,9 @@ def save_pose(path: Path, saved: SavedPose) -> None:
     something else than a pose: it stays.
     """
     _content(path)
-    content = {
-        'version': _VERSION,
-        'stamp_ns': saved.stamp_ns,
-        'frame': saved.frame,
-        'pose': saved.pose.tolist(),
-        'covariance': saved.covariance.tolist(),
-    }
+    content = {'version': _VERSION, **saved._asdict()}
     with atomic_write(path) as file:
-        file.write((json.dumps(content) + '\n').encode())
+        file.write((json.dumps(content, default=np.ndarray.tolist) + '\n').encode())
 
 
 def load_pose(path: Path, frame: str) -> SavedPose | None:

@@ -37,12 +37,7 @@ class SfaNodeConfig(Settings):
         'raw', 'listen to panorama, or to panorama/compressed', choices=('raw', 'compressed')
     )
     silence_timeout: float = setting(
-        2.0,
-        'time without a panorama after which diagnostics report an error',
-        unit='s',
-        low=0.1,
-        high=3600.0,
-        live=True,
+        2.0, 'time without panoramas that is an error', unit='s', low=0.1, high=3600.0, live=True
     )
 
 

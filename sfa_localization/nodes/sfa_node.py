@@ -147,14 +147,14 @@ class SfaNode(LocalizationNode):
         """An unusable image gets no pose without covariance: it would look like a usable one."""
         frame, slow, stamp_ns = self._config.map_frame, seen.slow_features, seen.stamp_ns
         if np.all(np.isfinite(slow)):
-            self._features.publish(convert.to_array(slow, 'slow features'))
-            self._feature_pose.publish(_feature_pose(slow, stamp_ns))
+            self.tell(self._features, convert.to_array, slow, 'slow features')
+            self.tell(self._feature_pose, _feature_pose, slow, stamp_ns)
         if math.isfinite(seen.turned):
-            self._turned.publish(convert.to_turned(seen.turned, stamp_ns, _TURNED_FRAME))
+            self.tell(self._turned, convert.to_turned, seen.turned, stamp_ns, _TURNED_FRAME)
         if not seen.problem:
-            self._pose.publish(convert.to_pose(seen.pose, stamp_ns, frame))
-        uncertain = convert.to_pose_with_covariance(seen.pose, seen.covariance, stamp_ns, frame)
-        self._uncertain.publish(uncertain)
+            self.tell(self._pose, convert.to_pose, seen.pose, stamp_ns, frame)
+        found = seen.pose, seen.covariance, stamp_ns, frame
+        self.tell(self._uncertain, convert.to_pose_with_covariance, *found)
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         assert self._observer is not None

@@ -72,7 +72,7 @@ def in_truth(message):
     from sfa_localization.data.geometry import rotation
     from sfa_localization.nodes.conversions import read_odometry
 
-    transform, pose = to_truth(), read_odometry(message).pose
+    transform, pose = to_truth(), np.array(read_odometry(message)[2])
     turn = rotation(transform.yaw_rad)
     spread = np.reshape(message.pose.covariance, (6, 6))[:2, :2]
     yaw = float(transform.apply_yaw(pose[2]))
