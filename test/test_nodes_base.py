@@ -218,7 +218,7 @@ def test_messages_survive_the_round_trip():
     message = convert.to_odometry([1, 2, 3], covariance, *twist, 5, frames)
     assert (message.header.frame_id, message.child_frame_id) == frames
     stamp_ns, motion, pose = convert.read_odometry(message)
-    assert stamp_ns == 5 and motion == (0.5, -0.2, 4e-4, 1e-4) and np.allclose(pose, [1, 2, 3])
+    assert (stamp_ns, *motion) == (5, 0.5, -0.2, 4e-4, 1e-4) and np.allclose(pose, [1, 2, 3])
     panorama = PanoramaConfig(width=300, elevation_min=-7.25, clockwise=False)
     assert convert.read_info(convert.to_info(panorama)) == panorama
 

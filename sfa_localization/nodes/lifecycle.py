@@ -363,17 +363,17 @@ class Executor(SingleThreadedExecutor):  # type: ignore[misc]
     wakes the executor itself, there is nothing to ask for.
     """
 
-    _woken, _events_s = False, 0.0
+    _woken, _with_events, _events_s = False, True, 0.0
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         super().spin_once(timeout_sec)
         self._woken = True
-        self.wake()
 
     def get_nodes(self) -> list[Any]:
-        """Those to wait for next."""
+        """Those to wait for next; where there are none, the wait ends at once."""
         woken, self._woken = self._woken, False
         if woken:
+            self.wake()
             return []
         self._with_events = steady_s() >= self._events_s
         if self._with_events:
