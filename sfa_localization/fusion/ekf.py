@@ -55,9 +55,10 @@ def measurement_event(
     z = value + sqrt(share) L ERROR + white, with L L^T the covariance and (1 - share) of it white.
     Raises DataError for a covariance that is not positive.
     """
-    size = len(value)
-    jacobian = _OBSERVED[:size].copy()
-    jacobian[:, ERROR : ERROR + size] = math.sqrt(share) * root(covariance)
+    jacobian, shared = _OBSERVED[: len(value)].copy(), math.sqrt(share)
+    for i, row in enumerate(root(covariance.tolist())):
+        for j, entry in enumerate(row, ERROR):
+            jacobian[i, j] = shared * entry
     return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
 
 
@@ -205,17 +206,14 @@ class Ekf:
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
-        image = _image(belief, event)
-        if belief.located and (event.value.size == 3 or not self._heading_lost(belief)):
-            return self._gated(belief, event, image)
-        return self._found(belief, event, image)
+        lost = belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2
+        if belief.located and (event.value.size == 3 or not lost):
+            return self._gated(belief, event)
+        return self._found(belief, event)
 
-    def _heading_lost(self, belief: Belief) -> bool:
-        return bool(belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2)
-
-    def _found(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+    def _found(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """Start from one image with heading, or from the path along which several lie."""
-        images, config = remembered(belief.memory.images, image), self._config
+        images, config = _images(belief, event, False), self._config
         if event.value.size == 3:
             x, y, yaw = event.covariance.diagonal().tolist()
             if max(x, y) <= config.lost_std**2 and yaw <= config.lost_yaw_std**2:
@@ -229,37 +227,33 @@ class Ekf:
         update = Update(event.stamp_ns, False, math.nan, math.nan, reason)
         return belief._replace(memory=belief.memory._replace(images=images, update=update))
 
-    def _gated(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+    def _gated(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """Accept what lies inside the gate; what is outlying within loses weight."""
         kalman, memory, size = self._kalman, belief.memory, event.value.size
         mean, covariance, d2 = kalman.corrected(belief, event)
         inside = d2 <= GATE[size]
         reason = 'accepted' if inside else 'outside the gate'
         update = Update(event.stamp_ns, inside, d2, GATE[size], reason, kalman.y, kalman.S)
-        memory = memory._replace(update=update, period_s=_period_s(memory, event.stamp_ns))
+        period_s = _period_s(memory, event.stamp_ns)
         if not inside:
-            return self._rejected(belief._replace(memory=memory), event, image)
+            memory = memory._replace(update=update, period_s=period_s)
+            return self._rejected(belief._replace(memory=memory), event)
         outlying = d2 / (memory.scatter * OUTLYING[size])
         if outlying > 1 and self._alike:
             lighter = event._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
         # At most 1: an image that claims too little is not believed more than it claims.
         scatter = min(max(_nearer(memory.scatter, d2 / MEDIAN[size]), _LEAST_SCATTER), 1.0)
-        memory = memory._replace(
-            support=memory.support + 1,
-            rejected=0,
-            accepted_ns=event.stamp_ns,
-            images=remembered(memory.images, image._replace(accepted=True)),
-            scatter=scatter,
-        )
-        return belief._replace(mean=mean, covariance=covariance, memory=memory)
+        images = _images(belief, event, True)
+        memory = Memory(memory.support + 1, 0, event.stamp_ns, images, update, scatter, period_s)
+        return Belief(belief.stamp_ns, mean, covariance, *belief[3:8], memory, *belief[9:])
 
     # Start, and start anew.
 
-    def _rejected(self, belief: Belief, event: MeasurementEvent, image: Image) -> Belief:
+    def _rejected(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """After a rejected image: restarted where those rejected outweigh the estimate."""
         memory = belief.memory
-        images = remembered(memory.images, image)
+        images = _images(belief, event, False)
         found = relocate(images, self._correlation.distance_m) if len(images) > 1 else None
         if found is not None and found.outweighs(belief):
             return self._restarted(belief, event, found, ELSEWHERE)
@@ -284,10 +278,10 @@ class Ekf:
         return placed._replace(memory=memory, track=track)
 
 
-def _image(belief: Belief, event: MeasurementEvent) -> Image:
-    """A measurement beside the pose by dead reckoning."""
+def _images(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Image, ...]:
+    """The images remembered, with a measurement beside the pose by dead reckoning."""
     variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
-    return Image(
+    newest = Image(
         event.stamp_ns,
         complex(x, y),
         yaw[0] if yaw else math.nan,
@@ -295,7 +289,9 @@ def _image(belief: Belief, event: MeasurementEvent) -> Image:
         variances[2] if yaw else math.inf,
         belief.dead_reckoned,
         belief.traveled_m,
+        accepted,
     )
+    return remembered(belief.memory.images, newest)
 
 
 def _nearer(usual: float, now: float) -> float:
@@ -320,6 +316,7 @@ def _at_pose(belief: Belief, pose: Array, covariance: Array, share: float) -> Be
     mean[YAW] = wrap(float(mean[YAW]))
     full, kept = np.eye(SIZE), slice(V, ERROR)
     full[:3, :3], full[kept, kept] = covariance, belief.covariance[kept, kept]
-    shared = -math.sqrt(share) * root(covariance)
-    full[:3, ERROR:], full[ERROR:, :3] = shared, shared.T
+    for i, row in enumerate(root(covariance.tolist())):
+        for j, entry in enumerate(row, ERROR):
+            full[i, j] = full[j, i] = -math.sqrt(share) * entry
     return belief._replace(mean=mean, covariance=full, located=True)

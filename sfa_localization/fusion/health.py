@@ -149,8 +149,8 @@ class _Window:
         self._yaw_variance = CAUTION * seen.yaw_variance + FLOOR_RAD**2 + yaw_drift
         yaw_width = np.sqrt(2 * np.pi * np.where(seen.has_yaw, self._yaw_variance, 2 * np.pi))
         self._peak = (1 - OUTLIERS) / (2 * np.pi * self._variance * yaw_width)
-        knots = np.array([(knot[0] - newest_ns, *knot[1:]) for knot in track.knots])
-        self._times, (x, y, yaw) = knots[:, 0] * 1e-9, knots[:, 1:].T
+        stamps_ns, x, y, yaw = map(np.array, zip(*track.knots, strict=True))
+        self._times = (stamps_ns - newest_ns) * 1e-9
         self._path, self._path_yaw = x + 1j * y, np.unwrap(yaw)
         self._power = min(1.0, max(1 + seen.behind_m[0], 3.0) / len(images))
 
@@ -162,7 +162,7 @@ class _Window:
         logs, sizes = self._fitted(rows, yaws, kinds)
         lever, turned, scale = (size[:, 0] for size in sizes)
         off_m, off_rad = np.abs(rows[:-3, -1] - rows[0, -1]), np.abs(yaws[:-3, -1] - yaws[0, -1])
-        of_delays = zip(logs[:-3], delays, off_m, off_rad, strict=True)
+        of_delays = np.array([logs[:-3], delays, off_m, off_rad]).T.tolist()
         late = [_Hypothesis('late', *each) for each in of_delays]
         nothing = self._power * len(self._places) * math.log(_ANYWHERE)
         found = [

@@ -25,7 +25,7 @@ COMMAND_RATE_STD = 0.2
 _UNKNOWN_STDS = np.array([POSITION_STD, POSITION_STD, 0.2])  # m, m, rad
 # Least standard deviations: drivers understate what encoders resolve (m/s, rad/s), and no map from
 # images is better everywhere (m, m, rad).
-_LEAST_TWIST_STDS, _LEAST_STDS = (0.01, 0.005), (0.05, 0.05, 0.02)
+_LEAST_TWIST_STDS, _LEAST_VARIANCES = (0.01, 0.005), (0.05**2, 0.05**2, 0.02**2)
 # Twists, some seconds of them, of which so many are repeated by odometry that repeats commands:
 # 0.66 to 0.82 on four small robots.
 _COMMANDS, _REPEATED = 200, 0.5
@@ -71,13 +71,14 @@ def read_twist(
     v, omega = float(v), float(omega)
     if not (abs(v) <= _LARGEST_TWIST and abs(omega) <= _LARGEST_TWIST):
         raise DataError('not finite, or absurdly fast')
+    (of_v, of_omega), factor = variances, config.odometry_factor
     rate_std = max(config.rate_std, COMMAND_RATE_STD) if commands else config.rate_std
-    known = zip(variances, _LEAST_TWIST_STDS, (config.speed_std, rate_std), strict=True)
-    return Twist(v, omega, *(_variance(config.odometry_factor, *each) for each in known))
+    v_variance = _variance(factor, of_v, _LEAST_TWIST_STDS[0], config.speed_std)
+    return Twist(v, omega, v_variance, _variance(factor, of_omega, _LEAST_TWIST_STDS[1], rate_std))
 
 
 def _variance(factor: float, claimed: float, floor: float, default: float) -> float:
-    if not (math.isfinite(claimed) and 0 < claimed < LARGEST_TWIST_VARIANCE):
+    if not 0 < claimed < LARGEST_TWIST_VARIANCE:
         return default**2
     return max(factor * float(claimed), floor**2)
 
@@ -90,21 +91,24 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     pose, matrix = np.asarray(value, float), np.asarray(covariance, float)
     if pose.shape not in ((2,), (3,)) or matrix.shape != (pose.size, pose.size):
         raise DataError('shape is not that of a position or a pose')
-    if not all(abs(place) <= _LARGEST_M for place in pose[:2].tolist()):
+    # Numbers: arrays of two or three cost more than what is done with them.
+    (x, y, *yaw), rows = pose.tolist(), matrix.tolist()
+    if not (abs(x) <= _LARGEST_M and abs(y) <= _LARGEST_M):
         raise DataError('position is not finite')
-    known = math.isfinite(pose[-1]) and matrix[-1, -1] <= YAW_STD_LIMIT**2
-    if pose.size == 3 and not (known and (matrix[2, 2] > 0 or not matrix.any())):
-        pose, matrix = pose[:2], matrix[:2, :2]
-    if not matrix.any():
+    if yaw:
+        known = math.isfinite(yaw[0]) and rows[2][2] <= YAW_STD_LIMIT**2
+        if not (known and (rows[2][2] > 0 or not matrix.any())):
+            pose, matrix = pose[:2], matrix[:2, :2]
+            rows = matrix.tolist()
+    if not any(map(any, rows)):
         matrix = np.diag(np.square(_UNKNOWN_STDS[: pose.size]))
-    require_symmetric(matrix)
-    variances = matrix.diagonal().tolist()
-    if max(variances[:2]) >= LARGEST_VARIANCE:
+        rows = matrix.tolist()
+    require_symmetric(rows)
+    if max(rows[0][0], rows[1][1]) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
-    noise, least = factor * symmetric(matrix), _LEAST_STDS[: pose.size]
-    noise.flat[:: pose.size + 1] = [
-        max(factor * own, std**2) for own, std in zip(variances, least, strict=True)
-    ]
+    noise = factor * symmetric(matrix)
+    for i, row in enumerate(rows):
+        noise[i, i] = max(factor * row[i], _LEAST_VARIANCES[i])
     return pose, noise
 
 
@@ -115,27 +119,37 @@ def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
     if matrix.shape != (3, 3):
         raise DataError('covariance of the initial pose is not (3, 3)')
-    require_symmetric(matrix)
-    root(matrix)
+    require_symmetric(matrix.tolist())
+    root(matrix.tolist())
     return value, symmetric(matrix)
 
 
-def require_symmetric(matrix: Array) -> None:
-    """Raise DataError for a matrix (N, N) that is not symmetric, or has no positive diagonal."""
-    rows = matrix.tolist()  # arrays of two or three cost more than what is done with them
-    pairs = [(rows[i][j], rows[j][i]) for i in range(len(rows)) for j in range(i)]
+def require_symmetric(rows: list[list[float]]) -> None:
+    """Raise DataError for a matrix that is not symmetric, or has no positive diagonal."""
+    pairs = [(row[j], rows[j][i]) for i, row in enumerate(rows) for j in range(i)]
     largest, least = max(map(max, rows)), min(row[i] for i, row in enumerate(rows))
     skewed = max(abs(a - b) for a, b in pairs) > _SKEW * largest
     if skewed or not (math.isfinite(sum(map(sum, rows))) and least > 0):
         raise DataError(_NO_COVARIANCE)
 
 
-def root(covariance: Array) -> Array:
-    """The lower triangular root (Cholesky). Raises DataError where there is none."""
+def root(rows: list[list[float]]) -> list[list[float]]:
+    """Rows, two or three, of the lower triangular root (Cholesky). Raises DataError for none."""
     try:
-        return np.asarray(np.linalg.cholesky(covariance))
-    except np.linalg.LinAlgError:
-        raise DataError(_NO_COVARIANCE) from None
+        a = math.sqrt(rows[0][0])
+        b = rows[1][0] / a
+        c = math.sqrt(rows[1][1] - b * b)
+        found, last = [[a], [b, c]], c
+        if len(rows) == 3:
+            d = rows[2][0] / a
+            e = (rows[2][1] - d * b) / c
+            last = math.sqrt(rows[2][2] - d * d - e * e)
+            found.append([d, e, last])
+    except (ValueError, ZeroDivisionError):
+        last = 0.0
+    if not last > 0:
+        raise DataError(_NO_COVARIANCE)
+    return found
 
 
 def symmetric(matrix: Array) -> Array:

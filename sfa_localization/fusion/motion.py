@@ -27,7 +27,6 @@ and its derivatives fill the Jacobian (`_advance`). The state has eight componen
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +60,7 @@ _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rou
 _DIAGONAL = slice(0, None, SIZE + 1)  # of flat matrices
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """Estimate at one stamp: `mean` (11,) and `covariance` (11, 11), in the order of X to ERROR."""
 
     stamp_ns: int
@@ -147,10 +145,6 @@ class Twist(NamedTuple):
     v_variance: float
     omega_variance: float
 
-    @property
-    def stands(self) -> bool:
-        return abs(self.v) < STANDSTILL_SPEED and abs(self.omega) < STANDSTILL_RATE
-
 
 class Arc(NamedTuple):
     """A motion over dt at constant v and omega, and its derivatives."""
@@ -202,7 +196,7 @@ def drive(
     of scale, loss and bias are v_odometry, -|omega_odometry| and -1 times those of v' and omega'.
     Each reading adds noise of its own variance through the same columns.
     """
-    if twist.stands:
+    if abs(twist.v) < STANDSTILL_SPEED and abs(twist.omega) < STANDSTILL_RATE:
         return _stand(mean)
     v, omega, by_loss = _corrected(mean, twist)
     step = _advance(mean, v, omega, twist, dt, noise)

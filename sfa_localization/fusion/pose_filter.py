@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -121,10 +120,8 @@ class PoseFilter:
         else:
             near = abs(stamp_ns - newest) <= COAST_S * 1e9
             stamp_ns = stamp_ns if near and self._history.reaches(stamp_ns) else newest
-        self._place_pose(int(stamp_ns), value, checked)
-
-    def _place_pose(self, stamp_ns: int, pose: Array, covariance: Array) -> None:
-        self._history.add((stamp_ns, POSE), PoseEvent(stamp_ns, pose, covariance))
+        event = PoseEvent(int(stamp_ns), value, checked)
+        self._history.add((event.stamp_ns, POSE), event)
 
     def add_odometry(
         self,
@@ -214,19 +211,14 @@ class PoseFilter:
         """When an image was taken, on the clock of the odometry. Where that shows far more motion
         in the delay than it takes, as after a network's stall, the order of the stamps says more.
         """
-        if stamp_ns <= 0:
-            return stamp_ns
-        delay_ns = self._camera.clock_at(stamp_ns).delay_ns
+        delay_ns = self._camera.clock_at(stamp_ns).delay_ns if stamp_ns > 0 else 0
         if abs(delay_ns) > DELAY_LIMIT_NS:
             raise DataError('clocks of camera and odometry are more than 0.5 s apart')
         if delay_ns == 0:
             return stamp_ns
         taken_ns = max(stamp_ns - delay_ns, 1)
-        if stalled(
-            self._history.before(taken_ns), self._history.before(stamp_ns), taken_ns, stamp_ns
-        ):
-            return stamp_ns
-        return taken_ns
+        earlier, later = self._history.before(taken_ns), self._history.before(stamp_ns)
+        return stamp_ns if stalled(earlier, later, taken_ns, stamp_ns) else taken_ns
 
     def _with_time_noise(self, taken_ns: int, stamp_ns: int, pose: Array, noise: Array) -> Array:
         """With what a moving robot's pose (2,) or (3,) errs by because the time is uncertain."""
@@ -258,7 +250,7 @@ class PoseFilter:
         given_ns = self._history.newest_ns
         if given_ns is None or not 0 <= stamp_ns - given_ns <= ODOMETRY_TIMEOUT_S * 1e9:
             self._history = self._fresh(self._ekf.blank(0))
-            self._place_pose(stamp_ns, *self._waiting)
+            self._history.add((stamp_ns, POSE), PoseEvent(stamp_ns, *self._waiting))
         self._waiting = None
 
     # Outputs.
@@ -267,12 +259,6 @@ class PoseFilter:
     def camera_clock(self) -> CameraClock:
         """By how much images are stamped late, as far as turns have shown it."""
         return self._camera.clock
-
-    @property
-    def _compensated_s(self) -> float:
-        """By how much images are fused before their stamps."""
-        delay_ns = self._camera.clock.delay_ns
-        return delay_ns * 1e-9 if abs(delay_ns) <= DELAY_LIMIT_NS else 0.0
 
     @property
     def nis(self) -> float:
@@ -299,18 +285,20 @@ class PoseFilter:
 
     def _at(self, stamp_ns: int) -> State | None:
         """A robot that is commanded is where its odometry was a delay ago, and its images right."""
-        delay_ns = round(self._compensated_s * 1e9) if self._open_loop.found else 0
-        robot_ns = stamp_ns - delay_ns if self._history.reaches(stamp_ns - delay_ns) else stamp_ns
+        robot_ns, delay_ns = stamp_ns, self._camera.clock.delay_ns if self._open_loop.found else 0
+        if 0 < abs(delay_ns) <= DELAY_LIMIT_NS and self._history.reaches(stamp_ns - delay_ns):
+            robot_ns -= delay_ns
         state = self._ekf.coast(self._history.before(robot_ns), robot_ns).state
-        return state and replace(self._widened(state), stamp_ns=stamp_ns)
+        return state and self._widened(state)._replace(stamp_ns=stamp_ns)
 
     def _widened(self, state: State) -> State:
         """The estimate, less certain by what may be the matter."""
-        if not any(self.health.variances):
+        variances = self.health.variances
+        if not any(variances):
             return state
         covariance = state.covariance.copy()
-        covariance[:3, :3] += np.diag(self.health.variances)
-        return replace(state, covariance=covariance)
+        covariance[:3, :3] += np.diag(variances)
+        return state._replace(covariance=covariance)
 
     @property
     def health(self) -> Health:

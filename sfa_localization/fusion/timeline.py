@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.belief import Belief, Event
 from sfa_localization.fusion.history import History
@@ -25,23 +23,15 @@ class ClockWentBack(Exception):
     """The clock went back: whoever knows the time starts anew."""
 
 
-class _Again(NamedTuple):
-    """Odometry in a row that is no newer than what came before it: how many of its messages lie
-    among those, and the first and last stamp.
-    """
-
-    among: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-
-
 class Timeline:
     """Feed it the stamps of all messages; it says which can be used."""
 
     def __init__(self) -> None:
         self._behind = self._ahead = 0
         self._apart = 0, 0
-        self._again = _Again()
+        # Odometry in a row that is no newer than what came before it: how many of its messages lie
+        # among those, and the first and last stamp.
+        self._again = 0, 0, 0
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack.
@@ -77,7 +67,7 @@ class Timeline:
     @property
     def problems(self) -> list[str]:
         """How images and odometry are apart in time, in words."""
-        if self._again.among > 1:
+        if self._again[0] > 1:
             return ['odometry is stamped with times that it had passed: did the clock go back?']
         count, apart_ns = self._apart
         if count < FEW_AHEAD:
@@ -91,13 +81,13 @@ class Timeline:
         """Odometry that covers once more, in order, what other odometry covered before it, means
         that the clock went back; what fills a hole, or comes out of order, was held up.
         """
-        again = self._again
+        among, first_ns, last_ns = self._again
         if newest_ns is None or stamp_ns > newest_ns:
-            self._again = _Again()
-        elif stamp_ns < again.last_ns or again.last_ns == 0:
-            self._again = _Again(0, stamp_ns, stamp_ns)
+            self._again = 0, 0, 0
+        elif stamp_ns < last_ns or last_ns == 0:
+            self._again = 0, stamp_ns, stamp_ns
         else:
-            passed = (history.before(stamp_ns).odometry_ns or 0) > again.last_ns
-            self._again = _Again(again.among + passed, again.first_ns, stamp_ns)
-            if self._again.among >= FEW_BEHIND and stamp_ns - again.first_ns >= _AGAIN_NS:
+            among += (history.before(stamp_ns).odometry_ns or 0) > last_ns
+            self._again = among, first_ns, stamp_ns
+            if among >= FEW_BEHIND and stamp_ns - first_ns >= _AGAIN_NS:
                 raise ClockWentBack

@@ -52,7 +52,7 @@ def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
     """The images with one more, without what is too far behind."""
     last = newest_new(images)
     if last is not None and not _moved(last, newest):
-        newest = newest._replace(is_new=False)
+        newest = Image(*newest[:-1], False)
     reach_m, first = max(REACH_M, REACH_STDS * math.sqrt(newest.variance)), 0
     while first < len(images) and newest.traveled_m - images[first].traveled_m > reach_m:
         first += 1
@@ -65,7 +65,10 @@ def remembered(images: tuple[Image, ...], newest: Image) -> tuple[Image, ...]:
 
 def newest_new(images: Sequence[Image]) -> Image | None:
     """The latest image that showed something new."""
-    return next((image for image in reversed(images) if image.is_new), None)
+    for image in reversed(images):
+        if image.is_new:
+            return image
+    return None
 
 
 def _moved(last: Image, image: Image) -> bool:
