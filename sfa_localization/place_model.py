@@ -51,7 +51,7 @@ from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 FORMAT = 'sfa_localization place model'
-VERSION = 12
+VERSION = 13
 SCALE_STD = 0.01
 """Of the scale of a map: its meters are those of wheels, seldom known better."""
 _LONGEST_DELAY_S = 10.0

@@ -29,7 +29,7 @@ from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Panoramas, Run, Trajectory
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.image_features import evenly
-from sfa_localization.features.keyframes import Keyframes, correlate, quantized, texture
+from sfa_localization.features.keyframes import Keyframes, encoded, parts_of, quantized, texture
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
@@ -149,17 +149,17 @@ def new_views(
     chosen = chosen[_spread(poses[chosen])]
     tilts = np.reshape([one.tilt for one in seen], (-1, 2))
     level = LeveledPanoramas(run.panoramas, tilts, model.keyframes.sphere)
-    return Additions(_textures(level, chosen, model.keyframes), poses[chosen])
+    return Additions(_textures(level, chosen), poses[chosen])
 
 
 def familiar_score(model: PlaceModel) -> float:
     """The correlation with its likest neighbor that 19 of 20 keyframes of the training reach."""
     first = np.flatnonzero(model.keyframes.first)
-    spectra, columns = model.keyframes.spectra(first), model.keyframes.textures.shape[2]
+    rows = first[evenly(len(first), _SAMPLE)]
     best = list[float]()
-    for row in evenly(len(first), _SAMPLE).tolist():
-        scores = correlate(spectra[row][None], spectra, columns)[0][0]
-        best.append(float(np.delete(scores, row).max()))
+    for row, spectrum in zip(rows.tolist(), model.keyframes.spectra(rows), strict=True):
+        scores = model.keyframes.correlated(spectrum[None], first)[0][0]
+        best.append(float(scores[first != row].max()))
     return float(np.quantile(best, _RARELY))
 
 
@@ -200,10 +200,10 @@ def _spread(poses: Array) -> NDArray[np.int64]:
         cell_m *= _COARSER
 
 
-def _textures(images: Panoramas, chosen: NDArray[np.int64], like: Keyframes) -> NDArray[np.int8]:
-    """Textures (M, rows, columns) of the chosen images (M,), as keyframes hold them."""
+def _textures(images: Panoramas, chosen: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Textures (M, rows, columns) of the chosen images (M,)."""
     if not len(chosen):
-        return np.zeros((0, *like.textures.shape[1:]), np.int8)
+        return np.zeros((0, 0, 0), np.int8)
     read = (images.read(i, i + 1)[0] for i in chosen.tolist())
     return quantized(np.stack([texture(image) for image in read]))
 
@@ -215,17 +215,15 @@ def extended(model: PlaceModel, new: Additions, name: str) -> PlaceModel:
     """
     if not len(new):
         return model
-    old, count = model.keyframes, len(new)
-    rows = _kept(old, new.poses)
-    keyframes = Keyframes.of(
-        np.concatenate([old.textures[rows], new.textures]),
-        np.concatenate([old.poses[rows], new.poses]),
-        old.noise,
-        old.sphere,
-        np.append(old.drives[rows], np.full(count, old.drives.max() + 1, np.int32)),
-        old.trained,
+    old, rows = model.keyframes, _kept(model.keyframes, new.poses)
+    values, _ = encoded(parts_of(new.textures, new.poses, old.sphere), old.step)
+    keyframes = replace(
+        old,
+        values=np.concatenate([old.values[rows], values]),
+        poses=np.concatenate([old.poses[rows], new.poses]),
+        drives=np.append(old.drives[rows], np.full(len(new), old.drives.max() + 1, np.int32)),
     )
-    updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': count}]
+    updates: list[Any] = [*model.quality.get('updates', ()), {'bag': name, 'images': len(new)}]
     quality = {**model.quality, 'updates': updates}
     return replace(model, keyframes=keyframes, quality=quality)
 

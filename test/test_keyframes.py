@@ -14,11 +14,7 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.features.keyframe_training import fit_keyframes, spread
-from sfa_localization.features.keyframes import (
-    Keyframes,
-    quantized,
-    texture,
-)
+from sfa_localization.features.keyframes import Keyframes, quantized, texture
 from sfa_localization.features.observation import Match
 from sfa_localization.metric.keyframe_map import usual_turn_std
 

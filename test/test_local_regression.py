@@ -5,9 +5,8 @@
 import numpy as np
 import pytest
 
-from sfa_localization.features import local_regression
 from sfa_localization.features.keyframes import normalized, spectrum
-from sfa_localization.features.local_regression import averaged, turned, weights
+from sfa_localization.features.local_regression import Neighbors, averaged, turned, vectors_of
 from sfa_localization.features.observation import Match
 
 ROWS = 8
@@ -52,9 +51,11 @@ class Scene:
         return place_among(self.seen(place, more), kept, places, self.columns)
 
 
-def place_among(image, keyframes, places, columns, *more, **others):
-    held = keyframes * weights(keyframes.shape[-1], columns)
-    return local_regression.place_among(image, held, places, columns, *more, **others)
+def place_among(image, keyframes, places, columns, channels=None, drives=None):
+    channels = channels or (slice(0, keyframes.shape[1]),)
+    drives = np.zeros(len(places), np.int32) if drives is None else drives
+    among = Neighbors(vectors_of(keyframes, columns), places, drives, channels, columns)
+    return among.find(image[None]).match()
 
 
 @SIZES
@@ -107,7 +108,7 @@ def test_a_channel_that_shows_something_else_counts_little(spoil):
     scene, place = Scene(), np.array([0.3, -0.2])
     keyframes = np.concatenate([scene.kept] * 2, axis=1)
     image = np.concatenate([scene.seen(place), spoil(scene.seen(place))])
-    channels = slice(ROWS), slice(ROWS, 2 * ROWS)
+    channels = slice(0, ROWS), slice(ROWS, 2 * ROWS)
     plain = place_among(image, keyframes, scene.places, 60)
     found = place_among(image, keyframes, scene.places, 60, channels)
     assert np.hypot(*(found.pose[:2] - place)) < 0.03

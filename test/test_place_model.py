@@ -196,7 +196,7 @@ def test_a_damaged_model_is_refused_with_the_remedy(saved):
     for cut in (0.1, 0.99):
         saved.write_bytes(whole[: int(len(whole) * cut)])
         refused(saved, 'not a sfa_localization place model')
-    for name in ('metric/linear', 'keyframes/textures', 'turned/axes'):
+    for name in ('metric/linear', 'keyframes/values', 'turned/axes'):
         data = bytearray(whole)
         data[whole.index(arrays[name].tobytes()) + 9] ^= 16
         saved.write_bytes(data)

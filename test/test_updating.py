@@ -115,7 +115,7 @@ def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     assert newer.network is model.network and newer.metric is model.metric
     assert newer.turned is model.turned and newer.keyframes.noise == model.keyframes.noise
     first = len(model.keyframes.poses)
-    np.testing.assert_array_equal(newer.keyframes.textures[:first], model.keyframes.textures)
+    np.testing.assert_array_equal(newer.keyframes.values[:first], model.keyframes.values)
     np.testing.assert_array_equal(newer.keyframes.poses[first:], new.poses)
     assert newer.keyframes.first.sum() == first and 'updates' not in model.quality
     newer.save(tmp_path / 'model.npz')
@@ -171,7 +171,8 @@ def finer(odometry, times=10):
 def added(model, count, x_m, name='later'):
     """The model with so many more keyframes in a row that begins at x."""
     poses = np.column_stack([x_m + 0.01 * np.arange(count), np.zeros((count, 2))])
-    textures = np.repeat(model.keyframes.textures[:1], count, 0)
+    texture = np.fft.irfft(model.keyframes.spectra([0]), model.keyframes.columns)
+    textures = np.repeat(updating.quantized(texture), count, 0)
     return extended(model, Additions(textures, poses), name)
 
 

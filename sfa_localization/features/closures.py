@@ -108,7 +108,7 @@ class _Drive:
 
     views: Views
     spectra: Spectra
-    rough: Spectra
+    rough: NDArray[np.float32]
 
     @classmethod
     def of(cls, views: Views) -> _Drive:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.image_features import evenly
-from sfa_localization.features.keyframes import NEIGHBORS, Keyframes, correlate
+from sfa_localization.features.keyframes import NEIGHBORS, Keyframes
 from sfa_localization.features.observation import LOWEST, Match, MatchNoise
 from sfa_localization.features.rotation_spread import (
     LENGTH_TO_STD,
@@ -34,7 +34,7 @@ a third of them, 16 m x 18 m are known as well; smaller places show nearer thing
 _TRIALS = 400
 # A keyframe is matched without those of the same stretch of driving: they are too alike.
 _STRETCH_M = 3.0
-_AT_ONCE = 64  # bounds the memory
+_AT_ONCE = 8  # bounds the memory
 # A place is unknown below this share of what keyframes of other stretches of driving reach.
 _LOWEST_SHARE = 0.5
 _TEMPERATURES = np.geomspace(0.003, 0.1, 12)
@@ -112,18 +112,16 @@ def _of_light(keyframes: Keyframes, rows: NDArray[np.int64], light: int) -> floa
 
 def left_out(keyframes: Keyframes, path_m: Array) -> Iterator[Correlations]:
     """Some keyframes, each correlated with those of other stretches: index, (K,) correlations,
-    -inf for its own stretch, and (K,) shifts. `path_m` (K,) is the distance driven until each.
+    -inf for its own stretch, and (K,) yaws rad. `path_m` (K,) is the distance driven until each.
     """
-    count, spectra = len(keyframes.poses), keyframes.spectra()
-    sample = evenly(count, _TRIALS)
+    sample = evenly(len(keyframes.poses), _TRIALS)
     for start in range(0, len(sample), _AT_ONCE):
         rows = sample[start : start + _AT_ONCE]
-        columns = keyframes.textures.shape[2]
-        found = correlate(spectra[rows], spectra, columns)
-        for row, scores, shifts in zip(rows.tolist(), *found, strict=True):
+        found = keyframes.correlated(keyframes.spectra(rows), np.arange(len(path_m)))
+        for row, scores, yaws in zip(rows.tolist(), *found, strict=True):
             scores[np.abs(path_m - path_m[row]) < _STRETCH_M] = -np.inf
             if np.isfinite(scores).sum() >= NEIGHBORS and scores.max() >= LOWEST:
-                yield row, scores, shifts
+                yield row, scores, yaws
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,9 +143,9 @@ class _Trial:
         keyframes: Keyframes,
         row: int,
         scores: NDArray[np.float32],
-        shifts: NDArray[np.float32],
+        yaws: NDArray[np.float32],
     ) -> _Trial:
-        match = keyframes.located(keyframes.spectra([row])[0], scores, shifts)
+        match = keyframes.located(keyframes.spectra([row])[0], scores, yaws)
         error = match.pose - keyframes.poses[row]
         reach = keyframes.reach(int(scores.argmax()))
         squares = (keyframes.elsewhere(scores, match.pose[:2], reach) ** 2).sum(1)

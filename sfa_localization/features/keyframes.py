@@ -15,7 +15,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -28,14 +29,8 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.local_regression import averaged, place_among, turned, weights
-from sfa_localization.features.observation import (
-    Leveled,
-    Match,
-    MatchNoise,
-    Spectra,
-    unlikeness,
-)
+from sfa_localization.features.local_regression import Neighbors, averaged, turned, vectors_of
+from sfa_localization.features.observation import Leveled, Match, MatchNoise, Spectra, unlikeness
 from sfa_localization.features.tilt import derivatives, find_tilt, visible
 
 Texture = NDArray[np.float32]
@@ -47,8 +42,10 @@ _BLUR = 1 / 37.5
 # Keeps the noise of dark and of plain surfaces small beside texture: of the brightness (8 bit),
 # and of its logarithm.
 _DARKEST, _FLATTEST = 8.0, 0.1
-# Textures are stored with one byte a pixel.
-_STEPS = 127 / 4.0  # for a standard deviation
+# Textures and spectra are stored with one byte a number: of a texture so many steps are a standard
+# deviation.
+_LARGEST, _LEAST_STEP = 127, 1e-9
+_STEPS = _LARGEST / 4.0
 NEIGHBORS = 24
 """Keyframes about a place that may be it."""
 _FEWEST = 6  # a place, its slopes along both axes, and as many to spare
@@ -60,9 +57,12 @@ _DRIVES = 3
 # How far it may put the image from the best keyframe, of the distance to its farthest neighbor.
 _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
-_COARSE, _CANDIDATES = 15, 64
+_COARSE, _CANDIDATES = 12, 64
 # The likest keyframes to which an image is leveled: with a tilt the first may be another place.
-_LEVELED = 48
+_LEVELED = 24
+# Sets of neighbors that are kept, 0.8 MB each: of both regressions in three drives. And keyframes
+# that are read at once.
+_KEPT, _AT_ONCE = 6, 512
 # Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees it is, even of a
 # known place, and each of these makes it like them up to 6 degrees on.
 _STEEP_RAD = math.radians(8.0) * np.array(
@@ -143,67 +143,86 @@ def correlate(spectra: Spectra, keyframes: Spectra, columns: int) -> Scores:
     """Largest correlation of T spectra (T, rows, F) with each of K (K, rows, F), (T, K), and the
     shift of columns, to a part of one of so many, at which it is reached.
     """
-    products = keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0)
-    return _peaks(products.transpose(2, 1, 0), columns)
+    return _peaks(keyframes.transpose(2, 0, 1) @ np.conj(spectra).transpose(2, 1, 0), columns)
 
 
 def _peaks(products: Spectra, columns: int) -> Scores:
-    """The same, (...), by products (..., F) over the rows."""
-    curves = fft.irfft(products, columns)
-    top = curves.argmax(-1)[..., None]
-    around = np.take_along_axis(curves, (top + np.arange(-1, 2)) % columns, -1)
-    left, middle, right = np.moveaxis(around, -1, 0)
-    bend = left - 2 * middle + right
-    part = np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1), 0)
-    return middle, np.asarray(top[..., 0] + part, np.float32)
+    """The same by products (F, K, T) over the rows."""
+    # Half columns: between whole ones, the same image would seem to be another one.
+    curves = fft.irfft(products, 2 * columns, axis=0)
+    top = curves.argmax(0)
+    around = (top + np.arange(-1, 2)[:, None, None]) % len(curves)
+    left, middle, right = np.take_along_axis(curves, around, 0)
+    bend = np.minimum(left - 2 * middle + right, -1e-9)
+    part = 0.5 * (left - right) / bend
+    return (2 * middle - (left - right) * part / 2).T, np.asarray((top + part) / 2, np.float32).T
 
 
-def _least(values: Array, number: int) -> NDArray[np.int64]:
+def _least(values: NDArray[Any], number: int) -> NDArray[np.int64]:
     """Where so many values (K,) are least, in their order."""
     few = len(values) <= number
     found = np.arange(len(values)) if few else np.argpartition(values, number)[:number]
     return found[np.argsort(values[found])]
 
 
-def coarse(spectra: Spectra) -> Spectra:
-    """Low frequencies of spectra (K, rows, F), in pairs of rows, of unit norm: (F', K, rows')."""
-    return np.ascontiguousarray(_low(spectra).transpose(2, 0, 1))
+def coarse(spectra: Spectra) -> Texture:
+    """Low frequencies of spectra (K, rows, F), the sums of four rows each, of unit norm: real parts
+    and below them imaginary ones, (F', 2 rows', K).
+    """
+    low = _low(spectra).transpose(2, 1, 0)
+    return np.ascontiguousarray(np.concatenate([low.real, low.imag], axis=1))
 
 
-def coarse_scores(spectra: Spectra, keyframes: Spectra) -> NDArray[np.float32]:
+def coarse_scores(spectra: Spectra, keyframes: Texture) -> NDArray[np.float32]:
     """About the largest correlation (T, K) of spectra (T, rows, F) with keyframes' `coarse`."""
-    products = keyframes @ np.conj(_low(spectra)).transpose(2, 1, 0)
-    curves = fft.irfft(products.transpose(2, 1, 0), 2 * len(keyframes), axis=2)
-    return np.asarray(curves.max(2))
+    low, (frequencies, rows, count) = _low(spectra).transpose(2, 0, 1), keyframes.shape
+    parts = np.concatenate([low.real, low.imag, -low.imag, low.real], axis=2)
+    images = parts.reshape(frequencies, -1, 2, rows).swapaxes(1, 2)
+    products = images.reshape(frequencies, -1, rows) @ keyframes
+    curves = _waves(frequencies) @ products.reshape(2 * frequencies, -1)
+    return np.asarray(curves.max(0).reshape(len(spectra), count))
+
+
+@cache
+def _waves(frequencies: int) -> Texture:
+    """What makes correlations (N,) at all headings of the parts (2 F,) of their coefficients."""
+    angle = np.outer(np.arange(2 * frequencies + 2), np.arange(1, frequencies + 1))
+    waves = np.exp(-1j * angle * np.pi / (frequencies + 1))
+    return np.asarray(waves.astype(np.complex64).view(np.float32))
 
 
 def _low(spectra: Spectra) -> Spectra:
-    """Low frequencies of spectra (T, rows, F), in pairs of rows, of unit norm."""
-    low = spectra[:, : spectra.shape[1] // 2 * 2, 1 : _COARSE + 1]
-    low = low[:, ::2] + low[:, 1::2] if low.shape[1] else spectra[:, :, 1 : _COARSE + 1]
-    low = np.concatenate([np.zeros_like(low[:, :, :1]), low], axis=2)
+    """Low frequencies of spectra (T, rows, F), the sums of four rows each, of unit norm."""
+    low = np.add.reduceat(spectra[:, :, 1 : _COARSE + 1], range(0, spectra.shape[1], 4), axis=1)
     return np.asarray(low / np.maximum(np.linalg.norm(low, axis=(1, 2), keepdims=True), 1e-9))
 
 
 @dataclass(frozen=True, slots=True)
 class Keyframes:
-    """`textures` (K, rows, columns) int8 and `poses` (K, 3) [x m, y m, yaw rad] in the map.
+    """K textures of so many `columns`, with their `poses` (K, 3) [x m, y m, yaw rad] in the map.
 
-    `drives` (K,) are the numbers of their drives, of which the first `trained` were those of the
-    training; drives of the training in one light have one number. To be matched they are held as
-    `aligned` spectra (K, rows, F), of images with yaw 0 and times `weights`, with the `phases`
-    (K, F) that turn these to their own yaws, and `coarse`.
+    They are held as the spectra of images with yaw 0: `values` (K, F, 2 rows) int8, real and
+    imaginary parts in turn, in units of `step`; and as `coarse` ones. `drives` (K,) are the
+    numbers of their drives, of which the first `trained` were those of the training; drives of the
+    training in one light have one number.
     """
 
-    textures: NDArray[np.int8]
+    values: NDArray[np.int8] | Texture
+    step: float
+    columns: int
     poses: Array
     noise: MatchNoise
     sphere: Sphere
     drives: NDArray[np.int32]
     trained: int
-    aligned: Spectra
-    phases: Spectra
-    coarse: Spectra
+    coarse: Texture = field(init=False, repr=False)
+    _last: dict[bytes, Neighbors] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        blocks = range(0, len(self.values), _AT_ONCE)
+        rough = [coarse(self.aligned(slice(at, at + _AT_ONCE), _COARSE + 1)) for at in blocks]
+        object.__setattr__(self, 'coarse', np.concatenate(rough, axis=2))
+        object.__setattr__(self, '_last', {})
 
     @classmethod
     def of(
@@ -213,25 +232,28 @@ class Keyframes:
         noise: MatchNoise,
         sphere: Sphere,
         drives: NDArray[np.int32] | None = None,
-        trained: int | None = None,
+        rounded: bool = True,
     ) -> Keyframes:
-        """Keyframes ready to be matched, by default of one drive, and all of the training. Raises
-        DataError for too few.
+        """Of quantized textures (K, rows, columns), by default of one drive; all are of the
+        training. Raises DataError for too few. Those that nobody saves need not be `rounded`.
         """
+        if len(poses) < _FEWEST:
+            raise DataError(f'{len(poses)} images are too few for keyframes')
         drives = np.zeros(len(poses), np.int32) if drives is None else drives
-        trained = int(drives.max(initial=0)) + 1 if trained is None else trained
-        first = np.count_nonzero(drives < trained)
-        if first < _FEWEST:
-            raise DataError(f'{first} images are too few for keyframes')
-        spectra, yaws = spectra_of(textures), poses[:, 2] * (1 if sphere.clockwise else -1)
-        phases = np.exp(-1j * np.multiply.outer(yaws, np.arange(spectra.shape[2])))
-        aligned = turned(spectra, yaws) * weights(spectra.shape[2], textures.shape[2])
-        matched = aligned, phases.astype(np.complex64), coarse(spectra)
-        return cls(textures, poses, noise, sphere, drives, trained, *matched)
+        parts = parts_of(textures, poses, sphere)
+        values, step = encoded(parts) if rounded else (parts, 1.0)
+        of_all = textures.shape[2], poses, noise, sphere, drives, int(drives.max()) + 1
+        return cls(values, step, *of_all)
 
     def spectra(self, rows: Any = slice(None)) -> Spectra:
         """The spectra (M, rows, F) of the textures of some keyframes, by default of all."""
-        return spectra_of(self.textures[rows])
+        return turned(self.aligned(rows), -self._sign * self.poses[rows, 2])
+
+    def aligned(self, rows: Any, frequencies: int | None = None) -> Spectra:
+        """The same with yaw 0, by default at all frequencies."""
+        held = self.values[rows, :frequencies].astype(np.float32)
+        held *= self.step
+        return np.asarray(held.view(np.complex64).swapaxes(1, 2))
 
     @property
     def first(self) -> NDArray[np.bool_]:
@@ -264,8 +286,8 @@ class Keyframes:
             return Leveled(panorama, panorama, tilt, whole, whole, *self._unmatched())
         level = leveled(panorama, tilt, self.sphere)
         image = texture(level)
-        rows = [part.stop - part.start for part in self._channels]
-        mask = np.concatenate([visible(tilt, n, self._columns, self.sphere) for n in rows])
+        rows = [part.stop - part.start for part in self.channels]
+        mask = np.concatenate([visible(tilt, n, self.columns, self.sphere) for n in rows])
         part = image * mask
         # What was not seen would count as unlike.
         part /= np.float32(max(float(np.linalg.norm(part)), 1e-6) * math.sqrt(mask.mean()))
@@ -275,19 +297,17 @@ class Keyframes:
     def _compared(self, panorama: Image, tilt: Array) -> Leveled:
         """The same, correlated with the keyframes that it is likest."""
         known = self._seen(panorama, tilt)
-        self._add(known, self._candidates(known.visible[None]))
+        scores = coarse_scores(known.visible[None], self.coarse)[0]
+        self._add(known, np.sort(_least(-scores, _CANDIDATES)))
         return known
 
     def _upright(self, known: Leveled) -> Leveled:
         """An image without the tilt that it has against one of its likest keyframes."""
-        likely = np.argsort(-known.scores, kind='stable')[:_LEVELED]
-        likely = likely[np.isfinite(known.scores[likely])]
-        apart = np.asarray(known.shifts[likely], float) * (2 * np.pi / self._columns)
-        apart -= self._sign * self.poses[likely, 2]
-        others = turned(self.aligned[likely], apart)
-        others /= weights(others.shape[2], self._columns)
-        image, level = (fft.irfft(each, self._columns) for each in (known.spectrum, others))
-        tilts, scores = find_tilt(image, level, self._channels, self.sphere)
+        likely = np.flatnonzero(np.isfinite(known.scores))
+        likely = likely[_least(-known.scores[likely], _LEVELED)]
+        level, turn = self.aligned(likely), -self._sign * known.yaws[likely]
+        others = level, turn.astype(float), self.columns, self.channels, self.sphere
+        tilts, scores = find_tilt(known.spectrum, *others)
         return self._leveled(known, tilts[int(scores.argmax())])
 
     def _leveled(self, known: Leveled, tilt: Array) -> Leveled:
@@ -302,7 +322,7 @@ class Keyframes:
 
     def match_level(self, known: Leveled, pattern: Spectra | None = None) -> Match:
         """The same for a leveled panorama; what is left of its tilt is taken out."""
-        known = replace(known, scores=known.scores.copy(), shifts=known.shifts.copy())
+        known = replace(known, scores=known.scores.copy(), yaws=known.yaws.copy())
         match = self._match_around(known, pattern)
         finer = self._leveled(known, match.tilt)
         if finer is not known:
@@ -313,35 +333,33 @@ class Keyframes:
         best = self.poses[int(known.scores.argmax()), :2]
         around = [self._around(best, drive) for drive in self._likeliest_drives(known.scores)]
         self._add(known, np.unique(np.concatenate(around)))
-        return self.located(known.spectrum, known.scores, known.shifts, pattern)
+        return self.located(known.spectrum, known.scores, known.yaws, pattern)
 
     def match_among(self, spectrum: Spectra, rows: NDArray[np.int64]) -> Match:
         """Find the spectrum (rows, F) of an image with some keyframes alone."""
-        found = self._unmatched()
-        self._correlate(spectrum, found, rows)
-        return self.located(spectrum, *found)
+        scores, yaws = self._unmatched()
+        scores[rows], yaws[rows] = (found[0] for found in self.correlated(spectrum[None], rows))
+        return self.located(spectrum, scores, yaws)
 
     def _unmatched(self) -> Scores:
-        """Correlations (K,) that are all unknown, and shifts (K,)."""
+        """Correlations (K,) that are all unknown, and yaws (K,)."""
         count = len(self.poses)
         return np.full(count, -np.inf, np.float32), np.zeros(count, np.float32)
 
-    def _correlate(self, spectrum: Spectra, found: Scores, rows: NDArray[np.int64]) -> None:
-        """Fill in some correlations (K,) of the spectrum (rows, F) of an image, and shifts (K,)."""
-        image = np.conj(spectrum / weights(spectrum.shape[1], self._columns))
-        products = (self.aligned[rows].transpose(2, 0, 1) @ image.T[:, :, None])[..., 0].T
-        found[0][rows], found[1][rows] = _peaks(products * self.phases[rows], self._columns)
+    def correlated(self, spectra: Spectra, rows: NDArray[np.int64]) -> Scores:
+        """Largest correlations (T, M) of spectra (T, rows, F) with some keyframes (M,), and the
+        yaws (T, M) rad at which they are reached.
+        """
+        images = np.conj(spectra).transpose(2, 1, 0) * np.float32(self.step)
+        held = self.values[rows].astype(np.float32).view(np.complex64)
+        scores, shifts = _peaks(held.swapaxes(0, 1) @ images, self.columns)
+        return scores, shifts * np.float32(-2 * self._sign * np.pi / self.columns)
 
     def _add(self, known: Leveled, wanted: NDArray[np.int64]) -> None:
         """Fill in what is still missing of the wanted keyframes' correlations."""
         wanted = wanted[np.isneginf(known.scores[wanted])]
-        self._correlate(known.visible, (known.scores, known.shifts), wanted)
-
-    def _candidates(self, spectrum: Spectra) -> NDArray[np.int64]:
-        """The keyframes that are likeliest by the coarse structure of the image."""
-        scores = coarse_scores(spectrum, self.coarse)[0]
-        number = min(_CANDIDATES, len(scores))
-        return np.sort(np.argpartition(-scores, number - 1)[:number])
+        scores, yaws = self.correlated(known.visible[None], wanted)
+        known.scores[wanted], known.yaws[wanted] = scores[0], yaws[0]
 
     def nearest(self, place: Array, number: int = NEIGHBORS) -> NDArray[np.int64]:
         """So many keyframes nearest to a place (2,) m."""
@@ -349,10 +367,9 @@ class Keyframes:
 
     def _likeliest_drives(self, scores: NDArray[np.float32]) -> list[int]:
         """The drives of the training that the likeliest keyframes are of, by correlations (K,)."""
-        first, likest = self.first, np.full(self.trained, -np.inf, np.float32)
-        np.maximum.at(likest, self.drives[first], scores[first])
-        numbers: list[int] = np.argsort(-likest, kind='stable')[:_DRIVES].tolist()
-        return numbers
+        own = {drive: scores[self.drives == drive] for drive in range(self.trained)}
+        likest = {drive: float(one.max()) for drive, one in own.items() if len(one)}
+        return sorted(likest, key=likest.__getitem__, reverse=True)[:_DRIVES]
 
     def _around(self, place: Array, drive: int) -> NDArray[np.int64]:
         """The keyframes of the regression about a place (2,) m: the nearest of a drive of the
@@ -368,23 +385,23 @@ class Keyframes:
         self,
         spectrum: Spectra,
         scores: NDArray[np.float32],
-        shifts: NDArray[np.float32],
+        yaws: NDArray[np.float32],
         pattern: Spectra | None = None,
     ) -> Match:
-        """The match of the spectrum (rows, F) of an image, by its correlations (K,), -inf where
-        unknown, and shifts (K,) of the columns; without a `pattern` that its light adds.
+        """The match of an image (rows, F) without the `pattern` of its light, by its correlations
+        (K,), -inf where unknown, and the yaws (K,) rad that each of them shows.
         """
         best = int(scores.argmax())
-        turn = -2 * self._sign * np.pi / self._columns
-        yaws = self.poses[:, 2] + turn * np.asarray(shifts, float)
-        reach = self.reach(best)
-        found = self._regressed(spectrum, scores, yaws, reach, pattern)
+        reach, start = self.reach(best), np.append(self.poses[best, :2], yaws[best])
+        if pattern is not None:
+            spectrum = spectrum - turned(pattern, -self._sign * start[2])
+        found = self._regressed(spectrum, scores, start, reach)
         *place, yaw = found.pose.tolist()
         elsewhere = np.zeros((3, 3))
         weight = self.likelihood(scores, self.noise.temperature)
         offset = self.elsewhere(scores, found.pose[:2], reach)
         elsewhere[:2, :2] = (offset * weight[:, None]).T @ offset
-        turns = np.square(wrap_angle(yaws[np.isfinite(scores)] - yaw))
+        turns = np.square(wrap_angle(yaws[np.isfinite(scores)].astype(float) - yaw))
         turns[(turns < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
         elsewhere[2, 2] = weight @ turns
         return replace(
@@ -397,79 +414,67 @@ class Keyframes:
         )
 
     def _regressed(
-        self,
-        spectrum: Spectra,
-        scores: NDArray[np.float32],
-        yaws: Array,
-        reach: float,
-        pattern: Spectra | None,
+        self, spectrum: Spectra, scores: NDArray[np.float32], start: Array, reach: float
     ) -> Match:
-        """Where the spectrum (rows, F) of an image without the light's `pattern` is among the
-        keyframes around the best one, of those whose correlations (K,) are known; `yaws` (K,) rad
-        are what each of them shows, `reach` m how far the place may be from the best. Each drive of
-        the training says so by itself, and counts by how certain it is.
+        """Where the spectrum (rows, F) of an image is among the keyframes around the best one, of
+        those whose correlations (K,) are known; its pose is the `start` (3,), `reach` m how far the
+        place may be from it. Each drive of the training says so by itself, and counts by how
+        certain it is.
         """
-        best, known = int(scores.argmax()), np.isfinite(scores)
-        start = np.append(self.poses[best, :2], yaws[best])
-        seen = np.concatenate([spectrum[None], self._by_tilt(spectrum)])
-        by_drive = [
-            self._among(drive, seen, start, known, reach, pattern)
-            for drive in self._likeliest_drives(scores)
-        ]
+        seen, known = self._with_tilts(spectrum), np.isfinite(scores)
+        drives = self._likeliest_drives(scores)
+        by_drive = [self._among(drive, seen, start, known, reach) for drive in drives]
         parts = [one for one in by_drive if one is not None]
         if not parts:
-            return Match(start, unlikeness(float(scores[best])), 0.0, 1.0)
+            return Match(start, unlikeness(float(scores.max())), 0.0, 1.0)
         return averaged(parts, [1 / self._variance(one) for one in parts])
 
     def _among(
-        self,
-        drive: int,
-        seen: Spectra,
-        start: Array,
-        known: NDArray[np.bool_],
-        reach: float,
-        pattern: Spectra | None,
+        self, drive: int, seen: Spectra, start: Array, known: NDArray[np.bool_], reach: float
     ) -> Match | None:
         """The same of a spectrum with its derivatives by tilt (3, rows, F) among the `known` (K,)
-        keyframes of one drive, from a pose (3,) on; None where they are too few.
+        keyframes of one drive; None where they are too few.
         """
-        found, pose, limit = None, start.copy(), 2 * np.pi / self._columns
+        found, pose, limit = None, start.copy(), 2 * np.pi / self.columns
         for _ in range(_REPEATED):
             near = self._around(pose[:2], drive)
             near = near[known[near]]
             if len(near) < _FEWEST:
                 break
-            here = seen
-            if pattern is not None:
-                here = np.concatenate([seen[:1] - turned(pattern, -self._sign * pose[2]), seen[1:]])
-            found = self._placed(here, float(pose[2]), near)
+            found = self._near(np.sort(near)).find(seen, self._sign * float(pose[2]))
             step = found.pose[:2] - start[:2]
             apart = float(np.hypot(*step))
             pose[:2] = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
-            pose[2] += np.clip(found.pose[2] - pose[2], -limit, limit)
-            found = replace(found, pose=pose.copy())
+            pose[2] += np.clip(self._sign * found.pose[2], -limit, limit)
             if apart < _NEARER * reach:
                 break
-        return found
+        return None if found is None else replace(found.match(), pose=pose)
 
     def place(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
         """Where the spectrum (rows, F) of an image with about this yaw rad is among some keyframes:
         `Match.shares` of them.
         """
-        return self._placed(np.concatenate([image[None], self._by_tilt(image)]), yaw, near)
-
-    def _placed(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
-        """The same with the derivatives of the image, (3, rows, F)."""
-        among = image, self.aligned[near], self.poses[near, :2], self._columns
-        found = place_among(*among, self._channels, self.drives[near], self._sign * yaw)
+        found = self._near(near).find(self._with_tilts(image), self._sign * yaw).match()
         found.pose[2] = yaw + self._sign * found.pose[2]
         return found
 
-    def _by_tilt(self, image: Spectra) -> Spectra:
-        """Derivatives (2, rows, F) of the spectrum (rows, F) of an image by roll and pitch."""
-        texture = fft.irfft(image, self._columns)
-        parts = [derivatives(texture[rows], self.sphere) for rows in self._channels]
-        return spectrum(np.concatenate(parts, axis=1))
+    def _near(self, rows: NDArray[np.int64]) -> Neighbors:
+        """Some keyframes. Their products are costly, and a robot stays among them for a while."""
+        key = rows.tobytes()
+        found = self._last.pop(key, None)
+        if found is None:
+            vectors, places = vectors_of(self.aligned(rows), self.columns), self.poses[rows, :2]
+            found = Neighbors(vectors, places, self.drives[rows], self.channels, self.columns)
+        self._last[key] = found
+        if len(self._last) > _KEPT:
+            del self._last[next(iter(self._last))]
+        return found
+
+    def _with_tilts(self, image: Spectra) -> Spectra:
+        """Of an image (rows, F) and of its derivatives by roll and pitch: (3, rows, F)."""
+        texture = fft.irfft(image, self.columns)
+        slopes = spectrum(derivatives(texture, self.channels, self.sphere))
+        return np.concatenate([image[None], slopes])
 
     def _variance(self, match: Match) -> float:
         """Variance m^2 along each axis of a place by the keyframes of one drive."""
@@ -494,39 +499,47 @@ class Keyframes:
         return np.where(near[:, None], 0.0, offset)
 
     @property
-    def _columns(self) -> int:
-        return int(self.textures.shape[2])
-
-    @property
     def _sign(self) -> int:
         """Of the angle by which `turned` makes of an image at some yaw that at another."""
         return 1 if self.sphere.clockwise else -1
 
     @property
-    def _channels(self) -> tuple[slice, ...]:
-        return channels(self.textures.shape[1])
+    def channels(self) -> tuple[slice, ...]:
+        return channels(self.values.shape[2] // 2)
 
     def reach(self, best: int) -> float:
         """How far, m, the regression may put an image from the best keyframe."""
-        own = self.drives == self.drives[best]
-        apart = self.poses[own if self.first[best] else self.first, :2] - self.poses[best, :2]
-        farthest = np.sort(np.hypot(*apart.T))[:NEIGHBORS][-1]
+        drive = self.drives[best]
+        own = self.drives == drive if drive < self.trained else self.first
+        apart = np.hypot(*(self.poses[own, :2] - self.poses[best, :2]).T)
+        farthest = np.partition(apart, min(NEIGHBORS, len(apart)) - 1)[:NEIGHBORS].max()
         return _REACH_SHARE * max(float(farthest), 1e-6)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""
-        return {
-            'textures': self.textures,
-            'poses': self.poses,
-            'noise': np.array(dataclasses.astuple(self.noise)),
-            'drives': self.drives,
-            'trained': np.array(self.trained),
-        }
+        kept = 'values', 'step', 'columns', 'poses', 'drives', 'trained'
+        arrays = {name: np.asarray(getattr(self, name)) for name in kept}
+        return {**arrays, 'noise': np.array(dataclasses.astuple(self.noise))}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], sphere: Sphere) -> Keyframes:
         """Read the arrays of `to_arrays`, of panoramas that show so much of the `sphere`."""
-        noise = MatchNoise(*np.asarray(arrays['noise'], float).tolist())
-        textures = np.asarray(arrays['textures'], np.int8)
-        poses, drives = np.asarray(arrays['poses'], float), np.asarray(arrays['drives'], np.int32)
-        return cls.of(textures, poses, noise, sphere, drives, int(arrays['trained']))
+        values, step = np.asarray(arrays['values'], np.int8), float(arrays['step'])
+        poses, drives = arrays['poses'].astype(float), arrays['drives'].astype(np.int32)
+        noise = MatchNoise(*arrays['noise'].astype(float).tolist())
+        columns, trained = int(arrays['columns']), int(arrays['trained'])
+        return cls(values, step, columns, poses, noise, sphere, drives, trained)
+
+
+def parts_of(textures: NDArray[np.int8], poses: Array, sphere: Sphere) -> Texture:
+    """`Keyframes.values` of textures (K, rows, columns) with poses (K, 3), as they are."""
+    spectra = turned(spectra_of(textures), poses[:, 2] * (1 if sphere.clockwise else -1))
+    return spectra.swapaxes(1, 2).copy().view(np.float32)
+
+
+def encoded(parts: Texture, step: float = 0.0) -> tuple[NDArray[np.int8], float]:
+    """The same (K, F, 2 rows) with one byte each, and the step, by default the one with which the
+    largest is 127: one thousandth of their squares is lost.
+    """
+    step = step or max(float(np.abs(parts).max()) / _LARGEST, _LEAST_STEP)
+    return np.rint(parts / step).clip(-_LARGEST, _LARGEST).astype(np.int8), step

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, sparse
+from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from sfa_localization.camera.leveling import TILTED_RAD, LeveledPanoramas
@@ -33,7 +33,6 @@ from sfa_localization.features.keyframes import (
     correlate,
     spectra_of,
 )
-from sfa_localization.features.local_regression import turned
 from sfa_localization.features.tilt import find_tilt
 
 Complex = NDArray[np.complex128]
@@ -116,8 +115,7 @@ def links_between(views: Views, sphere: Sphere) -> Links:
             continue
         shifts = correlate(image[None], spectra[likely], columns)[1][0]
         turn = np.asarray(shifts, float) * (2 * np.pi / columns)
-        others = fft.irfft(turned(spectra[likely], turn), columns)
-        tilts, alike = find_tilt(fft.irfft(image, columns), others, parts, sphere)
+        tilts, alike = find_tilt(image, spectra[likely], turn, columns, parts, sphere)
         heading = turn if sphere.clockwise else -turn
         both = np.column_stack([np.full(len(likely), row), likely, tilts, heading])
         found.append(both[alike >= LIKE])

@@ -11,12 +11,13 @@ little to do with them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.linalg import lapack
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.observation import Match, Spectra
@@ -65,94 +66,155 @@ class _Regression:
 
 
 @dataclass(frozen=True, slots=True)
-class _Compared:
-    """C channels and a mean of their N keyframes: its derivative by the angle, `turning` (D,), the
-    shares of its likeness to the mean that the image has kept, `gains` (C,), and the
-    products (C, N + 2 + T, N + 2 + T) of keyframes, the image and its derivatives, which get back
-    what they lack, and `turning`.
-    """
+class Neighbors:
+    """N keyframes at `places` (N, 2) m, among which images are located: the `vectors` (N, D) of
+    their spectra (rows, F) at one heading, and the `products` (C, N, N) of these in C `channels`.
 
-    turning: Vectors
-    gains: Array
-    products: Array
-
-
-@dataclass(frozen=True, slots=True)
-class _Textures:
-    """N keyframes, an image, and T derivatives of it by what is no matter of its place: their
-    `vectors` (N + 1 + T, D), in that order, and the products (C, N + 1 + T, N + 1 + T) of these in
-    C channels, which are correlations; of a channel the vectors are those `parts`.
+    Channels are rows, all in their order, that may be unlike for reasons of their own: each counts
+    by how well the keyframes explain it. Textures have so many `columns`; keyframes of different
+    `drives` (N,) may differ by their light.
     """
 
     vectors: Vectors
-    parts: tuple[slice, ...]
-    products: Array
-    frequencies: int
+    places: Array
+    drives: NDArray[np.int32]
+    channels: tuple[slice, ...]
+    columns: int
+    products: Array = field(init=False, repr=False)
 
-    @classmethod
-    def of(cls, keyframes: Spectra, image: Spectra, channels: Sequence[slice]) -> _Textures:
-        """Of spectra (N, rows, F) and (1 + T, rows, F), times `weights`."""
-        both = np.concatenate([keyframes, image])
-        count, rows, frequencies = both.shape
-        vectors = both.reshape(count, -1).view(np.float32)
-        size = 2 * frequencies
-        parts = tuple(slice(*(size * end for end in one.indices(rows)[:2])) for one in channels)
-        products = [vectors[:, part] @ vectors[:, part].T for part in parts]
-        return cls(vectors, parts, np.array(products, np.float64), frequencies)
+    def __post_init__(self) -> None:
+        products = _with(self.vectors, np.zeros((len(self.channels), 0, 0)), self.channels)
+        object.__setattr__(self, 'products', products)
 
-    def about(self, mean: Array) -> _Compared:
-        """With a mean by shares (N,) of the keyframes."""
-        count, size = len(mean), len(self.vectors)
-        spectra = (mean.astype(np.float32) @ self.vectors[:count]).view(np.complex64)
-        by_angle = np.tile(1j * np.arange(self.frequencies), len(spectra) // self.frequencies)
-        turning = (spectra * by_angle.astype(np.complex64)).view(np.float32)
-        products = np.zeros((len(self.parts), size + 1, size + 1))
-        products[:, :-1, :-1] = self.products
-        for product, part in zip(products, self.parts, strict=True):
-            product[-1, :-1] = product[:-1, -1] = self.vectors[:, part] @ turning[part]
-            product[-1, -1] = turning[part] @ turning[part]
-        kept, whole = self.products[:, count, :count] @ mean, self.products[:, :count, :count]
-        gains = np.maximum(kept / np.maximum(whole @ mean @ mean, 1e-12), _LEAST_GAIN)
-        products[:, count:-1] /= gains[:, None, None]
-        products[:, :, count:-1] /= gains[:, None, None]
-        return _Compared(turning, gains, products)
-
-    def remainder(
-        self, found: _Regression, compared: _Compared, angle: float, columns: int
-    ) -> tuple[Spectra, Array]:
-        """What is left of the image, turned by an angle, (rows, F), and by how much, m, each
-        channel moves the place in each sector of the panorama, (2, C, sectors): light and what
-        hides the view are alike within one, not in all.
+    def find(self, image: Spectra, angle: float = 0.0) -> Found:
+        """The place of the spectrum of a texture, (1, rows, F), followed by its derivatives
+        (1 + 2, rows, F) by roll and pitch, or without; at the heading of the keyframes when it is
+        `turned` by an angle rad.
         """
-        combine, changes = found.combine.astype(np.float32), len(found.changed)
-        vectors = combine[:, -1:] * compared.turning
-        for part, gain in zip(self.parts, compared.gains.tolist(), strict=True):
-            own = combine[:, :-1].copy()
-            own[:, -changes:] /= gain
-            vectors[:, part] += own @ self.vectors[:, part]
-        spectra = vectors.view(np.complex64).reshape(3, -1, self.frequencies)
-        spectra = turned(spectra / weights(self.frequencies, columns), angle)
+        vectors, count = vectors_of(turned(image, angle), self.columns), len(self.vectors)
+        seen = _with(vectors, self.products, self.channels, self.vectors)
+        basis = _Basis.of(seen[:, count, :count].sum(axis=0), self.drives, self.places)
+        turning, gains, products = self._compared(seen, vectors, basis.mean)
+        trust = self._trust(gains, products, basis)
+        found = _regressed(_summed(trust, products), basis)
+        for _ in range(_WEIGHED if len(basis.means) > 1 else 0):
+            basis = basis.about(found.place)
+            turning, gains, products = self._compared(seen, vectors, basis.mean)
+            found = _regressed(_summed(trust, products), basis)
+        return Found(self, angle, vectors, turning, gains, trust, found)
+
+    def by_row(self, values: Array) -> Vectors:
+        """Of each row (rows,) what is given of channels (C,)."""
+        heights = [part.stop - part.start for part in self.channels]
+        return np.repeat(values, heights).astype(np.float32)
+
+    def _compared(self, seen: Array, image: Vectors, mean: Array) -> tuple[Vectors, Array, Array]:
+        """With a mean by shares (N,) of the keyframes: its derivative by the angle, `turning`
+        (1, D), the shares of its likeness to the mean that the image has kept in each channel,
+        `gains` (C,), and the products (C, N + 2 + T, N + 2 + T) of keyframes, the image and its T
+        derivatives, which get back what they lack, and `turning`.
+        """
+        count, rows = len(mean), self.channels[-1].stop
+        spectra = (mean.astype(np.float32) @ self.vectors).view(np.complex64).reshape(rows, -1)
+        by_angle = (1j * np.arange(spectra.shape[1])).astype(np.complex64)
+        turning = (spectra * by_angle).view(np.float32).reshape(1, -1)
+        alike = np.maximum(self.products @ mean @ mean, 1e-12)
+        gains = np.maximum(seen[:, count, :count] @ mean / alike, _LEAST_GAIN)
+        products = _with(turning, seen, self.channels, self.vectors, image)
+        products[:, count:-1] /= gains[:, None, None]
+        products[..., count:-1] /= gains[:, None, None]
+        return turning, gains, products
+
+    def _trust(self, gains: Array, products: Array, basis: _Basis) -> Array:
+        """How much each channel counts, 1 at most: by how well the keyframes explain it there."""
+        left = _regressed(_summed(gains**2, products), basis).combine[0]
+        sizes = [part.stop - part.start for part in self.channels]
+        errors = (products @ left) @ left / sizes
+        trust = 1 / (errors + errors.min() + 1e-12)
+        return np.asarray(trust / trust.max())
+
+
+def vectors_of(spectra: Spectra, columns: int) -> Vectors:
+    """Spectra (M, rows, F) of textures of so many columns as vectors (M, D), whose products are
+    those of the textures.
+    """
+    weighted = spectra * weights(spectra.shape[2], columns)
+    return weighted.reshape(len(spectra), -1).view(np.float32)
+
+
+def _with(new: Vectors, products: Array, channels: Sequence[slice], *known: Vectors) -> Array:
+    """Products (C, n, n) of vectors that are `known`, and M new ones: (C, n + M, n + M)."""
+    size, count = new.shape[1] // channels[-1].stop, products.shape[1]
+    both = np.empty((len(products), count + len(new), count + len(new)))
+    both[:, :count, :count] = products
+    for one, part in zip(both, channels, strict=True):
+        own = np.s_[:, part.start * size : part.stop * size]
+        one[count:] = np.hstack([new[own] @ each[own].T for each in (*known, new)])
+    both[:, :count, count:] = both[:, count:, :count].swapaxes(1, 2)
+    return both
+
+
+def _summed(shares: Array, products: Array) -> Array:
+    """The sum (N, N) of products (C, N, N) by shares (C,)."""
+    return np.asarray((shares @ products.reshape(len(shares), -1)).reshape(products.shape[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Where an image, turned by an `angle`, is `among` keyframes."""
+
+    among: Neighbors
+    angle: float
+    image: Vectors
+    turning: Vectors
+    gains: Array
+    trust: Array
+    regression: _Regression
+
+    @property
+    def pose(self) -> Array:
+        """Its place m, and the angle rad by which `turned` would still turn it to them, (3,)."""
+        return np.append(self.regression.place, -self.regression.changed[-1])
+
+    def match(self) -> Match:
+        """With what else is known of it."""
+        found, (left, moved) = self.regression, self._remainder()
+        offset = self.among.places - found.place
+        aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
+        made = Match(self.pose, found.unlike, found.variation, aside, moved @ moved.T, left=left)
+        tilt = found.changed[:-1] if len(found.changed) > 1 else made.tilt
+        return replace(made, shares=found.shares, tilt=tilt)
+
+    def _remainder(self) -> tuple[Spectra, Array]:
+        """What is left of the image, as it was seen, (rows, F), and by how much, m, each sector of
+        the panorama moves the place, (2, sectors): light and what hides the view are alike within
+        one, not in all.
+        """
+        among, combine = self.among, self.regression.combine.astype(np.float32)
+        gains, columns = among.by_row(self.gains), among.columns
+        count, frequencies = len(among.vectors), columns // 2 + 1
+        vectors = combine[:, count:-1] @ self.image / np.repeat(gains, 2 * frequencies)
+        vectors += combine[:, -1:] * self.turning + combine[:, :count] @ among.vectors
+        spectra = vectors.view(np.complex64).reshape(3, -1, frequencies)
+        spectra = turned(spectra * (1 / weights(frequencies, columns)), -self.angle)
         left, *along = fft.irfft(spectra, columns)
-        rows = [part.start // (2 * self.frequencies) for part in self.parts]
         sectors = min(_SECTORS, columns)
         starts = np.arange(sectors) * columns // sectors
-        pull = np.add.reduceat(along * left, rows, axis=1)
-        moved = np.add.reduceat(pull, starts, axis=2).astype(np.float64)
-        gains = np.repeat(compared.gains, np.diff([*rows, len(left)])).astype(np.float32)
-        return spectra[0] * gains[:, None], moved
+        moved = np.add.reduceat(among.by_row(self.trust) @ (along * left), starts, axis=1)
+        return spectra[0] * gains[:, None], moved.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class _Basis:
     """What N keyframes are compared with: shares `mean` (N,) of the mean that is most like the
-    image, `means` (D, N) of that of each drive's, whose number is `drive` (N,), and the `likest`
-    (D,), the largest correlation of each; `places` (N, 2) m, and their weights in the regression
-    (N,), of sum 1.
+    image, `means` (D, N) of that of each drive's, which is the `owner` (D, N) of some, and the
+    `likest` (D,), the largest correlation of each; `places` (N, 2) m, and their weights in the
+    regression (N,), of sum 1.
     """
 
     mean: Array
     means: Array
-    drive: NDArray[np.intp]
+    owner: Array
     likest: Array
     places: Array
     weight: Array
@@ -162,14 +224,14 @@ class _Basis:
         """By the correlations (N,) of the keyframes with the image, which say how near they are
         among those of one drive.
         """
-        numbers, drive = np.unique(drives, return_inverse=True)
-        own = np.where(numbers[:, None] == drives, scores, -np.inf)
+        owner = np.unique(drives)[:, None] == drives
+        own = np.where(owner, scores, -np.inf)
         likest = own.max(axis=1)
         means = np.exp((own - likest[:, None]) / _LIKENESS)
         means /= means.sum(axis=1, keepdims=True)
         mean = np.exp((scores - scores.max()) / _LIKENESS)
-        weight = means.sum(axis=0) / len(numbers)
-        return cls(mean / mean.sum(), means, drive, likest, places, weight)
+        weight = means.sum(axis=0) / len(means)
+        return cls(mean / mean.sum(), means, owner.astype(float), likest, places, weight)
 
     def about(self, place: Array) -> _Basis:
         """With a mean that counts each drive by how certain a place (2,) m is by it: a light that
@@ -181,48 +243,6 @@ class _Basis:
         mean = (1 / np.maximum(variance, 1e-6)) @ self.means
         mean /= mean.sum()
         return replace(self, mean=mean, weight=mean)
-
-
-def place_among(
-    image: Spectra,
-    keyframes: Spectra,
-    places: Array,
-    columns: int,
-    channels: Sequence[slice] = (slice(None),),
-    drives: NDArray[np.int32] | None = None,
-    angle: float = 0.0,
-) -> Match:
-    """The place of the spectrum (rows, F) of a texture of so many columns, among those (N, rows,
-    F) of keyframes, times `weights`, at places (N, 2) m, all at the heading of the image when it is
-    `turned` by an angle rad; it may be followed by its derivatives (1 + 2, rows, F) by roll and
-    pitch, which then are found too. The yaw of the match is the angle rad by which `turned` would
-    still turn the image to them.
-
-    `channels` are rows, all in their order, that may be unlike for reasons of their own: each
-    counts by how well the keyframes explain it. Keyframes of different `drives` (N,) may differ by
-    their light.
-    """
-    image, count = image if image.ndim == 3 else image[None], len(places)
-    seen = turned(image, angle) * weights(image.shape[-1], columns)
-    textures = _Textures.of(keyframes, seen, channels)
-    scores = textures.products[:, count, :count].sum(axis=0)
-    drives = np.zeros(count, np.int32) if drives is None else drives
-    basis = _Basis.of(scores, drives, places)
-    compared = textures.about(basis.mean)
-    trust = _trust(textures, compared, basis)
-    found = _regressed(np.tensordot(trust, compared.products, 1), basis)
-    for _ in range(_WEIGHED if len(basis.means) > 1 else 0):
-        basis = basis.about(found.place)
-        compared = textures.about(basis.mean)
-        found = _regressed(np.tensordot(trust, compared.products, 1), basis)
-    left, moves = textures.remainder(found, compared, -angle, columns)
-    moved = np.tensordot(moves, trust, (1, 0))
-    offset = places - found.place
-    aside = float(np.hypot(*offset.mean(0)) / max(np.hypot(*offset.T).mean(), 1e-9))
-    *tilt, turning = found.changed
-    pose, noise = np.append(found.place, -turning), moved @ moved.T
-    made = Match(pose, found.unlike, found.variation, aside, noise, left=left, shares=found.shares)
-    return replace(made, tilt=np.array(tilt)) if tilt else made
 
 
 def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
@@ -251,79 +271,49 @@ def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
     )
 
 
-def _trust(textures: _Textures, compared: _Compared, basis: _Basis) -> Array:
-    """How much each channel counts, 1 at most: by how well the keyframes explain it there."""
-    products = np.tensordot(np.square(compared.gains), compared.products, 1)
-    left = _regressed(products, basis).combine[0]
-    sizes = [part.stop - part.start for part in textures.parts]
-    errors = (compared.products @ left) @ left / sizes
-    trust = 1 / (errors + errors.min() + 1e-12)
-    return np.asarray(trust / trust.max())
-
-
-@dataclass(frozen=True, slots=True)
-class _Apart:
-    """What N keyframes and an image differ by: the products (N + 1, N + 1) of these differences;
-    what was taken out of them, shares `out` (C, N + 1) of combinations `common` (C, N + 1 + M) of
-    keyframes, the image and M changes; and the `square` of the mean.
+def _apart(products: Array, basis: _Basis) -> tuple[Array, Array, Array, float]:
+    """What N keyframes and an image differ by, of the products (N + 1 + M, N + 1 + M) of these and
+    M changes. Neither the drive, nor likeness to the mean, nor a change is a matter of the place:
+    besides the products (N + 1, N + 1) of the differences what was taken out of them, shares
+    (C, N + 1) of combinations (C, N + 1 + M), and the square of the mean.
     """
-
-    products: Array
-    out: Array
-    common: Array
-    square: float
-
-    @classmethod
-    def of(cls, products: Array, basis: _Basis) -> _Apart:
-        """Neither the drive, nor likeness to the mean, nor a change is a matter of the place: of
-        the products (N + 1 + M, N + 1 + M) the parts of all vectors along these are taken out.
-        """
-        count, means, drive = len(basis.mean), basis.means, basis.drive
-        common = np.zeros((len(products) - count, len(products)))
-        common[0, :count] = basis.mean
-        common[1:, count + 1 :] = np.eye(len(common) - 1)
-        apart = products[:, : count + 1].copy()
-        apart[:, :-1] -= (apart[:, :-1] @ means.T)[:, drive]
-        both = apart[: count + 1].copy()
-        both[:-1] -= (means @ both[:-1])[drive]
-        within = common @ products @ common.T
-        square = max(float(within[0, 0]), 1e-12)
-        within[np.diag_indices(len(common))] += 1e-9 * within.diagonal() + 1e-12
-        along = common @ apart
-        out = np.asarray(np.linalg.solve(within, along), float)
-        return cls(both - along.T @ out, out, common, square)
+    count, means, owner = len(basis.mean), basis.means, basis.owner
+    common = np.eye(len(products))[count:]
+    common[0, :count], common[0, count] = basis.mean, 0.0
+    apart = products[:, : count + 1].copy()
+    apart[:, :-1] -= (products[:, :count] @ means.T) @ owner
+    both = apart[: count + 1].copy()
+    both[:-1] -= owner.T @ (means @ apart[:count])
+    within = common @ products @ common.T
+    square = max(float(within[0, 0]), 1e-12)
+    within[np.diag_indices(len(common))] += 1e-9 * within.diagonal() + 1e-12
+    along = common @ apart
+    out = np.asarray(np.linalg.solve(within, along), float)
+    return both - along.T @ out, out, common, square
 
 
 def _regressed(products: Array, basis: _Basis) -> _Regression:
     """The regression by the products (N + 1 + M, N + 1 + M) of N keyframes, the image, and M
     changes that are no matter of the place.
     """
-    count, means, drive = len(basis.mean), basis.means, basis.drive
-    apart = _Apart.of(products, basis)
-    root = np.sqrt(basis.weight)
-    gram, shown = apart.products[:-1, :-1] * np.outer(root, root), apart.products[:-1, -1]
-    variation = float(np.trace(gram))
-    ridge = max(_RIDGE * variation, 1e-12)
-    offsets = basis.places - (means @ basis.places)[drive]
-    wanted = np.column_stack([shown, offsets]) * root[:, None]
-    share = (np.linalg.solve(gram + ridge * np.eye(count), wanted) * root[:, None]).T
-    share[0] *= -1
-    sums = np.stack([np.bincount(drive, one, len(means)) for one in share])
-    of_image = np.array([1.0, 0.0, 0.0])
-    centered = np.column_stack([share, of_image])
+    count, means, owner = len(basis.mean), basis.means, basis.owner
+    apart, out, common, square = _apart(products, basis)
+    root = np.sqrt(basis.weight)[:, None]
+    gram = apart[:-1, :-1] * root * root.T
+    variation = float(gram.trace())
+    gram.flat[:: count + 1] += max(_RIDGE * variation, 1e-12)
+    offsets = basis.places - owner.T @ (means @ basis.places)
+    wanted = np.column_stack([-apart[:-1, -1], offsets]) * root
     combine = np.zeros((3, len(products)))
-    own = share - sums @ means
-    combine[:, : count + 1] = np.column_stack([own, of_image])
-    combine -= (centered @ apart.out.T) @ apart.common
-    shares = basis.mean - own[0]
-    return _Regression(
-        shares @ basis.places,
-        shares,
-        apart.out[1:, -1],
-        max(float(centered[0] @ apart.products @ centered[0]), 0.0) / apart.square,
-        variation / apart.square,
-        combine,
-    )
+    combine[0, count] = 1.0
+    combine[:, :count] = (lapack.dposv(gram, wanted)[1] * root).T
+    centered = combine[:, : count + 1].copy()
+    combine[:, :count] -= (centered[:, :-1] @ owner.T) @ means
+    shares = basis.mean - combine[0, :count]
+    combine -= (centered @ out.T) @ common
+    unlike = max(float(centered[0] @ apart @ centered[0]), 0.0) / square
+    place, changed = shares @ basis.places, out[1:, -1]
+    return _Regression(place, shares, changed, unlike, variation / square, combine)
 
 
 @cache

@@ -156,7 +156,7 @@ class Leveled:
     """The `panorama` (H, W, 3) that a `tilt`, roll and pitch (2,) rad, made the one that was
     `seen`, and what is known of it: the `spectrum` (rows, F) of its texture, that of the part that
     was `visible`, so that its correlations are those of the whole; the `scores` (K,), correlations
-    with the keyframes, -inf where unknown, and the `shifts` (K,) of the columns.
+    with the keyframes, -inf where unknown, and the `yaws` (K,) rad at which they are reached.
     """
 
     seen: Image
@@ -165,7 +165,7 @@ class Leveled:
     spectrum: Spectra
     visible: Spectra
     scores: NDArray[np.float32]
-    shifts: NDArray[np.float32]
+    yaws: NDArray[np.float32]
 
     @property
     def score(self) -> float:

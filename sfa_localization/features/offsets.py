@@ -56,7 +56,8 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
     if len(known) < _FEWEST:
         return Offsets.none()
     drives = views.run[known].astype(np.int32)
-    among = Keyframes.of(views.textures[known], poses[known], MatchNoise(), sphere, drives)
+    own = views.textures[known], poses[known]
+    among = Keyframes.of(*own, MatchNoise(), sphere, drives, rounded=False)
     path, found = views.path_m[known], []
     for row in _spaced(path, drives):
         near = among.nearest(among.poses[row, :2], _NEAREST)

@@ -18,18 +18,18 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy import fft, linalg
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.sphere import Sphere, rotation
+from sfa_localization.features.local_regression import turned
+from sfa_localization.features.observation import Spectra
 
 Texture = NDArray[np.float32]
 
 _LARGEST = np.radians(12.0)
 """Of the tilts that are tried, along each axis."""
-_EVERY = 2
-"""So many columns are one apart where tilts are tried: a tilt is the same in all."""
 _UNLIKELY = 0.01 / np.radians(4.0) ** 2
 """What a correlation with a tilt counts less, per squared rad: few tilts are above 4 degrees."""
 
@@ -40,25 +40,28 @@ def visible(tilt: Array, rows: int, columns: int, sphere: Sphere) -> NDArray[np.
     return np.asarray((up > np.sin(sphere.low)) & (up < np.sin(sphere.high)))
 
 
-def derivatives(texture: Texture, sphere: Sphere) -> Texture:
-    """Of a panorama (rows, columns) by roll and pitch: (2, rows, columns) per rad."""
-    sin, cos, aside = _waves(sphere, *texture.shape)
-    up = np.empty_like(texture)
-    np.subtract(texture[:-2], texture[2:], out=up[1:-1])
-    up[0], up[-1] = 2 * (texture[0] - texture[1]), 2 * (texture[-2] - texture[-1])
-    up *= np.float32(texture.shape[0] / (2 * (sphere.high - sphere.low)))
-    left = (np.roll(texture, -1, 1) - np.roll(texture, 1, 1)) * aside
+def derivatives(texture: Texture, channels: Sequence[slice], sphere: Sphere) -> Texture:
+    """Of a panorama (rows, columns) by roll and pitch: (2, rows, columns) per rad; `channels` are
+    rows of one panorama each.
+    """
+    heights = tuple(part.stop - part.start for part in channels)
+    upward, sideways, sin, cos = _slopes(sphere, heights, texture.shape[1])
+    up, left = upward @ texture, np.roll(texture, -1, 1) - np.roll(texture, 1, 1)
+    left *= sideways
     return np.stack([up * sin - left * cos, -left * sin - up * cos])
 
 
 @lru_cache(maxsize=8)
-def _waves(sphere: Sphere, rows: int, columns: int) -> tuple[Texture, Texture, Texture]:
-    """Sine and cosine of the azimuths (columns,), and by how much two columns' difference is the
-    derivative along which a tilt moves the rows sideways, (rows, 1).
+def _slopes(sphere: Sphere, heights: tuple[int, ...], columns: int) -> tuple[Texture, ...]:
+    """What makes of textures their derivatives along which a tilt moves them up, (rows, rows), and
+    of two columns' differences those sideways, (rows, 1); sine and cosine of azimuths (columns,).
     """
+    slopes = [np.gradient(np.eye(n), (sphere.low - sphere.high) / n, axis=0) for n in heights]
+    upward = linalg.block_diag(*slopes)
+    elevations = np.concatenate([sphere.elevations(rows) for rows in heights])
     azimuth, sign = sphere.azimuths(columns), -1 if sphere.clockwise else 1
-    aside = np.tan(sphere.elevations(rows))[:, None] * (sign * columns / (4 * np.pi))
-    return _single(np.sin(azimuth)), _single(np.cos(azimuth)), _single(aside)
+    sideways = np.tan(elevations)[:, None] * (sign * columns / (4 * np.pi))
+    return _single(upward), _single(sideways), _single(np.sin(azimuth)), _single(np.cos(azimuth))
 
 
 def _single(values: Array) -> Texture:
@@ -66,20 +69,29 @@ def _single(values: Array) -> Texture:
 
 
 def find_tilt(
-    texture: Texture, others: Texture, channels: Sequence[slice], sphere: Sphere
+    image: Spectra,
+    others: Spectra,
+    turn: Array,
+    columns: int,
+    channels: Sequence[slice],
+    sphere: Sphere,
 ) -> tuple[Array, Array]:
-    """Roll and pitch rad with which a texture (rows, columns) is likest each of M others, level
-    ones at its heading, (M, rows, columns): the tilts (M, 2), and the correlations (M,), less for
-    large tilts. `channels` are rows of one panorama each, of the first one the most.
+    """Roll and pitch rad with which a texture is likest each of M level ones, by the spectra of
+    their columns, (rows, F) and (M, rows, F), of its heading when `turned` by `turn` (M,) rad: the
+    tilts (M, 2), and the correlations (M,), less for large tilts. `channels` are rows of one
+    panorama each, of the first one the most.
 
     All tilts up to 12 degrees in steps of one row are tried: each column is correlated with shifted
-    ones of the others once, and the correlation by a tilt is a sum of these over the columns.
+    ones of the others once, and the correlation by a tilt is a sum of these over the columns. Every
+    second column will do: a tilt is the same in all.
     """
-    tried = _Tilts.of(sphere, channels[0].stop - channels[0].start, texture.shape[1])
-    few, others = texture[:, ::_EVERY], others[..., ::_EVERY]
-    shifted = np.concatenate([tried.shifted(few[part]) for part in channels], axis=1)
-    by_shift = others.transpose(2, 0, 1) @ shifted
-    scores = by_shift.transpose(1, 0, 2).reshape(len(others), -1) @ tried.weights
+    tried = _Tilts.of(sphere, tuple(part.stop - part.start for part in channels), columns)
+    few = tried.columns // 2 + 1
+    others = turned(others[..., :few], turn)
+    level = fft.irfft(others.swapaxes(1, 2), tried.columns, axis=1)
+    shifted = fft.irfft(image[:, :few], tried.columns).T @ tried.shifts
+    by_shift = level.swapaxes(0, 1) @ shifted.reshape(*level.shape[1:], -1)
+    scores = by_shift.swapaxes(0, 1).reshape(len(others), -1) @ tried.weights
     count = len(tried.steps)
     square = scores.reshape(len(others), count, count) - tried.unlikely
     return _peaks(square, tried.steps), square.max((1, 2))
@@ -87,24 +99,28 @@ def find_tilt(
 
 @dataclass(frozen=True, slots=True)
 class _Tilts:
-    """Rolls, and pitches, `steps` (S,) rad that are tried, and what shifts of columns each makes:
-    `weights` (columns * shifts, S * S); how much `unlikely` (S, S) makes them; and of the `shifts`
-    in rows, 0 in the middle, the `scale` that fewer columns and overlapping rows ask for.
+    """Rolls, and pitches, `steps` (S,) rad that are tried, of textures with so many `columns` left.
+
+    `shifts` (rows, rows * S) are what makes of one column all of its shifts, so that correlations
+    are those of all columns, and all rows; `weights` (columns * S, S * S) what shifts of columns
+    each tilt makes; and how much `unlikely` (S, S) tilts are.
     """
 
     steps: Array
+    columns: int
+    shifts: Texture
     weights: Texture
     unlikely: Texture
-    scale: Texture
-    rows: int
 
     @classmethod
     @lru_cache(maxsize=4)
-    def of(cls, sphere: Sphere, rows: int, columns: int) -> _Tilts:
+    def of(cls, sphere: Sphere, heights: tuple[int, ...], columns: int) -> _Tilts:
+        rows, few = heights[0], columns // 2
         row = (sphere.high - sphere.low) / rows
         count = max(min(round(_LARGEST / row), rows // 2 - 1), 1)
         shifts = np.arange(-count, count + 1)
-        azimuth = sphere.azimuths(columns)[::_EVERY, None, None]
+        first = sphere.azimuths(columns)[0] - sphere.azimuths(few)[0]
+        azimuth = (sphere.azimuths(few) + first)[:, None, None]
         shift = shifts * np.cos(azimuth) - shifts[:, None] * np.sin(azimuth)
         # Of each column, between two whole rows.
         near = np.maximum(
@@ -112,21 +128,14 @@ class _Tilts:
         )
         steps = row * shifts
         unlikely = _UNLIKELY * np.add.outer(steps**2, steps**2)
-        scale = _EVERY * np.sqrt(rows / (rows - np.abs(shifts)))
-        weights = near.reshape(len(azimuth) * len(shifts), -1)
-        return cls(steps, _single(weights), _single(unlikely), _single(scale), rows)
-
-    def shifted(self, texture: Texture) -> Texture:
-        """Columns of a texture (rows, columns) under all shifts: (columns, rows, shifts)."""
-        count, rows, few = len(self.scale) // 2, self.rows, len(texture)
-        fine = np.arange(rows) * few // rows
-        padded = np.pad(texture[fine].T, ((0, 0), (count, count)))
-        moved = sliding_window_view(padded, len(self.scale), axis=1)[..., ::-1] * self.scale
-        return (
-            moved
-            if few == rows
-            else np.add.reduceat(moved, np.searchsorted(fine, np.arange(few)), 1)
-        )
+        # Of half as many columns, spectra make values twice as large.
+        scale = np.sqrt(rows / (rows - np.abs(shifts))) * few / columns
+        # Rows of a texture with fewer of them are as many finer ones.
+        fine = [np.arange(n) == (np.arange(rows) * n // rows)[:, None] for n in heights]
+        moved = [linalg.block_diag(*(f.T @ np.eye(rows, k=k) @ f for f in fine)) for k in shifts]
+        weights = near.reshape(few * len(shifts), -1)
+        shifted = (np.stack(moved, axis=2) * scale).reshape(sum(heights), -1)
+        return cls(steps, few, _single(shifted), _single(weights), _single(unlikely))
 
 
 def _peaks(scores: Texture, steps: Array) -> Array:

@@ -99,11 +99,11 @@ def _judged(
 ) -> KeyframeMap:
     """Errors of both together where both were left out; keyframe k is row `rows[k]` (K,)."""
     errors, variances, alone, weights, turned = [], [], [], [], []
-    for k, scores, shifts in left_out(keyframes, path_m):
+    for k, scores, yaws in left_out(keyframes, path_m):
         row, place, error = rows[k], keyframes.poses[k, :2], result.left_out[rows[k]]
         spread = np.diag([variance[row], variance[row], UNKNOWN_YAW_VARIANCE])
         slow = Observation(np.append(place + error, 0.0), spread, np.zeros(0))
-        match = keyframes.located(keyframes.spectra([k])[0], scores, shifts)
+        match = keyframes.located(keyframes.spectra([k])[0], scores, yaws)
         pose, covariance = combine(slow, match, keyframes.noise)
         errors.append(pose[:2] - place)
         variances.append(np.trace(covariance[:2, :2]) / 2)

@@ -16,12 +16,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from sfa_localization.data.array_files import Arrays, packed, unpacked
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import Basis, basis_from
+
+_FEW = 4  # rows, for which one triangular product each is quicker than one of all
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,7 @@ class MetricMap:
     basis: Basis
     linear: Array
     constant: Array
-    factor: Array
+    factor: NDArray[np.float32]
     floor: float
     inflation: float
     common_m: float
@@ -66,9 +69,8 @@ class MetricMap:
         rows = np.column_stack([weights.mean, 2 * q[:, -1]])
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + floor + prior
-        rounded = np.asfortranarray(factor, float)
         linear = basis.turn @ rows[:-1]
-        return cls(basis, linear, constant, rounded, floor, inflation, common_m)
+        return cls(basis, linear, constant, np.asfortranarray(factor), floor, inflation, common_m)
 
     @property
     def features(self) -> int:
@@ -96,7 +98,7 @@ class MetricMap:
             **self.basis.to_arrays(),
             'linear': self.linear,
             'constant': self.constant,
-            'factor': packed(self.factor.astype(np.float32)),
+            'factor': packed(self.factor),
             'scalars': np.array([self.floor, self.inflation, self.common_m]),
         }
 
@@ -105,7 +107,7 @@ class MetricMap:
         """The map of saved arrays. Raises ModelError where one is missing."""
         try:
             scalars = np.asarray(arrays['scalars'], float).tolist()
-            factor, basis = unpacked(arrays['factor']).astype(float), basis_from(arrays)
+            factor, basis = unpacked(arrays['factor']), basis_from(arrays)
             return cls(basis, arrays['linear'], arrays['constant'], factor, *scalars)
         except KeyError as error:
             raise ModelError(f'the metric map lacks {error}') from None
@@ -126,14 +128,14 @@ def lower_root(symmetric: Array) -> Array:
         return np.asarray(linalg.qr(root.T, mode='r')[0].T)
 
 
-def squares(rows: Array, factor: Array) -> Array:
-    """|k L|^2 (M,) of rows k (M, N), reading only the lower triangle for a single one.
+def squares(rows: Array, factor: NDArray[np.float32]) -> Array:
+    """|k L|^2 (M,) of rows k (M, N), for few of them reading only the lower triangle.
 
     `factor` (N, N) is in Fortran order.
     """
-    if len(rows) > 1:
-        product = rows @ factor
+    if len(rows) > _FEW:
+        product = rows.astype(factor.dtype) @ factor
     else:
         multiply = linalg.get_blas_funcs('trmv', (factor,))
-        product = multiply(factor, rows[0], lower=1, trans=1)[None]
-    return np.asarray((product**2).sum(1))
+        product = np.array([multiply(factor, row, lower=1, trans=1) for row in rows])
+    return np.asarray(np.square(product, dtype=np.float64).sum(1))

@@ -42,8 +42,9 @@ from sfa_localization.place_model import PlaceModel
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
-CLOSE = 110
-"""Keyframes that an image is compared with in full: the likeliest and two places' neighbors."""
+CLOSE, LEVELED, NEAR, TILTS, HEADINGS = 110, 24, 64, 11, 3
+"""Keyframes that an image is compared with in full, leveled to, and located among; the tilts that
+are tried along each axis, and the headings at which the map is read."""
 ARCHITECTURE = standard_architecture(SIZE, 'panorama')
 
 
@@ -147,31 +148,17 @@ def bench_locate(model: PlaceModel, images: np.ndarray, rounds: int = 300) -> di
     """Locating pictures (T, H, W, 3) of the place, in turns, against the matrix products of the
     equations, on one core.
     """
-    image, each = images[len(images) // 2], itertools.cycle(images)
-    products, network_only = bare_products(model, image), bare_network(model)
+    each, products = itertools.cycle(images), bare_products(model)
     with one_core():
-        whole, bare, matched, maps, bare_maps = in_turns(
-            [
-                lambda: model.locate(next(each)),
-                lambda: [product() for product in products],
-                lambda: model.keyframes.match(image),
-                lambda: model.network.maps(image[None]),
-                lambda: [product() for product in network_only],
-            ],
-            rounds,
+        whole, bare = in_turns(
+            [lambda: model.locate(next(each)), lambda: [product() for product in products]], rounds
         )
-        grown = _growth(lambda: model.locate(image), 500)
-    median = float(np.median(bare))
+        grown = _growth(lambda: model.locate(images[0]), 500)
     return {
-        'locate_over_matmul': float(np.median(whole)) / median,
-        'locate_p99_over_matmul_p99': float(np.percentile(whole, 99) / np.percentile(bare, 99)),
+        'locate_over_matmul': float(np.median(whole) / np.median(bare)),
         'locate_ms': float(np.median(whole)) * 1e3,
         'locate_p99_ms': float(np.percentile(whole, 99)) * 1e3,
-        'matmul_ms': median * 1e3,
-        'network_over_matmul': float(np.median(maps) / np.median(bare_maps)),
-        'locate_keyframes_cost': float(
-            np.median(matched) / (np.median(whole) - np.median(matched))
-        ),
+        'matmul_ms': float(np.median(bare)) * 1e3,
         'locate_growth_mib': grown,
     }
 
@@ -197,29 +184,37 @@ def bare_network(model: PlaceModel) -> list[Callable[[], object]]:
     return made
 
 
-def bare_products(model: PlaceModel, image: np.ndarray) -> list[Callable[[], object]]:
-    """All products of a model's equations, on inputs that are ready."""
-    made = bare_network(model)
+def bare_products(model: PlaceModel) -> list[Callable[[], object]]:
+    """All products of a model's equations, on inputs that are ready; each regression's once."""
     keyframes = model.keyframes
-    frequencies, _, rows = keyframes.coarse.shape
-    made.append(_product(keyframes.coarse, np.ones((frequencies, rows, 1), np.complex64)))
-    close = keyframes.aligned[:CLOSE].transpose(2, 0, 1)
-    made.append(_product(close, np.ones((len(close), close.shape[2], 1), np.complex64)))
-    made += bare_process(model.metric, np.ones((1, model.metric.features)))
+    (low, parts, count), (_, frequencies, size) = keyframes.coarse.shape, keyframes.values.shape
+    few, rows, length = keyframes.columns // 2, size // 2, frequencies * size
+    shapes = [
+        ((low, 2, parts), (low, parts, count)),  # the rough search
+        ((2 * low + 2, 2 * low), (2 * low, count)),
+        ((frequencies, CLOSE, size), (frequencies, size, 2)),
+        ((few, rows), (rows, rows * TILTS)),  # the tilt
+        ((few, LEVELED, rows), (few, rows, TILTS)),
+        ((LEVELED, few * TILTS), (few * TILTS, TILTS**2)),
+        ((NEAR, length), (length, NEAR)),  # keyframes with each other, the image and what turns it
+        ((4, length), (length, NEAR)),
+        ((4, NEAR), (NEAR, length)),
+    ]
     if model.turned is not None:
-        axes = model.turned.axes
-        made.append(_product(np.ones((1, len(axes)), np.float32), axes))
-    return made
+        shapes.append(((HEADINGS, len(model.turned.axes)), model.turned.axes.shape))
+    ready = [_product(*(np.ones(shape, np.float32) for shape in pair)) for pair in shapes]
+    features = np.ones((HEADINGS if model.turned else 1, model.metric.features))
+    return [*bare_network(model), *ready, *bare_process(model.metric, features)]
 
 
 def bare_process(learned: MetricMap, features: np.ndarray) -> list[Callable[[], object]]:
-    """The products of a map of features (1, K)."""
+    """The products of a map of features (N, K)."""
     basis = learned.basis
     assert isinstance(basis, Process)
     scaled = features[:, : basis.features] * basis.scale
-    kernel = np.ones((1, len(basis.points)))
+    kernel = np.ones((len(features), len(basis.points)))
     made = [_product(scaled, basis.points.T.copy()), _product(kernel, learned.linear)]
-    return [*made, _triangular(learned.factor)]
+    return made + len(features) * [_triangular(learned.factor)]
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> Callable[[], object]:
