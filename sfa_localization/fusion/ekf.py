@@ -25,7 +25,7 @@ from sfa_localization.fusion.belief import (
     Update,
 )
 from sfa_localization.fusion.filterpy_ekf import ExtendedKalmanFilter
-from sfa_localization.fusion.inputs import root, symmetric
+from sfa_localization.fusion.inputs import root
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
 from sfa_localization.fusion.odometry import COAST_S, Interval, interval
 from sfa_localization.fusion.relocation import Relocation, relocate
@@ -89,7 +89,7 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         jacobian = event.jacobian
         self.update(event.value, lambda _: jacobian, jacobian.dot, event.white, residual=_residual)
         self.x[YAW] = wrap(float(self.x[YAW]))
-        return self.x, symmetric(self.P), float(self.y.dot(self.SI).dot(self.y))
+        return self.x, self.P, float(self.y.dot(self.SI).dot(self.y))
 
 
 def _residual(z: Array, predicted: Array) -> Array:

@@ -144,7 +144,7 @@ class _Window:
     def __init__(self, track: Track, images: Sequence[Image]) -> None:
         seen, newest_ns = Columns(images), images[-1].stamp_ns
         self._seconds, self._places = (seen.stamps_ns - newest_ns) * 1e-9, seen.place
-        self._yaws, yaw_drift = seen.yaw, (YAW_DRIFT * seen.behind_m) ** 2
+        self._looks, yaw_drift = np.exp(1j * seen.yaw), (YAW_DRIFT * seen.behind_m) ** 2
         self._variance = CAUTION * seen.variance + FLOOR_M**2 + seen.drift
         self._yaw_variance = CAUTION * seen.yaw_variance + FLOOR_RAD**2 + yaw_drift
         yaw_width = np.sqrt(2 * np.pi * np.where(seen.has_yaw, self._yaw_variance, 2 * np.pi))
@@ -198,8 +198,8 @@ class _Window:
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
         """
         is_lever, is_turned, is_scale = (kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE))
-        look, arm = np.exp(1j * (self._yaws - yaws)), np.exp(1j * yaws)
-        weight = np.ones(rows.shape)
+        arm = np.exp(1j * yaws)
+        look, weight = self._looks * np.conj(arm), np.ones(rows.shape)
         angle, factor = np.zeros((len(rows), 1)), np.ones((len(rows), 1))
         lever = np.asarray(angle, complex)
         for step in range(_STEPS):

@@ -95,21 +95,18 @@ def read_measurement(value: ArrayLike, covariance: ArrayLike, factor: float) -> 
     (x, y, *yaw), rows = pose.tolist(), matrix.tolist()
     if not (abs(x) <= _LARGEST_M and abs(y) <= _LARGEST_M):
         raise DataError('position is not finite')
-    if yaw:
-        known = math.isfinite(yaw[0]) and rows[2][2] <= YAW_STD_LIMIT**2
-        if not (known and (rows[2][2] > 0 or not matrix.any())):
-            pose, matrix = pose[:2], matrix[:2, :2]
-            rows = matrix.tolist()
+    known = bool(yaw) and math.isfinite(yaw[0]) and rows[2][2] <= YAW_STD_LIMIT**2
+    if yaw and not (known and (rows[2][2] > 0 or not matrix.any())):
+        pose, rows = pose[:2], [row[:2] for row in rows[:2]]
     if not any(map(any, rows)):
-        matrix = np.diag(np.square(_UNKNOWN_STDS[: pose.size]))
-        rows = matrix.tolist()
-    require_symmetric(rows)
+        rows = np.diag(np.square(_UNKNOWN_STDS[: pose.size])).tolist()
+    make_symmetric(rows)
     if max(rows[0][0], rows[1][1]) >= LARGEST_VARIANCE:
         raise DataError('covariance means that nothing is known')
-    noise = factor * symmetric(matrix)
-    for i, row in enumerate(rows):
-        noise[i, i] = max(factor * row[i], _LEAST_VARIANCES[i])
-    return pose, noise
+    noise = [[factor * entry for entry in row] for row in rows]
+    for i, row in enumerate(noise):
+        row[i] = max(row[i], _LEAST_VARIANCES[i])
+    return pose, np.array(noise)
 
 
 def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
@@ -119,17 +116,21 @@ def read_pose(pose: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         raise DataError(f'initial pose {pose!r} is not x, y, yaw')
     if matrix.shape != (3, 3):
         raise DataError('covariance of the initial pose is not (3, 3)')
-    require_symmetric(matrix.tolist())
-    root(matrix.tolist())
-    return value, symmetric(matrix)
+    rows = matrix.tolist()
+    make_symmetric(rows)
+    root(rows)
+    return value, np.array(rows)
 
 
-def require_symmetric(rows: list[list[float]]) -> None:
-    """Raise DataError for a matrix that is not symmetric, or has no positive diagonal."""
-    pairs = [(row[j], rows[j][i]) for i, row in enumerate(rows) for j in range(i)]
-    largest, least = max(map(max, rows)), min(row[i] for i, row in enumerate(rows))
-    skewed = max(abs(a - b) for a, b in pairs) > _SKEW * largest
-    if skewed or not (math.isfinite(sum(map(sum, rows))) and least > 0):
+def make_symmetric(rows: list[list[float]]) -> None:
+    """Round off. Raises DataError where it is not nearly so, or the diagonal is not positive."""
+    fits, largest = True, max(map(max, rows))
+    for i, row in enumerate(rows):
+        for j in range(i):
+            fits &= abs(row[j] - rows[j][i]) <= _SKEW * largest
+            row[j] = rows[j][i] = (row[j] + rows[j][i]) * 0.5
+        fits &= 0 < row[i] < math.inf
+    if not fits:
         raise DataError(_NO_COVARIANCE)
 
 
