@@ -439,6 +439,18 @@ def _one_route(places: Array) -> bool:
     return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
 
 
+def lanes_apart(places: Array, reach_m: float) -> list[str]:
+    """That too little of the ground is near to an image, at places (N, >= 2); else nothing."""
+    share = covered_share(places, reach_m)
+    if share >= MIN_COVERED:
+        return []
+    return [
+        f'{share:.0%} of the area lie within {reach_m:g} m of an image, as by lanes '
+        f'{2 * reach_m / max(share, 0.01):.1f} m apart, and between lanes one image errs '
+        f'by about a tenth of that: drive lanes {2 * reach_m:g} m apart'
+    ]
+
+
 def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
     """The reasons why a bag is not enough to train on, each with the remedy."""
     if report.camera is None or report.motion is None:
@@ -466,7 +478,7 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
 
 
 def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
-    gap, share = spacing(places), covered_share(places, config.reach)
+    gap = spacing(places)
     if path_length(places) < 1.0:
         yield 'the robot did not move: drive it over the area'
         return
@@ -474,12 +486,7 @@ def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
         yield f'images are {gap:.2f} m apart: drive slower or record more of them'
     if _one_route(places):
         return
-    if share < MIN_COVERED:
-        yield (
-            f'{share:.0%} of the area lie within {config.reach:g} m of an image, as by lanes '
-            f'{2 * config.reach / max(share, 0.01):.1f} m apart, and between lanes one image errs '
-            f'by about a tenth of that: drive lanes {2 * config.reach:g} m apart'
-        )
+    yield from lanes_apart(places, config.reach)
     if directions(places) < MIN_DIRECTIONS:
         yield (
             f'driven along {directions(places)} of {SECTORS} directions: '

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
+from sfa_localization.inspection import InspectionConfig, lanes_apart
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.learning import positions
 from sfa_localization.metric.motion_sources import MAP
@@ -80,7 +81,7 @@ def write_training_report(
                      parts['line_fits']),
         page.section('Where is it weak?', page.items(weak_lines(trained)), parts['coverage']),
         page.section('May I trust it?', page.items(trust_lines(trained))),
-        page.section('What do I drive next?', page.items(advice(trained))),
+        page.section('What do I drive next?', page.items(advice(trained, places))),
         *(motion_section(check.as_dict()) for check in trained.checks),
         page.section('Slow features', parts['firing_maps']),
         page.section('Worst images', parts.get('worst_images', '')),
@@ -150,12 +151,14 @@ def trust_lines(trained: Trained) -> list[str]:
     ]
 
 
-def advice(trained: Trained) -> list[str]:
-    """What to drive next, most useful first."""
+def advice(trained: Trained, places: Array) -> list[str]:
+    """What to drive next, after images at places (M, 2) m, most useful first."""
     found, forecast = trained.metric.diagnostics, trained.metric.forecast
     lines = [
         f'Cross x {x:.1f} m, y {y:.1f} m, in two directions.' for x, y, _ in weak_places(forecast)
     ]
+    if not found.one_route:
+        lines += lanes_apart(places, InspectionConfig().reach)
     if found.directions < PARALLEL:
         lines.append('Drive in other directions: most of this drive was parallel.')
     if found.crossings < FEW_CROSSINGS:
