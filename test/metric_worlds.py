@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, integrate
+from sfa_localization.features.offsets import Offsets
 
 RATE = 50
 STEP_NS = 1_000_000_000 // RATE
@@ -121,3 +123,21 @@ def garden_features(places, *, noise=0.0, count=12, seed=0, world=0):
     x = np.cos(np.pi * (places / [8.0, 9.0] + 1) / 2)
     values[:, :2] += 3 * x
     return values + noise * np.random.default_rng(seed).standard_normal(values.shape)
+
+
+def mixtures(stack, poses, noise_m=0.0, count=400, seed=0):
+    """Offsets of images among six others within 1.5 m, whose places explain theirs."""
+    rng, found = np.random.default_rng(seed), []
+    places = poses[stack.images]
+    for row in rng.permutation(len(places))[:count]:
+        apart = np.hypot(*(places - places[row])[:, :2].T)
+        near = np.flatnonzero((apart < 1.5) & (np.abs(stack.owner - stack.owner[row]) > 1))
+        if len(near) >= 12:
+            near = rng.permutation(near)[:6]
+            design = np.column_stack([places[near, :2], np.ones(6)]).T
+            wanted = np.append(places[row, :2] + noise_m * rng.standard_normal(2), 1.0)
+            shares = np.linalg.lstsq(design, wanted, rcond=0.02)[0]
+            turn = wrap_angle(places[row, 2] - places[near, 2])
+            if np.allclose(design @ shares, wanted):  # not where they lie on a line
+                found.append((stack.images[row], stack.images[near], shares, turn, 0.1))
+    return Offsets(*map(np.array, zip(*found, strict=True)))

@@ -17,7 +17,7 @@ from cylinder_worlds import (
     wander,
 )
 from filter_drives import Drive as FilterDrive
-from metric_worlds import criss_cross, drive, exact_features, stand, straight, turn
+from metric_worlds import criss_cross, drive, exact_features, mixtures, stand, straight, turn
 from rosbags.typesys import Stores
 
 from sfa_localization.bags.decoding import typestore
@@ -33,6 +33,7 @@ from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map
 from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.points import points_of, read_points, stops
+from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
@@ -139,13 +140,16 @@ def measured_at(rows, wrong=None):
 
 
 @functools.cache
-def learned(rows=(), wrong=None):
-    """Segments and the map of the world by points at some images."""
+def learned(rows=(), wrong=None, tied=False):
+    """Segments and the map of the world by points at some images; its images tied by offsets."""
     odometry, run, features = world()
     images = PanoramaArray(run.stamps_ns, np.zeros((len(run.stamps_ns), 1, 1, 3), np.uint8))
     item = Drive(Run('drive', images, odometry), run.poses[:, 2].tolist())
     given = measured_at(list(rows), wrong) if rows else None
     drives = Drives((item,), Closures.none(), SegmentConfig(yaw_source='odometry'), points=given)
+    if tied:
+        offsets = mixtures(Stack.of(drives.cut()), run.poses, noise_m=0.02)
+        drives = replace(drives, offsets=offsets)
     return in_coordinates(drives, features)
 
 
@@ -161,9 +165,9 @@ def in_coordinates(drives, features):
     return segments, maps[-1]
 
 
-def errors(rows=(), wrong=None):
+def errors(rows=(), wrong=None, tied=False):
     """Mean errors (m) in the owner's coordinates, and by the best similarity; its scale."""
-    segments, result = learned(rows, wrong)
+    segments, result = learned(rows, wrong, tied)
     images, places = positions(result, segments)
     true = world()[1].poses[images, :2] @ [1, 1j]
     own = places @ [1, 1j]
@@ -179,16 +183,17 @@ def far_apart():
     return (*ends, int(np.argmin(np.hypot(*places.T))))
 
 
-def test_a_map_lies_in_the_coordinates_of_its_points():
+@pytest.mark.parametrize('tied', [False, True])
+def test_a_map_lies_in_the_coordinates_of_its_points(tied):
     rows = far_apart()
     before, rest, _ = errors()
     assert before > 1.0
     for chosen, wrong in ((rows[:2], None), (rows, None), (rows, 2)):
-        error, by_similarity, scale = errors(chosen, wrong)
-        anchors = learned(chosen, wrong)[0].anchors
+        error, by_similarity, scale = errors(chosen, wrong, tied)
+        segments, result = learned(chosen, wrong, tied)
         assert error < 1.25 * max(by_similarity, rest)
-        assert abs(scale - 1.0) < 3 * anchors.settled.scale_std
-        assert learned(chosen, wrong)[1].certificate.certified
+        assert abs(scale - 1.0) < 3 * segments.anchors.settled.scale_std
+        assert result.certificate.certified and (result.graph is not None) == tied
 
 
 def test_the_wrong_point_is_named_and_missed_by_what_it_is_wrong():

@@ -7,7 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 from cylinder_worlds import Spheres
-from metric_worlds import criss_cross, drive, garden_features, meander, straight, turn
+from metric_worlds import (
+    criss_cross,
+    drive,
+    garden_features,
+    meander,
+    mixtures,
+    straight,
+    turn,
+)
+from scipy import sparse
 
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
@@ -20,8 +29,9 @@ from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.metric import learning, selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.loops import Loops, loops_of
-from sfa_localization.metric.pose_graph import graph_poses
-from sfa_localization.metric.quadratic_form import Stack
+from sfa_localization.metric.phases import certify, synchronize
+from sfa_localization.metric.pose_graph import Graph, graph_poses, link_rows, proof
+from sfa_localization.metric.quadratic_form import Links, Solution, Stack, schur
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import tracks, with_closures
@@ -143,24 +153,6 @@ def test_closures_tie_drives_that_share_no_feature(wrong, quick):
     assert far < 0.25 and turned < 0.03
 
 
-def mixtures(stack, poses, noise_m=0.0, count=400, seed=0):
-    """Offsets of images among six others within 1.5 m, whose places explain theirs."""
-    rng, found = np.random.default_rng(seed), []
-    places = poses[stack.images]
-    for row in rng.permutation(len(places))[:count]:
-        apart = np.hypot(*(places - places[row])[:, :2].T)
-        near = np.flatnonzero((apart < 1.5) & (np.abs(stack.owner - stack.owner[row]) > 1))
-        if len(near) >= 12:
-            near = rng.permutation(near)[:6]
-            design = np.column_stack([places[near, :2], np.ones(6)]).T
-            wanted = np.append(places[row, :2] + noise_m * rng.standard_normal(2), 1.0)
-            shares = np.linalg.lstsq(design, wanted, rcond=0.02)[0]
-            turn = wrap_angle(places[row, 2] - places[near, 2])
-            if np.allclose(design @ shares, wanted):  # not where they lie on a line
-                found.append((stack.images[row], stack.images[near], shares, turn, 0.1))
-    return Offsets(*map(np.array, zip(*found, strict=True)))
-
-
 def test_the_form_is_the_sum_of_the_weighted_squares():
     poses, _, segments, first = in_two_lights()
     stack = Stack.of(segments)
@@ -192,9 +184,7 @@ def solved_places(stack, o, z, bias):
 
 
 def cost(loops, stack, x):
-    form = loops.form(stack, None)
-    assert np.abs(form - form.conj().T).max() < 1e-9 * np.abs(form).max()
-    return np.vdot(x, form @ x).real
+    return np.sum(np.abs(loops.ties(stack, None) @ x) ** 2)
 
 
 def test_offsets_hold_in_any_frame():
@@ -224,7 +214,7 @@ def test_offsets_show_what_closures_leave_open():
     measured = dataclasses.replace(tied, offsets=offsets)
     far = []
     for known in (tied, measured):
-        found = graph_poses(known, len(poses))
+        found = graph_poses(Graph.of(known), len(poses))
         assert np.isfinite(found[stack.images]).all()
         frame = align(found[stack.images, :2], poses[stack.images, :2])
         apart = frame.apply(found[stack.images, :2]) - poses[stack.images, :2]
@@ -232,13 +222,53 @@ def test_offsets_show_what_closures_leave_open():
     assert far[1] < 0.5 * far[0], far
 
 
-def test_where_offsets_tie_a_drive_features_bend_it_less(quick, monkeypatch):
+def measured_world(noise_m=0.02, seed=0):
+    """Two drives with offsets, each in an odometry frame of its own."""
     poses, features, segments, _ = in_two_lights()
-    offsets = mixtures(Stack.of(segments), poses, noise_m=0.02, count=2000)
-    measured, far = dataclasses.replace(segments, offsets=offsets), []
+    offsets = mixtures(Stack.of(segments), poses, noise_m, count=1000, seed=seed)
+    return poses, features, dataclasses.replace(segments, offsets=offsets)
+
+
+def test_the_graph_proves_what_is_best_and_nothing_else():
+    _, _, segments = measured_world()
+    graph, stack = Graph.of(segments), Stack.of(segments)
+    assert graph.certificate.certified
+    links, loops = Links.of(segments), loops_of(segments.closures, segments.offsets, stack)
+    rows = sparse.vstack([*link_rows(links, stack), *(one.ties(stack, None) for one in loops)])
+    bias, n = np.zeros(stack.period[-1] + 1), stack.segments
+    system = (rows.conj().T @ rows).toarray()[: 2 * n, : 2 * n]
+    h, origins = schur(system)
+    best = synchronize(h)
+    turned = best.copy()
+    turned[n // 2 :] *= -1
+    for z, right in ((best, True), (turned, False)):
+        assert certify(h, z).certified == right
+        found = proof(rows.tocsr(), Solution(z, origins @ z, bias), stack.period)
+        assert found.certified == right
+
+
+def test_the_graph_errs_as_it_says():
+    errors, stated = [], []
+    for seed in range(12):
+        poses, _, segments = measured_world(0.05, seed)
+        stack, graph = Stack.of(segments), Graph.of(segments)
+        rows = stack.first
+        error = np.angle(graph.solution.z) + stack.headings[rows] - poses[stack.images[rows], 2]
+        errors.append(wrap_angle(error - np.angle(np.exp(1j * error).mean())))
+        stated.append(np.diag(graph.angle_covariance))
+    size = np.sqrt(np.mean(np.square(errors)) / np.mean(stated))
+    assert 0.5 < size < 1.5, size
+
+
+def test_where_offsets_tie_a_drive_features_bend_it_less(quick, monkeypatch):
+    poses, features, measured = measured_world()
+    far = []
     for tied in (learning.TIED, 1.0):
         monkeypatch.setattr(learning, 'TIED', tied)
-        far.append(errors_of(learn_metric(features, measured, GP), measured, poses)[0])
+        result = learn_metric(features, measured, GP)
+        assert (result.graph is None) == (tied == 1.0)
+        assert result.certificate.certified
+        far.append(errors_of(result, measured, poses)[0])
     assert far[0] < 0.8 * far[1], far
 
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, sparse
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, relative
@@ -124,21 +124,21 @@ class Anchors:
         rows[at, 2 * n + owner] = stack.drift[row] + 1j * stack.times_s[row] * ahead
         return rows
 
-    def form(self, stack: Stack, before: Solution | None = None) -> Complex:
-        """The quadratic form (3N, 3N) of the used points in [o, z, -b z], 1 / m^2.
+    def ties(self, stack: Stack, before: Solution | None = None) -> sparse.csr_array:
+        """What is squared (K, 3N) of the used points in [o, z, -b z], over its standard deviation.
 
         The heading of the points turns with the mean of the segments from what it is in the
         solution `before`, without which nothing is tied.
         """
         n, used = stack.segments, self.settled.used & self.settled.turned
         if before is None or not used.any():
-            return np.zeros((3 * n, 3 * n), complex)
+            return sparse.csr_array((0, 3 * n), dtype=complex)
         rows, points, std = self.rows(stack)[used], self.points.places[used], self.points.std[used]
         points = points - points.mean()
         turn, _ = align_complex(points, rows @ before.coefficients(stack.period), std**-2)
         rows[:, n : 2 * n] -= np.outer(turn * points, before.z.conj() / n)
         rows = (rows - np.average(rows, axis=0, weights=std**-2)) / std[:, None]
-        return np.asarray(rows.conj().T @ rows)
+        return sparse.csr_array(rows)
 
     def frame(self, places: Complex, start: RigidTransform) -> RigidTransform:
         """The transform that lays places (K,) on the points used; `start` where there are none, and

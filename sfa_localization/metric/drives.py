@@ -26,7 +26,7 @@ from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
-from sfa_localization.metric.pose_graph import graph_poses
+from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -115,7 +115,7 @@ class Drives:
 
     def measured(self, views: Views, sphere: Sphere) -> Drives:
         """With the offsets of `views`, which the graph of odometry and closures leads to."""
-        poses = graph_poses(self.cut(), int(views.images.max()) + 1)
+        poses = graph_poses(Graph.of(self.cut()), int(views.images.max()) + 1)
         return replace(self, offsets=find_offsets(views, poses[views.images], sphere))
 
     def shown(self, segments: Segments, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:

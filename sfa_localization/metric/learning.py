@@ -33,6 +33,7 @@ from sfa_localization.metric.map_covariance import (
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
+from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
@@ -90,6 +91,8 @@ class MetricResult:
     points_covariance: Complex
     """(K, K) m^2 per axis, without a motion of the whole map."""
     diagnostics: Diagnostics
+    graph: Graph | None
+    """That gave the places, instead of features."""
 
     @property
     def left_out_error_m(self) -> float:
@@ -134,13 +137,15 @@ def learn_metric(
     """
     problem = MetricProblem.of(features, segments, config, seed)
     check_amount(problem.stack, problem.links)
+    tied = problem.stack.owner[np.isin(problem.stack.images, segments.offsets.images)]
+    if len(np.unique(tied)) > TIED * len(segments) and config.solver == 'certified':
+        problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
     left = _Left.of(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
-    tied = fit.stack.owner[np.isin(fit.stack.images, segments.offsets.images)]
-    overfits |= len(np.unique(tied)) > TIED * len(segments)
-    if overfits and config.solver == 'certified' and not diagnose(fit).one_route:
-        fit = fit.weighted(left.variance, left.images.errors)
+    searched = config.solver == 'certified' and problem.graph is None
+    if overfits and searched and not diagnose(fit).one_route:
+        fit = choose(replace(problem, graph=Graph.of(segments)), scale)
         left = _Left.of(fit)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
@@ -152,7 +157,7 @@ def learn_metric(
 
 def _check_certificate(fit: MapFit) -> None:
     """Reject directions that are not proven; of the paper's descent, those near a wrong minimum."""
-    solution, certificate = fit.solution, fit.solution.certificate
+    solution, certificate = fit.solution, fit.certificate
     paper = fit.problem.config.solver == 'paper'
     if paper:
         certificate = certify(solution.h, refine(solution.h, solution.z))
@@ -217,7 +222,7 @@ def _result(
         origins=plane(fit.solution.o * turn + shift),
         angle_covariance=angle_covariance(fit),
         yaw_bias=fit.solution.bias,
-        certificate=fit.solution.certificate,
+        certificate=fit.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
         left_out=plane(left.images.errors * turn),
@@ -227,6 +232,7 @@ def _result(
         points=points * turn + shift,
         points_covariance=points_covariance,
         diagnostics=diagnostics,
+        graph=fit.problem.graph,
     )
 
 

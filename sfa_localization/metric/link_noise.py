@@ -46,13 +46,17 @@ def learned(stated: Links, form: QuadraticForm, solution: Solution) -> Links:
     left_turn, left_move = (
         form.variance * _between(unknown, stated.at) for unknown in (unknown_turn, unknown_place)
     )
-    links, run = form.links, stated.run
-    missed_turn = _Missed(turned, left_turn, links.turn_variance, 1)
-    missed_move = _Missed(moved, left_move, links.displacement_variance, 2)
+    links = form.links
+    missed_turn = Missed(turned, left_turn, links.turn_variance, 1)
+    return grown(stated, missed_turn, Missed(moved, left_move, links.displacement_variance, 2))
+
+
+def grown(stated: Links, turns: Missed, moves: Missed) -> Links:
+    """Links of the `stated` variances or, in each run, of larger ones by what they missed."""
     return replace(
         stated,
-        turn_variance=_grown(stated.turn_variance, missed_turn, run),
-        displacement_variance=_grown(stated.displacement_variance, missed_move, run),
+        turn_variance=_grown(stated.turn_variance, turns, stated.run),
+        displacement_variance=_grown(stated.displacement_variance, moves, stated.run),
     )
 
 
@@ -63,7 +67,7 @@ def _between(covariance: Array, at: Indices) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class _Missed:
+class Missed:
     """By how much L links miss a solution, along each of so many `axes`: `squares` (L,), what the
     solution leaves unknown of them, `left` (L,), and the variances (L,) `assumed` for it.
     """
@@ -74,7 +78,7 @@ class _Missed:
     axes: int
 
 
-def _grown(stated: Array, missed: _Missed, run: Indices) -> Array:
+def _grown(stated: Array, missed: Missed, run: Indices) -> Array:
     """Variances (L,): those of each run as many times the `stated` ones as its links show, and
     more for single links that miss by far more (Student's distribution).
 

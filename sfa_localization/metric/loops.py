@@ -75,9 +75,9 @@ class Loops:
         _, same, count = np.unique(owner[kept], axis=0, return_inverse=True, return_counts=True)
         return replace(loops, share=1.0 / count[same.reshape(-1)])
 
-    def form(self, stack: Stack, before: Solution | None) -> Complex:
-        """The quadratic form (3N, 3N) in [o, z, -b z], weighted by the closures' variances: by
-        their residuals in the solution `before`."""
+    def ties(self, stack: Stack, before: Solution | None) -> sparse.csr_array:
+        """What is squared (2 L, 3N) of [o, z, -b z], over its standard deviation: by the residuals
+        in the solution `before`."""
         turn_std, place_std, doubt = self.turn_std, self.place_std, np.ones(len(self.share))
         if before is not None and len(doubt):
             x = before.coefficients(stack.period)
@@ -88,8 +88,7 @@ class Loops:
             turn_std, place_std = turn_part * turn_std, place_part * place_std
             doubt += (turned / (_HALF * turn_part)) ** 2 + (apart / (_HALF * place_part)) ** 2 / 2
         weight = np.sqrt(np.tile(self.share / doubt, 2)) / np.concatenate([turn_std, place_std])
-        rows = sparse.vstack([self.turns, self.places]).multiply(weight[:, None]).tocsr()
-        return np.asarray((rows.conj().T @ rows).toarray())
+        return sparse.vstack([self.turns, self.places]).multiply(weight[:, None]).tocsr()
 
 
 def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops, Loops]:

@@ -28,14 +28,17 @@ def plane(points: Complex) -> Array:
 
 def angle_covariance(fit: MapFit) -> Array:
     """Covariance (N, N) of the directions, rad^2, relative to the rotation of the whole map."""
+    if fit.problem.graph is not None:
+        return fit.problem.graph.angle_covariance
     return np.asarray(fit.link_variance * phases.angle_covariance(fit.solution.h, fit.solution.z))
 
 
 def place_variance(fit: MapFit) -> Array:
     """How uncertain the segments' origins and directions leave the place of each image, (M,) m^2
     over both axes, without a motion of the whole map, which is a matter of its frame."""
-    stack, places = fit.stack, fit.places
-    origins, directions = _uncertain_segments(fit)
+    stack, places, graph = fit.stack, fit.places, fit.problem.graph
+    # Three are the motions of the whole map.
+    origins, directions = graph.modes(_JOINT + 3) if graph else _uncertain_segments(fit)
     path = stack.corrected(fit.solution.bias)
     moved = origins[stack.owner] + directions[stack.owner] * path[:, None]
     around_center = 1j * (places - places.mean())
@@ -69,9 +72,12 @@ def places_of_points(fit: MapFit) -> tuple[Complex, Complex]:
     """Where the drive puts the robot at measured points (K,), and the covariance (K, K) per axis of
     that, without a motion of the whole map."""
     anchors, solution, period = fit.problem.segments.anchors, fit.solution, fit.stack.period
+    graph = fit.problem.graph
     if anchors is None:
         return np.zeros(0, complex), np.zeros((0, 0), complex)
     rows = anchors.rows(fit.stack)
+    if graph is not None:
+        return rows @ solution.coefficients(period), graph.covariance(rows)
     origins, directions = _uncertain_segments(fit)
     bias = solution.bias[period][:, None]
     moved = rows @ np.vstack([origins, directions, -bias * directions])

@@ -13,11 +13,12 @@ The noise matters because odometry's links are weighted against the images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from scipy import sparse
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
@@ -25,7 +26,10 @@ from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.link_noise import learned
 from sfa_localization.metric.loops import Loops, loops_of
+from sfa_localization.metric.phases import Certificate
+from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.quadratic_form import (
+    YAW_BIAS_STD,
     Elimination,
     Links,
     QuadraticForm,
@@ -41,8 +45,6 @@ Complex = NDArray[np.complex128]
 LINK_WEIGHT = 2.0
 """Weight of odometry's links over that by their variances: noise of the features, which least
 squares takes for noise of the place, contracts the map, and the links counteract that."""
-YAW_BIAS_STD = 0.003
-"""rad/s: the yaw-rate bias to expect of odometry or a gyroscope, estimated per period."""
 # m^2 per axis: a start that the first round replaces.
 _FIRST_VARIANCE = 0.04
 # Odometry's own paths are no better than this, however well a map fits them.
@@ -69,6 +71,8 @@ class MetricProblem:
     config: MetricConfig
     seed: int = 0
     """Of the parts that are left out, and of the points that the forecast draws."""
+    graph: Graph | None = None
+    """Where odometry, closures and points say more of the drive than features: its solution."""
 
     @classmethod
     def of(
@@ -82,22 +86,33 @@ class MetricProblem:
         return cls(rows, segments, stack, Links.of(segments), tuple(ties), config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
-        """Alternate solution and noise until the noise settles; a near `start` saves rounds."""
+        """Alternate solution and noise until the noise settles; a near `start` saves rounds.
+
+        With a graph the map is a regression to its places.
+        """
         expanded = expand(basis, self.features)
         noise_ratio = 1.0 + missing(basis, expanded)
         solution = start.solution if start else None
         variance = start.variance if start else _FIRST_VARIANCE
         correlation = start.correlation if start else LINK_WEIGHT
         links = start.links if start else self.links
-        elimination = eliminate(expanded, basis.ridge, 1.0 / noise_ratio, self.stack)
-        freedom = _freedom(elimination, basis, self.stack)
-        for _ in range(max(rounds, 1)):
-            loops = np.sum([one.form(self.stack, solution) for one in self.ties], axis=0)
+        elimination = self.eliminated(basis, expanded, 1.0 / noise_ratio)
+        freedom = _freedom(elimination, basis, len(expanded))
+        if self.graph is not None:
+            solution, loops = self.graph.solution, elimination.gram
+            weights, residuals = self.fitted(elimination, expanded, solution)
+            variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
+            rounds = 0
+        else:
+            freedom -= 1.5 * self.stack.segments
+        for _ in range(rounds):
+            ties = sparse.vstack([one.ties(self.stack, solution) for one in self.ties])
+            loops = np.asarray((ties.conj().T @ ties).toarray())
             form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
             bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
             solution = form.solve(solution.z if solution else None, bias)
             links, links_before = learned(self.links, form, solution), links
-            weights, residuals = _fitted(elimination, expanded, solution, self.stack)
+            weights, residuals = self.fitted(elimination, expanded, solution)
             before = variance
             correlation = LINK_WEIGHT * _correlation(residuals, self.stack)
             variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
@@ -109,6 +124,26 @@ class MetricProblem:
             self, basis, expanded, noise_ratio, variance, correlation, loops, links,
             elimination, solution, residuals, weights,
         )  # fmt: skip
+
+    def eliminated(self, basis: Basis, expanded: Array, weights: Array) -> Elimination:
+        """The map eliminated from expanded features (M, m) with weights (M,)."""
+        return eliminate(expanded, basis.ridge, weights, self.stack, form=self.graph is None)
+
+    def weights(self, elimination: Elimination, solution: Solution) -> Complex:
+        """The map's weights (m,) for a solution."""
+        if self.graph is not None:
+            places = solution.places(self.stack)
+            real, imag = (elimination.weights(part).real for part in (places.real, places.imag))
+            return np.asarray(real + 1j * imag)
+        return elimination.weights(solution.coefficients(self.stack.period))
+
+    def fitted(
+        self, elimination: Elimination, expanded: Array, solution: Solution
+    ) -> tuple[Complex, Complex]:
+        """The same, and the residuals (M,)."""
+        weights = self.weights(elimination, solution)
+        predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
+        return weights, np.asarray(solution.places(self.stack) - predicted)
 
     def form(
         self,
@@ -171,20 +206,17 @@ class MapFit:
         """Variance of a position against which odometry's links are weighted, m^2."""
         return self.variance * self.correlation
 
-    def weighted(self, variance: float, errors: Complex) -> MapFit:
-        """Solved again for this variance m^2 of a position, whose errors (M,) are so correlated,
-        and the links' stated variances: those of this fit may be learned of a bent drive.
-        """
-        problem, stack = self.problem, self.stack
-        correlation = LINK_WEIGHT * _correlation(errors, stack)
-        noise = variance * correlation
-        form = problem.form(self.elimination, self.loops, problem.links, noise, YAW_BIAS_STD)
-        solution = form.solve(None, np.zeros(stack.period[-1] + 1))
-        weights, residuals = _fitted(self.elimination, self.expanded, solution, stack)
-        return replace(
-            self, variance=variance, correlation=correlation, links=problem.links,
-            solution=solution, residuals=residuals, map_weights=weights,
-        )  # fmt: skip
+    @property
+    def certificate(self) -> Certificate:
+        """Of the directions."""
+        graph = self.problem.graph
+        return self.solution.certificate if graph is None else graph.certificate
+
+    def solved(self, elimination: Elimination) -> Solution:
+        """The solution after another elimination, with this noise."""
+        if self.problem.graph is not None:
+            return self.solution
+        return self.form(elimination).solve(self.solution.z, self.solution.bias)
 
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
@@ -212,22 +244,13 @@ def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
     return rows
 
 
-def _fitted(
-    elimination: Elimination, expanded: Array, solution: Solution, stack: Stack
-) -> tuple[Complex, Complex]:
-    """The map's weights (m,) for a solution, and the residuals (M,)."""
-    weights = elimination.weights(solution.coefficients(stack.period))
-    predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
-    return weights, np.asarray(solution.places(stack) - predicted)
-
-
-def _freedom(elimination: Elimination, basis: Basis, stack: Stack) -> float:
-    """Degrees of freedom that map, origins and directions leave to M residuals."""
+def _freedom(elimination: Elimination, basis: Basis, count: int) -> float:
+    """Degrees of freedom that a map leaves to M residuals."""
     inverse = scipy.linalg.solve_triangular(
         elimination.factor, np.eye(len(elimination.factor)), lower=True
     )
     used = len(basis.ridge) - float(basis.ridge @ (inverse**2).sum(0))
-    return float(len(stack.images)) - used - 1.5 * stack.segments
+    return count - used
 
 
 def residual_variance(residuals: Complex, freedom: float) -> float:

@@ -17,7 +17,6 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
 from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
-from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.quadratic_form import QuadraticForm, Solution, eliminate, schur
 
 Complex = NDArray[np.complex128]
@@ -173,7 +172,7 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     bias = np.zeros(stack.period[-1] + 1)
     form = QuadraticForm(elimination.gram, problem.links, stack.period, variance, 0.0)
     h = schur(form.system(bias))[0]
-    solution = Solution(z, o, bias, h, phase_cost(h, z))
+    solution = Solution(z, o, bias, h)
     no_loops = np.zeros_like(elimination.gram)
     return MapFit(
         problem, basis, expanded, ones, variance, 1.0, no_loops, problem.links,

@@ -1,40 +1,288 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where odometry and loop closures alone put the images of all drives."""
+"""What odometry, loop closures and measured points alone say of all drives, with a certificate.
+
+The least squares of loops.py, of odometry's links and of points in [o, z, -b z] (see
+quadratic_form.py), without features: each square reads few segments, so that Gauss and Newton's
+normal equations are sparse, and a drive of thousands of segments takes seconds. With multipliers
+Lambda = diag(Re(conj(z) * (S x)_z)), S the quadratic form at the biases and x = [o, z] where o is
+best, S - diag(0, Lambda) >= 0 proves the directions optimal, as H - Lambda >= 0 does in phases.py:
+H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.link_noise import learned
-from sfa_localization.metric.loops import loops_of
-from sfa_localization.metric.map_covariance import plane
-from sfa_localization.metric.map_fit import YAW_BIAS_STD
-from sfa_localization.metric.quadratic_form import Links, QuadraticForm, Stack
+from sfa_localization.features.image_features import evenly
+from sfa_localization.metric.anchors import Anchors
+from sfa_localization.metric.link_noise import Missed, grown
+from sfa_localization.metric.loops import Loops, loops_of
+from sfa_localization.metric.phases import CERTIFICATE_TOLERANCE, Certificate, unit
+from sfa_localization.metric.quadratic_form import YAW_BIAS_STD, Links, Solution, Stack
 from sfa_localization.metric.segments import Segments
+
+Complex = NDArray[np.complex128]
 
 # Of the solution and the weights that it shows, in turn: as settled as its use needs.
 _ROUNDS = 3
 # Weight of the distance from the middle beside closures, 1 / m^2: drives that nothing ties stay.
 _STAY = 1e-6
+# Far more than Gauss and Newton need from odometry's own path.
+_STEPS, _HALVED, _CONVERGED = 50, 20, 1e-9
+# Columns that are solved for at a time: memory.
+_AT_ONCE = 256
+# Links of which is found how well the others tell them: neighbors are told alike.
+_SHOWN = 500
 
 
-def graph_poses(segments: Segments, count: int) -> Array:
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """The `solution` of N segments with R biases, whether it is proven, and what that leaves
+    unknown: `factor` is that of the normal equations of [Re o, Im o, angles of z, b]."""
+
+    stack: Stack
+    solution: Solution
+    certificate: Certificate
+    factor: SuperLU
+
+    @classmethod
+    def of(cls, segments: Segments) -> Graph:
+        """Of segments with closures, offsets and points; loops and links as noisy as they show."""
+        stack, stated = Stack.of(segments), Links.of(segments)
+        given: list[Loops | Anchors] = [*loops_of(segments.closures, segments.offsets, stack)]
+        given += [segments.anchors] if segments.anchors else []
+        stay = sparse.diags_array(np.full(stack.segments, np.sqrt(_STAY)), dtype=complex)
+        stay.resize((stack.segments, 3 * stack.segments))
+        graph, links = None, stated
+        for _ in range(_ROUNDS):
+            links = graph._learned(stated, links) if graph else links
+            before = graph.solution if graph else None
+            ties = [one.ties(stack, before) for one in given]
+            rows = sparse.csr_array(sparse.vstack([*link_rows(links, stack), *ties, stay]))
+            graph = _solved(rows, stack, before)
+        assert graph is not None
+        return graph
+
+    def unknown(self, columns: Array) -> Array:
+        """The covariance of [Re o, Im o, angles of z, b] (P, P) times columns (P, K)."""
+        parts = [
+            self.factor.solve(np.ascontiguousarray(columns[:, k : k + _AT_ONCE]))
+            for k in range(0, columns.shape[1], _AT_ONCE)
+        ]
+        return np.hstack(parts)
+
+    @property
+    def angle_covariance(self) -> Array:
+        """(N, N) rad^2 of the directions, without a rotation of all together."""
+        n, size = self.stack.segments, self.factor.shape[0]
+        own = self.unknown(np.eye(size, n, -2 * n))[2 * n : 3 * n]
+        apart = own - own.mean(0)
+        return np.asarray(apart - apart.mean(1)[:, None])
+
+    def modes(self, count: int) -> tuple[Complex, Complex]:
+        """The largest changes of origins and directions (N, count), one standard deviation each."""
+        n, size = self.stack.segments, self.factor.shape[0]
+        inverse = LinearOperator((size, size), self.factor.solve, dtype=float)
+        values, vectors = eigsh(inverse, min(count, size - 1), v0=np.ones(size))
+        vectors = vectors * np.sqrt(np.maximum(values, 0.0))
+        real, imag, angle = vectors[:n], vectors[n : 2 * n], vectors[2 * n : 3 * n]
+        return real + 1j * imag, 1j * self.solution.z[:, None] * angle
+
+    def covariance(self, rows: Complex) -> Complex:
+        """Per axis (K, K) of rows (K, 3N) times [o, z, -b z], without a motion of the whole map."""
+        stack, solution = self.stack, self.solution
+        own, whole = (by_unknowns(one, solution, stack.period) for one in (rows, _images(stack)))
+        places = solution.places(stack)
+        around = places - places.mean()
+        mean = np.asarray(whole.mean(axis=0))
+        turn = np.real(-1j * (around.conj() @ whole)) / np.sum(np.abs(around) ** 2)
+        here = rows @ solution.coefficients(stack.period) - places.mean()
+        moved = own.toarray() - mean[None] - 1j * np.outer(here, turn)
+        unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
+        return np.asarray(moved @ unknown / 2)
+
+    def _learned(self, stated: Links, links: Links) -> Links:
+        """The links with the variances that this solution, of the `links`, shows."""
+        x, z = self.solution.coefficients(self.stack.period), self.solution.z
+        turns, moves = link_rows(links, self.stack)
+        turn, move = links.turn_variance, links.displacement_variance
+        # Along the turn: of its complex square the other part is none of the angles'.
+        along = sparse.diags_array(-1j * z[links.at + 1].conj()) @ turns
+        left_turn, left_move = self._left(along) * turn, self._left(moves, -1j * moves) * move / 2
+        return grown(
+            stated,
+            Missed(np.abs(turns @ x) ** 2 * turn, left_turn, turn, 1),
+            Missed(np.abs(moves @ x) ** 2 * move / 2, left_move, move, 2),
+        )
+
+    def _left(self, *sides: Any) -> Array:
+        """Variance (L,) that the solution leaves of the real parts of rows (L, 3N) times
+        [o, z, -b z], summed over the sides: of some rows, and as those nearby of the others."""
+        count = sides[0].shape[0]
+        shown, total = evenly(count, _SHOWN), np.zeros(min(count, _SHOWN))
+        for rows in sides:
+            by = by_unknowns(rows[shown], self.solution, self.stack.period).real.toarray()
+            total += (self.unknown(by.T).T * by).sum(axis=1)
+        return np.interp(np.arange(count), shown, total)
+
+
+def graph_poses(graph: Graph, count: int) -> Array:
     """Poses (count, 3) of the images, x m, y m, yaw rad, in a frame of their own; NaN for those of
     no segment."""
-    stack, stated = Stack.of(segments), Links.of(segments)
-    loops = loops_of(segments.closures, segments.offsets, stack)
-    stay = np.diag(np.repeat([_STAY, 0.0, 0.0], stack.segments)).astype(complex)
-    links, solution, bias = stated, None, np.zeros(stack.period[-1] + 1)
-    for _ in range(_ROUNDS):
-        gram = stay + np.sum([one.form(stack, solution) for one in loops], axis=0)
-        form = QuadraticForm(gram, links, stack.period, 1.0, YAW_BIAS_STD)
-        solution = form.solve(solution.z if solution else None, bias)
-        links, bias = learned(stated, form, solution), solution.bias
-    assert solution is not None
-    poses = np.full((count, 3), np.nan)
-    yaw = stack.headings - bias[stack.period[stack.owner]] * stack.times_s
+    stack, solution = graph.stack, graph.solution
+    poses, places = np.full((count, 3), np.nan), solution.places(stack)
+    yaw = stack.headings - solution.bias[stack.period[stack.owner]] * stack.times_s
+    poses[stack.images, 0], poses[stack.images, 1] = places.real, places.imag
     poses[stack.images, 2] = np.angle(solution.z)[stack.owner] + yaw
-    poses[stack.images, :2] = plane(solution.places(stack))
     return poses
+
+
+def by_unknowns(rows: Any, now: Solution, period: NDArray[np.int64]) -> Any:
+    """Derivative (L, P) of rows (L, 3N) times [o, z, -b z] by [Re o, Im o, angles of z, b]."""
+    rows, n = sparse.csr_array(rows), len(now.z)
+    own, by_bias = rows[:, :n], rows[:, 2 * n :] * now.z[None]
+    turned = (rows[:, n : 2 * n] - rows[:, 2 * n :] * now.bias[period][None]) * (1j * now.z)[None]
+    periods = sparse.csr_array((np.ones(n), (np.arange(n), period)), (n, len(now.bias)))
+    return sparse.hstack([own, 1j * own, turned, -by_bias @ periods]).tocsr()
+
+
+def link_rows(links: Links, stack: Stack) -> tuple[Any, Any]:
+    """Of the turns and of the displacements, (L, 3N) each over their standard deviations, turns to
+    first order in the biases; 0 for those of infinite variance."""
+    n, at, ones = stack.segments, links.at, np.ones(len(links.at))
+    turn = -np.exp(1j * links.turn)
+    turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * links.turn_time * turn)
+    moves = (
+        (at + 1, ones), (at, -ones), (n + at, -links.displacement),
+        (2 * n + at, -links.displacement_drift),
+    )  # fmt: skip
+    parts = (turns, links.turn_variance), (moves, links.displacement_variance)
+    return tuple(_scaled(entries, variance**-0.5, 3 * n) for entries, variance in parts)
+
+
+def _scaled(entries: Any, weight: Array, width: int) -> Any:
+    """Rows (L, width) times weights (L,), of the columns and values (L,) of their entries."""
+    columns, values = (np.concatenate(side) for side in zip(*entries, strict=True))
+    rows = np.tile(np.arange(len(weight)), len(entries))
+    values = np.nan_to_num(values * np.tile(weight, len(entries)))
+    return sparse.csr_array((values.astype(complex), (rows, columns)), (len(weight), width))
+
+
+def _images(stack: Stack) -> Any:
+    """Rows (M, 3N) whose products with [o, z, -b z] are the places of the images."""
+    n, ones = stack.segments, np.ones(len(stack.images))
+    entries = (stack.owner, ones), (n + stack.owner, stack.path), (2 * n + stack.owner, stack.drift)
+    return _scaled(entries, ones, 3 * n)
+
+
+def _solved(rows: Any, stack: Stack, before: Solution | None) -> Graph:
+    """The least squares of rows (L, 3N), from the solution before or from odometry's own path; from
+    the smallest eigenvector where that is not proven to be the best."""
+    pose = stack.starts
+    start = before or Solution(
+        np.exp(1j * pose[:, 2]), pose[:, 0] + 1j * pose[:, 1], np.zeros(stack.period[-1] + 1)
+    )
+    graph = _refined(rows, stack, start)
+    if graph.certificate.certified:
+        return graph
+    z = _spectral(_form(rows, graph.solution.bias, stack.period), stack.segments)
+    other = _refined(rows, stack, Solution(z, np.zeros_like(z), graph.solution.bias))
+    return min(graph, other, key=lambda one: _cost(rows, one.solution, stack))
+
+
+def _refined(rows: Any, stack: Stack, start: Solution) -> Graph:
+    """Gauss and Newton's steps, halved until they are a descent."""
+    now, n, period, cost = start, stack.segments, stack.period, _cost(rows, start, stack)
+    for _ in range(_STEPS):
+        factor, slope = _normal(rows, now, period)
+        step, size, new = factor.solve(-slope), 1.0, np.inf
+        for _ in range(_HALVED):
+            moved = size * step
+            tried = Solution(
+                now.z * np.exp(1j * moved[2 * n : 3 * n]),
+                now.o + moved[:n] + 1j * moved[n : 2 * n],
+                now.bias + moved[3 * n :],
+            )
+            if (new := _cost(rows, tried, stack)) <= cost * (1 + 1e-12):
+                break
+            size /= 2
+        else:
+            break
+        now, cost = tried, new
+        if np.abs(step[2 * n :]).max() < _CONVERGED:
+            break
+    return Graph(stack, now, proof(rows, now, period), _normal(rows, now, period)[0])
+
+
+def _cost(rows: Any, solution: Solution, stack: Stack) -> float:
+    missed = rows @ solution.coefficients(stack.period)
+    return float(np.sum(np.abs(missed) ** 2) + np.sum((solution.bias / YAW_BIAS_STD) ** 2))
+
+
+def _normal(rows: Any, now: Solution, period: NDArray[np.int64]) -> tuple[SuperLU, Array]:
+    """The factor of the normal equations, and half the gradient of the cost (P,).
+
+    Turning all together costs nothing: the first direction is held, for this step.
+    """
+    n, by = len(now.z), by_unknowns(rows, now, period)
+    own = np.concatenate([np.zeros(3 * n), np.full(len(now.bias), YAW_BIAS_STD**-2)])
+    slope = np.real(by.conj().T @ (rows @ now.coefficients(period)))
+    slope += own * np.concatenate([np.zeros(3 * n), now.bias])
+    own[2 * n] = 1.0
+    return _factor((by.conj().T @ by).real + sparse.diags_array(own)), slope
+
+
+def _factor(symmetric: Any) -> SuperLU:
+    """Of a sparse matrix, without exchanging rows: the signs of its pivots are its own."""
+    options = {'SymmetricMode': True}
+    return splu(symmetric.tocsc(), 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, options=options)
+
+
+def _form(rows: Any, bias: Array, period: NDArray[np.int64]) -> Any:
+    """S (2N, 2N) at the biases."""
+    n = len(period)
+    parts = rows[:, :n], rows[:, n : 2 * n] - rows[:, 2 * n :] * bias[period][None]
+    both = sparse.hstack(parts).tocsr()
+    return (both.conj().T @ both).tocsr()
+
+
+def _real(hermitian: Any) -> Any:
+    """The same form of real and imaginary parts."""
+    real, imag = hermitian.real, hermitian.imag
+    return sparse.block_array([[real, -imag], [imag, real]]).tocsc()
+
+
+def proof(rows: Any, now: Solution, period: NDArray[np.int64]) -> Certificate:
+    """The least pivot of S - diag(0, Lambda), over the largest entry: it is positive where all
+    eigenvalues are."""
+    n, form = len(period), _form(rows, now.bias, period)
+    pull = (form @ np.concatenate([now.o, now.z]))[n:]
+    least = np.concatenate([np.zeros(n), np.real(now.z.conj() * pull)])
+    scale = float(np.real(form.diagonal()[n:]).max())
+    shift = np.concatenate([np.zeros(n), np.full(n, CERTIFICATE_TOLERANCE * scale)])
+    factor = _factor(_real(form - sparse.diags_array(least - shift)))
+    return Certificate(float(factor.U.diagonal().min()) / scale)
+
+
+def _spectral(form: Any, n: int) -> Complex:
+    """Phases of the smallest eigenvector of H: of what the inverse of the form has for z."""
+    level = 1e-12 * float(np.real(form.diagonal()).max())
+    factor = _factor(_real(form + level * sparse.eye_array(2 * n)))
+
+    def apply(z: Array) -> Array:
+        right = np.zeros(4 * n)
+        right[n : 2 * n], right[3 * n :] = z[:n], z[n:]
+        found = factor.solve(right)
+        return np.concatenate([found[n : 2 * n], found[3 * n :]])
+
+    operator = LinearOperator((2 * n, 2 * n), apply, dtype=float)
+    vector = eigsh(operator, 1, v0=np.ones(2 * n))[1][:, 0]
+    return unit(vector[:n] + 1j * vector[n:])

@@ -24,7 +24,7 @@ eq. 2 to eq. 4 are zero, w and o are those of `Elimination.weights` and `schur`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,8 @@ from sfa_localization.metric.shared_tracks import tracks
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
+YAW_BIAS_STD = 0.003
+"""rad/s: the yaw-rate bias to expect of odometry or a gyroscope, estimated per period."""
 # Newton steps on the biases: their cost is nearly quadratic, so that three are usual.
 _BIAS_STEPS = 8
 # rad/s: of the numerical derivative by the biases, far below any bias that matters.
@@ -175,9 +177,9 @@ class Elimination:
 
     gram: Complex
     factor: Array
-    cross: Complex
+    cross: Array | Complex
 
-    def weights(self, coefficients: Complex) -> Complex:
+    def weights(self, coefficients: Array | Complex) -> Complex:
         """The map's weights (m, ...) for [o, z, -b z] (3N, ...)."""
         return np.asarray(_solve(self.factor, self.cross @ coefficients))
 
@@ -195,12 +197,17 @@ class Elimination:
         return 2.0 * float(np.log(np.diag(self.factor)).sum())
 
 
-def eliminate(expanded: Array, ridge: Array, weights: Array, stack: Stack) -> Elimination:
-    """Eliminate the map from features expanded to (M, m), each image with a weight (M,)."""
+def eliminate(
+    expanded: Array, ridge: Array, weights: Array, stack: Stack, form: bool = True
+) -> Elimination:
+    """Eliminate the map from features expanded to (M, m), each image with a weight (M,). Without
+    the quadratic `form` its weights are for places (M,), which are known."""
     weighted = expanded * weights[:, None]
     normal = weighted.T @ expanded
     normal[np.diag_indices_from(normal)] += ridge
     factor = _cholesky(normal)
+    if not form:
+        return Elimination(np.zeros((0, 0), complex), factor, weighted.T)
     columns = np.column_stack([np.ones(len(weights)), stack.path, stack.drift])
     cross = np.vstack([_products(weighted, column, stack) for column in columns.T]).T
     real, imag = _whiten(factor, cross)
@@ -244,20 +251,20 @@ def _whiten(factor: Array, right: Complex) -> tuple[Array, Array]:
     return np.ascontiguousarray(real), np.ascontiguousarray(imag)
 
 
-def _solve(factor: Array, right: Complex) -> Complex:
+def _solve(factor: Array, right: Array | Complex) -> Complex:
     real = scipy.linalg.cho_solve((factor, True), right.real)
     return np.asarray(real + 1j * scipy.linalg.cho_solve((factor, True), right.imag))
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods."""
+    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods; and the quadratic form
+    H (N, N) of the directions, where these are not those of a sparse graph."""
 
     z: Complex
     o: Complex
     bias: Array
-    h: Complex
-    cost: float
+    h: Complex = field(default_factory=lambda: np.zeros((0, 0), complex))
 
     @property
     def certificate(self) -> Certificate:
@@ -360,8 +367,7 @@ class QuadraticForm:
             bias, z = self._estimate_bias(bias, z)
             h, origins = schur(self.system(bias))
         z = synchronize(h, [z])
-        cost = float(np.real(np.vdot(z, h @ z))) / 2
-        return Solution(z, origins @ z, bias, h, cost)
+        return Solution(z, origins @ z, bias, h)
 
     def _refined(self, bias: Array, z: Complex) -> Complex:
         """[o, z] (2N,) at given biases, from directions nearby."""

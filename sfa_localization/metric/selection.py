@@ -23,7 +23,7 @@ from sfa_localization.metric.basis import (
 )
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
-from sfa_localization.metric.quadratic_form import Stack, eliminate, schur
+from sfa_localization.metric.quadratic_form import Stack, schur
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
@@ -101,9 +101,9 @@ def leave_out(fit: MapFit) -> LeftOut:
     for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
         weights = fit.weights
         weights[rows] = 0.0
-        elimination = eliminate(fit.expanded, fit.basis.ridge, weights, stack)
-        solution = fit.form(elimination).solve(fit.solution.z, fit.solution.bias)
-        coefficients = elimination.weights(solution.coefficients(stack.period))
+        elimination = fit.problem.eliminated(fit.basis, fit.expanded, weights)
+        solution = fit.solved(elimination)
+        coefficients = fit.problem.weights(elimination, solution)
         left = fit.expanded[rows]
         used = weights > 0
         turn, shift = align_complex(solution.places(stack)[used], places[used])
@@ -115,18 +115,24 @@ def leave_out(fit: MapFit) -> LeftOut:
 def evidence(basis: Basis, now: MapFit) -> float:
     """Negative log evidence of a Gaussian process's hyper-parameters, at their best directions.
 
-    Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
+    Origins have flat priors (restricted likelihood), where no graph knows the places; the signal's
+    variance is profiled out.
     """
     expanded = expand(basis, now.problem.features)
     weights = 1.0 / (1.0 + missing(basis, expanded))
     noise = float(basis.ridge[0])
-    elimination = eliminate(expanded, basis.ridge, weights, now.stack)
-    system = now.form(elimination).system(now.solution.bias)
-    h = schur(system)[0]
-    cost = 2.0 * phase_cost(h, refine(h, now.solution.z))
-    points, segments = len(expanded), now.stack.segments
-    own = np.real(system[:segments, :segments])
-    own = own + np.trace(own) / segments**2
+    elimination = now.problem.eliminated(basis, expanded, weights)
+    points, segments, own = len(expanded), 0, np.eye(1)
+    if now.problem.graph is not None:
+        residuals = now.problem.fitted(elimination, expanded, now.solution)[1]
+        cost = float(np.real(np.vdot(now.places, weights * residuals)))
+    else:
+        system = now.form(elimination).system(now.solution.bias)
+        h = schur(system)[0]
+        cost = 2.0 * phase_cost(h, refine(h, now.solution.z))
+        segments = now.stack.segments
+        own = np.real(system[:segments, :segments])
+        own = own + np.trace(own) / segments**2
     freedom = points - segments
     return (
         freedom * float(np.log(cost / noise / freedom))
