@@ -45,12 +45,10 @@ logger = logging.getLogger(__name__)
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
-LITTLE, OVERFIT, TIED = 0.9, 4.0, 0.5
+LITTLE, OVERFIT = 0.9, 4.0
 """Where features explain less than this share of the places of images left out, whose variance is
 so many times that of the others, a map follows noise: it leaves no residuals, and would bend the
-drive as it likes; and where more than this share of the segments have offsets, these know the shape
-of the drive better. Weighted by what is left out, a map leaves it the shape that odometry and loop
-closures give it."""
+drive as it likes. Then the drive keeps the shape of its odometry."""
 _LARGEST_SHARE = 0.8
 """Of the error of an image that its neighbors have too."""
 # Images that the components are found from, evenly along the drives: they are smooth statistics.
@@ -137,8 +135,8 @@ def learn_metric(
     """
     problem = MetricProblem.of(features, segments, config, seed)
     check_amount(problem.stack, problem.links)
-    tied = problem.stack.owner[np.isin(problem.stack.images, segments.offsets.images)]
-    if len(np.unique(tied)) > TIED * len(segments) and config.solver == 'certified':
+    tied = len(segments.closures) or len(segments.offsets.images) or segments.anchors
+    if tied and config.solver == 'certified':
         problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
     left = _Left.of(fit)

@@ -70,18 +70,14 @@ def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
 
 def places_of_points(fit: MapFit) -> tuple[Complex, Complex]:
     """Where the drive puts the robot at measured points (K,), and the covariance (K, K) per axis of
-    that, without a motion of the whole map."""
+    that, without a motion of the whole map; 0 for the paper's descent."""
     anchors, solution, period = fit.problem.segments.anchors, fit.solution, fit.stack.period
     graph = fit.problem.graph
     if anchors is None:
         return np.zeros(0, complex), np.zeros((0, 0), complex)
     rows = anchors.rows(fit.stack)
-    if graph is not None:
-        return rows @ solution.coefficients(period), graph.covariance(rows)
-    origins, directions = _uncertain_segments(fit)
-    bias = solution.bias[period][:, None]
-    moved = rows @ np.vstack([origins, directions, -bias * directions])
-    return rows @ solution.coefficients(period), moved @ moved.conj().T / 2
+    known = np.zeros((len(rows), len(rows)), complex) if graph is None else graph.covariance(rows)
+    return rows @ solution.coefficients(period), known
 
 
 def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: float) -> MetricMap:

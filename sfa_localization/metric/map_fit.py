@@ -18,14 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
-from scipy import sparse
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.link_noise import learned
-from sfa_localization.metric.loops import Loops, loops_of
 from sfa_localization.metric.phases import Certificate
 from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.quadratic_form import (
@@ -66,13 +63,11 @@ class MetricProblem:
     segments: Segments
     stack: Stack
     links: Links
-    ties: tuple[Loops | Anchors, ...]
-    """Loop closures, and measured points."""
     config: MetricConfig
     seed: int = 0
     """Of the parts that are left out, and of the points that the forecast draws."""
     graph: Graph | None = None
-    """Where odometry, closures and points say more of the drive than features: its solution."""
+    """Its solution, where closures or points tie the drive: they know more of it than features."""
 
     @classmethod
     def of(
@@ -81,9 +76,7 @@ class MetricProblem:
         """From features (N, K) of all images. Raises DataError when they are unusable."""
         stack = Stack.of(segments)
         rows = _checked_rows(np.asarray(features, float), stack, config)
-        ties: list[Loops | Anchors] = [*loops_of(segments.closures, segments.offsets, stack)]
-        ties += [segments.anchors] if segments.anchors else []
-        return cls(rows, segments, stack, Links.of(segments), tuple(ties), config, seed)
+        return cls(rows, segments, stack, Links.of(segments), config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
         """Alternate solution and noise until the noise settles; a near `start` saves rounds.
@@ -99,16 +92,14 @@ class MetricProblem:
         elimination = self.eliminated(basis, expanded, 1.0 / noise_ratio)
         freedom = _freedom(elimination, basis, len(expanded))
         if self.graph is not None:
-            solution, loops = self.graph.solution, elimination.gram
+            solution = self.graph.solution
             weights, residuals = self.fitted(elimination, expanded, solution)
             variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
             rounds = 0
         else:
             freedom -= 1.5 * self.stack.segments
         for _ in range(rounds):
-            ties = sparse.vstack([one.ties(self.stack, solution) for one in self.ties])
-            loops = np.asarray((ties.conj().T @ ties).toarray())
-            form = self.form(elimination, loops, links, variance * correlation, YAW_BIAS_STD)
+            form = self.form(elimination, links, variance * correlation, YAW_BIAS_STD)
             bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
             solution = form.solve(solution.z if solution else None, bias)
             links, links_before = learned(self.links, form, solution), links
@@ -121,7 +112,7 @@ class MetricProblem:
                 break
         assert solution is not None
         return MapFit(
-            self, basis, expanded, noise_ratio, variance, correlation, loops, links,
+            self, basis, expanded, noise_ratio, variance, correlation, links,
             elimination, solution, residuals, weights,
         )  # fmt: skip
 
@@ -148,16 +139,14 @@ class MetricProblem:
     def form(
         self,
         elimination: Elimination,
-        loops: Complex,
         links: Links,
         variance: float,
         bias_std: float,
     ) -> QuadraticForm:
-        """The quadratic form of the map, loop closures (3N, 3N) and links, for the variance m^2 of
-        a position; with a `bias_std` of 0 the biases stay what they are.
+        """The quadratic form of the map and links, for the variance m^2 of a position; with a
+        `bias_std` of 0 the biases stay what they are.
         """
-        gram = elimination.gram + variance * loops
-        return QuadraticForm(gram, links, self.stack.period, variance, bias_std)
+        return QuadraticForm(elimination.gram, links, self.stack.period, variance, bias_std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +165,6 @@ class MapFit:
     correlation: float
     """How many images count as one beside odometry's links, because residuals of neighbors are
     correlated; times LINK_WEIGHT."""
-    loops: Complex
-    """(3N, 3N) form of the loop closures, and of points, in [o, z, -b z], see loops.py."""
     links: Links
     """With the variances that the solution shows, see link_noise.py."""
     elimination: Elimination
@@ -221,7 +208,7 @@ class MapFit:
     def form(self, elimination: Elimination) -> QuadraticForm:
         """The quadratic form after another elimination, with this noise and these biases."""
         noise = self.links, self.link_variance
-        return self.problem.form(elimination, self.loops, *noise, bias_std=0.0)
+        return self.problem.form(elimination, *noise, bias_std=0.0)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:

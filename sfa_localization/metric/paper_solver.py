@@ -173,8 +173,7 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     form = QuadraticForm(elimination.gram, problem.links, stack.period, variance, 0.0)
     h = schur(form.system(bias))[0]
     solution = Solution(z, o, bias, h)
-    no_loops = np.zeros_like(elimination.gram)
     return MapFit(
-        problem, basis, expanded, ones, variance, 1.0, no_loops, problem.links,
+        problem, basis, expanded, ones, variance, 1.0, problem.links,
         elimination, solution, residuals, weights,
     )  # fmt: skip
