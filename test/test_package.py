@@ -229,7 +229,7 @@ SLOW_TO_IMPORT = {'filterpy', 'mdp', 'matplotlib', 'scipy.optimize', 'scipy.stat
     [
         ('fusion.pose_filter', {'cv2', 'scipy', *SLOW_TO_IMPORT}),
         ('camera.panorama', {'scipy', *SLOW_TO_IMPORT}),
-        ('localizer', {'scipy.sparse', 'scipy.spatial', *SLOW_TO_IMPORT}),
+        ('localizer', {'scipy', *SLOW_TO_IMPORT}),
     ],
 )
 def test_what_nodes_import_is_there_at_once(module, unwanted):

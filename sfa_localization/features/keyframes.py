@@ -22,14 +22,19 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from sfa_localization.camera.leveling import TILTED_RAD, leveled
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.local_regression import Neighbors, averaged, turned, vectors_of
+from sfa_localization.features.local_regression import (
+    Neighbors,
+    averaged,
+    columns_of,
+    turned,
+    vectors_of,
+)
 from sfa_localization.features.observation import Leveled, Match, MatchNoise, Spectra, unlikeness
 from sfa_localization.features.tilt import derivatives, find_tilt, visible
 
@@ -42,8 +47,7 @@ _BLUR = 1 / 37.5
 # Keeps the noise of dark and of plain surfaces small beside texture: of the brightness (8 bit),
 # and of its logarithm.
 _DARKEST, _FLATTEST = 8.0, 0.1
-# Textures and spectra are stored with one byte a number: of a texture so many steps are a standard
-# deviation.
+# Textures and spectra have one byte a number: of a texture so many steps are a standard deviation.
 _LARGEST, _LEAST_STEP = 127, 1e-9
 _STEPS = _LARGEST / 4.0
 NEIGHBORS = 24
@@ -118,7 +122,7 @@ def normalized(image: Texture) -> Texture:
 
 def spectrum(textures: Texture) -> Spectra:
     """Fourier coefficients of the columns, (..., rows, F)."""
-    return np.asarray(fft.rfft(textures, axis=-1), np.complex64)
+    return np.asarray(np.fft.rfft(textures), np.complex64)
 
 
 def channels(rows: int) -> tuple[slice, ...]:
@@ -149,7 +153,7 @@ def correlate(spectra: Spectra, keyframes: Spectra, columns: int) -> Scores:
 def _peaks(products: Spectra, columns: int) -> Scores:
     """The same by products (F, K, T) over the rows."""
     # Half columns: between whole ones, the same image would seem to be another one.
-    curves = fft.irfft(products, 2 * columns, axis=0)
+    curves = columns_of(products, 2 * columns, axis=0)
     top = curves.argmax(0)
     around = (top + np.arange(-1, 2)[:, None, None]) % len(curves)
     left, middle, right = np.take_along_axis(curves, around, 0)
@@ -263,8 +267,6 @@ class Keyframes:
     def match(self, panorama: Image, pattern: Spectra | None = None) -> Match:
         """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `pattern` (rows, F) is what the
         light adds to images, see `OtherLight`.
-
-        The likeliest by a coarse correlation and their best's neighbors are correlated in full.
         """
         return self.match_level(self.level(panorama), pattern)
 
@@ -360,10 +362,6 @@ class Keyframes:
         wanted = wanted[np.isneginf(known.scores[wanted])]
         scores, yaws = self.correlated(known.visible[None], wanted)
         known.scores[wanted], known.yaws[wanted] = scores[0], yaws[0]
-
-    def nearest(self, place: Array, number: int = NEIGHBORS) -> NDArray[np.int64]:
-        """So many keyframes nearest to a place (2,) m."""
-        return _least(np.hypot(*(self.poses[:, :2] - place).T), number)
 
     def _likeliest_drives(self, scores: NDArray[np.float32]) -> list[int]:
         """The drives of the training that the likeliest keyframes are of, by correlations (K,)."""
@@ -472,9 +470,8 @@ class Keyframes:
 
     def _with_tilts(self, image: Spectra) -> Spectra:
         """Of an image (rows, F) and of its derivatives by roll and pitch: (3, rows, F)."""
-        texture = fft.irfft(image, self.columns)
-        slopes = spectrum(derivatives(texture, self.channels, self.sphere))
-        return np.concatenate([image[None], slopes])
+        slopes = derivatives(columns_of(image, self.columns), self.channels, self.sphere)
+        return np.concatenate([image[None], spectrum(slopes)])
 
     def _variance(self, match: Match) -> float:
         """Variance m^2 along each axis of a place by the keyframes of one drive."""

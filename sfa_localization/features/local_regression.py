@@ -16,8 +16,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
-from scipy.linalg import lapack
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.observation import Match, Spectra
@@ -47,6 +45,11 @@ def turned(spectra: Spectra, angle: Array | float) -> Spectra:
     """
     phase = np.exp(1j * np.multiply.outer(angle, np.arange(spectra.shape[-1]))).astype(np.complex64)
     return np.asarray(spectra * phase[..., None, :])
+
+
+def columns_of(spectra: Spectra, columns: int, axis: int = -1) -> Vectors:
+    """So many columns of what has these spectra. (SciPy would take as long to import as NumPy.)"""
+    return np.asarray(np.fft.irfft(spectra, columns, axis), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +99,11 @@ class Neighbors:
         basis = _Basis.of(seen[:, count, :count].sum(axis=0), self.drives, self.places)
         turning, gains, products = self._compared(seen, vectors, basis.mean)
         trust = self._trust(gains, products, basis)
-        found = _regressed(_summed(trust, products), basis)
+        found = _regressed(np.tensordot(trust, products, 1), basis)
         for _ in range(_WEIGHED if len(basis.means) > 1 else 0):
             basis = basis.about(found.place)
             turning, gains, products = self._compared(seen, vectors, basis.mean)
-            found = _regressed(_summed(trust, products), basis)
+            found = _regressed(np.tensordot(trust, products, 1), basis)
         return Found(self, angle, vectors, turning, gains, trust, found)
 
     def by_row(self, values: Array) -> Vectors:
@@ -127,7 +130,7 @@ class Neighbors:
 
     def _trust(self, gains: Array, products: Array, basis: _Basis) -> Array:
         """How much each channel counts, 1 at most: by how well the keyframes explain it there."""
-        left = _regressed(_summed(gains**2, products), basis).combine[0]
+        left = _regressed(np.tensordot(gains**2, products, 1), basis).combine[0]
         sizes = [part.stop - part.start for part in self.channels]
         errors = (products @ left) @ left / sizes
         trust = 1 / (errors + errors.min() + 1e-12)
@@ -152,11 +155,6 @@ def _with(new: Vectors, products: Array, channels: Sequence[slice], *known: Vect
         one[count:] = np.hstack([new[own] @ each[own].T for each in (*known, new)])
     both[:, :count, count:] = both[:, count:, :count].swapaxes(1, 2)
     return both
-
-
-def _summed(shares: Array, products: Array) -> Array:
-    """The sum (N, N) of products (C, N, N) by shares (C,)."""
-    return np.asarray((shares @ products.reshape(len(shares), -1)).reshape(products.shape[1:]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +195,7 @@ class Found:
         vectors += combine[:, -1:] * self.turning + combine[:, :count] @ among.vectors
         spectra = vectors.view(np.complex64).reshape(3, -1, frequencies)
         spectra = turned(spectra * (1 / weights(frequencies, columns)), -self.angle)
-        left, *along = fft.irfft(spectra, columns)
+        left, *along = columns_of(spectra, columns)
         sectors = min(_SECTORS, columns)
         starts = np.arange(sectors) * columns // sectors
         moved = np.add.reduceat(among.by_row(self.trust) @ (along * left), starts, axis=1)
@@ -306,7 +304,7 @@ def _regressed(products: Array, basis: _Basis) -> _Regression:
     wanted = np.column_stack([-apart[:-1, -1], offsets]) * root
     combine = np.zeros((3, len(products)))
     combine[0, count] = 1.0
-    combine[:, :count] = (lapack.dposv(gram, wanted)[1] * root).T
+    combine[:, :count] = (np.linalg.solve(gram, wanted) * root).T
     centered = combine[:, : count + 1].copy()
     combine[:, :count] -= (centered[:, :-1] @ owner.T) @ means
     shares = basis.mean - combine[0, :count]

@@ -60,7 +60,8 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
     among = Keyframes.of(*own, MatchNoise(), sphere, drives, rounded=False)
     path, found = views.path_m[known], []
     for row in _spaced(path, drives):
-        near = among.nearest(among.poses[row, :2], _NEAREST)
+        apart = np.hypot(*(among.poses[:, :2] - among.poses[row, :2]).T)
+        near = np.argsort(apart, kind='stable')[:_NEAREST]
         own = (drives[near] == drives[row]) & (np.abs(path[near] - path[row]) < STRETCH_M)
         near = near[~own][:_AMONG]
         if len(near) < _FEWEST:

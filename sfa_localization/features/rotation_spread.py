@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.rotation import Map
@@ -117,6 +116,8 @@ def share_within(ratio: Array, axes: int, share: float, weight: Array) -> float:
 
 def chi_square(share: float, axes: int) -> float:
     """Square that so many of the sums of `axes` squared standard normal variables do not exceed."""
+    from scipy.special import gammaincinv  # for training alone
+
     return float(2 * gammaincinv(axes / 2, share))
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
@@ -81,6 +80,8 @@ def solve(statistics: Statistics, outputs: int, relative_cut: float) -> Solution
             f'the signal has rank {rank}, fewer than the {outputs} slow features asked for: '
             'record more varied images or ask for fewer'
         )
+    from scipy import linalg  # for training alone
+
     slow = white.T @ (statistics.difference / statistics.steps) @ white
     delta, rotation = linalg.eigh((slow + slow.T) / 2, subset_by_index=[0, outputs - 1])
     weights = signed(white @ rotation)
@@ -92,7 +93,7 @@ def whitening(covariance: Array, relative_cut: float, least: int) -> Array:
 
     At least `least` directions are kept, unless they are rounding errors.
     """
-    variance, axes = linalg.eigh(covariance, driver='evd')
+    variance, axes = np.linalg.eigh(covariance)
     cut = min(relative_cut * variance[-1], variance[-min(least, len(variance))])
     kept = (variance >= cut) & (variance > max(_ROUNDING * variance[-1], np.finfo(float).tiny))
     return np.asarray(axes[:, kept] / np.sqrt(variance[kept]))

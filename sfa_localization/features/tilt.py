@@ -19,11 +19,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.sphere import Sphere, rotation
-from sfa_localization.features.local_regression import turned
+from sfa_localization.features.local_regression import columns_of, turned
 from sfa_localization.features.observation import Spectra
 
 Texture = NDArray[np.float32]
@@ -56,16 +55,15 @@ def _slopes(sphere: Sphere, heights: tuple[int, ...], columns: int) -> tuple[Tex
     """What makes of textures their derivatives along which a tilt moves them up, (rows, rows), and
     of two columns' differences those sideways, (rows, 1); sine and cosine of azimuths (columns,).
     """
-    slopes = [np.gradient(np.eye(n), (sphere.low - sphere.high) / n, axis=0) for n in heights]
-    upward = linalg.block_diag(*slopes)
+    upward = np.zeros((sum(heights), sum(heights)))
+    for end, rows in zip(np.cumsum(heights), heights, strict=True):
+        part, row = slice(end - rows, end), (sphere.low - sphere.high) / rows
+        upward[part, part] = np.gradient(np.eye(rows), row, axis=0)
     elevations = np.concatenate([sphere.elevations(rows) for rows in heights])
     azimuth, sign = sphere.azimuths(columns), -1 if sphere.clockwise else 1
     sideways = np.tan(elevations)[:, None] * (sign * columns / (4 * np.pi))
-    return _single(upward), _single(sideways), _single(np.sin(azimuth)), _single(np.cos(azimuth))
-
-
-def _single(values: Array) -> Texture:
-    return np.asarray(values, np.float32)
+    slopes = upward, sideways, np.sin(azimuth), np.cos(azimuth)
+    return tuple(np.asarray(one, np.float32) for one in slopes)
 
 
 def find_tilt(
@@ -88,8 +86,8 @@ def find_tilt(
     tried = _Tilts.of(sphere, tuple(part.stop - part.start for part in channels), columns)
     few = tried.columns // 2 + 1
     others = turned(others[..., :few], turn)
-    level = fft.irfft(others.swapaxes(1, 2), tried.columns, axis=1)
-    shifted = fft.irfft(image[:, :few], tried.columns).T @ tried.shifts
+    level = columns_of(others.swapaxes(1, 2), tried.columns, axis=1)
+    shifted = columns_of(image[:, :few], tried.columns).T @ tried.shifts
     by_shift = level.swapaxes(0, 1) @ shifted.reshape(*level.shape[1:], -1)
     scores = by_shift.swapaxes(0, 1).reshape(len(others), -1) @ tried.weights
     count = len(tried.steps)
@@ -130,12 +128,15 @@ class _Tilts:
         unlikely = _UNLIKELY * np.add.outer(steps**2, steps**2)
         # Of half as many columns, spectra make values twice as large.
         scale = np.sqrt(rows / (rows - np.abs(shifts))) * few / columns
-        # Rows of a texture with fewer of them are as many finer ones.
-        fine = [np.arange(n) == (np.arange(rows) * n // rows)[:, None] for n in heights]
-        moved = [linalg.block_diag(*(f.T @ np.eye(rows, k=k) @ f for f in fine)) for k in shifts]
+        moved = np.zeros((sum(heights), sum(heights), len(shifts)))
+        for end, n in zip(np.cumsum(heights), heights, strict=True):
+            # Rows of a texture with fewer of them are as many finer ones.
+            fine = np.arange(n) == (np.arange(rows) * n // rows)[:, None]
+            by_shift = [fine.T @ np.eye(rows, k=k) @ fine for k in shifts.tolist()]
+            moved[end - n : end, end - n : end] = np.stack(by_shift, axis=2)
         weights = near.reshape(few * len(shifts), -1)
-        shifted = (np.stack(moved, axis=2) * scale).reshape(sum(heights), -1)
-        return cls(steps, few, _single(shifted), _single(weights), _single(unlikely))
+        tables = (moved * scale).reshape(len(moved), -1), weights, unlikely
+        return cls(steps, few, *(np.asarray(one, np.float32) for one in tables))
 
 
 def _peaks(scores: Texture, steps: Array) -> Array:

@@ -9,10 +9,10 @@ themselves, so one solver serves both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.array_files import Arrays
@@ -81,7 +81,7 @@ def monomials(features: Array) -> Array:
     return np.column_stack([np.ones(len(features)), features, features[:, i] * features[:, j]])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Process:
     """A Gaussian process with a Matern 5/2 kernel of unit variance and a free constant mean.
 
@@ -95,17 +95,19 @@ class Process:
     """(m, K) scaled inducing features."""
     noise: float
     """Variance of a point over the process's variance."""
-    turn: Array = field(init=False, repr=False)
-    """(m, m) transposed inverse of the lower Cholesky factor of the points' kernel."""
 
     def __post_init__(self) -> None:
-        points = self.points.astype(np.float32).astype(np.float64)
-        kernel = matern(points, points)
+        object.__setattr__(self, 'points', self.points.astype(np.float32).astype(np.float64))
+
+    @cached_property
+    def turn(self) -> Array:
+        """(m, m) transposed inverse of the lower Cholesky factor of the points' kernel."""
+        from scipy import linalg  # for training alone
+
+        kernel = matern(self.points, self.points)
         kernel[np.diag_indices_from(kernel)] += 1e-9
-        factor = scipy.linalg.cholesky(kernel, lower=True)
-        whiten = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
-        object.__setattr__(self, 'points', points)
-        object.__setattr__(self, 'turn', whiten.T)
+        factor = linalg.cholesky(kernel, lower=True)
+        return np.asarray(linalg.solve_triangular(factor, np.eye(len(factor)), lower=True).T)
 
     @classmethod
     def fit(cls, features: Array, scale: Array, noise: float, size: int) -> Process:

@@ -16,15 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import linalg
 
 from sfa_localization.data.array_files import Arrays, packed, unpacked
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import Basis, basis_from
 
-_FEW = 4  # rows, for which one triangular product each is quicker than one of all
+_BLOCK = 128  # columns of a triangular matrix that are multiplied at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,7 @@ class MetricMap:
     basis: Basis
     linear: Array
     constant: Array
-    factor: NDArray[np.float32]
+    factor: Array
     floor: float
     inflation: float
     common_m: float
@@ -70,7 +68,8 @@ class MetricMap:
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + floor + prior
         linear = basis.turn @ rows[:-1]
-        return cls(basis, linear, constant, np.asfortranarray(factor), floor, inflation, common_m)
+        rounded = np.asfortranarray(factor, float)
+        return cls(basis, linear, constant, rounded, floor, inflation, common_m)
 
     @property
     def features(self) -> int:
@@ -98,7 +97,7 @@ class MetricMap:
             **self.basis.to_arrays(),
             'linear': self.linear,
             'constant': self.constant,
-            'factor': packed(self.factor),
+            'factor': packed(self.factor.astype(np.float32)),
             'scalars': np.array([self.floor, self.inflation, self.common_m]),
         }
 
@@ -107,7 +106,7 @@ class MetricMap:
         """The map of saved arrays. Raises ModelError where one is missing."""
         try:
             scalars = np.asarray(arrays['scalars'], float).tolist()
-            factor, basis = unpacked(arrays['factor']), basis_from(arrays)
+            factor, basis = unpacked(arrays['factor']).astype(float), basis_from(arrays)
             return cls(basis, arrays['linear'], arrays['constant'], factor, *scalars)
         except KeyError as error:
             raise ModelError(f'the metric map lacks {error}') from None
@@ -121,21 +120,19 @@ def _sign(basis: Basis) -> float:
 def lower_root(symmetric: Array) -> Array:
     """Lower triangular L with L L^T = a matrix (N, N), its negative part (rounding) left out."""
     try:
-        return np.asarray(linalg.cholesky(symmetric, lower=True))
-    except linalg.LinAlgError:
-        values, axes = linalg.eigh(symmetric)
+        return np.asarray(np.linalg.cholesky(symmetric), float)
+    except np.linalg.LinAlgError:
+        values, axes = np.linalg.eigh(symmetric)
         root = axes * np.sqrt(np.maximum(values, 0.0))
-        return np.asarray(linalg.qr(root.T, mode='r')[0].T)
+        return np.asarray(np.linalg.qr(root.T, mode='r')).T
 
 
-def squares(rows: Array, factor: NDArray[np.float32]) -> Array:
-    """|k L|^2 (M,) of rows k (M, N), for few of them reading only the lower triangle.
+def squares(rows: Array, factor: Array) -> Array:
+    """|k L|^2 (M,) of rows k (M, N), reading little more than the lower triangle.
 
     `factor` (N, N) is in Fortran order.
     """
-    if len(rows) > _FEW:
-        product = rows.astype(factor.dtype) @ factor
-    else:
-        multiply = linalg.get_blas_funcs('trmv', (factor,))
-        product = np.array([multiply(factor, row, lower=1, trans=1) for row in rows])
-    return np.asarray(np.square(product, dtype=np.float64).sum(1))
+    sums = np.zeros(len(rows))
+    for at in range(0, len(factor), _BLOCK):
+        sums += np.square(rows[:, at:] @ factor[at:, at : at + _BLOCK]).sum(1)
+    return sums

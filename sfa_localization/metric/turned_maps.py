@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
@@ -64,6 +63,8 @@ class TurnedMaps:
 
         Raises DataError where all are equal.
         """
+        from scipy import linalg  # for training alone
+
         vectors = turned_back(spectra, yaw, sign)
         mean = vectors.mean(0, dtype=np.float64).astype(np.float32)
         centered = vectors - mean
