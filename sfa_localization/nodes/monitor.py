@@ -8,8 +8,6 @@ import math
 import time
 from collections import deque
 
-import numpy as np
-
 from sfa_localization.data.rejections import RejectionCounter
 
 _WINDOW = 500
@@ -53,7 +51,8 @@ class Monitor:
         """
         span_s = steady_s() - self._arrivals_s[0] if self._arrivals_s else 0.0
         rate_hz = max(len(self._arrivals_s) - 1, 0) / max(span_s, 1e-9)
-        p50, p99 = np.percentile(self._latencies_s or [0.0], [50, 99]) * 1e3
+        taken_ms = sorted(1e3 * latency_s for latency_s in self._latencies_s) or [0.0]
+        p50, p99 = (taken_ms[round(part * (len(taken_ms) - 1))] for part in (0.5, 0.99))
         texts = {
             f'{prefix}received': str(self.received),
             f'{prefix}used': str(self.used),
