@@ -53,7 +53,7 @@ _ANYWHERE = 1 / (100.0 * 2 * math.pi)
 """Density of poses anywhere in 100 m^2, 1/(m^2 rad)."""
 _TINY = 1e-9  # part of an image's weight that is left, so that some path fits best
 _STEPS = 2  # of reweighting, from where the fit hardly changes
-_LEVER, _TURNED, _SCALE = 1, 2, 3  # kinds of rows
+_LEVER, _TURNED, _SCALE = -3, -2, -1  # rows that have these nuisances
 _AHEAD_S = 0.3  # of the path: odometry may be a little behind
 
 
@@ -157,19 +157,17 @@ class _Window:
     def hypotheses(self) -> list[_Hypothesis]:
         """All, with log odds up to a constant."""
         rows, yaws, delays = self._paths()
-        kinds = np.append(np.zeros(len(rows)), [_LEVER, _TURNED, _SCALE])
         rows, yaws = (np.concatenate([x, np.repeat(x[:1], 3, 0)]) for x in (rows, yaws))
-        logs, sizes = self._fitted(rows, yaws, kinds)
-        lever, turned, scale = (size[:, 0] for size in sizes)
+        logs, (lever, turned, scale) = self._fitted(rows, yaws)
         off_m, off_rad = np.abs(rows[:-3, -1] - rows[0, -1]), np.abs(yaws[:-3, -1] - yaws[0, -1])
         of_delays = np.array([logs[:-3], delays, off_m, off_rad]).T.tolist()
         late = [_Hypothesis('late', *each) for each in of_delays]
         nothing = self._power * len(self._places) * math.log(_ANYWHERE)
         found = [
             late[0]._replace(name='as it is'),
-            _Hypothesis('lever', logs[-3], lever[-3], abs(lever[-3])),
-            _Hypothesis('turned', logs[-2], turned[-2], 0.0, abs(turned[-2])),
-            _Hypothesis('scale', logs[-1], scale[-1], abs(scale[-1] - 1) * AGREEING_M),
+            _Hypothesis('lever', logs[_LEVER], lever, abs(lever)),
+            _Hypothesis('turned', logs[_TURNED], turned, 0.0, abs(turned)),
+            _Hypothesis('scale', logs[_SCALE], scale, abs(scale - 1) * AGREEING_M),
             _Hypothesis('unrelated', nothing, 0j, AGREEING_M),
             *late[1:],
         ]
@@ -188,63 +186,52 @@ class _Window:
         places, yaws = (np.interp(at, self._times, x) for x in (self._path, self._path_yaw))
         return places, yaws, delays
 
-    def _fitted(
-        self, rows: Complex, yaws: Array, kinds: Array
-    ) -> tuple[Array, tuple[Complex, Array, Array]]:
-        """Log evidence (R,) of paths, and nuisances (R, 1): lever, angle and factor, each where it
-        is the kind of the row.
+    def _fitted(self, rows: Complex, yaws: Array) -> tuple[Array, tuple[complex, float, float]]:
+        """Log evidence (R,) of paths, and lever, angle and factor, which the last three have.
 
         With weights w and w', centered places z and path d, and v = exp(i (yaw - h)), the error
         sum w |z - u d|^2 + w' |v - u|^2 is least for the u along sum w conj(d) z + w' v.
         """
-        is_lever, is_turned, is_scale = (kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE))
-        arm = np.exp(1j * yaws)
+        arm, one = np.exp(1j * yaws), np.ones((len(rows), 1))
         look, weight = self._looks * np.conj(arm), np.ones(rows.shape)
-        angle, factor = np.zeros((len(rows), 1)), np.ones((len(rows), 1))
-        lever = np.asarray(angle, complex)
-        for step in range(_STEPS):
+        lever, angle, factor, by_yaw = 0j * one, 0.0 * one, 1.0 * one, 1.0 * one
+        by_yaw[_TURNED] = 0.0  # before its angle is known
+        for _ in range(_STEPS):
             w, w_yaw = weight / self._variance, weight / self._yaw_variance
             total, of_yaw = (each.sum(1, keepdims=True) for each in (w, w_yaw))
             d, g, z = (x - (w * x).sum(1, keepdims=True) / total for x in (rows, arm, self._places))
             seen, path = (w_yaw * look).sum(1, keepdims=True), factor * d + lever * g
             u = (w * np.conj(path) * z).sum(1, keepdims=True)
-            u = u + seen * np.exp(-1j * angle) * (1 - is_turned * (step == 0))
-            u = u / np.maximum(np.abs(u), _TINY)
-            of_arm, of_path, of_angle = _information(w, of_yaw, g, d)
-            reach = (w * np.conj(g) * (z * np.conj(u) - d)).sum(1, keepdims=True)
-            along = (w * (np.conj(u * d) * z).real).sum(1, keepdims=True) + SCALE_STD**-2
-            lever, factor = is_lever * reach / of_arm, np.where(is_scale, along / of_path, 1.0)
-            angle = is_turned * np.angle(seen * np.conj(u)) * of_yaw / of_angle
+            u = u + seen * np.exp(-1j * angle) * by_yaw
+            u, by_yaw = u / np.maximum(np.abs(u), _TINY), one
+            arms, ways = w[_LEVER] * np.conj(g[_LEVER]), w[_SCALE] * np.conj(d[_SCALE])
+            of_arm = float((arms @ g[_LEVER]).real) + LEVER_STD_M**-2
+            of_path = float((ways @ d[_SCALE]).real) + SCALE_STD**-2
+            of_angle = float(of_yaw[_TURNED, 0]) + TURNED_STD_RAD**-2
+            lever[_LEVER] = arms @ (z[_LEVER] * np.conj(u[_LEVER]) - d[_LEVER]) / of_arm
+            along = (np.conj(u[_SCALE]) * (ways @ z[_SCALE])).real
+            factor[_SCALE] = (along + SCALE_STD**-2) / of_path
+            turned = np.angle(seen[_TURNED] * np.conj(u[_TURNED]))
+            angle[_TURNED] = turned * of_yaw[_TURNED] / of_angle
             path = factor * d + lever * g
             apart = np.abs(z - u * path) ** 2 / self._variance
             apart += 2 * (1 - (look * np.conj(u * np.exp(1j * angle))).real) / self._yaw_variance
             fits = self._peak * np.exp(-0.5 * apart)
             anything = fits + OUTLIERS * _ANYWHERE
             weight = fits / anything + _TINY
-        square = (w * np.abs(path) ** 2).sum(1, keepdims=True) + of_yaw + _TINY
-        log = np.log(anything).sum(1, keepdims=True) - np.log(total)
-        log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5) - 0.5 * np.log(square)
-        sizes = lever, angle, factor
-        log -= _prior(kinds, sizes, (of_arm, of_angle, of_path))
-        return (self._power * log)[:, 0], sizes
+        square = (w * np.abs(path) ** 2).sum(1) + of_yaw[:, 0] + _TINY
+        log = np.log(anything).sum(1) - np.log(total[:, 0]) - 0.5 * np.log(square)
+        log += math.log(_ANYWHERE * (2 * math.pi) ** 1.5)
+        sizes = complex(lever[_LEVER, 0]), float(angle[_TURNED, 0]), float(factor[_SCALE, 0])
+        log[_LEVER:] -= _unexpected(sizes, (of_arm, of_angle, of_path))
+        return self._power * log, sizes
 
 
-def _prior(kinds: Array, sizes: tuple[Complex, Array, Array], known: tuple[Array, ...]) -> Array:
-    """Minus the log of what is expected of lever, angle and factor (R, 1), each where it is the
-    kind of the row, over how exactly it is `known` then (Laplace).
+def _unexpected(sizes: tuple[complex, float, float], known: tuple[float, ...]) -> list[float]:
+    """Minus the log of what is expected of lever, angle and factor, over how exactly each is then
+    `known` (Laplace).
     """
-    (lever, angle, factor), (of_arm, of_angle, of_path) = sizes, known
-    return np.select(
-        [kinds[:, None] == it for it in (_LEVER, _TURNED, _SCALE)],
-        [
-            np.abs(lever / LEVER_STD_M) ** 2 / 2 + np.log(of_arm * LEVER_STD_M**2),
-            ((angle / TURNED_STD_RAD) ** 2 + np.log(of_angle * TURNED_STD_RAD**2)) / 2,
-            (((factor - 1) / SCALE_STD) ** 2 + np.log(of_path * SCALE_STD**2)) / 2,
-        ],
-    )
-
-
-def _information(w: Array, of_yaw: Array, arm: Complex, path: Complex) -> tuple[Array, ...]:
-    """What is known about lever, factor and angle (R, 1): by the images, and before them."""
-    of_arm, of_path = ((w * np.abs(x) ** 2).sum(1, keepdims=True) for x in (arm, path))
-    return of_arm + LEVER_STD_M**-2, of_path + SCALE_STD**-2, of_yaw + TURNED_STD_RAD**-2
+    lever, angle, factor = sizes
+    stds, dimensions = (LEVER_STD_M, TURNED_STD_RAD, SCALE_STD), (2, 1, 1)
+    each = zip((abs(lever), angle, factor - 1), stds, known, dimensions, strict=True)
+    return [((x / std) ** 2 + n * math.log(of * std**2)) / 2 for x, std, of, n in each]
