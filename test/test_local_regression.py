@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.features.keyframes import normalized, spectrum
-from sfa_localization.features.local_regression import Neighbors, averaged, turned, vectors_of
+from sfa_localization.features.local_regression import Neighbors, averaged, turned
 from sfa_localization.features.observation import Match
 
 ROWS = 8
@@ -54,7 +54,8 @@ class Scene:
 def place_among(image, keyframes, places, columns, channels=None, drives=None):
     channels = channels or (slice(0, keyframes.shape[1]),)
     drives = np.zeros(len(places), np.int32) if drives is None else drives
-    among = Neighbors(vectors_of(keyframes, columns), places, drives, channels, columns)
+    vectors = Neighbors.vectors_of(keyframes, columns)
+    among = Neighbors(vectors, places, drives, channels, columns)
     return among.find(image[None]).match()
 
 

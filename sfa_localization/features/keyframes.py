@@ -28,13 +28,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.local_regression import (
-    Neighbors,
-    averaged,
-    columns_of,
-    turned,
-    vectors_of,
-)
+from sfa_localization.features.local_regression import Neighbors, averaged, columns_of, turned
 from sfa_localization.features.observation import Leveled, Match, MatchNoise, Spectra, unlikeness
 from sfa_localization.features.tilt import derivatives, find_tilt, visible
 
@@ -64,8 +58,7 @@ _REACH_SHARE = 0.6
 _COARSE, _CANDIDATES = 12, 64
 # The likest keyframes to which an image is leveled: with a tilt the first may be another place.
 _LEVELED = 24
-# Sets of neighbors that are kept, 0.8 MB each: of both regressions in three drives. And keyframes
-# that are read at once.
+# Sets of neighbors that are kept, 0.8 MB each, of three drives; keyframes that are read at once.
 _KEPT, _AT_ONCE = 6, 512
 # Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees it is, even of a
 # known place, and each of these makes it like them up to 6 degrees on.
@@ -265,9 +258,7 @@ class Keyframes:
         return self.drives < self.trained
 
     def match(self, panorama: Image, pattern: Spectra | None = None) -> Match:
-        """Find a panorama (H, W, 3) uint8 BGR among the keyframes; `pattern` (rows, F) is what the
-        light adds to images, see `OtherLight`.
-        """
+        """Find a panorama (H, W, 3) uint8 BGR without the `pattern` of its light, `OtherLight`."""
         return self.match_level(self.level(panorama), pattern)
 
     def level(self, panorama: Image) -> Leveled:
@@ -373,7 +364,7 @@ class Keyframes:
         """The keyframes of the regression about a place (2,) m: the nearest of a drive of the
         training, in that order, and of those that later drives added as many that are no farther.
         """
-        apart = np.hypot(*(self.poses[:, :2] - place).T)
+        apart = self._squares(place)
         own, added = np.flatnonzero(self.drives == drive), np.flatnonzero(~self.first)
         own = own[_least(apart[own], _REGRESSED)]
         added = added[apart[added] <= apart[own].max(initial=0.0)]
@@ -461,8 +452,9 @@ class Keyframes:
         key = rows.tobytes()
         found = self._last.pop(key, None)
         if found is None:
-            vectors, places = vectors_of(self.aligned(rows), self.columns), self.poses[rows, :2]
-            found = Neighbors(vectors, places, self.drives[rows], self.channels, self.columns)
+            vectors = Neighbors.vectors_of(self.aligned(rows), self.columns)
+            of_rows = self.poses[rows, :2], self.drives[rows], self.channels, self.columns
+            found = Neighbors(vectors, *of_rows)
         self._last[key] = found
         if len(self._last) > _KEPT:
             del self._last[next(iter(self._last))]
@@ -508,9 +500,14 @@ class Keyframes:
         """How far, m, the regression may put an image from the best keyframe."""
         drive = self.drives[best]
         own = self.drives == drive if drive < self.trained else self.first
-        apart = np.hypot(*(self.poses[own, :2] - self.poses[best, :2]).T)
+        apart = self._squares(self.poses[best, :2])[own]
         farthest = np.partition(apart, min(NEIGHBORS, len(apart)) - 1)[:NEIGHBORS].max()
-        return _REACH_SHARE * max(float(farthest), 1e-6)
+        return _REACH_SHARE * max(math.sqrt(farthest), 1e-6)
+
+    def _squares(self, place: Array) -> Array:
+        """Squared distances (K,) m^2 from a place (2,) m."""
+        x, y = self.poses[:, 0] - place[0], self.poses[:, 1] - place[1]
+        return np.asarray(x * x + y * y)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to save, without pickle."""

@@ -94,7 +94,7 @@ class Neighbors:
         (1 + 2, rows, F) by roll and pitch, or without; at the heading of the keyframes when it is
         `turned` by an angle rad.
         """
-        vectors, count = vectors_of(turned(image, angle), self.columns), len(self.vectors)
+        vectors, count = self.vectors_of(turned(image, angle), self.columns), len(self.vectors)
         seen = _with(vectors, self.products, self.channels, self.vectors)
         basis = _Basis.of(seen[:, count, :count].sum(axis=0), self.drives, self.places)
         turning, gains, products = self._compared(seen, vectors, basis.mean)
@@ -105,6 +105,14 @@ class Neighbors:
             turning, gains, products = self._compared(seen, vectors, basis.mean)
             found = _regressed(np.tensordot(trust, products, 1), basis)
         return Found(self, angle, vectors, turning, gains, trust, found)
+
+    @staticmethod
+    def vectors_of(spectra: Spectra, columns: int) -> Vectors:
+        """Spectra (M, rows, F) of textures of so many columns as vectors (M, D), whose products are
+        those of the textures.
+        """
+        weighted = spectra * weights(spectra.shape[2], columns)
+        return weighted.reshape(len(spectra), -1).view(np.float32)
 
     def by_row(self, values: Array) -> Vectors:
         """Of each row (rows,) what is given of channels (C,)."""
@@ -135,14 +143,6 @@ class Neighbors:
         errors = (products @ left) @ left / sizes
         trust = 1 / (errors + errors.min() + 1e-12)
         return np.asarray(trust / trust.max())
-
-
-def vectors_of(spectra: Spectra, columns: int) -> Vectors:
-    """Spectra (M, rows, F) of textures of so many columns as vectors (M, D), whose products are
-    those of the textures.
-    """
-    weighted = spectra * weights(spectra.shape[2], columns)
-    return weighted.reshape(len(spectra), -1).view(np.float32)
 
 
 def _with(new: Vectors, products: Array, channels: Sequence[slice], *known: Vectors) -> Array:
