@@ -12,13 +12,14 @@ from picture_readers import WithoutKeyframes
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import FROZEN_IMAGES, NOVELTY_WARNING
 from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.fusion.camera_clock import NEAR_NS
 from sfa_localization.localizer import UNKNOWN_VARIANCE, Observation
 from sfa_localization.place_model import PlaceModel
 
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
 from rclpy.parameter import Parameter
 from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image
@@ -77,6 +78,7 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     features = bench.listen(PoseStamped, 'sfa/slow_feature_pose')
     poses = bench.listen(PoseStamped, 'sfa/pose')
     uncertain = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
+    turned = bench.listen(QuaternionStamped, 'sfa/turned')
     sent = panorama(1)
     bench.publish('panorama', message(image=sent))
     assert until(lambda: slow and features and poses and uncertain)
@@ -93,6 +95,9 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
     bench.publish('panorama', message(seed=2))
     assert until(lambda: 'unlike' in node.health()[1])
     assert node.health()[2]['unlike by light'] == '0 %'
+    bench.publish('panorama', message(seed=3, stamp_ns=5_000_000_001 + NEAR_NS))
+    assert until(lambda: len(turned) == 2), 'those between are not used'
+    assert read_stamp(turned[1].header.stamp) == 5_000_000_001 + NEAR_NS
     assert until(lambda: 'no image on /panorama for' in told[-1].status[0].message)
 
 

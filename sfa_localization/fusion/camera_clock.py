@@ -20,6 +20,8 @@ from sfa_localization.data.run import Odometry, Stamps
 
 LONGEST_S = 2.5
 """Clocks farther apart are not recognized."""
+NEAR_NS = 150_000_000
+"""Headings of images nearer in time are left out: they show turns that are too small."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +57,10 @@ class CameraClock:
 _SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.0, 0.798  # of |x|: sqrt(2 / pi)
 _STEP_S = 0.02
 _GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
-# Images nearer in time show turns that are too small; farther ones, or with a pause of the odometry
-# between, are not compared. An estimate is for images stamped so much later, so that those in
-# transit do not depend on which message came first.
-_NEAR_NS, _APART_NS, _PAUSE_NS = 150_000_000, 1_000_000_000, 500_000_000
+# Images farther apart in time, or with a pause of the odometry between, are not compared. An
+# estimate is for images stamped so much later, so that those in transit do not depend on which
+# message came first.
+_APART_NS, _PAUSE_NS = 1_000_000_000, 500_000_000
 _IN_TRANSIT_NS, _REMEMBERED_NS = 1_000_000_000, 10_000_000_000
 _WINDOW_NS = round(LONGEST_S * 1e9) + 100_000_000
 # Differences beyond a few of these, rad, are mismatches of images and count no more; sums that
@@ -127,7 +129,7 @@ class CameraClockFinder:
 
     def add_heading(self, stamp_ns: int, yaw_rad: float) -> None:
         """Take the heading that a `VisualGyro` has added up at an image's stamp."""
-        if self._last is not None and 0 <= stamp_ns - self._last[0] < _NEAR_NS:
+        if self._last is not None and 0 <= stamp_ns - self._last[0] < NEAR_NS:
             return
         if self._last is not None and 0 < stamp_ns - self._last[0] < _APART_NS:
             turn = float(wrap_angle(yaw_rad - self._last[1]))

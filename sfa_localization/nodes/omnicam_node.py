@@ -176,9 +176,8 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
         panorama, frame = self._leveled(self._unwrapper(image), stamp_ns), frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
-        made = panorama, stamp_ns, frame
-        self.tell(self._panoramas, convert.to_image, *made)
-        self.tell(self._compressed, convert.to_compressed, *made, _JPEG_QUALITY)
+        self.tell(self._panoramas, convert.to_image, panorama, stamp_ns, frame)
+        self.tell(self._compressed, convert.to_compressed, panorama, stamp_ns, frame, _JPEG_QUALITY)
         self._frozen.add(image)
 
     # Parameters that change while running.

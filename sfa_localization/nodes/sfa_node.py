@@ -19,6 +19,7 @@ from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
 from sfa_localization.camera.watch import NOVELTY_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.settings import Settings
+from sfa_localization.fusion.camera_clock import NEAR_NS
 from sfa_localization.localizer import Observation, Observer
 from sfa_localization.nodes import conversions as convert
 from sfa_localization.nodes.discovery import Discovery
@@ -43,19 +44,20 @@ class SfaNode(LocalizationNode):
     def setup(self) -> None:
         self._observer = Observer(self._load(self._config.model), self.settings(WatchConfig))
         self._last: Observation | None = None
+        self._turned_ns = 0
         self._features = self.publisher(Float64MultiArray, 'sfa/slow_features')
         self._feature_pose = self.publisher(PoseStamped, 'sfa/slow_feature_pose')
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
-        correlation = 'sfa/error_correlation'
-        self._correlation = self.publisher(Float64MultiArray, correlation, latched_qos())
-        self._delay = self.publisher(Float64, 'sfa/camera_delay', latched_qos())
-        self._scale = self.publisher(Float64, 'sfa/odometry_scale', latched_qos())
+        latched = latched_qos()
+        self._correlation = self.publisher(Float64MultiArray, 'sfa/error_correlation', latched)
+        self._delay = self.publisher(Float64, 'sfa/camera_delay', latched)
+        self._scale = self.publisher(Float64, 'sfa/odometry_scale', latched)
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
         self._info = self.following('panorama/info')
-        self.subscribe(String, self._info, self._receive_info, latched_qos())
+        self.subscribe(String, self._info, self._receive_info, latched)
         compressed = self._config.image_transport == 'compressed'
         self._topic = self.following('panorama/compressed') if compressed else 'panorama'
         kinds = [CompressedImage, Image] if compressed else [Image, CompressedImage]
@@ -110,8 +112,7 @@ class SfaNode(LocalizationNode):
         return response
 
     def _publish_correlation(self) -> None:
-        """Publish how the model's errors correlate, how late images were, and the factor on the way
-        of odometry: ekf_node needs them."""
+        """Publish what ekf_node needs to know of the model."""
         assert self._observer is not None
         model = self._observer.model
         self._correlation.publish(convert.to_error_correlation(model.error_correlation))
@@ -149,7 +150,8 @@ class SfaNode(LocalizationNode):
         if np.all(np.isfinite(slow)):
             self.tell(self._features, convert.to_array, slow, 'slow features')
             self.tell(self._feature_pose, _feature_pose, slow, stamp_ns)
-        if math.isfinite(seen.turned):
+        if math.isfinite(seen.turned) and not 0 <= stamp_ns - self._turned_ns < NEAR_NS:
+            self._turned_ns = stamp_ns
             self.tell(self._turned, convert.to_turned, seen.turned, stamp_ns, _TURNED_FRAME)
         if not seen.problem:
             self.tell(self._pose, convert.to_pose, seen.pose, stamp_ns, frame)
