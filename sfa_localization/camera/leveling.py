@@ -39,12 +39,13 @@ def leveled(panorama: Image, tilt: Array, sphere: Sphere) -> Image:
 
 def _turned(panorama: Image, turn: Array, sphere: Sphere) -> Image:
     rows, columns = panorama.shape[:2]
-    x, y, z = np.moveaxis(sphere.rays(rows, columns).astype(np.float32) @ turn.T, -1, 0)
+    rays = sphere.rays(rows, columns).reshape(-1, 3).astype(np.float32)
+    x, y, z = (turn.astype(np.float32) @ rays.T).reshape(3, rows, columns)
     azimuth = np.arctan2(y, x) * (-1 if sphere.clockwise else 1)
-    column = (azimuth * (columns / (2 * np.pi)) + (columns / 2 - 0.5)) % columns
+    column = azimuth * (columns / (2 * np.pi)) + (columns / 2 + 0.5)
     elevation = np.arcsin(np.clip(z, -1, 1))
     row = (sphere.high - elevation) * (rows / (sphere.high - sphere.low)) - 0.5
-    wrapped = np.concatenate([panorama, panorama[:, :1]], axis=1)
+    wrapped = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
     across, down = np.asarray(column, np.float32), np.asarray(row, np.float32)
     kind, edge = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
     turned = cv2.remap(wrapped, across, down, kind, borderMode=edge)

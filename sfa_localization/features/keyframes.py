@@ -57,7 +57,7 @@ _REACH_SHARE = 0.6
 # Frequencies of the coarse correlation, and how many keyframes it leaves for the full one.
 _COARSE, _CANDIDATES = 12, 64
 # The likest keyframes to which an image is leveled: with a tilt the first may be another place.
-_LEVELED = 24
+_LEVELED = 16
 # Sets of neighbors that are kept, 0.8 MB each, of three drives; keyframes that are read at once.
 _KEPT, _AT_ONCE = 6, 512
 # Tilts that are tried for an image that is unlike all keyframes: beyond 8 degrees it is, even of a

@@ -23,7 +23,6 @@ import cv2
 import numpy as np
 import psutil
 from bench_busy import drive_of, images_of
-from scipy import linalg
 
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
@@ -37,12 +36,12 @@ from sfa_localization.features.network_training import (
     train_network,
 )
 from sfa_localization.metric.basis import Process
-from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.metric.saved_map import MetricMap, squares
 from sfa_localization.place_model import PlaceModel
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
-CLOSE, LEVELED, NEAR, TILTS, HEADINGS = 110, 24, 64, 11, 3
+CLOSE, LEVELED, NEAR, TILTS, HEADINGS = 110, 16, 64, 11, 3
 """Keyframes that an image is compared with in full, leveled to, and located among; the tilts that
 are tried along each axis, and the headings at which the map is read."""
 ARCHITECTURE = standard_architecture(SIZE, 'panorama')
@@ -214,17 +213,11 @@ def bare_process(learned: MetricMap, features: np.ndarray) -> list[Callable[[], 
     scaled = features[:, : basis.features] * basis.scale
     kernel = np.ones((len(features), len(basis.points)))
     made = [_product(scaled, basis.points.T.copy()), _product(kernel, learned.linear)]
-    return made + len(features) * [_triangular(learned.factor)]
+    return [*made, lambda: squares(kernel, learned.factor)]
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> Callable[[], object]:
     return lambda: a @ b
-
-
-def _triangular(factor: np.ndarray) -> Callable[[], object]:
-    product = linalg.get_blas_funcs('trmv', (factor,))
-    vector = np.ones(len(factor), factor.dtype)
-    return lambda: product(factor, vector, lower=1, trans=1)
 
 
 def bench_memory(folder: Path, quick: bool = False) -> dict[str, float]:
