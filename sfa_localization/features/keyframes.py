@@ -457,7 +457,7 @@ class Keyframes:
             found = Neighbors(vectors, *of_rows)
         self._last[key] = found
         if len(self._last) > _KEPT:
-            del self._last[next(iter(self._last))]
+            self._last.pop(next(iter(self._last)), None)
         return found
 
     def _with_tilts(self, image: Spectra) -> Spectra:
