@@ -22,7 +22,7 @@ from sfa_localization.features.image_features import Spectrum, evenly
 from sfa_localization.features.rotation_spread import Agreement, needed_factor
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
-from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
+from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.map_covariance import (
     angle_covariance,
     metric_map,
@@ -37,7 +37,7 @@ from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import LeftOut, choose, folds, leave_out
+from sfa_localization.metric.selection import LeftOut, choose, leave_out, on_the_ground
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.turned_maps import TurnedMaps
 
@@ -145,12 +145,21 @@ def learn_metric(
     if overfits and searched and not diagnose(fit).one_route:
         fit = choose(replace(problem, graph=Graph.of(segments)), scale)
         left = _Left.of(fit)
+    if fit.problem.graph is not None:
+        fit, left = _as_left_out(fit, left)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
     by_points = segments.anchors is not None and segments.anchors.settled.used.any()
     frame = map_frame(fit) if onto is None or by_points else _frame_of(onto, fit)
     return _result(fit, left, frame, diagnostics)
+
+
+def _as_left_out(fit: MapFit, left: _Left) -> tuple[MapFit, _Left]:
+    """With the variance that left-out images show: neighbors err alike, and a map follows them."""
+    variances = left.images.variances * (left.variance / fit.variance)
+    images = replace(left.images, variances=variances)
+    return replace(fit, variance=left.variance), replace(left, images=images)
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -190,8 +199,7 @@ class _Left:
     def of(cls, fit: MapFit) -> _Left:
         images, places = leave_out(fit), plane(fit.places)
         drive_std = np.sqrt(place_variance(fit))
-        distances = ground_distances(places, np.random.default_rng(fit.problem.seed))
-        weight = importance(nearest_used(places, folds(fit.stack, fit.problem.seed)), distances)
+        distances, weight = on_the_ground(fit)
         expected = Forecast(places, np.abs(images.errors), drive_std, weight, distances)
         return cls(images, expected, float(places.var(0).sum()))
 

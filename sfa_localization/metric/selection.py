@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
@@ -21,6 +22,8 @@ from sfa_localization.metric.basis import (
     missing,
     spread,
 )
+from sfa_localization.metric.forecast import ground_distances, importance, nearest_used
+from sfa_localization.metric.map_covariance import plane
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
 from sfa_localization.metric.quadratic_form import Stack, schur
@@ -115,24 +118,18 @@ def leave_out(fit: MapFit) -> LeftOut:
 def evidence(basis: Basis, now: MapFit) -> float:
     """Negative log evidence of a Gaussian process's hyper-parameters, at their best directions.
 
-    Origins have flat priors (restricted likelihood), where no graph knows the places; the signal's
-    variance is profiled out.
+    Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
     """
     expanded = expand(basis, now.problem.features)
     weights = 1.0 / (1.0 + missing(basis, expanded))
     noise = float(basis.ridge[0])
     elimination = now.problem.eliminated(basis, expanded, weights)
-    points, segments, own = len(expanded), 0, np.eye(1)
-    if now.problem.graph is not None:
-        residuals = now.problem.fitted(elimination, expanded, now.solution)[1]
-        cost = float(np.real(np.vdot(now.places, weights * residuals)))
-    else:
-        system = now.form(elimination).system(now.solution.bias)
-        h = schur(system)[0]
-        cost = 2.0 * phase_cost(h, refine(h, now.solution.z))
-        segments = now.stack.segments
-        own = np.real(system[:segments, :segments])
-        own = own + np.trace(own) / segments**2
+    system = now.form(elimination).system(now.solution.bias)
+    h = schur(system)[0]
+    cost = 2.0 * phase_cost(h, refine(h, now.solution.z))
+    points, segments = len(expanded), now.stack.segments
+    own = np.real(system[:segments, :segments])
+    own = own + np.trace(own) / segments**2
     freedom = points - segments
     return (
         freedom * float(np.log(cost / noise / freedom))
@@ -141,6 +138,32 @@ def evidence(basis: Basis, now: MapFit) -> float:
         + elimination.log_determinant
         + float(np.linalg.slogdet(own)[1])
     )
+
+
+def on_the_ground(fit: MapFit) -> tuple[Array, Array]:
+    """Distances (K,) m of the covered ground to the nearest image, and the weights (M,) by which
+    images that are left out stand for it."""
+    places, seed = plane(fit.places), fit.problem.seed
+    distances = ground_distances(places, np.random.default_rng(seed))
+    return distances, importance(nearest_used(places, folds(fit.stack, seed)), distances)
+
+
+def left_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
+    """Mean error, m, by a weight (M,), of images left out of a regression to places that are known.
+
+    The evidence would take neighbors that err alike for proof of little noise.
+    """
+    expanded, places = expand(basis, now.problem.features), plane(now.places)
+    weighted = expanded / (1.0 + missing(basis, expanded))[:, None]
+    normal, right, error = weighted.T @ expanded, weighted.T @ places, 0.0
+    normal[np.diag_indices_from(normal)] += basis.ridge
+    part = folds(now.stack, now.problem.seed)
+    for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
+        own = expanded[rows], weighted[rows], places[rows]
+        rest = normal - own[1].T @ own[0], right - own[1].T @ own[2]
+        found = scipy.linalg.solve(*rest, assume_a='pos', overwrite_a=True)
+        error += float(weight[rows] @ np.hypot(*(own[2] - own[0] @ found).T))
+    return error
 
 
 def feature_scale(features: Array, stack: Stack, count: int) -> Array:
@@ -174,7 +197,8 @@ def choose(problem: MetricProblem, scale: Array | None = None) -> MapFit:
 
 
 def _choose_process(problem: MetricProblem, scale: Array) -> MapFit:
-    """Length and noise by the evidence, with fewer inducing points: they rank alike."""
+    """Length and noise by the evidence, or, where places are known, by images left out; with fewer
+    inducing points: they rank alike."""
     scaled = problem.features[:, : len(scale)] * scale
     points = scaled[spread(scaled, min(_SEARCH_POINTS, INDUCING_POINTS))]
 
@@ -182,20 +206,23 @@ def _choose_process(problem: MetricProblem, scale: Array) -> MapFit:
         return Process(scale / length, points / length, noise)
 
     now = problem.fit(make(*_FIRST_HYPER), None, 3)
-    length, noise = _descend(make, _FIRST_HYPER, now)
+    if problem.graph is None:
+        length, noise = _descend(lambda *pair: evidence(make(*pair), now))
+    else:
+        weight = on_the_ground(now)[1]
+        length, noise = _descend(lambda *pair: left_out_error(make(*pair), now, weight))
     basis = Process.fit(problem.features, scale / length, noise, INDUCING_POINTS)
     return problem.fit(basis, now)
 
 
-def _descend(
-    make: Callable[[float, float], Process], hyper: tuple[float, float], now: MapFit
-) -> tuple[float, float]:
-    """Coordinate descent of the evidence by factors, over length and noise."""
+def _descend(judge: Callable[[float, float], float]) -> tuple[float, float]:
+    """Coordinate descent by factors, over length and noise."""
     costs: dict[tuple[float, float], float] = {}
+    hyper = _FIRST_HYPER
 
     def cost(pair: tuple[float, float]) -> float:
         if pair not in costs:
-            costs[pair] = evidence(make(*pair), now)
+            costs[pair] = judge(*pair)
         return costs[pair]
 
     for factor in (2.0, 1.4):
