@@ -7,11 +7,11 @@
 3  train the SFA hierarchy (section 2)                   features/network_training.py
 4  slow features of all images (section 2.2)             features/image_features.py
 5  cut the odometry into segments (section 3.1)          metric/segments.py
-6  learn the certified map (section 3, eq. 1 and eq. 5)  metric/learning.py
+6  the certified drive, and the map of its features      metric/pose_graph.py, learning.py
 7  learn it again, from maps turned by its headings      metric/turned_maps.py
 8  keyframes, and the model for section 5                metric/keyframe_map.py, place_model.py
 
-Steps 2, 7 and keyframes go beyond the paper.
+Steps 2, 7 and keyframes go beyond the paper; without closures step 6 is its section 3, eq. 1, 5.
 """
 
 from __future__ import annotations

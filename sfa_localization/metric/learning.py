@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unsupervised metric learning: meters from slow features and odometry, section 3 of the paper.
 
-The certified solver finds, and proves, the global optimum of the paper's problem; the paper's own
-descent is in paper_solver.py. Complex numbers are x + i y in meters.
+Where closures or points tie a drive, its places are those of a sparse graph (pose_graph.py), and
+the map is a regression to them. Else the certified solver finds the global optimum of the paper's
+problem; the paper's own descent is in paper_solver.py. Complex numbers are x + i y in meters.
 """
 
 from __future__ import annotations
