@@ -260,6 +260,16 @@ def test_the_graph_errs_as_it_says():
     assert 0.5 < size < 1.5, size
 
 
+def test_what_nothing_ties_is_known_to_be_unknown():
+    _, _, segments, _ = in_two_lights()
+    one = Graph.of(dataclasses.replace(segments, items=segments.items[:1]))
+    assert one.certificate.certified and abs(one.solution.z[0]) == pytest.approx(1.0)
+    graph, first = Graph.of(segments), [s.run for s in segments].count(0)
+    between = np.eye(len(segments))[0] - np.eye(len(segments))[first]
+    assert graph.certificate.certified
+    assert between @ graph.angle_covariance @ between > np.pi**2
+
+
 def test_where_offsets_tie_a_drive_features_do_not_bend_it(quick):
     poses, features, measured = measured_world()
     closures, far = true_closures(poses, in_two_lights()[3]), []

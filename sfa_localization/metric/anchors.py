@@ -181,6 +181,8 @@ class Anchors:
                 yield f'{name}: {miss:.2f} m from where the others put it: left out, measure again'
         if settled.used.sum() == 2 < self.placed.sum():
             yield 'no third point agrees with the two that are used: measure more points'
+        if settled.used.sum() == 2 == self.placed.sum() and settled.turned:
+            yield 'two points fit a mirrored drive too: a third shows whether x and y are swapped'
         if settled.used.sum() > 1 and not settled.turned:
             yield (
                 'the points are at one place: heading and scale are those of the odometry; measure '

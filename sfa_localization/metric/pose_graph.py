@@ -35,6 +35,8 @@ Complex = NDArray[np.complex128]
 _ROUNDS = 3
 # Weight of the distance from the middle beside closures, 1 / m^2: drives that nothing ties stay.
 _STAY = 1e-6
+# The same of directions, 1 / rad^2.
+_UNTIED = 1e-3
 # Far more than Gauss and Newton need from odometry's own path.
 _STEPS, _HALVED, _CONVERGED = 50, 20, 1e-9
 # Columns that are solved for at a time: memory.
@@ -73,11 +75,11 @@ class Graph:
 
     def unknown(self, columns: Array) -> Array:
         """The covariance of [Re o, Im o, angles of z, b] (P, P) times columns (P, K)."""
-        parts = [
-            self.factor.solve(np.ascontiguousarray(columns[:, k : k + _AT_ONCE]))
-            for k in range(0, columns.shape[1], _AT_ONCE)
-        ]
-        return np.hstack(parts)
+        found = np.empty(columns.shape)
+        for k in range(0, columns.shape[1], _AT_ONCE):
+            part = np.ascontiguousarray(columns[:, k : k + _AT_ONCE])
+            found[:, k : k + _AT_ONCE] = self.factor.solve(part)
+        return found
 
     @property
     def angle_covariance(self) -> Array:
@@ -131,7 +133,7 @@ class Graph:
         for rows in sides:
             by = by_unknowns(rows[shown], self.solution, self.stack.period).real.toarray()
             total += (self.unknown(by.T).T * by).sum(axis=1)
-        return np.interp(np.arange(count), shown, total)
+        return np.interp(np.arange(count), shown, total) if count else total
 
 
 def graph_poses(graph: Graph, count: int) -> Array:
@@ -230,12 +232,14 @@ def _cost(rows: Any, solution: Solution, stack: Stack) -> float:
 def _normal(rows: Any, now: Solution, period: NDArray[np.int64]) -> tuple[SuperLU, Array]:
     """The factor of the normal equations, and half the gradient of the cost (P,).
 
-    Turning all together costs nothing: the first direction is held, for this step.
+    Turning all together costs nothing: the first direction is held, for this step, and any that
+    nothing ties to the others is known to be unknown.
     """
     n, by = len(now.z), by_unknowns(rows, now, period)
     own = np.concatenate([np.zeros(3 * n), np.full(len(now.bias), YAW_BIAS_STD**-2)])
     slope = np.real(by.conj().T @ (rows @ now.coefficients(period)))
     slope += own * np.concatenate([np.zeros(3 * n), now.bias])
+    own[2 * n : 3 * n] = _UNTIED
     own[2 * n] = 1.0
     return _factor((by.conj().T @ by).real + sparse.diags_array(own)), slope
 
@@ -266,7 +270,7 @@ def proof(rows: Any, now: Solution, period: NDArray[np.int64]) -> Certificate:
     n, form = len(period), _form(rows, now.bias, period)
     pull = (form @ np.concatenate([now.o, now.z]))[n:]
     least = np.concatenate([np.zeros(n), np.real(now.z.conj() * pull)])
-    scale = float(np.real(form.diagonal()[n:]).max())
+    scale = max(float(np.real(form.diagonal()[n:]).max()), 1.0)
     shift = np.concatenate([np.zeros(n), np.full(n, CERTIFICATE_TOLERANCE * scale)])
     factor = _factor(_real(form - sparse.diags_array(least - shift)))
     return Certificate(float(factor.U.diagonal().min()) / scale)

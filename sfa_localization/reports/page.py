@@ -11,8 +11,10 @@ from pathlib import Path
 
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.reports.figures import save_text
+from sfa_localization.reports.summary import BAD as BAD
+from sfa_localization.reports.summary import GOOD as GOOD
+from sfa_localization.reports.summary import WEAK as WEAK
 
-GOOD, WEAK, BAD = 'good', 'weak', 'bad'
 PAGE = 'index.html'
 MARK = '<meta name="generator" content="sfa_localization">'
 _STYLE = """

@@ -7,7 +7,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sfa_localization.metric.motion_sources import MAP
 from sfa_localization.training import Trained
+
+GOOD, WEAK, BAD = 'good', 'weak', 'bad'
+GOOD_M, USEFUL_M = 0.5, 2.0
+"""Expected errors of one image (m) at which the filter's default limits make a state DEGRADED, and
+LOST."""
+TRUSTED_SHARE = 0.9
+"""Of the left-out images, the regions of 95 % hold at least so many where they can be believed."""
+EXPLAINED = 0.5
+"""Share of the places' spread that features explain in images left out: below, knowing no image is
+nearly as good."""
 
 
 def summary(trained: Trained) -> str:
@@ -44,7 +55,26 @@ def summary(trained: Trained) -> str:
     used['metric learning: odometry'] = trained.segments.odometry
     for name, count in used.items():
         lines += [f'{name}: {n} skipped: {why}' for why, n in sorted(count.skipped.items())]
-    return '\n'.join(lines)
+    grade, verdict = judgment(trained)
+    return '\n'.join(lines if grade == GOOD else [verdict, *lines])
+
+
+def judgment(trained: Trained) -> tuple[str, str]:
+    """The color of the page, and its answer in a sentence."""
+    quality = trained.model.quality
+    expected = quality['expected_error_m']
+    by_map = [pair for check in trained.checks for pair in check.pairs if pair.b == MAP]
+    if any(pair.differs('alike') or pair.differs('scale') for pair in by_map):
+        return BAD, 'The map cannot be used: it has another shape than its odometry.'
+    route = trained.metric.diagnostics.one_route
+    if quality['explained'] < EXPLAINED and not route:
+        return BAD, 'The map cannot be used: the images hardly show where they were taken.'
+    if expected > USEFUL_M:
+        return BAD, 'The map cannot be used yet: see what to drive next.'
+    sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
+    if expected > GOOD_M or not sure:
+        return WEAK, 'The map can be used with care: see where it is weak.'
+    return GOOD, f'The map is good: expect an error of {expected:.2f} m from one image.'
 
 
 def point_lines(quality: Mapping[str, Any]) -> list[str]:

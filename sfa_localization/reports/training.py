@@ -15,22 +15,13 @@ from sfa_localization.data.run import Image
 from sfa_localization.inspection import InspectionConfig, lanes_apart
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.learning import positions
-from sfa_localization.metric.motion_sources import MAP
 from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure
 from sfa_localization.reports.figures import WorstImage
-from sfa_localization.reports.summary import summary
+from sfa_localization.reports.summary import judgment, summary
 from sfa_localization.training import Trained
 
-GOOD_M, USEFUL_M = 0.5, 2.0
-"""Expected errors of one image (m) at which the filter's default limits make a state DEGRADED, and
-LOST."""
-TRUSTED_SHARE = 0.9
-"""Of the left-out images, the regions of 95 % hold at least so many where they can be believed."""
-EXPLAINED = 0.5
-"""Share of the places' spread that features explain in images left out: below, knowing no image is
-nearly as good."""
 FEW_CROSSINGS = 5
 """With fewer crossings one bad stretch of odometry bends the map unnoticed."""
 PARALLEL = 0.3
@@ -86,24 +77,6 @@ def write_training_report(
         page.section('Slow features', parts['firing_maps']),
         page.section('Worst images', parts.get('worst_images', '')),
     )  # fmt: skip
-
-
-def judgment(trained: Trained) -> tuple[str, str]:
-    """The color of the page, and its answer in a sentence."""
-    quality = trained.model.quality
-    expected = quality['expected_error_m']
-    by_map = [pair for check in trained.checks for pair in check.pairs if pair.b == MAP]
-    if any(pair.differs('alike') or pair.differs('scale') for pair in by_map):
-        return page.BAD, 'The map cannot be used: it has another shape than its odometry.'
-    route = trained.metric.diagnostics.one_route
-    if quality['explained'] < EXPLAINED and not route:
-        return page.BAD, 'The map cannot be used: the images hardly show where they were taken.'
-    if expected > USEFUL_M:
-        return page.BAD, 'The map cannot be used yet: see what to drive next.'
-    sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
-    if expected > GOOD_M or not sure:
-        return page.WEAK, 'The map can be used with care: see where it is weak.'
-    return page.GOOD, f'The map is good: expect an error of {expected:.2f} m from one image.'
 
 
 def weak_places(forecast: Forecast) -> Iterator[tuple[float, float, float]]:
