@@ -195,7 +195,10 @@ def _solved(rows: Any, stack: Stack, before: Solution | None) -> Graph:
     graph = _refined(rows, stack, start)
     if graph.certificate.certified:
         return graph
-    z = _spectral(_form(rows, graph.solution.bias, stack.period), stack.segments)
+    try:
+        z = _spectral(_form(rows, graph.solution.bias, stack.period), stack.segments)
+    except RuntimeError:  # no vector was found: what there is stays, unproven
+        return graph
     other = _refined(rows, stack, Solution(z, np.zeros_like(z), graph.solution.bias))
     return min(graph, other, key=lambda one: _cost(rows, one.solution, stack))
 
@@ -253,8 +256,8 @@ def _factor(symmetric: Any) -> SuperLU:
 def _form(rows: Any, bias: Array, period: NDArray[np.int64]) -> Any:
     """S (2N, 2N) at the biases."""
     n = len(period)
-    parts = rows[:, :n], rows[:, n : 2 * n] - rows[:, 2 * n :] * bias[period][None]
-    both = sparse.hstack(parts).tocsr()
+    turned = rows[:, n : 2 * n] - rows[:, 2 * n :] * bias[period][None]
+    both = sparse.hstack([rows[:, :n], turned]).tocsr()
     return (both.conj().T @ both).tocsr()
 
 
@@ -278,8 +281,7 @@ def proof(rows: Any, now: Solution, period: NDArray[np.int64]) -> Certificate:
 
 def _spectral(form: Any, n: int) -> Complex:
     """Phases of the smallest eigenvector of H: of what the inverse of the form has for z."""
-    level = 1e-12 * float(np.real(form.diagonal()).max())
-    factor = _factor(_real(form + level * sparse.eye_array(2 * n)))
+    factor = _factor(_real(form + 1e-12 * form.diagonal().real.max() * sparse.eye_array(2 * n)))
 
     def apply(z: Array) -> Array:
         right = np.zeros(4 * n)
