@@ -54,7 +54,7 @@ ROOMS: dict[str, tuple[set[str], set[str]]] = {
     'updating': (CORE - {'metric'} | {'place_model', 'localizer'}, NUMERIC),
     'inspection': ({'data', 'camera', 'features', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
-    'reports': ({'data', 'metric', 'training'}, {'numpy', 'matplotlib'}),
+    'reports': ({'data', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
     'nodes': (
         {'data', 'camera', 'fusion', 'place_model', 'localizer', 'config'},
         {'numpy', 'yaml'} | ROS,

@@ -31,8 +31,8 @@ START_YAW_STD = 0.3
 """rad: what positions alone must determine the heading to; up to there the EKF is linear enough."""
 AGREEING_PER_OTHER = 3
 """With fewer agreeing images per accepted one on the same path, the estimate is rather right."""
-OBVIOUS_STDS, OBVIOUS_JUMP_M, OBVIOUS_TURN_RAD = 8.0, 1.5, 0.5
-"""A displacement larger than both 8 standard deviations of an image and this (m, rad) has no
+OBVIOUS_STDS, OBVIOUS_JUMP_M = 8.0, 1.5
+"""A displacement larger than both 8 standard deviations of an image and this (m) has no
 other explanation than that the robot was moved; a smaller one may be the map's own error."""
 _TINY = 1e-12  # keeps the variance finite where a lone position shows no turn
 
@@ -69,14 +69,10 @@ class Relocation(NamedTuple):
             return False
         if self.distance_m >= max(AGREEING_M, OBVIOUS_STDS * self.position_std):
             return True
-        return (support < ENOUGH_IMAGES or self._displaced(belief.mean)) and self.yaw_std < math.inf
-
-    def _displaced(self, mean: Array) -> bool:
-        """The robot is elsewhere, or turned, by so much that no error of images explains it."""
-        jump_m = math.hypot(*(self.pose[:2] - mean[:2]))
-        turn = abs(wrap(float(self.pose[YAW] - mean[YAW])))
+        # Turned where it is may be the camera alone: then the way must agree.
+        jump_m = math.hypot(*(self.pose[:2] - belief.mean[:2]))
         elsewhere = jump_m >= max(OBVIOUS_JUMP_M, OBVIOUS_STDS * self.position_std)
-        return elsewhere or turn >= max(OBVIOUS_TURN_RAD, OBVIOUS_STDS * self.yaw_std)
+        return (support < ENOUGH_IMAGES or elsewhere) and self.yaw_std < math.inf
 
 
 def relocate(images: Sequence[Image], decorrelation_m: float) -> Relocation | None:
