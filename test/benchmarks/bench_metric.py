@@ -27,6 +27,7 @@ from sfa_localization.metric.basis import Monomials, monomials
 from sfa_localization.metric.drive_check import check, diagnose
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, descend, odometry_start
+from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -106,7 +107,8 @@ def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
     problem = MetricProblem.of(trial.features, replace(trial.segments, items=alone), CONFIG)
     basis = Monomials.fit(problem.features, 8, 0.0)
     known = MetricProblem.of(trial.features, trial.segments, CONFIG).fit(basis)
-    least = problem.fit(basis, known).solution.cost
+    best = problem.fit(basis, known).solution
+    least = phase_cost(best.h, best.z)
     stack = problem.stack
     regressors = monomials(problem.features)
     lines = Lines(regressors, stack.path.real, stack.owner, np.zeros(0))
