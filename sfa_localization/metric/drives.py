@@ -133,10 +133,8 @@ class Drives:
 
         All have the same scale: it is that of the map, and no drive is better known by itself.
         """
-        found, drives = (
-            [],
-            zip(self.items, self.turns(), self.shown(segments, result), segments.ways, strict=True),
-        )
+        found, shown = [], self.shown(segments, result)
+        drives = zip(self.items, self.turns(), shown, segments.ways, strict=True)
         for drive, turns, (stamps_ns, (x, y, yaw)), way in drives:
             track = tracked(drive.run.odometry, self.config, drive.run.yaw_rate, turns)
             time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9

@@ -253,8 +253,7 @@ def positions(result: MetricResult, segments: Segments) -> tuple[Indices, Array]
 def headings(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
     """Images (M,) of the segments, and the robot's yaw (M,) rad in the map frame."""
     stack = Stack.of(segments)
-    own = stack.headings - result.yaw_bias[stack.period[stack.owner]] * stack.times_s
-    return stack.images, wrap_angle(result.angles[stack.owner] + own)
+    return stack.images, wrap_angle(stack.yaws(result.angles, result.yaw_bias))
 
 
 def correlation_along_drive(

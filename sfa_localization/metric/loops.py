@@ -1,6 +1,6 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closures as squares beside those of odometry's links (see quadratic_form.py).
+"""Loop closures as squares beside those of odometry's links (see pose_graph.py).
 
 An image b of segment j lies at the mixture of images a_k of segments i_k, by shares c_k of sum 1,
 and is turned by t_k from each; h are the headings in the segments:

@@ -141,9 +141,8 @@ def graph_poses(graph: Graph, count: int) -> Array:
     no segment."""
     stack, solution = graph.stack, graph.solution
     poses, places = np.full((count, 3), np.nan), solution.places(stack)
-    yaw = stack.headings - solution.bias[stack.period[stack.owner]] * stack.times_s
-    poses[stack.images, 0], poses[stack.images, 1] = places.real, places.imag
-    poses[stack.images, 2] = np.angle(solution.z)[stack.owner] + yaw
+    yaws = stack.yaws(np.angle(solution.z), solution.bias)
+    poses[stack.images] = np.column_stack([places.real, places.imag, yaws])
     return poses
 
 
@@ -188,10 +187,8 @@ def _images(stack: Stack) -> Any:
 def _solved(rows: Any, stack: Stack, before: Solution | None) -> Graph:
     """The least squares of rows (L, 3N), from the solution before or from odometry's own path; from
     the smallest eigenvector where that is not proven to be the best."""
-    pose = stack.starts
-    start = before or Solution(
-        np.exp(1j * pose[:, 2]), pose[:, 0] + 1j * pose[:, 1], np.zeros(stack.period[-1] + 1)
-    )
+    x, y, yaw = stack.starts.T
+    start = before or Solution(np.exp(1j * yaw), x + 1j * y, np.zeros(stack.period[-1] + 1))
     graph = _refined(rows, stack, start)
     if graph.certificate.certified:
         return graph

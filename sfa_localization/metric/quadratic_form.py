@@ -96,6 +96,11 @@ class Stack:
         """Paths (M,) without the yaw-rate bias of each period (R,)."""
         return np.asarray(self.path - bias[self.period[self.owner]] * self.drift)
 
+    def yaws(self, angles: Array, bias: Array) -> Array:
+        """Headings (M,) rad without the biases, of segments whose directions are `angles` (N,)."""
+        own = self.headings - bias[self.period[self.owner]] * self.times_s
+        return np.asarray(angles[self.owner] + own)
+
     def rows(self, images: Indices) -> Indices:
         """Rows of images (...) of the drives, -1 for those of no segment."""
         order = np.argsort(self.images, kind='stable')
