@@ -380,7 +380,7 @@ class Keyframes:
         """The match of an image (rows, F) without the `pattern` of its light, by its correlations
         (K,), -inf where unknown, and the yaws (K,) rad that each of them shows.
         """
-        best = int(scores.argmax())
+        best, image = int(scores.argmax()), spectrum
         reach, start = self.reach(best), np.append(self.poses[best, :2], yaws[best])
         if pattern is not None:
             spectrum = spectrum - turned(pattern, -self._sign * start[2])
@@ -392,7 +392,7 @@ class Keyframes:
         elsewhere[:2, :2] = (offset * weight[:, None]).T @ offset
         turns = np.square(wrap_angle(yaws[np.isfinite(scores)].astype(float) - yaw))
         turns[(turns < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
-        elsewhere[2, 2] = weight @ turns
+        elsewhere[2, 2] = weight @ turns + self._turned_otherwise(image, best)
         return replace(
             found,
             pose=np.array([*place, wrap_angle(yaw)]),
@@ -478,6 +478,17 @@ class Keyframes:
         known = scores[np.isfinite(scores)]
         weight = np.exp((known - known.max()) / temperature, dtype=np.float64)
         return np.asarray(weight / weight.sum())
+
+    def _turned_otherwise(self, image: Spectra, best: int) -> float:
+        """Variance rad^2 of the yaw of an image (rows, F) by the other turn that makes it as like
+        its best keyframe: in a corridor the one by 180 degrees.
+        """
+        product = (self.aligned([best])[0] * image.conj()).sum(0)
+        curve = np.fft.irfft(product, 2 * self.columns) * 2
+        turn = wrap_angle((np.arange(len(curve)) - curve.argmax()) * np.pi / self.columns)
+        other = np.where(np.abs(turn) > _PARALLAX_RAD, curve, -np.inf)
+        likely = math.exp((float(other.max()) - float(curve.max())) / self.noise.temperature)
+        return float(turn[other.argmax()]) ** 2 * likely / (1 + likely)
 
     def elsewhere(self, scores: NDArray[np.float32], place: Array, reach: float) -> Array:
         """Offsets (M, 2) m from a place of the keyframes whose correlations (K,) are known; 0 for

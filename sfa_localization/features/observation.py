@@ -46,7 +46,7 @@ class Match:
     of them, of their mean distance: 0 among them, 0.64 at a straight border of theirs, 1 far beside
     all. `noise` (2, 2) m^2 is the covariance of the place by what is left of the image, `apart`
     (2, 2) m^2 how far apart several drives put it (in a map they are shifted), and `elsewhere`
-    (3, 3) the scatter of [x, y, yaw] about it of other keyframes that are as like the image. The
+    (3, 3) the scatter of [x, y, yaw] about it of other poses that are as like the image. The
     place is that of the keyframes by `shares` (N,) of sum 1; None where several drives say so.
 
     `score` is the correlation with the best keyframe, 1 for the same image, and `known` whether it
