@@ -135,20 +135,22 @@ def test_two_that_agree_are_weighted_by_their_information():
 def test_the_farther_apart_the_less_sure_and_where_they_contradict_keyframes_count():
     near, far = (combine(slow_at(x, 0.1), match_at(0.1), EXACT)[1][0, 0] for x in (0.0, 0.4))
     assert far == pytest.approx(near * 0.4**2 / 0.02 / 2, rel=1e-3)
-    for slow, match, doubt in (
-        (slow_at(0.6, 0.1), match_at(0.1), 1.0),
-        (slow_at(0.1, 0.1), match_at(0.1), 1.1),
-        (slow_at(math.nan, 0.1), match_at(0.1), 1.0),
-    ):
-        pose, covariance = combine(slow, match, EXACT, doubt=doubt)
-        assert np.array_equal(pose, match.pose)
-        assert np.array_equal(covariance, EXACT.covariance(match))
+    for slow in slow_at(0.6, 0.1), slow_at(math.nan, 0.1):
+        pose, covariance = combine(slow, match_at(0.1), EXACT)
+        assert np.array_equal(pose, np.zeros(3))
+        assert np.array_equal(covariance, EXACT.covariance(match_at(0.1)))
+
+
+def test_slow_features_that_lately_were_far_off_count_little():
+    pose, covariance = combine(slow_at(0.3, 0.1), match_at(0.1), EXACT, doubt=3.0)
+    assert pose[0] == pytest.approx(0.3 / 10)
+    assert covariance[0, 0] == pytest.approx(0.9 * 0.1**2, rel=1e-3)
 
 
 def test_an_unknown_place_is_left_to_slow_features():
     slow = slow_at(3.0, 0.1)
     pose, covariance = combine(slow, match_at(0.1, known=False), EXACT, doubt=4.0)
-    assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(4.0 * slow.covariance)
+    assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(16.0 * slow.covariance)
     assert math.isnan(distance(slow, match_at(0.1, known=False), EXACT))
 
 
@@ -216,10 +218,10 @@ def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_slow_features_that_contradict_known_places_for_long_do_not_count(known):
+def test_slow_features_that_contradict_known_places_for_long_count_little(known):
     """Both are as sure of places 0.4 m apart."""
     match = match_at(0.1, score=0.7 if known else 0.3, known=known)
     observer = Observer(Matched(slow_at(0.4, 0.1), match, EXACT))
     seen = [observer.observe(k, panorama(seed=k)).position[0] for k in range(1, 50)]
     assert seen[0] == pytest.approx(0.2 if known else 0.4, abs=0.02)
-    assert seen[-1] == (0.0 if known else 0.4)
+    assert seen[-1] == pytest.approx(0.0 if known else 0.4, abs=0.03)
