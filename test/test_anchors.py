@@ -33,8 +33,8 @@ from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map
 from sfa_localization.metric.learning import learn_metric, positions
 from sfa_localization.metric.points import points_of, read_points, stops
-from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.stack import Stack
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
 from sfa_localization.reports.training import write_training_report

@@ -28,13 +28,15 @@ from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
+from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops, loops_of
 from sfa_localization.metric.phases import certify, synchronize
-from sfa_localization.metric.pose_graph import Graph, graph_poses, link_rows, proof
-from sfa_localization.metric.quadratic_form import Links, Solution, Stack, schur
+from sfa_localization.metric.pose_graph import Graph, graph_poses, proof
+from sfa_localization.metric.quadratic_form import schur
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import tracks, with_closures
+from sfa_localization.metric.stack import Solution, Stack
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)
@@ -234,10 +236,10 @@ def test_the_graph_proves_what_is_best_and_nothing_else():
     graph, stack = Graph.of(segments), Stack.of(segments)
     assert graph.certificate.certified
     links, loops = Links.of(segments), loops_of(segments.closures, segments.offsets, stack)
-    rows = sparse.vstack([*link_rows(links, stack), *(one.ties(stack, None) for one in loops)])
+    rows = sparse.vstack([links.ties(stack), *(one.ties(stack, None) for one in loops)])
     bias, n = np.zeros(stack.period[-1] + 1), stack.segments
     system = (rows.conj().T @ rows).toarray()[: 2 * n, : 2 * n]
-    h, origins = schur(system)
+    h, origins = schur(system, n)
     best = synchronize(h)
     turned = best.copy()
     turned[n // 2 :] *= -1

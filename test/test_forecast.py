@@ -17,10 +17,10 @@ from sfa_localization.metric.forecast import (
     REACH_M,
 )
 from sfa_localization.metric.learning import learn_metric, positions
-from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.stack import Stack
 
 CONFIG = MetricConfig(slow_features=12)
 DRIVES = {

@@ -23,15 +23,15 @@ from metric_worlds import (
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
 from sfa_localization.features.rotation_spread import share_within
-from sfa_localization.metric import paper_solver, quadratic_form, selection
+from sfa_localization.metric import map_fit, paper_solver, selection
 from sfa_localization.metric.basis import expand, missing, monomials
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
 from sfa_localization.metric.phases import Certificate
-from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import assignment, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.stack import Stack
 
 ANY = SegmentConfig()
 STRAIGHT = SegmentConfig(segments='straight')
@@ -308,7 +308,7 @@ def test_unusable_features_are_named():
 
 def test_an_unproven_map_is_rejected(monkeypatch):
     """Odometry that contradicts the images so is hard to make; the proof is taken away."""
-    monkeypatch.setattr(quadratic_form, 'certify', lambda h, z: Certificate(-1.0))
+    monkeypatch.setattr(map_fit, 'certify', lambda h, z: Certificate(-1.0))
     run = lines_drive()
     segments = cut(run.odometry, run.stamps_ns, STRAIGHT)
     with pytest.raises(DataError, match='not proven to be optimal'):

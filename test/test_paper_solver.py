@@ -18,9 +18,9 @@ from sfa_localization.metric.paper_solver import (
     learn,
     odometry_start,
 )
-from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.stack import Stack
 
 
 def problem(turns=True, seed=0):

@@ -31,7 +31,7 @@ from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.run import Odometry, Points, Stamps
 
 if TYPE_CHECKING:
-    from sfa_localization.metric.quadratic_form import Solution, Stack
+    from sfa_localization.metric.stack import Solution, Stack
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
@@ -115,14 +115,8 @@ class Anchors:
         """Rows (K, 3N) whose products with [o, z, -b z] are where the drive puts the robot; 0 of
         points that are near no image.
         """
-        n, at = stack.segments, np.flatnonzero(self.placed)
-        row = stack.rows(self.images[at])
-        owner, ahead = stack.owner[row], np.exp(1j * stack.headings[row]) * self.offset[at]
-        rows = np.zeros((len(self.points), 3 * n), complex)
-        rows[at, owner] = 1.0
-        rows[at, n + owner] = stack.path[row] + ahead
-        rows[at, 2 * n + owner] = stack.drift[row] + 1j * stack.times_s[row] * ahead
-        return rows
+        rows = stack.place_rows(stack.rows(self.images), self.placed.astype(float), self.offset)
+        return np.asarray(rows.toarray())
 
     def ties(self, stack: Stack, before: Solution | None = None) -> sparse.csr_array:
         """What is squared (K, 3N) of the used points in [o, z, -b z], over its standard deviation.

@@ -35,11 +35,11 @@ from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.pose_graph import Graph
-from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import LeftOut, choose, leave_out, on_the_ground
 from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.metric.stack import Stack
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 logger = logging.getLogger(__name__)

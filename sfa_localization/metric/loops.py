@@ -17,6 +17,7 @@ quadratic and its solution certified.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +27,8 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
 from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
-from sfa_localization.metric.quadratic_form import Solution, Stack
+from sfa_localization.metric.stack import Solution, Stack
 
-Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
 
 # Standard deviations that are expected, rad and m per axis: they grow with `Offsets.unlike`, which
@@ -46,8 +46,8 @@ class Loops:
     `share` (L,), one over how many say the same.
     """
 
-    turns: sparse.csr_array
-    places: sparse.csr_array
+    turns: Any
+    places: Any
     turn_std: Array
     place_std: Array
     share: Array
@@ -60,9 +60,9 @@ class Loops:
         whole = shares.sum(axis=1)
         kept = (row >= 0) & (np.abs(whole - 1.0) < _LEAST)
         shares, unlike = shares[kept] / whole[kept, None], offsets.unlike[kept]
-        squares = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
+        turns, places = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
         place_std = _PLACE_STD_M * np.hypot(_ALIKE, unlike)
-        return cls(*squares, _TURN_STD * (1 + unlike), place_std, np.ones(len(unlike)))
+        return cls(turns, places, _TURN_STD * (1 + unlike), place_std, np.ones(len(unlike)))
 
     @classmethod
     def of_closures(cls, closures: Closures, stack: Stack, tied: Indices) -> Loops:
@@ -75,7 +75,7 @@ class Loops:
         _, same, count = np.unique(owner[kept], axis=0, return_inverse=True, return_counts=True)
         return replace(loops, share=1.0 / count[same.reshape(-1)])
 
-    def ties(self, stack: Stack, before: Solution | None) -> sparse.csr_array:
+    def ties(self, stack: Stack, before: Solution | None) -> Any:
         """What is squared (2 L, 3N) of [o, z, -b z], over its standard deviation: by the residuals
         in the solution `before`."""
         turn_std, place_std, doubt = self.turn_std, self.place_std, np.ones(len(self.share))
@@ -99,23 +99,12 @@ def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops,
 
 def _squares(
     row: Indices, others: Indices, shares: Array, turn: Array, stack: Stack
-) -> tuple[sparse.csr_array, sparse.csr_array]:
+) -> tuple[Any, Any]:
     """Of the turns and of the places, (L, 3N), of rows (L,) of the stack among others (L, K); turns
     to first order in the biases."""
-    rows = np.column_stack([row, others])
-    minus = np.column_stack([np.ones(len(row)), -shares])
-    yaw = stack.headings[rows] + np.column_stack([np.zeros(len(row)), turn])
-    turns = minus * np.exp(1j * yaw)
+    rows, none = np.column_stack([row, others]), np.zeros(len(row))
+    minus = np.column_stack([none + 1.0, -shares])
+    turns = minus * np.exp(1j * (stack.headings[rows] + np.column_stack([none, turn])))
     n, owner = stack.segments, stack.owner[rows]
-    directions = [(n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)]
-    places = [(owner, minus), (n + owner, minus * stack.path[rows])]
-    places.append((2 * n + owner, minus * stack.drift[rows]))
-    return _sparse(directions, 3 * n), _sparse(places, 3 * n)
-
-
-def _sparse(parts: list[tuple[Indices, Complex]], width: int) -> sparse.csr_array:
-    """A matrix (L, width) from columns and values (L, K) of its rows; equal columns add up."""
-    columns, values = (np.hstack(list(side)) for side in zip(*parts, strict=True))
-    rows = np.repeat(np.arange(len(columns)), columns.shape[1])
-    entries = values.astype(complex).ravel(), (rows, columns.ravel())
-    return sparse.csr_array(entries, shape=(len(columns), width))
+    turned = (n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)
+    return stack.sparse(*turned), stack.place_rows(rows, minus)

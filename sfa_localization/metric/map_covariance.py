@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.metric import phases
 from sfa_localization.metric.map_fit import MapFit
-from sfa_localization.metric.quadratic_form import schur
 from sfa_localization.metric.saved_map import MetricMap, Weights
 
 Complex = NDArray[np.complex128]
@@ -54,12 +52,12 @@ def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:
     First those of the directions, which the origins follow; then of the origins along both axes.
     """
     solution = fit.solution
-    system = fit.form(fit.elimination).system(solution.bias)
-    follow = schur(system)[1]
+    form, n = fit.form(fit.ridge), fit.stack.segments
+    bias = -solution.bias[form.period]
+    follow = form.origins[:, :n] + form.origins[:, n:] * bias
     values, vectors = np.linalg.eigh(angle_covariance(fit))
     turned = 1j * solution.z[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0)))
-    n = fit.stack.segments
-    values, vectors = np.linalg.eigh(np.real(system[:n, :n]))
+    values, vectors = np.linalg.eigh(form.own)
     # Moving all origins together costs nothing, and is no error of the map.
     fixed = values > 1e-9 * values[-1]
     scale = np.sqrt(fit.link_variance / np.where(fixed, values, 1.0)) * fixed
@@ -84,8 +82,6 @@ def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: f
     """The map of a fit in the map frame, with the covariance of its weights."""
     weights = np.exp(1j * frame.yaw_rad) * fit.map_weights
     weights[-1] += frame.x_m + 1j * frame.y_m
-    factor = fit.elimination.factor
-    inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True)
     std = float(np.sqrt(fit.variance))
-    learned = Weights(plane(weights), np.ascontiguousarray(std * inverse.T), std)
-    return MetricMap.of(fit.basis, learned, inflation, common_m)
+    learned = Weights(plane(weights), np.ascontiguousarray(std * fit.ridge.root.T), std)
+    return MetricMap.of(fit.ridge.basis, learned, inflation, common_m)

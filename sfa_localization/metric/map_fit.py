@@ -1,43 +1,36 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit a map for one basis: alternate between the global solution and the noise of its residuals.
+"""Fit a map for one basis: a regression to known places, or the places with it from eq. 1.
+
+Then solution and noise are found in turn, because odometry's links are weighted against the images:
 
     expand      slow features to phi(s)                          basis.py
     eliminate   the map's weights from eq. 1                quadratic_form.py
     solve       directions, origins and biases, certified        quadratic_form.py, phases.py
     noise       variance and correlation of the residuals        here
-    links       variances of odometry's links                    link_noise.py
-
-The noise matters because odometry's links are weighted against the images.
+    links       variances of odometry's links                    links.py
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.basis import Basis, expand, missing
-from sfa_localization.metric.link_noise import learned
-from sfa_localization.metric.phases import Certificate
+from sfa_localization.metric.basis import Basis
+from sfa_localization.metric.links import Links
+from sfa_localization.metric.phases import Certificate, certify
 from sfa_localization.metric.pose_graph import Graph
-from sfa_localization.metric.quadratic_form import (
-    YAW_BIAS_STD,
-    Elimination,
-    Links,
-    QuadraticForm,
-    Solution,
-    Stack,
-    eliminate,
-)
+from sfa_localization.metric.quadratic_form import QuadraticForm, Ridge
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.metric.stack import Solution, Stack
 
 Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
 
 LINK_WEIGHT = 2.0
 """Weight of odometry's links over that by their variances: noise of the features, which least
@@ -79,74 +72,12 @@ class MetricProblem:
         return cls(rows, segments, stack, Links.of(segments), config, seed)
 
     def fit(self, basis: Basis, start: MapFit | None = None, rounds: int = _ROUNDS) -> MapFit:
-        """Alternate solution and noise until the noise settles; a near `start` saves rounds.
-
-        With a graph the map is a regression to its places.
-        """
-        expanded = expand(basis, self.features)
-        noise_ratio = 1.0 + missing(basis, expanded)
-        solution = start.solution if start else None
-        variance = start.variance if start else _FIRST_VARIANCE
-        correlation = start.correlation if start else LINK_WEIGHT
-        links = start.links if start else self.links
-        elimination = self.eliminated(basis, expanded, 1.0 / noise_ratio)
-        freedom = _freedom(elimination, basis, len(expanded))
-        if self.graph is not None:
-            solution = self.graph.solution
-            weights, residuals = self.fitted(elimination, expanded, solution)
-            variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
-            rounds = 0
-        else:
-            freedom -= 1.5 * self.stack.segments
-        for _ in range(rounds):
-            form = self.form(elimination, links, variance * correlation, YAW_BIAS_STD)
-            bias = solution.bias if solution else np.zeros(self.stack.period[-1] + 1)
-            solution = form.solve(solution.z if solution else None, bias)
-            links, links_before = learned(self.links, form, solution), links
-            weights, residuals = self.fitted(elimination, expanded, solution)
-            before = variance
-            correlation = LINK_WEIGHT * _correlation(residuals, self.stack)
-            variance = residual_variance(residuals * np.sqrt(1.0 / noise_ratio), freedom)
-            steady = links.alike(links_before, _LINKS_SETTLED)
-            if steady and abs(variance - before) < _SETTLED * variance:
-                break
-        assert solution is not None
-        return MapFit(
-            self, basis, expanded, noise_ratio, variance, correlation, links,
-            elimination, solution, residuals, weights,
-        )  # fmt: skip
-
-    def eliminated(self, basis: Basis, expanded: Array, weights: Array) -> Elimination:
-        """The map eliminated from expanded features (M, m) with weights (M,)."""
-        return eliminate(expanded, basis.ridge, weights, self.stack, form=self.graph is None)
-
-    def weights(self, elimination: Elimination, solution: Solution) -> Complex:
-        """The map's weights (m,) for a solution."""
-        if self.graph is not None:
-            places = solution.places(self.stack)
-            real, imag = (elimination.weights(part).real for part in (places.real, places.imag))
-            return np.asarray(real + 1j * imag)
-        return elimination.weights(solution.coefficients(self.stack.period))
-
-    def fitted(
-        self, elimination: Elimination, expanded: Array, solution: Solution
-    ) -> tuple[Complex, Complex]:
-        """The same, and the residuals (M,)."""
-        weights = self.weights(elimination, solution)
-        predicted = expanded @ weights.real + 1j * (expanded @ weights.imag)
-        return weights, np.asarray(solution.places(self.stack) - predicted)
-
-    def form(
-        self,
-        elimination: Elimination,
-        links: Links,
-        variance: float,
-        bias_std: float,
-    ) -> QuadraticForm:
-        """The quadratic form of the map and links, for the variance m^2 of a position; with a
-        `bias_std` of 0 the biases stay what they are.
-        """
-        return QuadraticForm(elimination.gram, links, self.stack.period, variance, bias_std)
+        """The map of a basis: a regression to the places of the graph, where there is one, else
+        found with these from eq. 1; a near `start` saves rounds."""
+        ridge = Ridge.of(basis, self.features)
+        if self.graph is None:
+            return _alternated(self, ridge, start, rounds)
+        return MapFit.of(self, ridge, self.graph.solution, ridge.freedom)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,34 +85,32 @@ class MapFit:
     """A problem solved for one basis."""
 
     problem: MetricProblem
-    basis: Basis
-    expanded: Array
-    """(M, m)"""
-    noise_ratio: Array
-    """(M,) variance of each residual over `variance`: at least 1, more where inducing points are
-    missing."""
-    variance: float
-    """Of an image's residual, m^2 per axis."""
-    correlation: float
-    """How many images count as one beside odometry's links, because residuals of neighbors are
-    correlated; times LINK_WEIGHT."""
-    links: Links
-    """With the variances that the solution shows, see link_noise.py."""
-    elimination: Elimination
+    ridge: Ridge
     solution: Solution
+    variance: float
+    """Of an image's residual, m^2 per axis, over its weight."""
     residuals: Complex
     """(M,) where odometry puts an image minus where the map does, meters."""
     map_weights: Complex
     """(m,)"""
+    links: Links
+    """With the variances that the solution shows, see links.py."""
+    correlation: float = 1.0
+    """How many images count as one beside odometry's links, because residuals of neighbors are
+    correlated; times LINK_WEIGHT."""
+
+    @classmethod
+    def of(cls, problem: MetricProblem, ridge: Ridge, solution: Solution, freedom: float) -> MapFit:
+        """The map of a solution, which leaves residuals with so many degrees of freedom."""
+        places = solution.places(problem.stack)
+        weights = ridge.fitted(places)
+        residuals = np.asarray(places - ridge.expanded @ weights)
+        variance = residual_variance(residuals * np.sqrt(ridge.weights), freedom)
+        return cls(problem, ridge, solution, variance, residuals, weights, problem.links)
 
     @property
     def stack(self) -> Stack:
         return self.problem.stack
-
-    @property
-    def weights(self) -> Array:
-        """(M,) of each image in the least squares."""
-        return 1.0 / self.noise_ratio
 
     @property
     def places(self) -> Complex:
@@ -196,19 +125,43 @@ class MapFit:
     @property
     def certificate(self) -> Certificate:
         """Of the directions."""
-        graph = self.problem.graph
-        return self.solution.certificate if graph is None else graph.certificate
+        graph, solution = self.problem.graph, self.solution
+        return graph.certificate if graph else certify(solution.h, solution.z)
 
-    def solved(self, elimination: Elimination) -> Solution:
-        """The solution after another elimination, with this noise."""
-        if self.problem.graph is not None:
-            return self.solution
-        return self.form(elimination).solve(self.solution.z, self.solution.bias)
+    def form(self, ridge: Ridge) -> QuadraticForm:
+        """The quadratic form of another regression, with this noise."""
+        gram = ridge.gram(self.stack)
+        return QuadraticForm.of(gram, self.links, self.stack, self.link_variance)
 
-    def form(self, elimination: Elimination) -> QuadraticForm:
-        """The quadratic form after another elimination, with this noise and these biases."""
-        noise = self.links, self.link_variance
-        return self.problem.form(elimination, *noise, bias_std=0.0)
+    def without(self, rows: Indices) -> tuple[Ridge, Solution]:
+        """The regression without some images, and the solution, which the graph's does not need
+        them for; with this noise and these biases."""
+        ridge, now = self.ridge.without(rows), self.solution
+        return ridge, now if self.problem.graph else self.form(ridge).solved(now.z, now.bias)
+
+
+def _alternated(problem: MetricProblem, ridge: Ridge, start: MapFit | None, rounds: int) -> MapFit:
+    """Alternate solution and noise until the noise settles."""
+    stack, gram = problem.stack, ridge.gram(problem.stack)
+    bias: Array = start.solution.bias if start else np.zeros(stack.period[-1] + 1)
+    z = start.solution.z if start else None
+    links = start.links if start else problem.links
+    variance = start.variance if start else _FIRST_VARIANCE
+    correlation = start.correlation if start else LINK_WEIGHT
+    freedom = ridge.freedom - 1.5 * stack.segments
+    for _ in range(rounds):
+        form = QuadraticForm.of(gram, links, stack, variance * correlation)
+        solution = form.with_biases(z, bias)
+        z, bias = solution.z, solution.bias
+        fit = MapFit.of(problem, ridge, solution, freedom)
+        correlation = LINK_WEIGHT * _correlation(fit.residuals, stack)
+        found = problem.links.learned(links, stack, solution, *form.unknown_links(solution, links))
+        steady = found.alike(links, _LINKS_SETTLED)
+        steady &= abs(fit.variance - variance) < _SETTLED * fit.variance
+        links, variance = found, fit.variance
+        if steady:
+            break
+    return replace(fit, links=links, correlation=correlation)
 
 
 def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
@@ -229,15 +182,6 @@ def _checked_rows(features: Array, stack: Stack, config: MetricConfig) -> Array:
             f'slow_features is {config.slow_features}, but there are only {features.shape[1]}'
         )
     return rows
-
-
-def _freedom(elimination: Elimination, basis: Basis, count: int) -> float:
-    """Degrees of freedom that a map leaves to M residuals."""
-    inverse = scipy.linalg.solve_triangular(
-        elimination.factor, np.eye(len(elimination.factor)), lower=True
-    )
-    used = len(basis.ridge) - float(basis.ridge @ (inverse**2).sum(0))
-    return count - used
 
 
 def residual_variance(residuals: Complex, freedom: float) -> float:

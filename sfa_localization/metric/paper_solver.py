@@ -8,7 +8,7 @@ cosine of eq. 5 is the same for a turn and its mirror image; signed turns decide
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
 from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
-from sfa_localization.metric.quadratic_form import QuadraticForm, Solution, eliminate, schur
+from sfa_localization.metric.quadratic_form import Ridge
+from sfa_localization.metric.stack import Solution
 
 Complex = NDArray[np.complex128]
 
@@ -162,18 +163,10 @@ def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProble
     """The result of the descent as a fit."""
     stack, terms = problem.stack, regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
-    expanded = np.column_stack([regressors[:, 1:], np.ones(len(regressors))])
+    ridge, bias = Ridge.of(basis, problem.features), np.zeros(stack.period[-1] + 1)
     weights = np.roll(theta.weights, -1, axis=0) @ np.array([1.0, 1.0j])
-    o, z = theta.origins @ np.array([1.0, 1.0j]), np.exp(1j * theta.alpha)
-    residuals = o[stack.owner] + z[stack.owner] * stack.path - expanded @ weights
-    freedom = len(residuals) - terms - 1.5 * stack.segments
-    variance, ones = residual_variance(residuals, freedom), np.ones(len(expanded))
-    elimination = eliminate(expanded, basis.ridge, ones, stack)
-    bias = np.zeros(stack.period[-1] + 1)
-    form = QuadraticForm(elimination.gram, problem.links, stack.period, variance, 0.0)
-    h = schur(form.system(bias))[0]
-    solution = Solution(z, o, bias, h)
-    return MapFit(
-        problem, basis, expanded, ones, variance, 1.0, problem.links,
-        elimination, solution, residuals, weights,
-    )  # fmt: skip
+    solution = Solution(np.exp(1j * theta.alpha), theta.origins @ np.array([1.0, 1.0j]), bias)
+    residuals = solution.places(stack) - ridge.expanded @ weights
+    variance = residual_variance(residuals, ridge.freedom - 1.5 * stack.segments)
+    fit = MapFit(problem, ridge, solution, variance, residuals, weights, problem.links)
+    return replace(fit, solution=replace(solution, h=fit.form(ridge).at(bias)))

@@ -56,18 +56,6 @@ def certify(h: Complex, z: Complex) -> Certificate:
     return Certificate(float(least) / scale)
 
 
-def proven(h: Complex, z: Complex) -> bool:
-    """Whether no other angles are better than those of z (N,): as `certify`, for far less work."""
-    rest = h - np.diag(np.real(np.conj(z) * (h @ z)))
-    largest = max(float(np.real(np.diag(h)).max()), 1e-300)
-    rest[np.diag_indices_from(rest)] += CERTIFICATE_TOLERANCE * largest
-    try:
-        scipy.linalg.cholesky(rest, lower=True, overwrite_a=True)
-    except np.linalg.LinAlgError:
-        return False
-    return True
-
-
 def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> Complex:
     """Global minimizer z (N,), which may be unproven: see `certify`.
 
@@ -75,7 +63,7 @@ def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> Complex:
     proven minimum, and then from the mirror image of the best so far.
     """
     z = min((refine(h, unit(s)) for s in starts or [spectral_start(h)]), key=_by_cost(h))
-    if not proven(h, z):
+    if not certify(h, z).certified:
         z = min([z, *(refine(h, s) for s in (spectral_start(h), np.conj(z)))], key=_by_cost(h))
     return z
 

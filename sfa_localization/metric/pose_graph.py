@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What odometry, loop closures and measured points alone say of all drives, with a certificate.
 
-The least squares of loops.py, of odometry's links and of points in [o, z, -b z] (see
-quadratic_form.py), without features: each square reads few segments, so that Gauss and Newton's
-normal equations are sparse, and a drive of thousands of segments takes seconds. With multipliers
+The least squares of links.py, loops.py and anchors.py in [o, z, -b z] (see stack.py), without
+features: each square reads few segments, so that Gauss and Newton's normal equations are sparse,
+and a drive of thousands of segments takes seconds. With multipliers
 Lambda = diag(Re(conj(z) * (S x)_z)), S the quadratic form at the biases and x = [o, z] where o is
 best, S - diag(0, Lambda) >= 0 proves the directions optimal, as H - Lambda >= 0 does in phases.py:
 H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
@@ -23,11 +23,12 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.image_features import evenly
 from sfa_localization.metric.anchors import Anchors
-from sfa_localization.metric.link_noise import Missed, grown
+from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops, loops_of
 from sfa_localization.metric.phases import CERTIFICATE_TOLERANCE, Certificate, unit
-from sfa_localization.metric.quadratic_form import YAW_BIAS_STD, Links, Solution, Stack
+from sfa_localization.metric.quadratic_form import YAW_BIAS_STD
 from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.stack import Solution, Stack
 
 Complex = NDArray[np.complex128]
 
@@ -61,14 +62,14 @@ class Graph:
         stack, stated = Stack.of(segments), Links.of(segments)
         given: list[Loops | Anchors] = [*loops_of(segments.closures, segments.offsets, stack)]
         given += [segments.anchors] if segments.anchors else []
-        stay = sparse.diags_array(np.full(stack.segments, np.sqrt(_STAY)), dtype=complex)
-        stay.resize((stack.segments, 3 * stack.segments))
+        stay = stack.sparse((np.arange(stack.segments), np.full(stack.segments, np.sqrt(_STAY))))
         graph, links = None, stated
         for _ in range(_ROUNDS):
-            links = graph._learned(stated, links) if graph else links
+            if graph:
+                links = stated.learned(links, stack, graph.solution, *graph._unknown_links(links))
             before = graph.solution if graph else None
             ties = [one.ties(stack, before) for one in given]
-            rows = sparse.csr_array(sparse.vstack([*link_rows(links, stack), *ties, stay]))
+            rows = sparse.csr_array(sparse.vstack([links.ties(stack), *ties, stay]))
             graph = _solved(rows, stack, before)
         assert graph is not None
         return graph
@@ -101,7 +102,8 @@ class Graph:
     def covariance(self, rows: Complex) -> Complex:
         """Per axis (K, K) of rows (K, 3N) times [o, z, -b z], without a motion of the whole map."""
         stack, solution = self.stack, self.solution
-        own, whole = (by_unknowns(one, solution, stack.period) for one in (rows, _images(stack)))
+        images = stack.place_rows(np.arange(len(stack.images)), np.ones(len(stack.images)))
+        own, whole = (by_unknowns(one, solution, stack.period) for one in (rows, images))
         places = solution.places(stack)
         around = places - places.mean()
         mean = np.asarray(whole.mean(axis=0))
@@ -111,19 +113,12 @@ class Graph:
         unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
         return np.asarray(moved @ unknown / 2)
 
-    def _learned(self, stated: Links, links: Links) -> Links:
-        """The links with the variances that this solution, of the `links`, shows."""
-        x, z = self.solution.coefficients(self.stack.period), self.solution.z
-        turns, moves = link_rows(links, self.stack)
-        turn, move = links.turn_variance, links.displacement_variance
+    def _unknown_links(self, links: Links) -> tuple[Array, Array]:
+        """Variances (L,) that the solution leaves of turns and, per axis, displacements."""
+        turns, moves = links.rows(self.stack)
         # Along the turn: of its complex square the other part is none of the angles'.
-        along = sparse.diags_array(-1j * z[links.at + 1].conj()) @ turns
-        left_turn, left_move = self._left(along) * turn, self._left(moves, -1j * moves) * move / 2
-        return grown(
-            stated,
-            Missed(np.abs(turns @ x) ** 2 * turn, left_turn, turn, 1),
-            Missed(np.abs(moves @ x) ** 2 * move / 2, left_move, move, 2),
-        )
+        along = sparse.diags_array(-1j * self.solution.z[links.at + 1].conj()) @ turns
+        return self._left(along), self._left(moves, -1j * moves) / 2
 
     def _left(self, *sides: Any) -> Array:
         """Variance (L,) that the solution leaves of the real parts of rows (L, 3N) times
@@ -153,35 +148,6 @@ def by_unknowns(rows: Any, now: Solution, period: NDArray[np.int64]) -> Any:
     turned = (rows[:, n : 2 * n] - rows[:, 2 * n :] * now.bias[period][None]) * (1j * now.z)[None]
     periods = sparse.csr_array((np.ones(n), (np.arange(n), period)), (n, len(now.bias)))
     return sparse.hstack([own, 1j * own, turned, -by_bias @ periods]).tocsr()
-
-
-def link_rows(links: Links, stack: Stack) -> tuple[Any, Any]:
-    """Of the turns and of the displacements, (L, 3N) each over their standard deviations, turns to
-    first order in the biases; 0 for those of infinite variance."""
-    n, at, ones = stack.segments, links.at, np.ones(len(links.at))
-    turn = -np.exp(1j * links.turn)
-    turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * links.turn_time * turn)
-    moves = (
-        (at + 1, ones), (at, -ones), (n + at, -links.displacement),
-        (2 * n + at, -links.displacement_drift),
-    )  # fmt: skip
-    parts = (turns, links.turn_variance), (moves, links.displacement_variance)
-    return tuple(_scaled(entries, variance**-0.5, 3 * n) for entries, variance in parts)
-
-
-def _scaled(entries: Any, weight: Array, width: int) -> Any:
-    """Rows (L, width) times weights (L,), of the columns and values (L,) of their entries."""
-    columns, values = (np.concatenate(side) for side in zip(*entries, strict=True))
-    rows = np.tile(np.arange(len(weight)), len(entries))
-    values = np.nan_to_num(values * np.tile(weight, len(entries)))
-    return sparse.csr_array((values.astype(complex), (rows, columns)), (len(weight), width))
-
-
-def _images(stack: Stack) -> Any:
-    """Rows (M, 3N) whose products with [o, z, -b z] are the places of the images."""
-    n, ones = stack.segments, np.ones(len(stack.images))
-    entries = (stack.owner, ones), (n + stack.owner, stack.path), (2 * n + stack.owner, stack.drift)
-    return _scaled(entries, ones, 3 * n)
 
 
 def _solved(rows: Any, stack: Stack, before: Solution | None) -> Graph:

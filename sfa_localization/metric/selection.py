@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
@@ -18,15 +17,14 @@ from sfa_localization.metric.basis import (
     Basis,
     Monomials,
     Process,
-    expand,
-    missing,
     spread,
 )
 from sfa_localization.metric.forecast import ground_distances, importance, nearest_used
 from sfa_localization.metric.map_covariance import plane
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
-from sfa_localization.metric.quadratic_form import Stack, schur
+from sfa_localization.metric.quadratic_form import Ridge
+from sfa_localization.metric.stack import Stack
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
@@ -102,16 +100,12 @@ def leave_out(fit: MapFit) -> LeftOut:
     variances = np.zeros(len(stack.images))
     part = folds(stack, fit.problem.seed)
     for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
-        weights = fit.weights
-        weights[rows] = 0.0
-        elimination = fit.problem.eliminated(fit.basis, fit.expanded, weights)
-        solution = fit.solved(elimination)
-        coefficients = fit.problem.weights(elimination, solution)
-        left = fit.expanded[rows]
-        used = weights > 0
-        turn, shift = align_complex(solution.places(stack)[used], places[used])
-        errors[rows] = places[rows] - (turn * (left @ coefficients) + shift)
-        variances[rows] = fit.variance * (fit.noise_ratio[rows] + elimination.leverage(left))
+        ridge, solution = fit.without(rows)
+        found, left = solution.places(stack), fit.ridge.expanded[rows]
+        turn, shift = align_complex(found, places, ridge.weights)
+        errors[rows] = places[rows] - (turn * (left @ ridge.fitted(found)) + shift)
+        spread = (ridge.whitened(left) ** 2).sum(0)
+        variances[rows] = fit.variance * (1.0 / fit.ridge.weights[rows] + spread)
     return LeftOut(errors, variances)
 
 
@@ -120,22 +114,18 @@ def evidence(basis: Basis, now: MapFit) -> float:
 
     Origins have flat priors (restricted likelihood); the signal's variance is profiled out.
     """
-    expanded = expand(basis, now.problem.features)
-    weights = 1.0 / (1.0 + missing(basis, expanded))
-    noise = float(basis.ridge[0])
-    elimination = now.problem.eliminated(basis, expanded, weights)
-    system = now.form(elimination).system(now.solution.bias)
-    h = schur(system)[0]
-    cost = 2.0 * phase_cost(h, refine(h, now.solution.z))
-    points, segments = len(expanded), now.stack.segments
-    own = np.real(system[:segments, :segments])
-    own = own + np.trace(own) / segments**2
+    ridge, noise, z = Ridge.of(basis, now.problem.features), float(basis.ridge[0]), now.solution.z
+    form = now.form(ridge)
+    h = form.at(now.solution.bias)
+    cost = 2.0 * phase_cost(h, refine(h, z))
+    points, segments = len(ridge.expanded), len(z)
+    own = form.own + np.trace(form.own) / segments**2
     freedom = points - segments
     return (
         freedom * float(np.log(cost / noise / freedom))
         + (points - len(basis.ridge) + 1 - segments) * float(np.log(noise))
-        - float(np.log(weights).sum())
-        + elimination.log_determinant
+        - float(np.log(ridge.weights).sum())
+        + ridge.log_determinant
         + float(np.linalg.slogdet(own)[1])
     )
 
@@ -153,16 +143,11 @@ def left_out_error(basis: Basis, now: MapFit, weight: Array) -> float:
 
     The evidence would take neighbors that err alike for proof of little noise.
     """
-    expanded, places = expand(basis, now.problem.features), plane(now.places)
-    weighted = expanded / (1.0 + missing(basis, expanded))[:, None]
-    normal, right, error = weighted.T @ expanded, weighted.T @ places, 0.0
-    normal[np.diag_indices_from(normal)] += basis.ridge
+    ridge, places, error = Ridge.of(basis, now.problem.features), now.places, 0.0
     part = folds(now.stack, now.problem.seed)
     for rows in (np.flatnonzero(part == number) for number in np.unique(part)):
-        own = expanded[rows], weighted[rows], places[rows]
-        rest = normal - own[1].T @ own[0], right - own[1].T @ own[2]
-        found = scipy.linalg.solve(*rest, assume_a='pos', overwrite_a=True)
-        error += float(weight[rows] @ np.hypot(*(own[2] - own[0] @ found).T))
+        found = ridge.expanded[rows] @ ridge.without(rows).fitted(places)
+        error += float(weight[rows] @ np.abs(places[rows] - found))
     return error
 
 

@@ -71,14 +71,15 @@ def certified(trial: Problem) -> dict[str, float]:
     result = problem.fit(Monomials.fit(problem.features, 8, 0.0))
     seconds = time.perf_counter() - started
     truth = trial.run.poses[problem.stack.images, :2]
-    found = result.expanded @ result.map_weights
+    expanded = result.ridge.expanded
+    found = expanded @ result.map_weights
     own = np.column_stack([found.real, found.imag])
-    weights = np.linalg.lstsq(result.expanded, truth, rcond=None)[0]
+    weights = np.linalg.lstsq(expanded, truth, rcond=None)[0]
     return {
-        'certified': result.solution.certificate.certified,
+        'certified': result.certificate.certified,
         'ms': 1e3 * seconds,
         'uml': error(align(own, truth).apply(own), truth),
-        'supervised': error(result.expanded @ weights, truth),
+        'supervised': error(expanded @ weights, truth),
         'segments': problem.stack.segments,
         'sufficient': sufficient(result),
     }

@@ -22,9 +22,9 @@ from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.basis import PAPER_FEATURES, monomials
 from sfa_localization.metric.learning import correlation_along_drive, learn_metric
 from sfa_localization.metric.paper_solver import Lines, Parameters, descend
-from sfa_localization.metric.quadratic_form import Stack
 from sfa_localization.metric.segments import assignment
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.metric.stack import Stack
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.evaluation import firing_maps_figure
 from study import paper_report as report

@@ -1,0 +1,158 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What odometry measured from one segment to the next, and how noisy it is, learned with the map.
+
+    |z_{n+1} - exp(i (turn_n - b time_n)) z_n|^2      signed turns: the second sum of eq. 5, which
+                                                  has only cosines, the same for left and right
+    |o_{n+1} - o_n - z_n displacement_n|^2        displacements: not in the paper
+
+each over its variance, turns to first order in the biases. What messages state of their noise, or
+data sheets, is of wheels on a good floor. Where the links of a drive miss its solution by more than
+that, their variances grow. They miss it by less than they err, because it follows them: a link has
+as much of a degree of freedom left as the solution's own uncertainty of it is smaller than its
+variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.stack import Solution, Stack
+
+Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
+
+# Degrees of freedom of Student's distribution: wheels slip now and then, by far more than usual.
+_TAIL = 4.0
+# Of a run's factor and the doubts of its links in turn: far more than they need.
+_STEPS = 10
+# The variances that are stated or assumed count as so many links that miss by just as much: those
+# of a few say little.
+_PRIOR_LINKS = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """L turns and displacements of segments `at` (L,). One of infinite variance has no weight."""
+
+    at: Indices
+    run: Indices
+    turn: Array
+    turn_variance: Array
+    turn_time: Array
+    displacement: Complex
+    displacement_variance: Array
+    displacement_drift: Complex
+
+    @classmethod
+    def of(cls, segments: Segments) -> Links:
+        """Of all segments from which odometry leads on."""
+        items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
+        at = np.array([n for n, _ in items], np.int64)
+        run = np.array([s.run for _, s in items], np.int64)
+        column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
+        return cls(at, run, *column)
+
+    def rows(self, stack: Stack) -> tuple[Any, Any]:
+        """Of the turns and of the displacements, (L, 3N) each: what is squared of [o, z, -b z]."""
+        n, at, ones = stack.segments, self.at, np.ones(len(self.at))
+        turn = -np.exp(1j * self.turn)
+        turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * self.turn_time * turn)
+        moved = (n + at, -self.displacement), (2 * n + at, -self.displacement_drift)
+        return stack.sparse(*turns), stack.sparse((at + 1, ones), (at, -ones), *moved)
+
+    def ties(self, stack: Stack) -> Any:
+        """The same (2 L, 3N), over their standard deviations."""
+        std = np.sqrt(np.concatenate([self.turn_variance, self.displacement_variance]))
+        return sparse.vstack(self.rows(stack)).multiply(1 / std[:, None]).tocsr()
+
+    def alike(self, other: Links, tolerance: float) -> bool:
+        """Whether the variances of the same links differ by less than a part, on average."""
+        pairs = (
+            (self.turn_variance, other.turn_variance),
+            (self.displacement_variance, other.displacement_variance),
+        )
+        return all(_mean_change(own, its) < tolerance for own, its in pairs)
+
+    @property
+    def used(self) -> bool:
+        """Whether any turn or displacement has a weight."""
+        variances = np.concatenate([self.turn_variance, self.displacement_variance])
+        return bool(np.isfinite(variances).any())
+
+    def learned(
+        self, before: Links, stack: Stack, solution: Solution, turn_left: Array, move_left: Array
+    ) -> Links:
+        """Links of these variances or, in each run, of larger ones that a solution shows.
+
+        It is that of the links `before`, and leaves the variances (L,) `turn_left` and `move_left`,
+        per axis, of their turns and displacements unknown.
+        """
+        x = solution.coefficients(stack.period)
+        turned, moved = (np.abs(rows @ x) ** 2 for rows in self.rows(stack))
+        return replace(
+            self,
+            turn_variance=_grown(
+                self.turn_variance, before.turn_variance, turned, turn_left, self.run, 1
+            ),
+            displacement_variance=_grown(
+                self.displacement_variance,
+                before.displacement_variance,
+                moved / 2,
+                move_left,
+                self.run,
+                2,
+            ),
+        )
+
+
+_MEASURED = (
+    'turn_rad',
+    'turn_variance',
+    'turn_time_s',
+    'displacement',
+    'displacement_variance',
+    'displacement_drift',
+)
+
+
+def _mean_change(variances: Array, others: Array) -> float:
+    """Mean relative difference of two kinds of variances (L,) where they are finite."""
+    known = np.isfinite(others)
+    change = variances[known] / others[known] - 1.0
+    return float(np.abs(change).mean()) if known.any() else 0.0
+
+
+def _doubt(ratio: Array, axes: int) -> Array:
+    """What the variance grows by of a link whose squared error along each axis is so many times it:
+    1 on average where it is right."""
+    return np.asarray((_TAIL + axes * ratio) / (_TAIL + axes))
+
+
+def _grown(
+    stated: Array, assumed: Array, squares: Array, left: Array, run: Indices, axes: int
+) -> Array:
+    """Variances (L,): those of each run as many times the `stated` ones as its links show, and
+    more for single links that miss by far more (Student's distribution).
+
+    Links miss a solution that `assumed` other variances along each of so many `axes` by `squares`
+    (L,), and it leaves the variances `left` (L,) unknown. An infinite variance stays.
+    """
+    known = np.isfinite(stated)
+    of = np.where(known, stated, 1.0)
+    followed = np.minimum(left / assumed, 1.0)
+    freedom = np.bincount(run, known * (1.0 - followed)) + _PRIOR_LINKS
+    error, miss = (squares + left) / of, known * squares / of
+    factor = np.ones(len(freedom))
+    for _ in range(_STEPS):
+        doubt = _doubt(error / factor[run], axes)
+        factor = (np.bincount(run, miss / doubt) + _PRIOR_LINKS) / freedom
+        factor = np.maximum(factor, 1.0)
+    return np.asarray(stated * factor[run] * _doubt(error / factor[run], axes))

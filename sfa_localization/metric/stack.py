@@ -1,0 +1,131 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is unknown of a drive, and what its images say of that.
+
+With p = x + i y in meters and z_n = exp(i alpha_n), image m of segment n lies at
+
+    o_n + z_n (q_nm - b drift_nm)
+
+with the odometry's path q_nm in the segment, d_nm of the paper on a straight line, and the yaw-rate
+bias b of its period. That is linear in the unknowns [o, z, -b z] (3N,): links of odometry
+(links.py), loop closures (loops.py) and measured points (anchors.py) are rows that read a few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.metric.segments import Segments
+from sfa_localization.metric.shared_tracks import tracks
+
+Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Stack:
+    """The images of all N segments, one after the other: M rows."""
+
+    images: Indices
+    """(M,) indices of the images among all of the drives."""
+    owner: Indices
+    """(M,) segment of each row."""
+    path: Complex
+    """(M,) q: places in the frame of the segment, meters."""
+    drift: Complex
+    """(M,) meters per rad/s that a yaw-rate bias adds to `path`."""
+    headings: Array
+    """(M,) rad in the frame of the segment."""
+    times_s: Array
+    """(M,) seconds since the reference heading of the segment: drift of `headings`."""
+    first: Indices
+    """(N,) row of each segment's first image."""
+    period: Indices
+    """(N,) period of each segment, in which the yaw-rate bias is constant."""
+    starts: Array
+    """(N, 3) odometry poses of the segments' frames."""
+    track: Indices
+    """(N,) the first segment along the same track: see shared_tracks.py."""
+
+    @classmethod
+    def of(cls, segments: Segments) -> Stack:
+        sizes = [len(s.images) for s in segments]
+        return cls(
+            np.concatenate([s.images for s in segments]),
+            np.repeat(np.arange(len(sizes)), sizes),
+            np.concatenate([s.path for s in segments]),
+            np.concatenate([s.path_drift for s in segments]),
+            np.concatenate([s.headings for s in segments]),
+            np.concatenate([s.times_s for s in segments]),
+            np.concatenate([[0], np.cumsum(sizes)[:-1]]),
+            np.array([s.period for s in segments]),
+            np.array([s.start for s in segments]),
+            tracks(segments),
+        )
+
+    @property
+    def segments(self) -> int:
+        return len(self.first)
+
+    def corrected(self, bias: Array) -> Complex:
+        """Paths (M,) without the yaw-rate bias of each period (R,)."""
+        return np.asarray(self.path - bias[self.period[self.owner]] * self.drift)
+
+    def yaws(self, angles: Array, bias: Array) -> Array:
+        """Headings (M,) rad without the biases, of segments whose directions are `angles` (N,)."""
+        own = self.headings - bias[self.period[self.owner]] * self.times_s
+        return np.asarray(angles[self.owner] + own)
+
+    def rows(self, images: Indices) -> Indices:
+        """Rows of images (...) of the drives, -1 for those of no segment."""
+        order = np.argsort(self.images, kind='stable')
+        at = np.searchsorted(self.images, images, sorter=order)
+        rows = order[np.minimum(at, len(order) - 1)]
+        return np.where(self.images[rows] == images, rows, -1)
+
+    def sums(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Sum (N, ...) of the rows (M, ...) of each segment."""
+        return np.asarray(np.add.reduceat(rows, self.first, axis=0))
+
+    def place_rows(self, rows: Indices, shares: Array, ahead: Complex | float = 0.0) -> Any:
+        """Rows (L, 3N) whose products with [o, z, -b z] are sums of places by `shares`: of images,
+        `rows` (L,) or (L, K) of the stack, and what is `ahead` of them, x + i y m, in their axes.
+        """
+        n, owner, ahead = self.segments, self.owner[rows], np.exp(1j * self.headings[rows]) * ahead
+        drift = self.drift[rows] + 1j * self.times_s[rows] * ahead
+        places = n + owner, shares * (self.path[rows] + ahead)
+        return self.sparse((owner, shares), places, (2 * n + owner, shares * drift))
+
+    def sparse(self, *parts: tuple[Indices, Array | Complex]) -> Any:
+        """Rows (L, 3N) of [o, z, -b z] from columns and values, (L,) or (L, K); equal columns add
+        up."""
+        columns, values = (np.column_stack(side) for side in zip(*parts, strict=True))
+        rows = np.repeat(np.arange(len(columns)), columns.shape[1])
+        entries = values.astype(complex).ravel(), (rows, columns.ravel())
+        return sparse.csr_array(entries, shape=(len(columns), 3 * self.segments))
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Directions z (N,), origins o (N,), biases (R,) rad/s of the periods; and the quadratic form
+    H (N, N) of the directions, where these are not those of a sparse graph."""
+
+    z: Complex
+    o: Complex
+    bias: Array
+    h: Complex = field(default_factory=lambda: np.zeros((0, 0), complex))
+
+    def places(self, stack: Stack) -> Complex:
+        """Where the segments put the images (M,), meters."""
+        path = stack.corrected(self.bias)
+        return np.asarray(self.o[stack.owner] + self.z[stack.owner] * path)
+
+    def coefficients(self, period: Indices) -> Complex:
+        """[o, z, -b z] (3N,)."""
+        return np.concatenate([self.o, self.z, -self.bias[period] * self.z])
