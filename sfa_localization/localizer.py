@@ -35,7 +35,7 @@ from sfa_localization.place_model import PlaceModel, View, require_panorama
 UNKNOWN_VARIANCE = LARGEST_VARIANCE
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
 # The distance of slow features from keyframes, 1 on average where both variances are right, is
-# averaged over about ten images, outliers cut.
+# averaged over about ten images, outliers cut, each by the share that slow features have in it.
 _LATELY, _FARTHEST = 0.1, 100.0
 
 
@@ -100,9 +100,9 @@ class Observer:
             self._light.add(match, noise)
         light = self._light.unlike
         found = self.model.combined(slow, match, light, max(self._apart, 1.0))
-        apart = distance(slow, match, noise, light)
+        apart, share = distance(slow, match, noise, light)
         if np.isfinite(apart):
-            self._apart += _LATELY * (min(apart, _FARTHEST) - self._apart)
+            self._apart += _LATELY * share * (min(apart, _FARTHEST) - self._apart)
         return found
 
     def _usable(self, found: Observation) -> Observation:

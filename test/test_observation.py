@@ -107,10 +107,9 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
     assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3
 
 
-def slow_at(x: float, std_m: float, yaw: float = 0.0, yaw_std: float = 0.1) -> Observation:
+def slow_at(x: float, std_m: float, yaw: float = 0.0) -> Observation:
     """Slow features put an image on the x axis."""
-    spread = np.diag([std_m**2, std_m**2, yaw_std**2])
-    return Observation(np.array([x, 0.0, yaw]), spread, np.zeros(2))
+    return Observation(np.array([x, 0.0, yaw]), np.diag([std_m, std_m, 0.1]) ** 2, np.zeros(2))
 
 
 def match_at(std_m: float, **more) -> Match:
@@ -125,8 +124,7 @@ MATCHED = {
 EXACT = MatchNoise(floor_m=1e-6, yaw_std=0.1)
 
 
-def test_two_that_agree_are_weighted_by_their_information():
-    """The yaw is that of keyframes."""
+def test_two_that_agree_are_weighted_by_their_information_and_keyframes_know_the_yaw():
     pose, covariance = combine(slow_at(0.2, 0.1, yaw=0.1), match_at(0.2), EXACT)
     assert pose == pytest.approx([0.16, 0.0, 0.0], abs=1e-6)
     assert np.diag(covariance) == pytest.approx([0.2**2 * 0.1**2 / 0.05] * 2 + [0.01], rel=1e-3)
@@ -135,23 +133,17 @@ def test_two_that_agree_are_weighted_by_their_information():
 def test_the_farther_apart_the_less_sure_and_where_they_contradict_keyframes_count():
     near, far = (combine(slow_at(x, 0.1), match_at(0.1), EXACT)[1][0, 0] for x in (0.0, 0.4))
     assert far == pytest.approx(near * 0.4**2 / 0.02 / 2, rel=1e-3)
-    for slow in slow_at(0.6, 0.1), slow_at(math.nan, 0.1):
-        pose, covariance = combine(slow, match_at(0.1), EXACT)
+    for x, doubt in (0.6, 1.0), (0.1, 1.1), (math.nan, 1.0):
+        pose, covariance = combine(slow_at(x, 0.1), match_at(0.1), EXACT, doubt=doubt)
         assert np.array_equal(pose, np.zeros(3))
         assert np.array_equal(covariance, EXACT.covariance(match_at(0.1)))
-
-
-def test_slow_features_that_lately_were_far_off_count_little():
-    pose, covariance = combine(slow_at(0.3, 0.1), match_at(0.1), EXACT, doubt=3.0)
-    assert pose[0] == pytest.approx(0.3 / 10)
-    assert covariance[0, 0] == pytest.approx(0.9 * 0.1**2, rel=1e-3)
 
 
 def test_an_unknown_place_is_left_to_slow_features():
     slow = slow_at(3.0, 0.1)
     pose, covariance = combine(slow, match_at(0.1, known=False), EXACT, doubt=4.0)
-    assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(16.0 * slow.covariance)
-    assert math.isnan(distance(slow, match_at(0.1, known=False), EXACT))
+    assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(4.0 * slow.covariance)
+    assert math.isnan(distance(slow, match_at(0.1, known=False), EXACT, 0.0)[0])
 
 
 def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
@@ -203,7 +195,7 @@ def test_beyond_the_keyframes_both_estimates_are_wrong_together_and_light_is_no_
 def in_other_light() -> Matched:
     """Keyframes alone know the place; all images are unlike by their light."""
     noise, match = MatchNoise(floor_m=0.02, slope_m=0.4), match_at(0.01, unlike=0.6, score=0.7)
-    return Matched(slow_at(0.0, 100.0, yaw_std=2.0), match, noise)
+    return Matched(slow_at(0.0, 100.0), match, noise)
 
 
 def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
@@ -218,10 +210,22 @@ def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
 
 
 @pytest.mark.parametrize('known', [True, False])
-def test_slow_features_that_contradict_known_places_for_long_count_little(known):
+def test_slow_features_that_contradict_known_places_for_long_do_not_count(known):
     """Both are as sure of places 0.4 m apart."""
     match = match_at(0.1, score=0.7 if known else 0.3, known=known)
     observer = Observer(Matched(slow_at(0.4, 0.1), match, EXACT))
     seen = [observer.observe(k, panorama(seed=k)).position[0] for k in range(1, 50)]
     assert seen[0] == pytest.approx(0.2 if known else 0.4, abs=0.02)
-    assert seen[-1] == pytest.approx(0.0 if known else 0.4, abs=0.03)
+    assert seen[-1] == (0.0 if known else 0.4)
+
+
+@pytest.mark.parametrize(('own_m', 'its_m', 'shown'), [(0.1, 0.6, 0.0), (0.6, 0.1, 36 / 37)])
+def test_slow_features_are_not_blamed_for_errors_of_uncertain_keyframes(own_m, its_m, shown):
+    """Beside all keyframes these err by more than slow features, as they say."""
+    model = Matched(slow_at(0.0, 0.1), match_at(0.1), EXACT)
+    observer = Observer(model)
+    for k in range(1, 50):
+        if k == 30:
+            model.slow, model.found = slow_at(1.0, its_m), match_at(own_m)
+        seen = observer.observe(k, panorama(seed=k))
+    assert seen.position[0] == pytest.approx(shown, abs=1e-3)

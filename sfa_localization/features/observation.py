@@ -220,7 +220,7 @@ def combine(
     Where the place makes the image unlike by u (`MatchNoise.by_place`), slow features extrapolate
     as well; they get a share of what that adds to a match, with b its slope in m:
 
-        C_s' = doubt^2 C_s + (b u / 2)^2 I
+        C_s' = doubt C_s + (b u / 2)^2 I
 
     Both are weighted by their information, and where they are farther apart than that allows, by
     their squared Mahalanobis distance d^2 = (p_s - p_k)^T (C_k + C_s')^-1 (p_s - p_k) over its
@@ -230,14 +230,14 @@ def combine(
         C = j max(1, d^2 / 2) (G C_s' G^T + (I - G) C_k (I - G)^T)
 
     The yaw is that of keyframes. Slow features count alone at a place that the keyframes do not
-    know; keyframes alone where slow features give no position, or contradict them (d^2 > 12). How
-    far apart both have been lately, d^2 / 2 of many images, is the `doubt`.
+    know; keyframes alone where slow features give no position, contradict them (d^2 > 12), or
+    lately did (`doubt` > 1).
     """
     mine, its = noise.covariance(match, light), _slow_covariance(slow, match, noise, light, doubt)
     if not match.known:
         return slow.pose, its
     apart, own, other = slow.position - match.pose[:2], mine[:2, :2], its[:2, :2]
-    if not (np.isfinite(apart).all() and np.isfinite(other).all()):
+    if doubt > 1 or not (np.isfinite(apart).all() and np.isfinite(other).all()):
         return match.pose, mine
     squared = _squared(apart, own + other)
     if squared > _CONTRADICTS:
@@ -250,22 +250,24 @@ def combine(
     return match.pose + np.append(gain @ apart, 0.0), covariance
 
 
-def distance(slow: Observation, match: Match, noise: MatchNoise, light: float = 0.0) -> float:
-    """Half the squared Mahalanobis distance of both positions: 1 on average where both variances
-    are right. NaN where one of them is unknown.
+def distance(
+    slow: Observation, match: Match, noise: MatchNoise, light: float
+) -> tuple[float, float]:
+    """Half the squared Mahalanobis distance of both positions, 1 on average where both variances
+    are right, NaN for an unknown one; and the share that slow features have in the variance.
     """
     if not match.known or not np.isfinite(slow.pose[:2]).all():
-        return math.nan
-    apart = slow.pose[:2] - match.pose[:2]
-    joint = noise.covariance(match, light) + _slow_covariance(slow, match, noise, light)
-    return _squared(apart, joint[:2, :2]) / 2
+        return math.nan, 0.0
+    apart, own = slow.pose[:2] - match.pose[:2], noise.covariance(match, light)[:2, :2]
+    its = _slow_covariance(slow, match, noise, light)[:2, :2]
+    return _squared(apart, own + its) / 2, float(np.trace(its) / np.trace(own + its))
 
 
 def _slow_covariance(
     slow: Observation, match: Match, noise: MatchNoise, light: float, doubt: float = 1.0
 ) -> Array:
     """C_s' of `combine`."""
-    wider = slow.covariance * doubt**2
+    wider = slow.covariance * doubt
     extrapolated = _SLOW_SHARE * noise.slope_m * noise.by_place(match, light)
     wider[:2, :2] += extrapolated**2 * np.eye(2)
     return wider
