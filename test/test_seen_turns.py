@@ -15,7 +15,7 @@ from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
-from sfa_localization.metric.seen_turns import CLOSURES_MIN, Headings, corrections
+from sfa_localization.metric.odometry_errors import CLOSURES_MIN, Headings, corrections
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.training_input import TrainingInput

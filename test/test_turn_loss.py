@@ -11,8 +11,8 @@ from cylinder_worlds import Spheres, place, recipe, run_in, wander
 from sfa_localization.data.geometry import align
 from sfa_localization.data.run import Odometry, integrate
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
+from sfa_localization.metric.odometry_errors import LARGEST_LOSS, PAIRS_MIN, way_of
 from sfa_localization.metric.settings import SegmentConfig
-from sfa_localization.metric.turn_loss import LARGEST_LOSS, PAIRS_MIN, Shown, way_of
 from sfa_localization.reports.summary import summary
 from sfa_localization.training import learn_place
 
@@ -45,8 +45,8 @@ def found(loss, every=4, before=None, larger=1.0, **how):
     places, yaw = shown(poses, every)
     places = larger * places
     track = OdometryTrack.of(odometry, SegmentConfig(), None)
-    times = (odometry.stamps_ns[::every] - odometry.stamps_ns[0]) * 1e-9
-    return track, way_of(track, Shown(times, places, yaw), before)
+    poses = np.column_stack([places.real, places.imag, yaw])
+    return track, way_of(track, odometry.stamps_ns[::every], poses, before)
 
 
 @pytest.mark.parametrize('v', [0.3, -0.3])

@@ -82,16 +82,15 @@ class OdometryTrack:
         cls, odometry: Odometry, config: SegmentConfig, yaw_rate: YawRate | None = None
     ) -> OdometryTrack:
         """From wheel odometry, with the turns of the gyroscope where there is one."""
-        kept, skipped = _usable(odometry)
-        stamps, poses = odometry.stamps_ns[kept], np.array(odometry.poses[kept], float)
-        twists = odometry.twists[kept]
+        stamps, poses, skipped = odometry.stamps_ns, odometry.poses, dict[str, int]()
+        if len(stamps) < 2:
+            raise DataError('fewer than two usable odometry messages: check the odometry topic')
         # Some drivers publish poses only.
-        twists = twists if np.any(twists) else differences(stamps, poses)
+        twists = odometry.twists if np.any(odometry.twists) else differences(stamps, poses)
         breaks = _breaks(stamps, twists, skipped)
-        variances = np.where(odometry.variances[kept, 1] > 0, odometry.variances[kept, 1], 0.0)
-        yaw = np.unwrap(poses[:, 2])
-        gyro = None if config.yaw_source == 'odometry' else _usable_gyro(yaw_rate)
-        if gyro is not None:
+        variances, yaw = odometry.variances[:, 1], np.unwrap(poses[:, 2])
+        gyro = None if config.yaw_source == 'odometry' else yaw_rate
+        if gyro is not None and len(gyro.stamps_ns) > 1:
             turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, skipped)
             measured = yaw[0] + np.concatenate([[0.0], np.cumsum(turns)])
             poses, yaw = _with_yaw(poses, yaw, measured), measured
@@ -101,7 +100,7 @@ class OdometryTrack:
         sums = _running_sums(stamps, poses, yaw, variances, config.yaw_noise)
         rate = _smoothed(seconds_since_start(stamps), twists[:, 1])
         part = np.concatenate([[0], np.cumsum(breaks)])
-        count = Count(int(kept.sum()), skipped)
+        count = Count(len(stamps), skipped)
         return cls(stamps, poses, yaw, np.abs(twists[:, 0]), rate, part, sums, count)
 
     def corrected(self, turns: TurnCorrection) -> OdometryTrack:
@@ -138,24 +137,6 @@ def seconds_since_start(stamps_ns: Stamps) -> Array:
     return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
 
 
-def _increasing(stamps: Stamps, finite: Mask) -> Mask:
-    """Mask (N,) of the finite messages whose stamps are later than all before."""
-    never = np.iinfo(np.int64).min
-    known = np.where(finite, stamps, never)
-    return np.asarray(known > np.concatenate([[never], np.maximum.accumulate(known)[:-1]]))
-
-
-def _usable(odometry: Odometry) -> tuple[Mask, dict[str, int]]:
-    """Mask of messages with finite numbers and increasing stamps; why others are not used."""
-    finite = np.asarray(np.isfinite(np.hstack([odometry.poses, odometry.twists])).all(1))
-    kept, skipped = _increasing(odometry.stamps_ns, finite), dict[str, int]()
-    if kept.sum() < 2:
-        raise DataError('fewer than two usable odometry messages: check the odometry topic')
-    tally(skipped, 'not finite', ~finite)
-    tally(skipped, 'out of order', finite & ~kept)
-    return kept, skipped
-
-
 def _breaks(stamps: Stamps, twists: Array, skipped: dict[str, int]) -> Mask:
     """Mask (N - 1,) of the pauses that odometry does not bridge."""
     dt = np.diff(stamps) * 1e-9
@@ -174,17 +155,6 @@ def _steady(dt: Array, twists: Array) -> Mask:
     unsure = np.abs(np.diff(twists, axis=0)) * dt[:, None]
     alike = (unsure[:, 0] < _UNSURE_M) & (unsure[:, 1] < _UNSURE_RAD)
     return np.asarray(alike & (dt < _BRIDGE_MAX_S))
-
-
-def _usable_gyro(yaw_rate: YawRate | None) -> YawRate | None:
-    """The finite readings with increasing stamps; None where they are fewer than two."""
-    if yaw_rate is None:
-        return None
-    kept = _increasing(yaw_rate.stamps_ns, np.isfinite(yaw_rate.omega))
-    if kept.sum() < 2:
-        return None
-    variance = np.nan_to_num(yaw_rate.variance[kept])
-    return YawRate(yaw_rate.stamps_ns[kept], yaw_rate.omega[kept], variance)
 
 
 def _gyro_turns(
@@ -212,7 +182,7 @@ def _gyro_turns(
         return wheels, variances
     tally(skipped, 'in a gap of the gyroscope', unbroken & ~measured)
     offset = float((turns - wheels)[both].sum() / dt[both].sum())
-    own = np.interp(at, seconds, np.maximum(gyro.variance, 0.0))
+    own = np.interp(at, seconds, gyro.variance)
     own = np.where(np.append(measured, measured[-1]), own, variances)
     return np.where(measured, turns, wheels + offset * dt), own
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.features.rotation_spread import quantile
+from sfa_localization.metric.fitted_map import angle_covariance
 from sfa_localization.metric.links import Links
-from sfa_localization.metric.map_covariance import angle_covariance
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.stack import Stack
 

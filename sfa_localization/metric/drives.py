@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The drives that a map is learned from: odometry, what images show of its errors, and segments.
 
-Wheels err in turns: images show how far the robot turned (seen_turns.py) and, once there is a map,
-how much of the way was lost in turns (turn_loss.py).
+Wheels err in turns: images show how far the robot turned and, once there is a map, how much of the
+way was lost in turns (odometry_errors.py).
 """
 
 from __future__ import annotations
@@ -26,12 +26,11 @@ from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
+from sfa_localization.metric.odometry_errors import Headings, corrections, way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
-from sfa_localization.metric.seen_turns import Headings, corrections
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.shared_tracks import with_closures
-from sfa_localization.metric.turn_loss import Shown, way_of
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]
@@ -119,14 +118,14 @@ class Drives:
         return replace(self, offsets=find_offsets(views, poses[views.images], sphere))
 
     def shown(self, segments: Segments, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
-        """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (3, M)
+        """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (M, 3)
         of these by the map."""
         images, places = positions(result, segments)
-        poses = np.vstack([(places - result.residuals).T, headings(result, segments)[1]])
+        poses = np.column_stack([places - result.residuals, headings(result, segments)[1]])
         for drive, start in zip(self.items, self.starts, strict=True):
             rows = images - start
             own = (rows >= 0) & (rows < len(drive.stamps_ns))
-            yield drive.stamps_ns[rows[own]], poses[:, own]
+            yield drive.stamps_ns[rows[own]], poses[own]
 
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
         """The way of each drive by the map, where its wheels lose some in turns.
@@ -135,10 +134,9 @@ class Drives:
         """
         found, shown = [], self.shown(segments, result)
         drives = zip(self.items, self.turns(), shown, segments.ways, strict=True)
-        for drive, turns, (stamps_ns, (x, y, yaw)), way in drives:
+        for drive, turns, (stamps_ns, poses), way in drives:
             track = tracked(drive.run.odometry, self.config, drive.run.yaw_rate, turns)
-            time_s = (stamps_ns - track.stamps_ns[0]) * 1e-9
-            found.append(way_of(track, Shown(time_s, x + 1j * y, yaw), way))
+            found.append(way_of(track, stamps_ns, poses, way))
         scales = [way.scale for way in found if way]
         return [way and way._replace(scale=float(np.mean(scales))) for way in found]
 
@@ -149,7 +147,7 @@ def compare_with_map(
     """Add to what the sources of each drive's motion tell how far the images moved by the map."""
     shown = drives.shown(segments, result)
     for check, drive, (stamps_ns, poses) in zip(checks, drives.items, shown, strict=True):
-        pair = compare_map(drive.run.odometry, stamps_ns, poses.T)
+        pair = compare_map(drive.run.odometry, stamps_ns, poses)
         check.pairs += [pair] if pair else []
 
 

@@ -20,24 +20,23 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, wrap_angle
 from sfa_localization.features.image_features import Spectrum, evenly
-from sfa_localization.features.rotation_spread import Agreement, needed_factor
+from sfa_localization.features.rotation_spread import Agreement
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
-from sfa_localization.metric.forecast import Forecast
-from sfa_localization.metric.map_covariance import (
+from sfa_localization.metric.fitted_map import (
     angle_covariance,
+    map_frame,
     metric_map,
-    place_variance,
     places_of_points,
     plane,
 )
+from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
-from sfa_localization.metric.map_frame import map_frame
 from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.selection import LeftOut, choose, leave_out, on_the_ground
+from sfa_localization.metric.selection import LeftOut, choose, leave_out
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.stack import Stack
 from sfa_localization.metric.turned_maps import TurnedMaps
@@ -140,27 +139,22 @@ def learn_metric(
     if tied and config.solver == 'certified':
         problem = replace(problem, graph=(onto and onto.graph) or Graph.of(segments))
     fit = paper_solver.learn(problem) if config.solver == 'paper' else choose(problem, scale)
-    left = _Left.of(fit)
+    left = leave_out(fit)
     overfits = left.explained < LITTLE and left.variance > OVERFIT * fit.variance
     searched = config.solver == 'certified' and problem.graph is None
     if overfits and searched and not diagnose(fit).one_route:
         fit = choose(replace(problem, graph=Graph.of(segments)), scale)
-        left = _Left.of(fit)
+        left = leave_out(fit)
     if fit.problem.graph is not None:
-        fit, left = _as_left_out(fit, left)
+        # Neighbors err alike, and a map follows them: the variance is that of left-out images.
+        left = replace(left, variances=left.variances * (left.variance / fit.variance))
+        fit = replace(fit, variance=left.variance)
     diagnostics = diagnose(fit)
     _check_certificate(fit)
     check(diagnostics)
     by_points = segments.anchors is not None and segments.anchors.settled.used.any()
     frame = map_frame(fit) if onto is None or by_points else _frame_of(onto, fit)
     return _result(fit, left, frame, diagnostics)
-
-
-def _as_left_out(fit: MapFit, left: _Left) -> tuple[MapFit, _Left]:
-    """With the variance that left-out images show: neighbors err alike, and a map follows them."""
-    variances = left.images.variances * (left.variance / fit.variance)
-    images = replace(left.images, variances=variances)
-    return replace(fit, variance=left.variance), replace(left, images=images)
 
 
 def _check_certificate(fit: MapFit) -> None:
@@ -187,38 +181,10 @@ def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
     return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Left:
-    """Images left out of a fit, and the forecast by them."""
-
-    images: LeftOut
-    forecast: Forecast
-    spread: float
-    """Mean square distance (m^2) of the images from their middle."""
-
-    @classmethod
-    def of(cls, fit: MapFit) -> _Left:
-        images, places = leave_out(fit), plane(fit.places)
-        drive_std = np.sqrt(place_variance(fit))
-        distances, weight = on_the_ground(fit)
-        expected = Forecast(places, np.abs(images.errors), drive_std, weight, distances)
-        return cls(images, expected, float(places.var(0).sum()))
-
-    @property
-    def variance(self) -> float:
-        """Of the position of an image that was left out, m^2 per axis."""
-        return float(self.forecast.weight @ self.forecast.left_out**2) / 2
-
-    @property
-    def explained(self) -> float:
-        """Share of the spread of the places that the features explain in images left out."""
-        return 1.0 - 2.0 * self.variance / max(self.spread, 1e-12)
-
-
 def _result(
-    fit: MapFit, left: _Left, frame: RigidTransform, diagnostics: Diagnostics
+    fit: MapFit, left: LeftOut, frame: RigidTransform, diagnostics: Diagnostics
 ) -> MetricResult:
-    inflation = max(needed_factor(left.images.ratio, 2, left.forecast.weight), 1.0)
+    inflation = left.inflation
     drive_std = np.sqrt(inflation) * left.forecast.drive_std
     common_m = float(np.sqrt((drive_std**2).mean() / 2))
     turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
@@ -232,8 +198,8 @@ def _result(
         certificate=fit.certificate,
         images=fit.stack.images,
         residuals=plane(fit.residuals * turn),
-        left_out=plane(left.images.errors * turn),
-        left_out_variance=left.images.variances * inflation,
+        left_out=plane(left.errors * turn),
+        left_out_variance=left.variances * inflation,
         explained=left.explained,
         forecast=replace(left.forecast, drive_std=drive_std).moved(frame),
         points=points * turn + shift,

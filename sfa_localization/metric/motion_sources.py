@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, quantile
 
 Mask = NDArray[np.bool_]
 
@@ -239,9 +239,7 @@ def _moved(source: Source, windows: Stamps, what: str) -> Array:
 
 def _usual(x: Array) -> float:
     """The step in which half of the motion is done, or larger ones: standing does not matter."""
-    size = np.sort(np.abs(x))
-    total = np.cumsum(size)
-    return float(size[np.searchsorted(total, total[-1] / 2)]) if len(size) else 0.0
+    return quantile(np.abs(x), 0.5, np.abs(x)) if len(x) else 0.0
 
 
 def _fitted(what: str, a: str, b: str, x: Array, y: Array) -> Pair | None:
@@ -290,10 +288,7 @@ def _summit(around: Array) -> float:
 def _slope(x: Array, y: Array) -> float:
     """k of the least sum of |y - k x|: the median of y / x, weighted by |x|."""
     moved = x != 0
-    ratio, weight = y[moved] / x[moved], np.abs(x[moved])
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    return float(ratio[order][np.searchsorted(total, total[-1] / 2)]) if len(ratio) else 0.0
+    return quantile(y[moved] / x[moved], 0.5, np.abs(x[moved])) if moved.any() else 0.0
 
 
 def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | None:

@@ -187,7 +187,7 @@ def _refined(rows: Any, stack: Stack, start: Solution) -> Graph:
         now, cost = tried, new
         if np.abs(step[2 * n :]).max() < _CONVERGED:
             break
-    return Graph(stack, now, proof(rows, now, period), _normal(rows, now, period)[0])
+    return Graph(stack, now, proof(rows, now, period), factor)
 
 
 def _cost(rows: Any, solution: Solution, stack: Stack) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, align_complex
+from sfa_localization.features.rotation_spread import needed_factor
 from sfa_localization.metric.basis import (
     PAPER_FEATURES,
     Basis,
@@ -19,8 +20,8 @@ from sfa_localization.metric.basis import (
     Process,
     spread,
 )
-from sfa_localization.metric.forecast import ground_distances, importance, nearest_used
-from sfa_localization.metric.map_covariance import plane
+from sfa_localization.metric.fitted_map import place_variance, plane
+from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
 from sfa_localization.metric.quadratic_form import Ridge
@@ -55,11 +56,20 @@ class LeftOut:
     """(M,) m: where the solution of all data puts an image minus where that map does."""
     variances: Array
     """(M,) of the prediction per axis, before inflation, m^2."""
+    forecast: Forecast
+    explained: float
+    """Share of the spread of the places that the features explain."""
 
     @property
-    def ratio(self) -> Array:
-        """(M,) squared errors over both axes, over the variances of one."""
-        return np.asarray(np.abs(self.errors) ** 2 / self.variances)
+    def variance(self) -> float:
+        """Of the position of an image that was left out, m^2 per axis."""
+        return float(self.forecast.weight @ self.forecast.left_out**2) / 2
+
+    @property
+    def inflation(self) -> float:
+        """Factor on the covariance of the map that makes these consistent, at least 1."""
+        ratio = np.abs(self.errors) ** 2 / self.variances
+        return max(needed_factor(ratio, 2, self.forecast.weight), 1.0)
 
 
 def folds(stack: Stack, seed: int) -> Indices:
@@ -106,7 +116,12 @@ def leave_out(fit: MapFit) -> LeftOut:
         errors[rows] = places[rows] - (turn * (left @ ridge.fitted(found)) + shift)
         spread = (ridge.whitened(left) ** 2).sum(0)
         variances[rows] = fit.variance * (1.0 / fit.ridge.weights[rows] + spread)
-    return LeftOut(errors, variances)
+    distances, weight = on_the_ground(fit)
+    drive_std = np.sqrt(place_variance(fit))
+    expected = Forecast(plane(places), np.abs(errors), drive_std, weight, distances)
+    spread_m2 = max(float(plane(places).var(0).sum()), 1e-12)
+    explained = 1.0 - float(weight @ np.abs(errors) ** 2) / spread_m2
+    return LeftOut(errors, variances, expected, explained)
 
 
 def evidence(basis: Basis, now: MapFit) -> float:

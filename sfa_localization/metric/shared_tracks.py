@@ -74,13 +74,9 @@ def tracks(segments: Segments) -> Indices:
     images = np.take_along_axis(pairs, order, axis=1)[:, 1]
     for n, segment in enumerate(segments):
         own = (later == n) & (earlier >= 0) & (earlier < n)
-        found = _most_common(earlier[own])
+        found = int(np.bincount(earlier[own]).argmax()) if own.any() else -1
         near = np.abs(earlier[own] - found) <= 1
         path = np.abs(segment.path[np.isin(segment.images, images[own][near])])
         if len(path) and np.ptp(path) >= _SHARE * np.ptp(np.abs(segment.path)):
             track[n] = track[found]
     return track
-
-
-def _most_common(numbers: Indices) -> int:
-    return int(np.bincount(numbers).argmax()) if len(numbers) else -1
