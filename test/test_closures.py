@@ -29,14 +29,13 @@ from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.metric import selection
 from sfa_localization.metric.learning import headings, learn_metric, positions
 from sfa_localization.metric.links import Links
-from sfa_localization.metric.loops import Loops, loops_of
+from sfa_localization.metric.loops import Loops, loops_of, with_closures
 from sfa_localization.metric.phases import certify, synchronize
 from sfa_localization.metric.pose_graph import Graph, graph_poses, proof
 from sfa_localization.metric.quadratic_form import schur
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.metric.shared_tracks import tracks, with_closures
-from sfa_localization.metric.stack import Solution, Stack
+from sfa_localization.metric.stack import Solution, Stack, tracks
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)
@@ -260,6 +259,16 @@ def test_the_graph_errs_as_it_says():
         stated.append(np.diag(graph.angle_covariance))
     size = np.sqrt(np.mean(np.square(errors)) / np.mean(stated))
     assert 0.5 < size < 1.5, size
+
+
+def test_odometry_that_turns_wrongly_misleads_no_graph():
+    """From where it leads, the least squares end in a wrong minimum."""
+    twists, start = meander(150.0)
+    run = drive(twists, start=start, bias=0.06, yaw_noise=0.05)
+    segments = cut(run.odometry, run.stamps_ns, SegmentConfig())
+    offsets = mixtures(Stack.of(segments), run.poses, 0.03, count=1000)
+    found = Graph.of(dataclasses.replace(segments, offsets=offsets))
+    assert found.certificate.certified and found.solution.bias == pytest.approx(0.06, abs=0.01)
 
 
 def test_what_nothing_ties_is_known_to_be_unknown():

@@ -71,16 +71,3 @@ def test_a_worse_minimum_is_not_certified():
     z = synchronize(h, [wound])
     assert certify(h, z).certified
     assert phase_cost(h, z) == pytest.approx(0.0, abs=1e-12)
-
-
-def test_the_hessian_is_the_slope_of_the_gradient():
-    rng = np.random.default_rng(4)
-    h = ring(rng.uniform(-3, 3, 6), 0.3, rng)
-    angles, small = rng.uniform(-3, 3, 6), 1e-5
-    hessian = angle_hessian(h, np.exp(1j * angles))
-    for i, j in itertools.product(range(6), repeat=2):
-        e, f = np.eye(6)[i] * small, np.eye(6)[j] * small
-        corners = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
-        costs = [phase_cost(h, np.exp(1j * (angles + s * e + t * f))) for s, t in corners]
-        numeric = (costs[0] - costs[1] - costs[2] + costs[3]) / (4 * small**2)
-        assert hessian[i, j] == pytest.approx(numeric, abs=1e-4)

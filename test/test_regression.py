@@ -14,7 +14,7 @@ from sfa_localization.metric.basis import (
     missing,
     monomials,
 )
-from sfa_localization.metric.saved_map import MetricMap, Weights
+from sfa_localization.metric.saved_map import MetricMap
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.standard_normal((80, 6))
@@ -76,12 +76,15 @@ def test_fewer_inducing_points_leave_variance_missing_far_from_them():
     assert missing(basis, expand(basis, far))[0] == pytest.approx(100.0, rel=1e-6)
 
 
-def regressed(basis, noise_m=0.05):
+NOISE_M = 0.05
+
+
+def regressed(basis):
     """Weights as of a regression, so that a variance is a small difference of large numbers."""
     terms, rng = expand(basis, FEATURES), np.random.default_rng(1)
     precision = terms.T @ terms + np.diag(basis.ridge)
-    root = noise_m * np.linalg.inv(np.linalg.cholesky(precision)).T
-    return Weights(rng.standard_normal((len(precision), 2)), root, noise_m)
+    root = np.linalg.inv(np.linalg.cholesky(precision)).T
+    return rng.standard_normal((len(precision), 2)), root
 
 
 BASES = {
@@ -97,19 +100,18 @@ def basis(request):
 
 @pytest.fixture
 def metric_map(basis):
-    return MetricMap.of(basis, regressed(basis), 2.0, 0.1)
+    return MetricMap.of(basis, *regressed(basis), NOISE_M, 2.0, 0.1)
 
 
 def test_the_map_is_the_regression_in_closed_form(basis, metric_map):
-    terms, learned = expand(basis, FEATURES), regressed(basis)
-    own = ((terms @ learned.spread) ** 2).sum(1)
-    own += learned.noise_m**2 * (1.0 + missing(basis, terms))
+    terms, (mean, root) = expand(basis, FEATURES), regressed(basis)
+    own = NOISE_M**2 * (((terms @ root) ** 2).sum(1) + 1.0 + missing(basis, terms))
     positions, covariances = metric_map.predict(FEATURES)
-    assert np.allclose(positions, terms @ learned.mean, atol=1e-6)
+    assert np.allclose(positions, terms @ mean, atol=1e-6)
     expected = (2.0 * own + 0.1**2)[:, None, None] * np.eye(2)
     assert np.allclose(covariances, expected, rtol=0.01)
     assert np.array_equal(covariances, covariances.transpose(0, 2, 1))
-    assert np.linalg.eigvalsh(covariances).min() >= 2.0 * 0.05**2 * (1 - 1e-9)
+    assert np.linalg.eigvalsh(covariances).min() >= 2.0 * NOISE_M**2 * (1 - 1e-9)
 
 
 def test_saved_maps_and_single_rows_predict_alike_and_what_is_missing_is_named(metric_map):

@@ -80,10 +80,8 @@ def check_amount(stack: Stack, links: Links) -> None:
 def diagnose(fit: MapFit) -> Diagnostics:
     """Diagnostics of a fit."""
     places, stack = fit.places, fit.stack
-    lengths = np.array([segment.length_m for segment in fit.problem.segments])
-    steps = stack.path[1:] - stack.path[:-1]
-    same = stack.owner[1:] == stack.owner[:-1]
-    heading = steps[same] * fit.solution.z[stack.owner[1:][same]]
+    lengths, same = stack.sums(stack.steps), np.diff(stack.owner, prepend=-1) == 0
+    heading = (np.diff(stack.path, prepend=0.0) * fit.solution.z[stack.owner])[same]
     return Diagnostics(
         segments=stack.segments,
         images=len(places),

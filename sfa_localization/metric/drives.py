@@ -24,13 +24,13 @@ from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
+from sfa_localization.metric.loops import with_closures
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.odometry_errors import Headings, corrections, way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import Segments, cut, join, tracked
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.metric.shared_tracks import with_closures
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 Maps = tuple[MetricResult, TurnedMaps | None, MetricResult]

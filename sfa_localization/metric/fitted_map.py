@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, compose, invert
 from sfa_localization.metric import phases
 from sfa_localization.metric.map_fit import MapFit
-from sfa_localization.metric.saved_map import MetricMap, Weights
+from sfa_localization.metric.saved_map import MetricMap
 
 Complex = NDArray[np.complex128]
 
@@ -86,9 +86,8 @@ def metric_map(fit: MapFit, frame: RigidTransform, inflation: float, common_m: f
     """The map of a fit in the map frame, with the covariance of its weights."""
     weights = np.exp(1j * frame.yaw_rad) * fit.map_weights
     weights[-1] += frame.x_m + 1j * frame.y_m
-    std = float(np.sqrt(fit.variance))
-    learned = Weights(plane(weights), np.ascontiguousarray(std * fit.ridge.root.T), std)
-    return MetricMap.of(fit.ridge.basis, learned, inflation, common_m)
+    root, noise_m = fit.ridge.root.T, float(np.sqrt(fit.variance))
+    return MetricMap.of(fit.ridge.basis, plane(weights), root, noise_m, inflation, common_m)
 
 
 def map_frame(fit: MapFit) -> RigidTransform:

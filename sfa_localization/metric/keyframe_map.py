@@ -19,7 +19,7 @@ from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observat
 from sfa_localization.features.rotation_spread import Agreement, needed_factor, share_within
 from sfa_localization.metric.learning import MetricResult, headings, positions
 from sfa_localization.metric.segments import Segments, assignment
-from sfa_localization.metric.shared_tracks import tracks
+from sfa_localization.metric.stack import tracks
 
 # Between the drives: farther than any stretch.
 _ANOTHER_DRIVE_M = 1e6

@@ -230,15 +230,11 @@ def correlation_along_drive(
     A turn counts as `turn_radius_m` per rad. The share is bounded: errors of left-out maps are
     more alike than those of the final map, because each bridges a gap.
     """
-    driven = [
-        np.cumsum(np.abs(np.diff(s.path, prepend=s.path[0])))
-        + turn_radius_m * np.cumsum(np.abs(np.diff(s.headings, prepend=s.headings[0])))
-        for s in segments
-    ]
-    owner = np.repeat(np.arange(len(driven)), [len(part) for part in driven])
-    found = ErrorCorrelation.fit(
-        result.left_out, result.left_out_variance, np.concatenate(driven), owner
-    )
+    stack = Stack.of(segments)
+    turns = np.abs(np.diff(stack.headings, prepend=0.0))
+    turns[stack.first] = 0.0
+    driven = np.cumsum(stack.steps + turn_radius_m * turns)
+    found = ErrorCorrelation.fit(result.left_out, result.left_out_variance, driven, stack.owner)
     return ErrorCorrelation(min(found.share, _LARGEST_SHARE), found.distance_m)
 
 

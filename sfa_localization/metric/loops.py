@@ -27,6 +27,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
 from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
+from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
 
 Indices = NDArray[np.int64]
@@ -35,6 +36,9 @@ Indices = NDArray[np.int64]
 # closures do not know; and the least part of them that the map may show.
 _TURN_STD, _PLACE_STD_M, _ALIKE, _UNKNOWN = 0.005, 0.65, 0.03, 0.5
 _LEAST = 0.2
+_SURE_M, _DRIFT = 1.0, 0.1
+"""Odometry that errs by more than this, and this part of the distance driven, is of no use: wheels
+that slip err by 5 % of it."""
 # Residual, in standard deviations, at which a closure counts half.
 _HALF = 2.4
 
@@ -108,3 +112,22 @@ def _squares(
     n, owner = stack.segments, stack.owner[rows]
     turned = (n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)
     return stack.sparse(*turned), stack.place_rows(rows, minus)
+
+
+def with_closures(segments: Segments, closures: Closures) -> Segments:
+    """Segments with those of the closures that their odometry allows, where it is unbroken.
+
+    Places can look alike: doors of a corridor, trees in rows. Odometry errs, but not without bound.
+    """
+    stack = Stack.of(segments)
+    owner, (x, y, yaw) = stack.owner, stack.starts[stack.owner].T
+    places, driven = x + 1j * y + np.exp(1j * yaw) * stack.path, np.cumsum(stack.steps)
+    # To the next one's first image; how far beyond the last of this one does not matter.
+    beyond = [np.nan_to_num(abs(s.displacement)) for s in segments] - stack.sums(stack.steps)
+    driven += np.concatenate([[0.0], np.cumsum(np.maximum(beyond, 0.0))])[owner]
+    chain = np.cumsum([0, *(not one.linked for one in segments)])[owner]
+    rows = stack.rows(closures.images)
+    first, second = rows.T
+    apart, way = np.abs(places[second] - places[first]), np.abs(driven[second] - driven[first])
+    far = (apart > _SURE_M + _DRIFT * way) & (chain[first] == chain[second]) & (rows >= 0).all(1)
+    return replace(segments, closures=Closures(closures.images[~far], closures.turn[~far]))

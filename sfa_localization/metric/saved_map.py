@@ -26,17 +26,6 @@ _BLOCK = 128  # columns of a triangular matrix that are multiplied at once
 
 
 @dataclass(frozen=True, slots=True)
-class Weights:
-    """What is learned of a basis of m functions: `mean` (m, 2) m; `spread` (m, m), a square root of
-    their posterior covariance; and `noise_m`, an image's residual per axis, standard deviation.
-    """
-
-    mean: Array
-    spread: Array
-    noise_m: float
-
-
-@dataclass(frozen=True, slots=True)
 class MetricMap:
     """From slow features to meters in the map frame, with covariance.
 
@@ -55,16 +44,26 @@ class MetricMap:
     common_m: float
 
     @classmethod
-    def of(cls, basis: Basis, weights: Weights, inflation: float, common_m: float) -> MetricMap:
-        """Compile a map."""
-        floor = weights.noise_m**2
+    def of(
+        cls,
+        basis: Basis,
+        mean: Array,
+        root: Array,
+        noise_m: float,
+        inflation: float,
+        common_m: float,
+    ) -> MetricMap:
+        """Compile a map of weights that were learned, `mean` (m, 2) m, with the posterior
+        covariance noise_m^2 root root^T (m, m); `noise_m` is the standard deviation of an image's
+        residual per axis."""
+        floor = noise_m**2
         prior = floor * basis.prior
-        q = weights.spread @ weights.spread.T
+        q = floor * (root @ root.T)
         inner = _sign(basis) * (q[:-1, :-1] - prior * np.eye(len(q) - 1))
         quadratic = basis.turn @ inner @ basis.turn.T
         # Rounded as model files hold it: standard deviations change by 0.5 % at most.
         factor = lower_root((quadratic + quadratic.T) / 2).astype(np.float32)
-        rows = np.column_stack([weights.mean, 2 * q[:, -1]])
+        rows = np.column_stack([mean, 2 * q[:, -1]])
         constant = rows[-1].copy()
         constant[2] = q[-1, -1] + floor + prior
         linear = basis.turn @ rows[:-1]

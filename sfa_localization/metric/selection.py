@@ -80,8 +80,7 @@ def folds(stack: Stack, seed: int) -> Indices:
     segments, and always at least two. Segments along one track are left out together. Raises
     DataError for a drive of one segment.
     """
-    steps = np.abs(np.diff(stack.path, prepend=0)) * (np.diff(stack.owner, prepend=-1) == 0)
-    lengths = np.bincount(stack.owner, steps)
+    lengths = stack.sums(stack.steps)
     length = min(LEFT_OUT_LENGTH_M, lengths.sum() / LEFT_OUT_FOLDS)
     # The middles of the first and the last segment are at least half the drive apart.
     middles = np.cumsum(lengths) - lengths / 2

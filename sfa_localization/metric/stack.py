@@ -21,11 +21,14 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array
-from sfa_localization.metric.segments import Segments
-from sfa_localization.metric.shared_tracks import tracks
+from sfa_localization.metric.segments import Segments, assignment
 
 Complex = NDArray[np.complex128]
 Indices = NDArray[np.int64]
+
+_TRACK_SHARE = 0.5
+"""Of the length of a segment that closures with an earlier one must span: a crossing track has
+closures along half a meter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +54,7 @@ class Stack:
     starts: Array
     """(N, 3) odometry poses of the segments' frames."""
     track: Indices
-    """(N,) the first segment along the same track: see shared_tracks.py."""
+    """(N,) the first segment along the same track."""
 
     @classmethod
     def of(cls, segments: Segments) -> Stack:
@@ -72,6 +75,13 @@ class Stack:
     @property
     def segments(self) -> int:
         return len(self.first)
+
+    @property
+    def steps(self) -> Array:
+        """(M,) m driven from the image before, 0 at the first of each segment."""
+        steps = np.abs(np.diff(self.path, prepend=0.0))
+        steps[self.first] = 0.0
+        return np.asarray(steps)
 
     def corrected(self, bias: Array) -> Complex:
         """Paths (M,) without the yaw-rate bias of each period (R,)."""
@@ -129,3 +139,30 @@ class Solution:
     def coefficients(self, period: Indices) -> Complex:
         """[o, z, -b z] (3N,)."""
         return np.concatenate([self.o, self.z, -self.bias[period] * self.z])
+
+
+def tracks(segments: Segments) -> Indices:
+    """For each of the N segments the first segment along the same track (N,): mostly itself.
+
+    A part of the drive that is left out to check a map stands for places that were never seen.
+    Where a later drive follows the same track, perhaps in another light, its images would give the
+    answer away: a map that is learned without one segment must do without both.
+    """
+    track = np.arange(len(segments))
+    pairs = segments.closures.images
+    if not len(pairs):
+        return track
+    count = max(int(pairs.max()), max(int(s.images.max()) for s in segments)) + 1
+    owner = assignment(segments, count)
+    both = owner[pairs]
+    order = np.argsort(both, axis=1)
+    earlier, later = np.take_along_axis(both, order, axis=1).T
+    images = np.take_along_axis(pairs, order, axis=1)[:, 1]
+    for n, segment in enumerate(segments):
+        own = (later == n) & (earlier >= 0) & (earlier < n)
+        found = int(np.bincount(earlier[own]).argmax()) if own.any() else -1
+        near = np.abs(earlier[own] - found) <= 1
+        path = np.abs(segment.path[np.isin(segment.images, images[own][near])])
+        if len(path) and np.ptp(path) >= _TRACK_SHARE * np.ptp(np.abs(segment.path)):
+            track[n] = track[found]
+    return track
