@@ -91,7 +91,7 @@ def train(
     given = TrainingInput.of(runs, recipe, progress)  # step 2
     network = train_hierarchy(given, checkpoint)  # step 3
     trained = _learn(network, given, strict)  # steps 4 to 8
-    compare_with_map(checks, given.drives, trained.segments, trained.metric)
+    compare_with_map(checks, given.drives, trained.metric)
     trained.model.save(output)
     checkpoint.remove()
     return replace(trained, checks=checks)

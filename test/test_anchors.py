@@ -31,7 +31,7 @@ from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map
-from sfa_localization.metric.learning import learn_metric, positions
+from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.points import points_of, read_points, stops
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
@@ -167,8 +167,8 @@ def in_coordinates(drives, features):
 
 def errors(rows=(), wrong=None):
     """Mean errors (m) in the owner's coordinates, and by the best similarity; its scale."""
-    segments, result = learned(rows, wrong)
-    images, places = positions(result, segments)
+    _, result = learned(rows, wrong)
+    images, places = result.images, result.poses[:, :2]
     true = world()[1].poses[images, :2] @ [1, 1j]
     own = places @ [1, 1j]
     frame = np.column_stack([own, np.ones(len(own))])
@@ -209,9 +209,9 @@ def test_the_wrong_point_is_named_and_missed_by_what_it_is_wrong():
 
 def test_one_point_moves_the_map_of_the_odometry():
     plain, (segments, result) = learned()[1], learned(far_apart()[:1])
-    turned = align(plain.origins, result.origins)
+    turned = align(plain.poses[:, :2], result.poses[:, :2])
     assert turned.yaw_rad == pytest.approx(0.0, abs=1e-3)
-    assert np.abs(turned.apply(plain.origins) - result.origins).max() < 1e-2
+    assert np.abs(turned.apply(plain.poses[:, :2]) - result.poses[:, :2]).max() < 1e-2
     assert segments.anchors.quality(result.points)['points'][0]['miss_m'] < 1e-9
     assert segments.anchors.settled.scale == 1.0
 
@@ -231,8 +231,8 @@ def test_points_bend_a_route_straight():
     missed = []
     for measured in (None, given):
         drives = Drives((item,), Closures.none(), config, points=measured)
-        segments, result = in_coordinates(drives, features)
-        images, places = positions(result, segments)
+        _, result = in_coordinates(drives, features)
+        images, places = result.images, result.poses[:, :2]
         true = run.poses[images, :2]
         to_truth = align(places, true) if measured is None else RigidTransform(0.0, 0.0, 0.0)
         missed.append(np.hypot(*(to_truth.apply(places) - true).T).mean())

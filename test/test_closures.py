@@ -27,7 +27,7 @@ from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.metric import selection
-from sfa_localization.metric.learning import headings, learn_metric, positions
+from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops, loops_of, with_closures
 from sfa_localization.metric.phases import certify, synchronize
@@ -133,10 +133,10 @@ def true_closures(poses, first, wrong=0.0, seed=0):
     return Closures(pairs, turn)
 
 
-def errors_of(result, segments, poses):
-    images, places = positions(result, segments)
+def errors_of(result, poses):
+    images, places = result.images, result.poses[:, :2]
     frame = align(places, poses[images, :2])
-    yaw = headings(result, segments)[1] + frame.yaw_rad
+    yaw = result.poses[:, 2] + frame.yaw_rad
     far = np.hypot(*(frame.apply(places) - poses[images, :2]).T)
     return far.mean(), np.abs(wrap_angle(yaw - poses[images, 2])).mean()
 
@@ -149,7 +149,7 @@ def test_closures_tie_drives_that_share_no_feature(wrong, quick):
     closures = true_closures(poses, first, wrong)
     tied = dataclasses.replace(segments, closures=closures)
     result = learn_metric(features, tied, GP)
-    far, turned = errors_of(result, tied, poses)
+    far, turned = errors_of(result, poses)
     assert result.certificate.certified
     assert far < 0.25 and turned < 0.03
 
@@ -288,7 +288,7 @@ def test_where_offsets_tie_a_drive_features_do_not_bend_it(quick):
     for segments, shown in ((measured, features), (measured, features[:, ::-1]), (loose, features)):
         result = learn_metric(shown, segments, GP)
         assert result.certificate.certified
-        far.append(errors_of(result, segments, poses)[0])
+        far.append(errors_of(result, poses)[0])
     assert far[0] == pytest.approx(far[1], rel=1e-9)
     assert far[0] < 0.8 * far[2], far
 

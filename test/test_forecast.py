@@ -16,7 +16,7 @@ from sfa_localization.metric import drive_check, selection
 from sfa_localization.metric.forecast import (
     REACH_M,
 )
-from sfa_localization.metric.learning import learn_metric, positions
+from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.selection import folds
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -87,7 +87,7 @@ def test_it_is_worst_where_the_images_mislead(monkeypatch):
     misled = poses[:, 0] > 2.5
     noise = 0.6 * np.random.default_rng(1).standard_normal(features.shape)
     result = learn_metric(features + np.where(misled, 1.0, 0.0)[:, None] * noise, segments, CONFIG)
-    images, places = positions(result, segments)
+    images, places = result.images, result.poses[:, :2]
     x, y, error = result.forecast.worst
     assert poses[images[np.hypot(*(places - [x, y]).T).argmin()], 0] > 2.0
     assert error > 1.5 * result.forecast.expected_m
@@ -105,7 +105,7 @@ def test_a_map_of_weak_images_keeps_the_shape_of_its_odometry_and_says_how_weak(
     with pytest.MonkeyPatch.context() as patch:
         quick_and_tolerant(patch)
         result = learn_metric(first, segments, CONFIG)
-    images, places = positions(result, segments)
+    images, places = result.images, result.poses[:, :2]
     laid = align(places, truth[images])
     assert np.hypot(*(laid.apply(places) - truth[images]).T).mean() < 0.3
     off = laid.apply(result.map.predict(again[images])[0]) - truth[images]

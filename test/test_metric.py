@@ -25,7 +25,7 @@ from sfa_localization.data.geometry import RigidTransform, align, compose, inver
 from sfa_localization.features.rotation_spread import share_within
 from sfa_localization.metric import map_fit, paper_solver, selection
 from sfa_localization.metric.basis import expand, missing, monomials
-from sfa_localization.metric.learning import headings, learn_metric, positions
+from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.map_fit import MetricProblem
 from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
 from sfa_localization.metric.phases import Certificate
@@ -98,9 +98,9 @@ def test_noiseless_data_gives_no_error(mode):
     truth = in_odometry_frame(run)
     predicted, _ = result.map.predict(exact_features(run.poses))
     assert np.abs(predicted - truth[:, :2]).max() < 1e-9
-    images, places = positions(result, segments)
+    images, places = result.images, result.poses[:, :2]
     assert np.abs(places - truth[images, :2]).max() < 1e-9
-    images, yaw = headings(result, segments)
+    images, yaw = result.images, result.poses[:, 2]
     assert np.abs(wrap_angle(yaw - truth[images, 2])).max() < 1e-9
     assert result.certificate.certified
     assert np.abs(result.residuals).max() < 1e-9
@@ -173,7 +173,7 @@ def test_a_bias_that_changes_every_minute_is_found():
     spreads = []
     for segments in (one, join([one], [0])):
         result = learn_metric(features, segments, GP)
-        images, yaw = headings(result, segments)
+        images, yaw = result.images, result.poses[:, 2]
         spreads.append(wrap_angle(yaw - in_odometry_frame(run)[images, 2]).std())
     assert result.yaw_bias == pytest.approx(BIASES, abs=4e-4)
     assert result.certificate.certified
@@ -182,8 +182,8 @@ def test_a_bias_that_changes_every_minute_is_found():
 
 def test_the_map_is_the_odometry_frame_at_the_start_and_an_anchor_moves_it():
     run, segments, features, result = noisy_result()
-    images, places = positions(result, segments)
-    _, yaw = headings(result, segments)
+    images, places = result.images, result.poses[:, :2]
+    yaw = result.poses[:, 2]
     truth = in_odometry_frame(run)[images]
     start = images < 40
     assert errors(places[start], truth[start, :2]).mean() < 0.15
@@ -192,7 +192,7 @@ def test_the_map_is_the_odometry_frame_at_the_start_and_an_anchor_moves_it():
     anchored = learn_metric(features, segments, dataclasses.replace(GP, anchor=(5.0, -2.0, 2.0)))
     expected = frame.apply(result.map.predict(features)[0])
     assert np.allclose(anchored.map.predict(features)[0], expected, atol=1e-6)
-    assert np.allclose(anchored.origins, frame.apply(result.origins))
+    assert np.allclose(anchored.poses[:, :2], frame.apply(result.poses[:, :2]))
     for anchor in ((1.0,), (1.0, 2.0, 3.0, 4.0)):
         with pytest.raises(ConfigError, match='x, y, yaw'):
             MetricConfig(anchor=anchor)
@@ -219,7 +219,7 @@ def test_what_positions_have_in_common_errors_is_about_as_large_as_they_err():
         segments = cut(run.odometry, run.stamps_ns, ANY)
         features = garden_features(run.poses[:, :2], noise=0.05)
         result = learn_metric(features, segments, GP)
-        images, places = positions(result, segments)
+        images, places = result.images, result.poses[:, :2]
         truth = run.poses[images, :2]
         true.append((errors(align(places, truth).apply(places), truth) ** 2).mean())
         claimed.append(2 * result.map.common_m**2 / result.map.inflation)
@@ -249,7 +249,7 @@ def test_two_runs_share_one_map():
     places = np.vstack([one.poses, two.poses])
     segments = join(parts, [0, len(one.poses)])
     result = learn_metric(garden_features(places[:, :2], noise=0.05), segments, GP)
-    images, found = positions(result, segments)
+    images, found = result.images, result.poses[:, :2]
     frame = align(found, places[images, :2])
     assert errors(frame.apply(found), places[images, :2]).mean() < 0.2
     minutes = [np.ptp(r.stamps_ns) / 60e9 for r in (one, two)]

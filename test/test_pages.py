@@ -17,7 +17,6 @@ from test_inspection import write as write_drive
 from sfa_localization.bags.drives import images_at
 from sfa_localization.cli import main
 from sfa_localization.data.run import Trajectory
-from sfa_localization.metric.learning import positions
 from sfa_localization.reports import evaluation, page, training
 
 FOREIGN = re.compile(r'<(script|link|iframe)|href=|srcset=|onload=|onclick=|url\(|@import')
@@ -73,7 +72,7 @@ def test_the_worst_images_are_those_and_lie_apart(reported):
 
 def test_lanes_that_are_far_apart_are_named_as_what_to_drive_next(reported):
     result, _, _ = reported
-    _, places = positions(result.metric, result.segments)
+    places = result.metric.poses[:, :2]
     near, far = (' '.join(training.advice(result, k * places)) for k in (1, 30))
     assert 'drive lanes 2 m apart' in far
     assert 'lanes' not in near

@@ -29,7 +29,6 @@ from sfa_localization.features import checkpoint as checkpoints
 from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.metric import learning
 from sfa_localization.metric.drive_check import ROUTE
-from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
 from sfa_localization.simulation.drive import simulate
@@ -74,7 +73,7 @@ def test_a_training_leaves_the_model_and_says_what_error_to_expect(trained):
     assert f'worst near x {worst["x_m"]:.1f} m, y {worst["y_m"]:.1f} m' in told
     assert f'expect {quality["expected_yaw_error_deg"]:.1f} degrees' in told
     assert '4 slow features, then turned maps, directions' in told
-    _, places = positions(result.metric, result.segments)
+    places = result.metric.poses[:, :2]
     assert np.hypot(*(places - [worst['x_m'], worst['y_m']]).T).min() < 1.0
     assert result.metric.map is result.model.metric
 

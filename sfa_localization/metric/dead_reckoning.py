@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +92,7 @@ class OdometryTrack:
         gyro = None if config.yaw_source == 'odometry' else yaw_rate
         if gyro is not None and len(gyro.stamps_ns) > 1:
             turns, variances = _gyro_turns(stamps, yaw, variances, ~breaks, gyro, skipped)
-            measured = yaw[0] + np.concatenate([[0.0], np.cumsum(turns)])
+            measured = yaw[0] + summed(turns)
             poses, yaw = _with_yaw(poses, yaw, measured), measured
             twists = np.column_stack([twists[:, 0], np.gradient(yaw, seconds_since_start(stamps))])
         elif config.yaw_source == 'gyro':
@@ -133,28 +133,27 @@ class OdometryTrack:
         return np.asarray(np.divide(step * turned, length, out=np.zeros_like(step), where=moves))
 
 
+def summed(steps: NDArray[Any]) -> NDArray[Any]:
+    """Sums (N + 1,) of steps (N,), from 0 on."""
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def seconds_since_start(stamps_ns: Stamps) -> Array:
     return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
 
 
 def _breaks(stamps: Stamps, twists: Array, skipped: dict[str, int]) -> Mask:
-    """Mask (N - 1,) of the pauses that odometry does not bridge."""
+    """Mask (N - 1,) of the pauses that odometry does not bridge: it says the same before and after
+    short ones. Drivers that repeat a command, or speak only when it changes, pause like that.
+    """
     dt = np.diff(stamps) * 1e-9
     # Odometry that is always slow does not pause at each message.
     gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
-    gap &= ~_steady(dt, twists)
-    tally(skipped, 'pauses', gap)
-    return np.asarray(gap)
-
-
-def _steady(dt: Array, twists: Array) -> Mask:
-    """Mask (N - 1,) of short pauses that odometry bridges: it says the same before and after.
-
-    Drivers that repeat a command, or speak only when it changes, pause like that.
-    """
     unsure = np.abs(np.diff(twists, axis=0)) * dt[:, None]
     alike = (unsure[:, 0] < _UNSURE_M) & (unsure[:, 1] < _UNSURE_RAD)
-    return np.asarray(alike & (dt < _BRIDGE_MAX_S))
+    gap &= ~(alike & (dt < _BRIDGE_MAX_S))
+    tally(skipped, 'pauses', gap)
+    return np.asarray(gap)
 
 
 def _gyro_turns(
@@ -173,7 +172,7 @@ def _gyro_turns(
     """
     seconds, at = (gyro.stamps_ns - stamps[0]) * 1e-9, seconds_since_start(stamps)
     areas = (gyro.omega[1:] + gyro.omega[:-1]) / 2 * np.diff(seconds)
-    turns = np.diff(np.interp(at, seconds, np.concatenate([[0.0], np.cumsum(areas)])))
+    turns = np.diff(np.interp(at, seconds, summed(areas)))
     wheels, dt = np.diff(yaw), np.diff(at)
     measured = _bridged(stamps, gyro.stamps_ns, round(GAP_MAX_S * 1e9))
     both = measured & unbroken
@@ -211,7 +210,7 @@ def _steps(poses: Array) -> Complex:
 
 def _along(start: Array, step: Complex, yaw: Array) -> Array:
     """Poses (N, 3) from the place of a `start` (3,) by displacements (N - 1,) m, with yaw (N,)."""
-    place = start[0] + 1j * start[1] + np.concatenate([[0.0], np.cumsum(step)])
+    place = start[0] + 1j * start[1] + summed(step)
     return np.column_stack([place.real, place.imag, yaw])
 
 
@@ -237,7 +236,7 @@ def _running_sums(
 
 def _smoothed(seconds: Array, rates: Array) -> Array:
     """Moving average over a fixed time, by the running integral."""
-    total = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(seconds))])
+    total = summed((rates[1:] + rates[:-1]) / 2 * np.diff(seconds))
     low = np.clip(seconds - _SMOOTHING_S / 2, seconds[0], seconds[-1])
     high = np.clip(seconds + _SMOOTHING_S / 2, seconds[0], seconds[-1])
     area = np.interp(high, seconds, total) - np.interp(low, seconds, total)

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +56,6 @@ class Diagnostics:
     def one_route(self) -> bool:
         """Whether nothing but odometry, by its turns, connects the parts of the drive."""
         return _connects_nothing(self.extent_m, self.crossings)
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def check_amount(stack: Stack, links: Links) -> None:

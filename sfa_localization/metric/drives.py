@@ -23,7 +23,7 @@ from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
 from sfa_localization.metric.drive_check import ROUTE
-from sfa_localization.metric.learning import MetricResult, headings, learn_metric, positions
+from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
@@ -117,13 +117,12 @@ class Drives:
         poses = graph_poses(Graph.of(self.cut()), int(views.images.max()) + 1)
         return replace(self, offsets=find_offsets(views, poses[views.images], sphere))
 
-    def shown(self, segments: Segments, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
+    def shown(self, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
         """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (M, 3)
         of these by the map."""
-        images, places = positions(result, segments)
-        poses = np.column_stack([places - result.residuals, headings(result, segments)[1]])
+        poses = result.poses - np.pad(result.residuals, ((0, 0), (0, 1)))
         for drive, start in zip(self.items, self.starts, strict=True):
-            rows = images - start
+            rows = result.images - start
             own = (rows >= 0) & (rows < len(drive.stamps_ns))
             yield drive.stamps_ns[rows[own]], poses[own]
 
@@ -132,7 +131,7 @@ class Drives:
 
         All have the same scale: it is that of the map, and no drive is better known by itself.
         """
-        found, shown = [], self.shown(segments, result)
+        found, shown = [], self.shown(result)
         drives = zip(self.items, self.turns(), shown, segments.ways, strict=True)
         for drive, turns, (stamps_ns, poses), way in drives:
             track = tracked(drive.run.odometry, self.config, drive.run.yaw_rate, turns)
@@ -141,11 +140,9 @@ class Drives:
         return [way and way._replace(scale=float(np.mean(scales))) for way in found]
 
 
-def compare_with_map(
-    checks: Sequence[MotionCheck], drives: Drives, segments: Segments, result: MetricResult
-) -> None:
+def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:
     """Add to what the sources of each drive's motion tell how far the images moved by the map."""
-    shown = drives.shown(segments, result)
+    shown = drives.shown(result)
     for check, drive, (stamps_ns, poses) in zip(checks, drives.items, shown, strict=True):
         pair = compare_map(drive.run.odometry, stamps_ns, poses)
         check.pairs += [pair] if pair else []
@@ -195,14 +192,11 @@ def anchored(
         now = settle(segments.anchors, result.points, result.points_covariance)
         if (now.used == before.used).all():
             break
-        ways = [_scaled(way or Way(), now.scale) for way in segments.ways]
+        old = [way or Way() for way in segments.ways]
+        ways = [Way(way.scale * now.scale, way.loss * now.scale) for way in old]
         segments = drives.cut(ways, replace(now, scale=before.scale * now.scale))
         maps = again(segments)
     if segments.anchors is not None:
         for text in segments.anchors.warnings(maps[-1].points):
             logger.warning(text)
     return segments, maps
-
-
-def _scaled(way: Way, scale: float) -> Way:
-    return Way(way.scale * scale, way.loss * scale)

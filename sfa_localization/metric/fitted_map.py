@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, RigidTransform, align_complex, compose, invert
 from sfa_localization.metric import phases
+from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.saved_map import MetricMap
 
@@ -105,12 +106,11 @@ def map_frame(fit: MapFit) -> RigidTransform:
 def _start_frame(fit: MapFit) -> RigidTransform:
     """By the odometry at the start of the first run, or the pose that it is to have."""
     segments, stack, anchor = fit.problem.segments, fit.stack, fit.problem.config.anchor
-    poses, variances = _odometry(fit)
-    rows = np.flatnonzero(stack.owner < len(poses))
-    owner = stack.owner[rows]
-    path = stack.corrected(fit.solution.bias)[rows]
-    driven = poses[owner, 0] + 1j * poses[owner, 1] + np.exp(1j * poses[owner, 2]) * path
-    weights = 1.0 / (variances[owner] + fit.variance)
+    starts, variances = _odometry(fit)
+    rows = np.flatnonzero(stack.owner < len(starts))
+    x, y, yaw = starts[stack.owner[rows]].T
+    driven = x + 1j * y + np.exp(1j * yaw) * stack.corrected(fit.solution.bias)[rows]
+    weights = 1.0 / (variances[stack.owner[rows]] + fit.variance)
     turn, shift = align_complex(fit.places[rows], driven, weights)
     frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
     if not anchor:
@@ -125,17 +125,14 @@ def _odometry(fit: MapFit) -> tuple[Array, Array]:
 
     Corrected for the bias; the variances are those of the places; up to the first break.
     """
-    segments = fit.problem.segments
-    poses, variances = [np.asarray(segments[0].start, float)], [0.0]
-    yaw_variance = place_variance = 0.0
-    for segment in segments.items[:-1]:
-        if not segment.linked:
-            break
-        bias = float(fit.solution.bias[segment.period])
-        moved = segment.displacement - bias * segment.displacement_drift
-        turned = segment.turn_rad - bias * segment.turn_time_s
-        poses.append(compose(poses[-1], np.array([moved.real, moved.imag, turned])))
-        place_variance += segment.displacement_variance + yaw_variance * abs(moved) ** 2
-        yaw_variance += segment.turn_variance
-        variances.append(place_variance)
-    return np.array(poses), np.array(variances)
+    links, stack = fit.problem.links, fit.stack
+    unbroken = np.cumprod(links.at == np.arange(len(links.at))).astype(bool)
+    bias = fit.solution.bias[stack.period[links.at]]
+    turned = (links.turn_rad - bias * links.turn_time_s)[unbroken]
+    moved = (links.displacement - bias * links.displacement_drift)[unbroken]
+    x, y, yaw = stack.starts[0]
+    yaw = yaw + summed(turned)
+    place = x + 1j * y + summed(np.exp(1j * yaw[:-1]) * moved)
+    turned_variance = summed(links.turn_variance[unbroken])[:-1] * np.abs(moved) ** 2
+    variances = summed(links.displacement_variance[unbroken] + turned_variance)
+    return np.column_stack([plane(place), yaw]), variances

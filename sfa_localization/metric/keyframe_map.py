@@ -17,7 +17,7 @@ from sfa_localization.features.keyframe_training import fit_keyframes, left_out,
 from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observation, combine
 from sfa_localization.features.rotation_spread import Agreement, needed_factor, share_within
-from sfa_localization.metric.learning import MetricResult, headings, positions
+from sfa_localization.metric.learning import MetricResult
 from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.stack import tracks
 
@@ -59,16 +59,15 @@ def learn_keyframes(
     """Keyframes where the certified solution puts the images of `views`; `disagreement` (N,) is
     that of all images' rotated views. Raises DataError for too few.
     """
-    labeled, places = positions(result, segments)
-    _, seen, row = np.intersect1d(views.images, labeled, return_indices=True)
-    poses = np.column_stack([places, headings(result, segments)[1]])[row]
+    _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
+    poses = result.poses[row]
     path = _along_tracks(views, segments)[seen]
     drives = views.run[seen].astype(np.int32)
     own = fit_keyframes(views.textures[seen], poses, path, sphere, drives)
     turn_std = usual_turn_std(result.angle_covariance)
     keyframes = replace(own, noise=own.noise.with_map(result.map.common_m, turn_std))
     kept = spread(poses)
-    variance = result.left_out_variance * agreement.factor(disagreement[labeled])
+    variance = result.left_out_variance * agreement.factor(disagreement[result.images])
     return _judged(keyframes, path[kept], row[kept], result, variance)
 
 

@@ -10,7 +10,7 @@ problem; the paper's own descent is in paper_solver.py. Complex numbers are x + 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,12 +62,10 @@ class MetricResult:
     """What was learned of N segments, M images in them, R periods. All in the map frame."""
 
     map: MetricMap
-    angles: Array
-    """(N,) rad: direction of each segment's frame."""
-    origins: Array
-    """(N, 2) m: first image of each segment."""
+    poses: Array
+    """(M, 3) x m, y m, yaw rad: where the certified solution puts each of `images`."""
     angle_covariance: Array
-    """(N, N) rad^2."""
+    """(N, N) rad^2, of the directions of the segments."""
     yaw_bias: Array
     """(R,) rad/s: by how much the odometry turned too fast in each period."""
     certificate: Certificate
@@ -113,7 +111,7 @@ class MetricResult:
             'worst': {'x_m': x, 'y_m': y, 'expected_error_m': error},
             'left_out_error_m': self.left_out_error_m,
             'explained': self.explained,
-            'coverage': self.diagnostics.as_dict(),
+            'coverage': asdict(self.diagnostics),
         }
 
 
@@ -176,8 +174,7 @@ def _check_certificate(fit: MapFit) -> None:
 
 def _frame_of(other: MetricResult, fit: MapFit) -> RigidTransform:
     """From the fit's arbitrary frame to that of another result of the same segments."""
-    places = positions(other, fit.problem.segments)[1] @ np.array([1.0, 1.0j])
-    turn, shift = align_complex(fit.places, places)
+    turn, shift = align_complex(fit.places, other.poses[:, 0] + 1j * other.poses[:, 1])
     return RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
 
 
@@ -189,10 +186,10 @@ def _result(
     common_m = float(np.sqrt((drive_std**2).mean() / 2))
     turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
     points, points_covariance = places_of_points(fit)
+    yaw = fit.stack.yaws(np.angle(fit.solution.z), fit.solution.bias)
     return MetricResult(
         map=metric_map(fit, frame, inflation, common_m),
-        angles=wrap_angle(np.angle(fit.solution.z) + frame.yaw_rad),
-        origins=plane(fit.solution.o * turn + shift),
+        poses=np.column_stack([plane(fit.places * turn + shift), wrap_angle(yaw + frame.yaw_rad)]),
         angle_covariance=angle_covariance(fit),
         yaw_bias=fit.solution.bias,
         certificate=fit.certificate,
@@ -207,19 +204,6 @@ def _result(
         diagnostics=diagnostics,
         graph=fit.problem.graph,
     )
-
-
-def positions(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
-    """Images (M,) of the segments, and where the certified solution puts them (M, 2) m."""
-    stack = Stack.of(segments)
-    path = stack.corrected(result.yaw_bias) * np.exp(1j * result.angles[stack.owner])
-    return stack.images, result.origins[stack.owner] + plane(path)
-
-
-def headings(result: MetricResult, segments: Segments) -> tuple[Indices, Array]:
-    """Images (M,) of the segments, and the robot's yaw (M,) rad in the map frame."""
-    stack = Stack.of(segments)
-    return stack.images, wrap_angle(stack.yaws(result.angles, result.yaw_bias))
 
 
 def correlation_along_drive(
@@ -256,7 +240,7 @@ def learn_turned(
     """Learn a map of the spectra (N, H, J) of all images, turned by the certified headings of the
     first map of the same segments, and in its frame. Raises DataError as ``learn_metric``.
     """
-    images, yaw = headings(first, segments)
+    images, yaw = first.images, first.poses[:, 2]
     rows = evenly(len(images), _COMPONENT_IMAGES)
     turned = TurnedMaps.fit(spectra[images[rows]], yaw[rows], sign)
     features = np.zeros((len(spectra), turned.axes.shape[1]))

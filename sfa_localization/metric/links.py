@@ -15,7 +15,7 @@ variance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -40,13 +40,14 @@ _PRIOR_LINKS = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """L turns and displacements of segments `at` (L,). One of infinite variance has no weight."""
+    """L turns and displacements of segments `at` (L,), as in `Segment`; those of infinite variance
+    have no weight."""
 
     at: Indices
     run: Indices
-    turn: Array
+    turn_rad: Array
     turn_variance: Array
-    turn_time: Array
+    turn_time_s: Array
     displacement: Complex
     displacement_variance: Array
     displacement_drift: Complex
@@ -57,14 +58,15 @@ class Links:
         items = [(n, s) for n, s in enumerate(segments.items[:-1]) if s.linked]
         at = np.array([n for n, _ in items], np.int64)
         run = np.array([s.run for _, s in items], np.int64)
-        column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in _MEASURED]
+        names = (one.name for one in fields(cls)[2:])
+        column: list[Any] = [np.array([getattr(s, name) for _, s in items]) for name in names]
         return cls(at, run, *column)
 
     def rows(self, stack: Stack) -> tuple[Any, Any]:
         """Of the turns and of the displacements, (L, 3N) each: what is squared of [o, z, -b z]."""
         n, at, ones = stack.segments, self.at, np.ones(len(self.at))
-        turn = -np.exp(1j * self.turn)
-        turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * self.turn_time * turn)
+        turn = -np.exp(1j * self.turn_rad)
+        turns = (n + at + 1, ones), (n + at, turn), (2 * n + at, 1j * self.turn_time_s * turn)
         moved = (n + at, -self.displacement), (2 * n + at, -self.displacement_drift)
         return stack.sparse(*turns), stack.sparse((at + 1, ones), (at, -ones), *moved)
 
@@ -75,11 +77,12 @@ class Links:
 
     def alike(self, other: Links, tolerance: float) -> bool:
         """Whether the variances of the same links differ by less than a part, on average."""
-        pairs = (
-            (self.turn_variance, other.turn_variance),
-            (self.displacement_variance, other.displacement_variance),
-        )
-        return all(_mean_change(own, its) < tolerance for own, its in pairs)
+        for name in ('turn_variance', 'displacement_variance'):
+            own, its = getattr(self, name), getattr(other, name)
+            change = np.abs(own / its - 1.0)[np.isfinite(its)]
+            if len(change) and change.mean() >= tolerance:
+                return False
+        return True
 
     @property
     def used(self) -> bool:
@@ -111,23 +114,6 @@ class Links:
                 2,
             ),
         )
-
-
-_MEASURED = (
-    'turn_rad',
-    'turn_variance',
-    'turn_time_s',
-    'displacement',
-    'displacement_variance',
-    'displacement_drift',
-)
-
-
-def _mean_change(variances: Array, others: Array) -> float:
-    """Mean relative difference of two kinds of variances (L,) where they are finite."""
-    known = np.isfinite(others)
-    change = variances[known] / others[known] - 1.0
-    return float(np.abs(change).mean()) if known.any() else 0.0
 
 
 def _doubt(ratio: Array, axes: int) -> Array:

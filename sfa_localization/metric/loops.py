@@ -27,6 +27,7 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
 from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
+from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
 
@@ -124,7 +125,7 @@ def with_closures(segments: Segments, closures: Closures) -> Segments:
     places, driven = x + 1j * y + np.exp(1j * yaw) * stack.path, np.cumsum(stack.steps)
     # To the next one's first image; how far beyond the last of this one does not matter.
     beyond = [np.nan_to_num(abs(s.displacement)) for s in segments] - stack.sums(stack.steps)
-    driven += np.concatenate([[0.0], np.cumsum(np.maximum(beyond, 0.0))])[owner]
+    driven += summed(np.maximum(beyond, 0.0))[owner]
     chain = np.cumsum([0, *(not one.linked for one in segments)])[owner]
     rows = stack.rows(closures.images)
     first, second = rows.T

@@ -21,6 +21,7 @@ from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
+from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -34,7 +35,6 @@ from sfa_localization.metric.motion_sources import (
     compare,
     late,
     sources_of,
-    summed,
     unit,
 )
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, quantile
+from sfa_localization.metric.dead_reckoning import summed
 
 Mask = NDArray[np.bool_]
 
@@ -98,11 +99,6 @@ def sources_of(
     if images is not None:
         found.append(Source(IMAGES, images[0], np.unwrap(images[1])))
     return [one for one in found if len(one.stamps_ns) > 2]
-
-
-def summed(steps: Array) -> Array:
-    """Sums (N + 1,) of steps (N,), from 0 on."""
-    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from sfa_localization.metric.dead_reckoning import (
     TurnCorrection,
     Way,
     seconds_since_start,
+    summed,
 )
 
 Complex = NDArray[np.complex128]
@@ -157,7 +158,7 @@ def way_of(
 
 def _interpolated(at: Array, seconds: Array, steps: Complex) -> Complex:
     """The sum of steps (N - 1,) until some times (M,)."""
-    total = np.concatenate([[0.0], np.cumsum(steps)])
+    total = summed(steps)
     return np.asarray(np.interp(at, seconds, total.real) + 1j * np.interp(at, seconds, total.imag))
 
 

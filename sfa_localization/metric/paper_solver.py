@@ -145,7 +145,7 @@ def learn(problem: MetricProblem) -> MapFit:
     count = min(problem.config.slow_features or PAPER_FEATURES, problem.features.shape[1])
     regressors = monomials(problem.features[:, :count])
     turns = np.full(stack.segments - 1, np.nan)
-    turns[links.at] = links.turn
+    turns[links.at] = links.turn_rad
     lines = Lines(regressors, stack.path.real, stack.owner, turns)
     theta, _ = descend(lines, odometry_start(lines, stack.starts))
     if _mirrored(theta.alpha, turns):

@@ -32,6 +32,7 @@ from sfa_localization.metric.dead_reckoning import (
     TurnCorrection,
     Way,
     seconds_since_start,
+    summed,
     tally,
 )
 from sfa_localization.metric.settings import SegmentConfig
@@ -367,7 +368,7 @@ def _wear(poses: ImagePoses, group: Indices) -> Array:
     random = DISTANCE_NOISE**2 * length / limit + yaw
     turned = (poses.slide + YAW_SLIP * PIECE_LENGTH_M / 2) * driven[:, TURNED]
     wear = np.maximum(length / PIECE_LENGTH_M, random) + turned / PIECE_STD_M
-    return np.concatenate([[0.0], np.cumsum(wear)])
+    return summed(wear)
 
 
 def _long_enough(
@@ -404,7 +405,7 @@ def _driven_distance(path: Complex) -> Complex:
     """Driven distance along a straight line, negative backwards."""
     step = np.diff(path)
     driven = np.abs(step) * np.where(step.real < 0, -1.0, 1.0)
-    return np.asarray(np.concatenate([[0.0], np.cumsum(driven)]), complex)
+    return np.asarray(summed(driven), complex)
 
 
 def _linked(poses: ImagePoses, a: Segment, b: Segment, first: int, last: int) -> Segment:

@@ -14,7 +14,6 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
 from sfa_localization.inspection import InspectionConfig, lanes_apart
 from sfa_localization.metric.forecast import Forecast
-from sfa_localization.metric.learning import positions
 from sfa_localization.reports import figures, page
 from sfa_localization.reports.bag import motion_section
 from sfa_localization.reports.evaluation import firing_maps_figure
@@ -38,7 +37,7 @@ _CAPTIONS = {
 
 def worst_of(trained: Trained) -> dict[WorstImage, tuple[int, int]]:
     """The images that the map puts farthest from where their segment does: run and stamp."""
-    images, places = positions(trained.metric, trained.segments)
+    images, places = trained.metric.images, trained.metric.poses[:, :2]
     stamps = [
         (number, stamp)
         for number, run in enumerate(trained.runs)
@@ -56,7 +55,7 @@ def write_training_report(
     The `samples` of the worst images too, where there are any. Makes the folder. Raises
     LocalizationError when a file cannot be written.
     """
-    images, places = positions(trained.metric, trained.segments)
+    images, places = trained.metric.images, trained.metric.poses[:, :2]
     coverage_figure(folder / 'coverage.png', trained, places)
     line_fits_figure(folder / 'line_fits.png', trained, places)
     firing_maps_figure(folder / 'firing_maps.png', places, trained.features[images])

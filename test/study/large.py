@@ -21,7 +21,6 @@ from sfa_localization.evaluation import moved, observed, score
 from sfa_localization.features.observation import Observation
 from sfa_localization.fusion.pose_filter import Level
 from sfa_localization.localizer import Localizer, Observer
-from sfa_localization.metric.learning import positions
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import Recipe, train
@@ -58,7 +57,7 @@ def _judge(out: Path, config: StudyConfig, area: tuple[float, float], every: flo
     started = time.process_time()
     trained = train(bags[:1], folder / 'model.npz', Recipe(), progress=True)
     seconds = time.process_time() - started
-    images, places = positions(trained.metric, trained.segments)
+    images, places = trained.metric.images, trained.metric.poses[:, :2]
     with Bag(bags[0]) as bag:
         truth = bag.trajectory().at(trained.runs[0].panoramas.stamps_ns[images])[:, :2]
     frame = align(places, truth)
