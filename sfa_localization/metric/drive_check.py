@@ -67,7 +67,8 @@ def check_amount(stack: Stack, links: Links) -> None:
             f'only {stack.segments} segments of odometry with images: drive at least '
             f'{_SEGMENTS_MIN}, in different directions and crossing each other'
         )
-    if not links.used and not stack.path.imag.any():
+    variances = np.concatenate([links.turn_variance, links.displacement_variance])
+    if not np.isfinite(variances).any() and not stack.path.imag.any():
         raise DataError(
             'the odometry breaks between all straight lines: check it, or set segments: any'
         )

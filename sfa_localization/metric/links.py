@@ -78,17 +78,11 @@ class Links:
     def alike(self, other: Links, tolerance: float) -> bool:
         """Whether the variances of the same links differ by less than a part, on average."""
         for name in ('turn_variance', 'displacement_variance'):
-            own, its = getattr(self, name), getattr(other, name)
-            change = np.abs(own / its - 1.0)[np.isfinite(its)]
+            known = np.isfinite(its := getattr(other, name))
+            change = np.abs(getattr(self, name)[known] / its[known] - 1.0)
             if len(change) and change.mean() >= tolerance:
                 return False
         return True
-
-    @property
-    def used(self) -> bool:
-        """Whether any turn or displacement has a weight."""
-        variances = np.concatenate([self.turn_variance, self.displacement_variance])
-        return bool(np.isfinite(variances).any())
 
     def learned(
         self, before: Links, stack: Stack, solution: Solution, turn_left: Array, move_left: Array

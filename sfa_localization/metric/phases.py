@@ -9,7 +9,7 @@ eliminated; the paper descends on the angles instead, eq. 2 and eq. 6 to eq. 8.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,14 +62,14 @@ def synchronize(h: Complex, starts: Sequence[Complex] = ()) -> Complex:
     Starts from `starts`; from the smallest eigenvector without any, or where they do not lead to a
     proven minimum, and then from the mirror image of the best so far.
     """
-    z = min((refine(h, unit(s)) for s in starts or [spectral_start(h)]), key=_by_cost(h))
+
+    def cost(z: Complex) -> float:
+        return phase_cost(h, z)
+
+    z = min((refine(h, unit(s)) for s in starts or [spectral_start(h)]), key=cost)
     if not certify(h, z).certified:
-        z = min([z, *(refine(h, s) for s in (spectral_start(h), np.conj(z)))], key=_by_cost(h))
+        z = min([z, *(refine(h, s) for s in (spectral_start(h), np.conj(z)))], key=cost)
     return z
-
-
-def _by_cost(h: Complex) -> Callable[[Complex], float]:
-    return lambda z: phase_cost(h, z)
 
 
 def unit(z: Complex) -> Complex:
@@ -88,7 +88,7 @@ def refine(h: Complex, z: Complex) -> Complex:
     damping, cost = 0.0, phase_cost(h, z)
     scale = max(float(np.real(np.diag(h)).max()), 1e-300)
     for _ in range(_NEWTON_STEPS):
-        gradient, hessian = _derivatives(h, z)
+        gradient, hessian = derivatives(h, z)
         step = _step(hessian, gradient, damping + 1e-12 * scale)
         proposal = z * np.exp(1j * step)
         new = phase_cost(h, proposal)
@@ -101,22 +101,17 @@ def refine(h: Complex, z: Complex) -> Complex:
     return z
 
 
-def _derivatives(h: Complex, z: Complex) -> tuple[Array, Array]:
+def derivatives(h: Complex, z: Complex) -> tuple[Array, Array]:
     """Gradient (N,) and Hessian (N, N) of the cost by the angles of z."""
     product = np.conj(z) * (h @ z)
     hessian = np.real(np.conj(z)[:, None] * h * z[None, :]) - np.diag(product.real)
     return np.asarray(product.imag), np.asarray(hessian)
 
 
-def angle_hessian(h: Complex, z: Complex) -> Array:
-    """Hessian (N, N) of the cost by the angles of z."""
-    return _derivatives(h, z)[1]
-
-
 def angle_covariance(h: Complex, z: Complex) -> Array:
     """Covariance (N, N) of the angles of z at a minimum, for a cost in units of the variance,
     without a rotation of all together."""
-    values, vectors = np.linalg.eigh(angle_hessian(h, refine(h, z)))
+    values, vectors = np.linalg.eigh(derivatives(h, refine(h, z))[1])
     n = len(values)
     common = np.abs(vectors.sum(0)) / np.sqrt(n) > 0.999
     inverse = np.where(common, 0.0, 1.0 / np.maximum(values, 1e-12 * max(values[-1], 1e-300)))

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array
 from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.links import Links
-from sfa_localization.metric.phases import angle_covariance, angle_hessian, refine, synchronize
+from sfa_localization.metric.phases import angle_covariance, derivatives, refine, synchronize
 from sfa_localization.metric.stack import Solution, Stack
 
 Complex = NDArray[np.complex128]
@@ -202,7 +202,7 @@ class QuadraticForm:
         slope = np.real(change.conj().T @ pull) + prior * bias
         bent = np.real(change.conj().T @ self.h[n:, n:] @ change) + prior * np.eye(len(bias))
         mixed = np.real(change.conj().T @ (self.h[n:] @ turned) + (1j * change).conj().T * pull)
-        follow = np.linalg.lstsq(angle_hessian(self.at(bias), z), mixed.T, rcond=None)[0]
+        follow = np.linalg.lstsq(derivatives(self.at(bias), z)[1], mixed.T, rcond=None)[0]
         curvature = bent - (mixed @ follow + follow.T @ mixed.T) / 2
         if np.linalg.eigvalsh(curvature)[0] < prior / 2:
             curvature = prior * np.eye(len(bias))
