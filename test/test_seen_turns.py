@@ -14,9 +14,9 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
 from sfa_localization.features.closures import Closures
-from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection
+from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, TurnCorrection
 from sfa_localization.metric.odometry_errors import CLOSURES_MIN, Headings, corrections
-from sfa_localization.metric.segments import cut
+from sfa_localization.metric.segments import cut_track
 from sfa_localization.metric.settings import SegmentConfig
 from sfa_localization.training_input import TrainingInput
 
@@ -110,14 +110,17 @@ def test_segments_have_the_corrected_turns_and_their_noise_and_are_longer():
     own = OdometryTrack.of(run.odometry, CONFIG, None)
     at = np.searchsorted(own.stamps_ns, run.stamps_ns)
     exact = TurnCorrection(run.stamps_ns, known - own.yaw[at], 0.002)
-    segments = cut(run.odometry, run.stamps_ns, CONFIG, turns=exact)
+    track = OdometryTrack.of(run.odometry, CONFIG)
+    segments = cut_track(track.corrected(exact), run.stamps_ns, CONFIG)
     for a, b in itertools.pairwise(segments.items):
         true = wrap_angle(known[b.images[0]] - known[a.images[0]])
         assert abs(wrap_angle(a.turn_rad - true)) < 1e-6
         assert a.turn_variance >= 0.002**2 * a.turn_time_s * 0.99
     (run, _) = drives(0.0)
     nothing = TurnCorrection(run.stamps_ns, np.zeros(len(run.stamps_ns)), CONFIG.yaw_noise)
-    parts = [cut(run.odometry, run.stamps_ns, CONFIG, turns=turns) for turns in (None, nothing)]
+    track = OdometryTrack.of(run.odometry, CONFIG)
+    tracks = track, track.corrected(nothing)
+    parts = [cut_track(one, run.stamps_ns, CONFIG) for one in tracks]
     before, after = (
         np.median([s.displacement_variance / s.turn_time_s for s in part if s.linked])
         for part in parts
@@ -138,11 +141,11 @@ def test_a_training_turns_by_its_images_where_wheels_slip(clockwise):
         true, twists=twists, poses=integrate(true.stamps_ns, twists, true.poses[0])
     )
     given = TrainingInput.of([run], config).drives
-    assert given.turns() == [None]
+    assert [track.slide for track in given.tracks()] == [TURN_SLIDE]
     bad = dataclasses.replace(run, odometry=slipping)
     (drive,) = given.items
     slipped = dataclasses.replace(given, items=(dataclasses.replace(drive, run=bad),))
-    assert slipped.turns() != [None]
+    assert [track.slide for track in slipped.tracks()] != [TURN_SLIDE]
     errors = []
     for seen in (dataclasses.replace(slipped, closures=Closures.none()), slipped):
         segments = seen.cut()

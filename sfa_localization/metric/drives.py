@@ -21,7 +21,7 @@ from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import Closures, Views
 from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.metric.anchors import Anchors, Settled, settle
-from sfa_localization.metric.dead_reckoning import OdometryTrack, TurnCorrection, Way
+from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
@@ -29,7 +29,7 @@ from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
 from sfa_localization.metric.odometry_errors import Headings, corrections, way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
-from sfa_localization.metric.segments import Segments, cut, join, tracked
+from sfa_localization.metric.segments import Segments, cut_track, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.turned_maps import TurnedMaps
 
@@ -80,17 +80,18 @@ class Drives:
         counts = [len(drive.run.panoramas) for drive in self.items]
         return [sum(counts[:k]) for k in range(len(counts))]
 
-    def turns(self) -> Sequence[TurnCorrection | None]:
-        """What the images correct of each drive's turns; None where odometry is as good."""
-        seen = [
-            Headings.of(
-                OdometryTrack.of(drive.run.odometry, self.config, drive.run.yaw_rate),
-                drive.stamps_ns,
-                drive.seen,
-            )
+    def tracks(self) -> list[OdometryTrack]:
+        """Dead reckoning of each drive, with the turns that images show where these are better."""
+        tracks = [
+            OdometryTrack.of(drive.run.odometry, self.config, drive.run.yaw_rate)
             for drive in self.items
         ]
-        return corrections(seen, self.closures) or [None] * len(self.items)
+        both = list(zip(tracks, self.items, strict=True))
+        seen = [Headings.of(track, drive.stamps_ns, drive.seen) for track, drive in both]
+        turns = corrections(seen, self.closures)
+        if turns is None:
+            return tracks
+        return [track.corrected(own) for track, own in zip(tracks, turns, strict=True)]
 
     def cut(self, ways: Sequence[Way | None] = (), settled: Settled | None = None) -> Segments:
         """The segments of section 3.1, of all drives; `ways` correct what wheels counted, and the
@@ -98,13 +99,12 @@ class Drives:
 
         Raises DataError.
         """
+        ways = ways or [None] * len(self.items)
         parts = [
-            cut(drive.run.odometry, drive.stamps_ns, self.config, drive.run.yaw_rate, turns, way)
-            for drive, turns, way in zip(
-                self.items, self.turns(), ways or [None] * len(self.items), strict=True
-            )
+            cut_track(track.driven(way) if way else track, drive.stamps_ns, self.config)
+            for track, drive, way in zip(self.tracks(), self.items, ways, strict=True)
         ]
-        joined = replace(join(parts, self.starts), offsets=self.offsets)
+        joined = replace(join(parts, self.starts), offsets=self.offsets, ways=tuple(ways))
         segments = with_closures(joined, self.closures)
         if self.points is None:
             return segments
@@ -131,11 +131,8 @@ class Drives:
 
         All have the same scale: it is that of the map, and no drive is better known by itself.
         """
-        found, shown = [], self.shown(result)
-        drives = zip(self.items, self.turns(), shown, segments.ways, strict=True)
-        for drive, turns, (stamps_ns, poses), way in drives:
-            track = tracked(drive.run.odometry, self.config, drive.run.yaw_rate, turns)
-            found.append(way_of(track, stamps_ns, poses, way))
+        drives = zip(self.tracks(), self.shown(result), segments.ways, strict=True)
+        found = [way_of(track, *shown, way) for track, shown, way in drives]
         scales = [way.scale for way in found if way]
         return [way and way._replace(scale=float(np.mean(scales))) for way in found]
 

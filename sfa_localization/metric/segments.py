@@ -29,7 +29,6 @@ from sfa_localization.metric.dead_reckoning import (
     TURNED,
     YAW_VARIANCE,
     OdometryTrack,
-    TurnCorrection,
     Way,
     seconds_since_start,
     summed,
@@ -152,21 +151,21 @@ def cut(
     image_stamps_ns: Stamps,
     config: SegmentConfig,
     yaw_rate: YawRate | None = None,
-    turns: TurnCorrection | None = None,
-    way: Way | None = None,
 ) -> Segments:
-    """Cut a drive into segments at the stamps of its images (N,).
+    """Cut a drive, as `cut_track` its dead reckoning."""
+    return cut_track(OdometryTrack.of(odometry, config, yaw_rate), image_stamps_ns, config)
+
+
+def cut_track(track: OdometryTrack, image_stamps_ns: Stamps, config: SegmentConfig) -> Segments:
+    """Cut dead reckoning into segments at the stamps of the drive's images (N,).
 
     `config.segments` names the cutter: 'straight' keeps lines between turns on the spot, by
     translational and angular velocity, as the paper does; 'any' cuts the whole drive into pieces
     bounded by length and by accumulated odometry error. Images without odometry, of a standing
-    robot, or in too short a piece are left out and counted in `Segments.images`. `turns` correct
-    those of the odometry, and state their noise; `way` corrects what its wheels counted.
+    robot, or in too short a piece are left out and counted in `Segments.images`.
 
     Raises DataError when no segment is left.
     """
-    track = tracked(odometry, config, yaw_rate, turns)
-    track = track if way is None else track.driven(way)
     skipped: dict[str, int] = {}
     poses = ImagePoses.on(track, np.asarray(image_stamps_ns, np.int64), skipped)
     poses = _without_standstill(poses, skipped)
@@ -179,18 +178,7 @@ def cut(
     for n in range(len(items) - 1):
         items[n] = _linked(poses, items[n], items[n + 1], firsts[n], firsts[n + 1])
     used = sum(len(item.images) for item in items)
-    return Segments(tuple(items), Count(used, skipped), track.count, ways=(way,))
-
-
-def tracked(
-    odometry: Odometry,
-    config: SegmentConfig,
-    yaw_rate: YawRate | None = None,
-    turns: TurnCorrection | None = None,
-) -> OdometryTrack:
-    """The dead reckoning that `cut` cuts, with its arguments."""
-    track = OdometryTrack.of(odometry, config, yaw_rate)
-    return track if turns is None else track.corrected(turns)
+    return Segments(tuple(items), Count(used, skipped), track.count)
 
 
 def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
@@ -211,7 +199,6 @@ def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
         tuple(items),
         _sum(part.images for part in parts),
         _sum(part.odometry for part in parts),
-        ways=tuple(way for part in parts for way in part.ways),
     )
 
 
