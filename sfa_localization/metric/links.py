@@ -94,20 +94,14 @@ class Links:
         """
         x = solution.coefficients(stack.period)
         turned, moved = (np.abs(rows @ x) ** 2 for rows in self.rows(stack))
-        return replace(
-            self,
-            turn_variance=_grown(
-                self.turn_variance, before.turn_variance, turned, turn_left, self.run, 1
-            ),
-            displacement_variance=_grown(
-                self.displacement_variance,
-                before.displacement_variance,
-                moved / 2,
-                move_left,
-                self.run,
-                2,
-            ),
-        )
+        shown: dict[str, Any] = {}
+        for name, squares, left, axes in (
+            ('turn_variance', turned, turn_left, 1),
+            ('displacement_variance', moved / 2, move_left, 2),
+        ):
+            variances = getattr(self, name), getattr(before, name)
+            shown[name] = _grown(*variances, squares, left, self.run, axes)
+        return replace(self, **shown)
 
 
 def _doubt(ratio: Array, axes: int) -> Array:

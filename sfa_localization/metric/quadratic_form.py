@@ -71,9 +71,8 @@ class Ridge:
         """The weights w (m,) for places (M,)."""
         return _solve(self.factor, self.expanded.T @ (self.weights * places))
 
-    def whitened(self, expanded: Array | None = None) -> Array:
-        """factor^-1 phi (m, M) of expanded features (M, m), by default those of the images."""
-        expanded = self.expanded if expanded is None else expanded
+    def whitened(self, expanded: Array) -> Array:
+        """factor^-1 phi (m, M) of expanded features (M, m)."""
         return np.asarray(scipy.linalg.solve_triangular(self.factor, expanded.T, lower=True))
 
     @property

@@ -106,11 +106,6 @@ class Segment:
     """Which of the `BIAS_PERIOD_S` of the joined runs it belongs to: each has a yaw-rate bias."""
 
     @property
-    def length_m(self) -> float:
-        """Driven length between the images."""
-        return float(np.abs(np.diff(self.path)).sum())
-
-    @property
     def linked(self) -> bool:
         """Whether odometry leads on to the next segment."""
         return bool(np.isfinite(self.turn_rad))

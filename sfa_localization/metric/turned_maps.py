@@ -58,8 +58,8 @@ class TurnedMaps:
     sign: float
 
     @classmethod
-    def fit(cls, spectra: Spectrum, yaw: Array, sign: float, count: int = DIMENSIONS) -> TurnedMaps:
-        """Of spectra (T, H, J) at headings yaw (T,) rad; at most `count` components.
+    def fit(cls, spectra: Spectrum, yaw: Array, sign: float) -> TurnedMaps:
+        """Of spectra (T, H, J) at headings yaw (T,) rad; at most DIMENSIONS components.
 
         Raises DataError where all are equal.
         """
@@ -68,7 +68,7 @@ class TurnedMaps:
         vectors = turned_back(spectra, yaw, sign)
         mean = vectors.mean(0, dtype=np.float64).astype(np.float32)
         centered = vectors - mean
-        size, count = len(centered), min(count, len(centered) - 1, vectors.shape[1])
+        size, count = len(centered), min(DIMENSIONS, len(centered) - 1, vectors.shape[1])
         gram = (centered @ centered.T).astype(np.float64)
         power, sides = linalg.eigh(gram, subset_by_index=(size - count, size - 1))
         kept = power > 1e-6 * max(float(power[-1]), 1e-30)
