@@ -451,6 +451,12 @@ def lanes_apart(places: Array, reach_m: float) -> list[str]:
     ]
 
 
+def too_sparse(places: Array, most_m: float) -> list[str]:
+    """That images at places (N, >= 2) are too far apart while driving; else nothing."""
+    gap = spacing(places)
+    return [f'images are {gap:.2f} m apart: drive slower or record more'] * (gap > most_m)
+
+
 def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
     """The reasons why a bag is not enough to train on, each with the remedy."""
     if report.camera is None or report.motion is None:
@@ -478,12 +484,10 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
 
 
 def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
-    gap = spacing(places)
     if path_length(places) < 1.0:
         yield 'the robot did not move: drive it over the area'
         return
-    if gap > config.max_spacing:
-        yield f'images are {gap:.2f} m apart: drive slower or record more of them'
+    yield from too_sparse(places, config.max_spacing)
     if _one_route(places):
         return
     yield from lanes_apart(places, config.reach)

@@ -316,7 +316,7 @@ def test_a_drive_that_hardly_turns_says_nothing():
     check = check_motion(run.odometry, (run.stamps_ns, 0 * run.stamps_ns), run.gyro)
     assert [(pair.b, pair.what) for pair in check.pairs] == [(TWIST, 'way')]
     assert check.wrong == check.corrected == []
-    assert check.notes == ['images: the drive turns too little to tell whether they are mirrored']
+    assert check.notes == ['images: too few of them, or turns, to tell whether they are mirrored']
 
 
 def test_wheels_that_skid_are_worth_a_word():

@@ -85,12 +85,14 @@ def test_the_answer_about_a_map_follows_its_figures(reported):
     for change, level in (
         ({}, page.GOOD), ({'expected_error_m': 0.6}, page.WEAK), ({'certified': False}, page.WEAK),
         ({'left_out_within_95': 0.7}, page.WEAK), ({'expected_error_m': 2.1}, page.BAD),
-        ({'explained': 0.3}, page.BAD),
+        ({'explained': 0.3}, page.BAD), ({'expected_yaw_error_deg': 90.0}, page.WEAK),
     ):  # fmt: skip
         quality = {**result.model.quality, **good, **change}
         found = replace(result, model=replace(result.model, quality=quality))
         assert training.judgment(found)[0] == level
         assert training.trust_lines(found)[0].startswith('NOT proven') != quality['certified']
+    sparse = replace(result.metric, poses=5 * result.metric.poses)
+    assert 'm apart' in training.judgment(replace(result, metric=sparse))[1]
 
 
 @pytest.fixture
@@ -184,11 +186,12 @@ def test_errors_by_hand():
 def test_figures_show_paths_to_scale_and_tables_what_could_not_be_judged(tmp_path):
     """A square path must come out as a square: equal axes."""
     row = {'mean': 0.12345, 'median': 0.1, 'p95': 0.2, 'rmse': 0.15, 'max': 0.3, 'n': 42}
-    scores = {'ekf': row, 'my filter': {**row, 'mean': 2.0}}
+    scores = {'ekf': row, 'my filter': {**row, 'mean': 2.0}, 'silent': dict.fromkeys(row)}
     places = np.random.default_rng(0).uniform(0, 10, (50, 2))
     features = np.column_stack([places / 5 - 1, places[:, 0] / 5 - 1])
     square = straight([5, 6, 7, 8, 9], [[0, 0, 0], [4, 0, 0], [4, 4, np.nan], [0, 4, 0], [0, 0, 0]])
-    estimates = {'ekf': square, 'my filter': square}
+    silent = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
+    estimates = {'ekf': square, 'my filter': square, 'silent': silent}
     evaluation.write_report(tmp_path / 'new', TRUTH, estimates, scores, places, features)
     pictures = {path.name: cv2.imread(str(path)) for path in (tmp_path / 'new').iterdir()}
     assert set(pictures) == {'overview.png', 'errors.png'}

@@ -111,8 +111,8 @@ def require_one_view(runs: Sequence[Run]) -> None:
         samples = [run.panoramas.read(k, k + 1)[0] for k in at.tolist()]
         if not _closes(samples) and _same_twice(samples):
             raise CameraError(
-                f'{run.name}: the images are two views side by side: record one omnidirectional '
-                'camera (train --force goes on)'
+                f'{run.name}: the images are two views side by side, or show a place that looks '
+                'alike from both: record one omnidirectional camera (train --force goes on)'
             )
 
 

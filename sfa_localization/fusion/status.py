@@ -21,6 +21,7 @@ LEAST_SILENCE_S, MOST_SILENCE_S, PERIODS = 1.4, 3.0, 1.25
 meanwhile the robot may be towed, held or carried away, and nothing shows it."""
 DEGRADED_YAW_RAD = 0.2
 """A heading with a larger standard deviation leads the robot a meter astray within a few."""
+_UNKNOWN_YAW_RAD = math.pi / math.sqrt(3)  # of an angle of which nothing is known
 
 
 class Level(enum.Enum):
@@ -80,7 +81,8 @@ def _known_to(state: State, std_m: float, std_rad: float) -> list[str]:
     if state.position_std > std_m:
         reasons.append(f'position known to {state.position_std:.1f} m only')
     if state.yaw_std > std_rad:
-        reasons.append(f'heading known to {math.degrees(state.yaw_std):.0f} deg only')
+        known = f'heading known to {math.degrees(state.yaw_std):.0f} deg only'
+        reasons.append(known if state.yaw_std < _UNKNOWN_YAW_RAD else 'heading unknown')
     return reasons
 
 

@@ -150,7 +150,7 @@ def check_motion(
         _judge_turns(check)
         _judge_clocks(check)
     if images is not None and not any(IMAGES in (pair.a, pair.b) for pair in check.pairs):
-        check.notes.append('images: the drive turns too little to tell whether they are mirrored')
+        check.notes.append('images: too few of them, or turns, to tell whether they are mirrored')
     if not panoramas:
         check.notes += [text for text in check.wrong if text.startswith('images')]
         check.wrong = [text for text in check.wrong if not text.startswith('images')]

@@ -267,8 +267,11 @@ def _draw_firing_maps(
 
 
 def _bulk(estimate: Trajectory) -> Array:
-    """Corners (2, 3) of the estimate without its outermost percents, which need not be seen."""
-    low, high = np.nanpercentile(estimate.poses[:, :2], (1.0, 99.0), axis=0)
+    """Corners (2, 3) of an estimate without its outermost percents, which need not be seen."""
+    known = estimate.poses[np.isfinite(estimate.poses).all(1)]
+    if not len(known):
+        return known
+    low, high = np.percentile(known[:, :2], (1.0, 99.0), axis=0)
     return np.pad(np.stack([low, high]), ((0, 0), (0, 1)))
 
 
@@ -361,7 +364,7 @@ def _weak_lines(truth: Trajectory, estimate: Trajectory) -> Iterator[str]:
     worst = worst_images(places, errors)
     found = [one for one in worst if one.error_m > _WEAK * errors.mean()]
     for one in found[:3]:
-        yield f'x {one.x_m:.1f} m, y {one.y_m:.1f} m: {one.error_m:.2f} m'
+        yield f'near x {one.x_m:.1f} m, y {one.y_m:.1f} m of the ground truth: {one.error_m:.2f} m'
     if found:
         yield 'Drive there in a further training drive, in two directions.'
     else:

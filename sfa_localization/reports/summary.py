@@ -7,13 +7,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sfa_localization.inspection import InspectionConfig, too_sparse
 from sfa_localization.metric.motion_sources import MAP
 from sfa_localization.training import Trained
 
 GOOD, WEAK, BAD = 'good', 'weak', 'bad'
-GOOD_M, USEFUL_M = 0.5, 2.0
-"""Expected errors of one image (m) at which the filter's default limits make a state DEGRADED, and
-LOST."""
+GOOD_M, USEFUL_M, GOOD_DEG = 0.5, 2.0, 11.5
+"""Expected errors of one image at which the filter's default limits make a state DEGRADED, and LOST
+(m), and DEGRADED by its heading (degrees)."""
 TRUSTED_SHARE = 0.9
 """Of the left-out images, the regions of 95 % hold at least so many where they can be believed."""
 EXPLAINED = 0.5
@@ -72,8 +73,13 @@ def judgment(trained: Trained) -> tuple[str, str]:
     if expected > USEFUL_M:
         return BAD, 'The map cannot be used yet: see what to drive next.'
     sure = quality['certified'] and quality['left_out_within_95'] >= TRUSTED_SHARE
+    care = too_sparse(trained.metric.poses, InspectionConfig().max_spacing)
+    if quality.get('expected_yaw_error_deg', 0.0) > GOOD_DEG:
+        care.append('images look alike from several headings, and perhaps places')
     if expected > GOOD_M or not sure:
-        return WEAK, 'The map can be used with care: see where it is weak.'
+        care.append('see where it is weak')
+    if care:
+        return WEAK, f'The map can be used with care: {"; ".join(care)}.'
     return GOOD, f'The map is good: expect an error of {expected:.2f} m from one image.'
 
 
