@@ -16,6 +16,8 @@ from sfa_localization.data.errors import DataError
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 SPOT_RADIUS_M = 0.1
 """A robot that turns more tightly than this turns on the spot: it has no way to lose there."""

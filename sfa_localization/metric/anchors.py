@@ -22,20 +22,24 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, RigidTransform, align_complex, relative
+from sfa_localization.data.geometry import (
+    Array,
+    Complex,
+    Indices,
+    Mask,
+    RigidTransform,
+    align_complex,
+    relative,
+)
 from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.run import Odometry, Points, Stamps
 
 if TYPE_CHECKING:
     from sfa_localization.metric.stack import Solution, Stack
 
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 WHEELS_STD = 0.02
 """Of the scale of wheels before anything is measured: half-real drives count up to 2 % wrong."""

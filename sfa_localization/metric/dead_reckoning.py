@@ -11,13 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, wrap_angle
+from sfa_localization.data.geometry import SPOT_RADIUS_M, Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, YawRate, differences
 from sfa_localization.metric.settings import SegmentConfig
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Complex = NDArray[np.complex128]
 
 GAP_MAX_S = 0.5
 """Longer pauses of odometry or gyroscope are breaks: the robot may have been moved meanwhile."""

@@ -7,18 +7,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.features.rotation_spread import quantile
 from sfa_localization.metric.fitted_map import angle_covariance
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.stack import Stack
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 ANGLE_STD_MAX_DEG = 10.0
 """Standard deviation of a segment's direction beyond which the map bends visibly."""

@@ -9,16 +9,19 @@ It is the odometry frame at the start of the first run, or given by an anchor or
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, RigidTransform, align_complex, compose, invert
+from sfa_localization.data.geometry import (
+    Array,
+    Complex,
+    RigidTransform,
+    align_complex,
+    compose,
+    invert,
+)
 from sfa_localization.metric import phases
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.map_fit import MapFit
 from sfa_localization.metric.saved_map import MetricMap
-
-Complex = NDArray[np.complex128]
-
 
 # Joint changes of the segments that count: a map averages over smaller ones.
 _JOINT = 24

@@ -16,12 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-from sfa_localization.data.geometry import Array, RigidTransform
-
-Indices = NDArray[np.int64]
+from sfa_localization.data.geometry import Array, Indices, RigidTransform
 
 REACH_M = 1.0
 """Ground further than this from every image is not covered by the drive."""

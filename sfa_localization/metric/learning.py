@@ -14,11 +14,17 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, RigidTransform, align_complex, wrap_angle
+from sfa_localization.data.geometry import (
+    Array,
+    Complex,
+    Indices,
+    RigidTransform,
+    align_complex,
+    wrap_angle,
+)
 from sfa_localization.features.image_features import Spectrum, evenly
 from sfa_localization.features.rotation_spread import Agreement
 from sfa_localization.metric import paper_solver
@@ -42,8 +48,6 @@ from sfa_localization.metric.stack import Stack
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 logger = logging.getLogger(__name__)
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 LITTLE, OVERFIT = 0.9, 4.0
 """Where features explain less than this share of the places of images left out, whose variance is

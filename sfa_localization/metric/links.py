@@ -19,15 +19,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 # Degrees of freedom of Student's distribution: wheels slip now and then, by far more than usual.
 _TAIL = 4.0

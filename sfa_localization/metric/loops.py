@@ -20,18 +20,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
 from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
-
-Indices = NDArray[np.int64]
 
 # Standard deviations that are expected, rad and m per axis: they grow with `Offsets.unlike`, which
 # closures do not know; and the least part of them that the map may show.

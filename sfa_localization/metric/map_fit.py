@@ -16,10 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.basis import Basis
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.phases import Certificate, certify
@@ -28,9 +27,6 @@ from sfa_localization.metric.quadratic_form import QuadraticForm, Ridge
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.settings import MetricConfig
 from sfa_localization.metric.stack import Solution, Stack
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 LINK_WEIGHT = 2.0
 """Weight of odometry's links over that by their variances: noise of the features, which least

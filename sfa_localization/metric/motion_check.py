@@ -14,11 +14,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
-from sfa_localization.data.geometry import Array, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import summed
@@ -38,7 +37,6 @@ from sfa_localization.metric.motion_sources import (
     unit,
 )
 
-Mask = NDArray[np.bool_]
 logger = logging.getLogger(__name__)
 
 SKIDDING = 5.0

@@ -12,14 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.dead_reckoning import summed
-
-Mask = NDArray[np.bool_]
 
 IMAGES, POSE, TWIST, GYRO = 'images', 'odometry pose', 'odometry twist', 'gyroscope'
 MAP = 'map'

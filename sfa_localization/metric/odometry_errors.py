@@ -20,9 +20,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, Indices, wrap_angle
 from sfa_localization.data.run import Stamps
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
@@ -34,9 +33,6 @@ from sfa_localization.metric.dead_reckoning import (
     seconds_since_start,
     summed,
 )
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 CLOSURES_MIN = 30
 """With fewer in the drives, chance decides which source is better."""

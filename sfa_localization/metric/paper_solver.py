@@ -20,8 +20,6 @@ from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_vari
 from sfa_localization.metric.quadratic_form import Ridge
 from sfa_localization.metric.stack import Solution
 
-Complex = NDArray[np.complex128]
-
 ITERATIONS = 1000
 """Section 4: the descent ends at about 1000 iterations."""
 LEARNING_RATE = 1e-5

@@ -14,11 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
-
-Complex = NDArray[np.complex128]
+from sfa_localization.data.geometry import Array, Complex
 
 # Relative to the largest eigenvalue of H; what rounding leaves of an exact zero.
 CERTIFICATE_TOLERANCE = 1e-9

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.features.image_features import evenly
 from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.links import Links
@@ -29,8 +29,6 @@ from sfa_localization.metric.phases import CERTIFICATE_TOLERANCE, Certificate, u
 from sfa_localization.metric.quadratic_form import YAW_BIAS_STD
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
-
-Complex = NDArray[np.complex128]
 
 # Of the solution and the weights that it shows, in turn: as settled as its use needs.
 _ROUNDS = 3

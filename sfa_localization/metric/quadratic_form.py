@@ -20,16 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.basis import Basis, expand, missing
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.phases import angle_covariance, derivatives, refine, synchronize
 from sfa_localization.metric.stack import Solution, Stack
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 YAW_BIAS_STD = 0.003
 """rad/s: the yaw-rate bias to expect of odometry or a gyroscope, estimated per period."""

@@ -15,10 +15,9 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
@@ -35,10 +34,6 @@ from sfa_localization.metric.dead_reckoning import (
     tally,
 )
 from sfa_localization.metric.settings import SegmentConfig
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 PIECE_LENGTH_M = 3.0
 """Longest piece of any drive: long enough to contain several images, short enough to be rigid."""

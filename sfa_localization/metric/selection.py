@@ -8,27 +8,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, align_complex
+from sfa_localization.data.geometry import Array, Complex, Indices, align_complex
 from sfa_localization.features.rotation_spread import needed_factor
-from sfa_localization.metric.basis import (
-    PAPER_FEATURES,
-    Basis,
-    Monomials,
-    Process,
-    spread,
-)
+from sfa_localization.metric.basis import PAPER_FEATURES, Basis, Monomials, Process, spread
 from sfa_localization.metric.fitted_map import place_variance, plane
 from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
 from sfa_localization.metric.phases import phase_cost, refine
 from sfa_localization.metric.quadratic_form import Ridge
 from sfa_localization.metric.stack import Stack
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 INDUCING_POINTS = 1000
 """Most images that span the Gaussian process: with half as many more it is no better, and the model

@@ -20,11 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.segments import Segments, assignment
-
-Complex = NDArray[np.complex128]
-Indices = NDArray[np.int64]
 
 _TRACK_SHARE = 0.5
 """Of the length of a segment that closures with an earlier one must span: a crossing track has
