@@ -146,11 +146,7 @@ def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: Metr
 
 
 def learn_map(
-    drives: Drives,
-    features: Array,
-    config: MetricConfig,
-    seed: int = 0,
-    strict: bool = False,
+    drives: Drives, features: Array, config: MetricConfig, seed: int = 0, strict: bool = False
 ) -> tuple[Segments, MetricResult]:
     """Segments, and the certified map from features (N, K) of all images to them: section 3.
 

@@ -74,9 +74,7 @@ class Source:
 
 
 def sources_of(
-    odometry: Odometry,
-    images: tuple[Stamps, Array] | None = None,
-    gyro: YawRate | None = None,
+    odometry: Odometry, images: tuple[Stamps, Array] | None = None, gyro: YawRate | None = None
 ) -> list[Source]:
     """The sources of a drive; those that say nothing are left out.
 

@@ -186,9 +186,7 @@ def join(parts: Sequence[Segments], offsets: Sequence[int]) -> Segments:
             for s, period in zip(part, periods, strict=True)
         ]
     return Segments(
-        tuple(items),
-        _sum(part.images for part in parts),
-        _sum(part.odometry for part in parts),
+        tuple(items), _sum(part.images for part in parts), _sum(part.odometry for part in parts)
     )
 
 

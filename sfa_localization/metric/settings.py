@@ -46,10 +46,7 @@ class MetricConfig(Settings):
         'gp', 'Gaussian process, or monomials up to degree 2', choices=('gp', 'monomials')
     )
     slow_features: int = setting(
-        0,
-        'slowest features used; 0: all, of monomials 8 as in the paper',
-        low=0,
-        high=1000,
+        0, 'slowest features used; 0: all, of monomials 8 as in the paper', low=0, high=1000
     )
     anchor: tuple[float, ...] = setting(
         (),
