@@ -454,7 +454,9 @@ def lanes_apart(places: Array, reach_m: float) -> list[str]:
 def too_sparse(places: Array, most_m: float) -> list[str]:
     """That images at places (N, >= 2) are too far apart while driving; else nothing."""
     gap = spacing(places)
-    return [f'images are {gap:.2f} m apart: drive slower or record more'] * (gap > most_m)
+    if gap <= most_m:
+        return []
+    return [f'images are {gap:.2f} m apart: drive slower or record more']
 
 
 def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:

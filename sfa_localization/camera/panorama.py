@@ -22,10 +22,9 @@ from sfa_localization.camera.settings import (
     PanoramaConfig,
 )
 from sfa_localization.data.errors import CameraError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.data.run import Image
 
-Mask = NDArray[np.bool_]
 _ASPECT = 3.5  # an image wider than this times its height is a panorama
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Odometry, Run, Stamps
 from sfa_localization.features.image_features import sample
 from sfa_localization.features.keyframes import (
@@ -27,8 +27,6 @@ from sfa_localization.features.keyframes import (
     texture,
 )
 from sfa_localization.features.observation import Spectra
-
-Indices = NDArray[np.int64]
 
 LIKE = 0.55
 """Least correlation of a closure: images of other places reach 0.4, some a little more."""

@@ -380,11 +380,12 @@ class Keyframes:
         """The match of an image (rows, F) without the `pattern` of its light, by its correlations
         (K,), -inf where unknown, and the yaws (K,) rad that each of them shows.
         """
-        best, image = int(scores.argmax()), spectrum
+        best = int(scores.argmax())
         reach, start = self.reach(best), np.append(self.poses[best, :2], yaws[best])
+        plain = spectrum
         if pattern is not None:
-            spectrum = spectrum - turned(pattern, -self._sign * start[2])
-        found = self._regressed(spectrum, scores, start, reach)
+            plain = spectrum - turned(pattern, -self._sign * start[2])
+        found = self._regressed(plain, scores, start, reach)
         *place, yaw = found.pose.tolist()
         elsewhere = np.zeros((3, 3))
         weight = self.likelihood(scores, self.noise.temperature)
@@ -392,7 +393,7 @@ class Keyframes:
         elsewhere[:2, :2] = (offset * weight[:, None]).T @ offset
         turns = np.square(wrap_angle(yaws[np.isfinite(scores)].astype(float) - yaw))
         turns[(turns < _PARALLAX_RAD**2) & ~offset.any(axis=1)] = 0.0
-        elsewhere[2, 2] = weight @ turns + self._turned_otherwise(image, best)
+        elsewhere[2, 2] = weight @ turns + self._turned_otherwise(spectrum, best)
         return replace(
             found,
             pose=np.array([*place, wrap_angle(yaw)]),
@@ -484,7 +485,7 @@ class Keyframes:
         its best keyframe: in a corridor the one by 180 degrees.
         """
         product = (self.aligned([best])[0] * image.conj()).sum(0)
-        curve = np.fft.irfft(product, 2 * self.columns) * 2
+        curve = 2 * columns_of(product, 2 * self.columns)
         turn = wrap_angle((np.arange(len(curve)) - curve.argmax()) * np.pi / self.columns)
         other = np.where(np.abs(turn) > _PARALLAX_RAD, curve, -np.inf)
         likely = math.exp((float(other.max()) - float(curve.max())) / self.noise.temperature)

@@ -22,6 +22,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from sfa_localization.camera.leveling import TILTED_RAD, LeveledPanoramas
+from sfa_localization.data.geometry import Complex
 from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import LIKE, STRETCH_M, Views, views_of
@@ -34,8 +35,6 @@ from sfa_localization.features.keyframes import (
     spectra_of,
 )
 from sfa_localization.features.tilt import find_tilt
-
-Complex = NDArray[np.complex128]
 
 _LIKEST = 24
 """Images that each is compared with; of 12 half as much of the tilt is found."""

@@ -14,13 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import STRETCH_M, Views
 from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.features.observation import MatchNoise
-
-Indices = NDArray[np.int64]
 
 # Of the views that are located, along a drive: nearer ones err alike.
 _APART_M = 0.5

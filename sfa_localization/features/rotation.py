@@ -27,11 +27,10 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Mask
 from sfa_localization.features.sfa import Statistics
 
 Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

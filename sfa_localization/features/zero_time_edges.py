@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.data.geometry import Indices
 from sfa_localization.data.run import Image, Panoramas, Stamps
-from sfa_localization.features.closures import Closures, Indices
+from sfa_localization.features.closures import Closures
 from sfa_localization.features.image_features import evenly
 from sfa_localization.features.network_training import ImageSequence
 
