@@ -150,8 +150,7 @@ class Localizer:
     ) -> None:
         self.observer = Observer(model, watch)
         self.filter = kind(config, model.error_correlation)
-        self.filter.expect_delay(model.camera_delay_s)
-        self.filter.expect_scale(model.odometry_scale)
+        self.filter.expect(model.rig)
 
     def add_odometry(
         self,

@@ -94,7 +94,7 @@ def read_drive(
         np.array([one.covariance for one in usable]),
         run.ground_truth,
         model.error_correlation,
-        model.odometry_scale,
+        model.rig.wheel_scale.value,
     )
 
 
