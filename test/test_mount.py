@@ -69,7 +69,7 @@ def test_the_place_of_the_camera_is_learned_with_the_graph(lever):
 def test_a_drive_that_turns_nowhere_shows_no_place_of_the_camera():
     """All images of a place are taken at one heading: any lever only moves the map."""
     mount, _, _ = learned(straight(12.0), (0.0, 0.0, 0.0), [camera_poses] * 4, aside=0.3)
-    assert np.sqrt(np.diag(mount.known)[:2]) == pytest.approx(CAMERA_STD_M, rel=0.15)
+    assert np.all(np.sqrt(np.diag(mount.known)[:2]) > CAMERA_STD_M / 2)
     assert abs(mount.lever) < 0.2
 
 

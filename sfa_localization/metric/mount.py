@@ -8,15 +8,16 @@ it. Image m of segment n lies at
     x_nm = o_n + z_n (q_nm + l exp(i h_nm)),
 
 and in drive d it looks kappa_d to the left of where it did in the first drive, so that closures
-turn by kappa_d more. For the best [o, z, b] at some l and kappa, what is squared of the closures is
-r, with derivatives A by [o, z, b] and B by [l, kappa]. Gauss and Newton's step for all together is
-for [l, kappa] alone
+turn by kappa_d more. With v = [l, kappa], for the best [o, z, b] at some v what is squared of the
+closures is r, with derivatives A by [o, z, b] and B by v. To first order the closures say of v
 
-    S = B^T B + P - B^T A N^-1 A^T B,    step = -S^-1 (B^T r + P (value - prior)),
+    S = B^T B - B^T A N^-1 A^T B,    h = S v - B^T r,
 
-with N the normal equations of [o, z, b], P the inverse of the prior's covariance, and S^-1 the
-covariance. A drive that never turns where it is seen again does not show l: its variance stays that
-of the prior.
+with N the normal equations of [o, z, b]. Beside them stands what is known of robots: the camera
+sits above base_link, or where it was measured, to a centimeter; or, as probable, anywhere on the
+robot. With the prior's covariance C, either has the posterior covariance (S + C^-1)^-1 = D, the
+mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2), by which both are mixed. A drive that
+never turns where it is seen again does not show l: its variance stays large.
 """
 
 from __future__ import annotations
@@ -57,12 +58,10 @@ class Mount:
         """The covariance, or that of the prior."""
         if self.covariance is not None:
             return self.covariance
-        return np.diag(self.prior_variances)
+        return np.diag(self._variances(CAMERA_STD_M if self.given is None else GIVEN_STD_M))
 
-    @property
-    def prior_variances(self) -> Array:
-        """(2 + D,) m^2, m^2, rad^2: of the first drive's yaw 0, by definition."""
-        lever_std = CAMERA_STD_M if self.given is None else GIVEN_STD_M
+    def _variances(self, lever_std: float) -> Array:
+        """(2 + D,) of a prior, m^2, m^2, rad^2: of the first drive's yaw 0, by definition."""
         later = [CAMERA_TURN_STD**2] * (len(self.yaw) - 1)
         return np.array([lever_std**2, lever_std**2, 0.0, *later])
 
@@ -82,20 +81,30 @@ class Mount:
         columns `solve` gives.
         """
         mount = self.of(by_mount.shape[1] - 2)
-        variances = mount.prior_variances
-        free = np.flatnonzero(variances)
-        prior = 0j if self.given is None else self.given
-        value = np.array([mount.lever.real, mount.lever.imag, *mount.yaw])
-        center = np.zeros(len(value))
-        center[:2] = prior.real, prior.imag
-        columns = by_mount[:, free]
-        inverse = np.real(columns.conj().T @ columns) - by_rest[:, free].T @ solve(by_rest[:, free])
-        inverse += np.diag(1 / variances[free])
-        pull = np.real(columns.conj().T @ missed) + (value - center)[free] / variances[free]
-        covariance = np.zeros((len(value), len(value)))
-        covariance[np.ix_(free, free)] = np.linalg.inv(inverse)
-        value[free] -= covariance[np.ix_(free, free)] @ pull
-        lever, yaw = complex(value[0], value[1]), tuple(value[2:].tolist())
+        center = 0j if self.given is None else self.given
+        moved = self.lever - center
+        value = np.array([moved.real, moved.imag, *mount.yaw])
+        free = np.flatnonzero(np.arange(len(value)) != 2)
+        columns, value = by_mount[:, free], value[free]
+        shown = np.real(columns.conj().T @ columns) - by_rest[:, free].T @ solve(by_rest[:, free])
+        pull = shown @ value - np.real(columns.conj().T @ missed)
+        means, spreads, evidence = [], [], []
+        for std in [GIVEN_STD_M] if self.given is not None else [GIVEN_STD_M, CAMERA_STD_M]:
+            prior = mount._variances(std)[free]
+            spread = np.linalg.inv(shown + np.diag(1 / prior))
+            size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
+            means.append(spread @ pull)
+            spreads.append(spread)
+            evidence.append((size + pull @ means[-1]) / 2)
+        share = np.exp(np.array(evidence) - max(evidence))
+        share /= share.sum()
+        mean = share @ np.array(means)
+        covariance = np.zeros((len(value) + 1, len(value) + 1))
+        covariance[np.ix_(free, free)] = sum(
+            part * (spread + np.outer(one - mean, one - mean))
+            for part, spread, one in zip(share, spreads, means, strict=True)
+        )
+        lever, yaw = center + complex(mean[0], mean[1]), (0.0, *mean[2:].tolist())
         return replace(self, lever=lever, yaw=yaw, covariance=covariance)
 
     def differs(self, other: Mount, least_m: float) -> bool:
