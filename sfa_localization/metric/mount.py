@@ -28,12 +28,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfa_localization.data.geometry import Array, Complex
-from sfa_localization.data.rig import CAMERA_STD_M, Quantity
+from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
 
 GIVEN_STD_M = 0.01
 """Of a camera's place that was measured on the robot."""
 CAMERA_TURN_STD = 1.0
 """rad, of the yaw of a camera in a later drive: it may have been taken off and put back anyhow."""
+
+MOUNTED_ANEW_RAD = 0.05
+"""A camera turned by more between two drives was taken off: how it looks now, nobody knows. What a
+drive of 100 m shows of it errs by 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +121,8 @@ class Mount:
         """Of `Rig`: where the camera sits, and how it looks on average of the drives."""
         ahead, left = np.sqrt(np.diag(self.known)[:2]).tolist()
         spread = float(np.std(self.yaw, ddof=1)) if len(self.yaw) > 1 else 0.0
+        # A filter takes an angle that stays for noise that does not.
+        spread = spread if max(map(abs, self.yaw)) < MOUNTED_ANEW_RAD else UNKNOWN_YAW_STD
         return {
             'camera_ahead': Quantity(self.lever.real, ahead),
             'camera_left': Quantity(self.lever.imag, left),
