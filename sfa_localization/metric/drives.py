@@ -143,6 +143,8 @@ class Drives:
             if not drives.mount.differs(before, _MOUNT_SETTLED_M):
                 break
         drives = replace(drives, mount=Graph.of(drives.cut()).mount)
+        if drives.mount.contradiction:
+            logger.warning(drives.mount.contradiction)
         for drive, yaw in zip(drives.items, drives.mount.of(len(drives.items)).yaw, strict=True):
             if abs(yaw) > MOUNTED_ANEW_RAD:
                 logger.warning(

@@ -22,10 +22,12 @@ never turns where it is seen again does not show l: its variance stays large.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
 from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
@@ -35,6 +37,8 @@ GIVEN_STD_M = 0.01
 CAMERA_TURN_STD = 1.0
 """rad, of the yaw of a camera in a later drive: it may have been taken off and put back anyhow."""
 
+CONTRADICTS = 4.0
+"""Standard deviations by which two measurements of a place never differ by chance, in the plane."""
 MOUNTED_ANEW_RAD = 0.05
 """A camera turned by more between two drives was taken off: how it looks now, nobody knows. What a
 drive of 100 m shows of it errs by 0.01."""
@@ -43,19 +47,20 @@ drive of 100 m shows of it errs by 0.01."""
 @dataclass(frozen=True, slots=True)
 class Mount:
     """The camera at a `lever`, ahead + i left of base_link, m, turned by `yaw` (D,) rad in each of
-    D drives, with their `covariance` (2 + D, 2 + D); `given` is a lever that was measured."""
+    D drives, with their `covariance` (2 + D, 2 + D); `given` is a lever that was measured, and
+    `learned` what the closures say of it."""
 
     lever: complex = 0j
     yaw: tuple[float, ...] = (0.0,)
     given: complex | None = None
     covariance: Array | None = None
+    learned: tuple[complex, float] | None = None
+    """The lever by closures alone, and the standard deviation of its coordinates, m."""
 
     @classmethod
-    def at(cls, place: Sequence[float]) -> Mount:
-        """Of a camera's measured place, ahead and left, m; empty for an unknown one."""
-        if not place:
-            return cls()
-        return cls(complex(*place), given=complex(*place))
+    def at(cls, place: complex | None) -> Mount:
+        """Of a camera at a measured place, ahead + i left, m; None for an unknown one."""
+        return cls(place or 0j, given=place)
 
     @property
     def known(self) -> Array:
@@ -85,7 +90,7 @@ class Mount:
         columns `solve` gives.
         """
         mount = self.of(by_mount.shape[1] - 2)
-        center = 0j if self.given is None else self.given
+        center, tight = self.given or 0j, self.given is not None
         moved = self.lever - center
         value = np.array([moved.real, moved.imag, *mount.yaw])
         free = np.flatnonzero(np.arange(len(value)) != 2)
@@ -93,15 +98,15 @@ class Mount:
         shown = np.real(columns.conj().T @ columns) - by_rest[:, free].T @ solve(by_rest[:, free])
         pull = shown @ value - np.real(columns.conj().T @ missed)
         means, spreads, evidence = [], [], []
-        for std in [GIVEN_STD_M] if self.given is not None else [GIVEN_STD_M, CAMERA_STD_M]:
+        for std in (GIVEN_STD_M, CAMERA_STD_M):
             prior = mount._variances(std)[free]
             spread = np.linalg.inv(shown + np.diag(1 / prior))
             size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
             means.append(spread @ pull)
             spreads.append(spread)
             evidence.append((size + pull @ means[-1]) / 2)
-        share = np.exp(np.array(evidence) - max(evidence))
-        share /= share.sum()
+        learned = center + complex(*means[1][:2]), float(np.sqrt(spreads[1].diagonal()[:2].mean()))
+        share = np.array([1.0, 0.0]) if tight else special.softmax(evidence)
         mean = share @ np.array(means)
         covariance = np.zeros((len(value) + 1, len(value) + 1))
         covariance[np.ix_(free, free)] = sum(
@@ -109,7 +114,21 @@ class Mount:
             for part, spread, one in zip(share, spreads, means, strict=True)
         )
         lever, yaw = center + complex(mean[0], mean[1]), (0.0, *mean[2:].tolist())
-        return replace(self, lever=lever, yaw=yaw, covariance=covariance)
+        return replace(self, lever=lever, yaw=yaw, covariance=covariance, learned=learned)
+
+    @property
+    def contradiction(self) -> str:
+        """How the closures contradict a measured place, in words; '' where they do not."""
+        if self.given is None or self.learned is None:
+            return ''
+        (lever, std), given = self.learned, self.given
+        if abs(lever - given) < CONTRADICTS * math.hypot(std, GIVEN_STD_M):
+            return ''
+        return (
+            f'the camera is said to sit {given.real:.2f} m ahead and {given.imag:.2f} m left of '
+            f'base_link, the images show {lever.real:.2f} and {lever.imag:.2f} m (+- {std:.2f}): '
+            'check camera_xy, or /tf_static'
+        )
 
     def differs(self, other: Mount, least_m: float) -> bool:
         """Whether another one is so far off, or turned by as much of a meter away."""
