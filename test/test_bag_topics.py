@@ -231,6 +231,8 @@ STAMPS = [
     ([*TIMES[:3], TIMES[4], TIMES[3], *TIMES[5:]], TIMES[:3] + TIMES[4:],
      {'stamp out of order': 1}),
     ([*TIMES[:4], LATER[4], *TIMES[5:]], TIMES[:4] + TIMES[5:], {'stamp jumps': 1}),
+    # One that is 0.4 s ahead blocks none of those in between.
+    ([*TIMES[:4], TIMES[8], *TIMES[5:]], TIMES[:4] + TIMES[5:], {'stamp jumps': 1}),
     ([*TIMES[:4], EARLIER[4], *TIMES[5:]], TIMES[:4] + TIMES[5:], {'clock was set back': 1}),
     ([LATER[0], *TIMES[1:]], TIMES[1:], {'stamp jumps': 1}),
     ([*TIMES[:9], LATER[9]], TIMES[:9], {'stamp jumps': 1}),
