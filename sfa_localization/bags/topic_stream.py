@@ -104,13 +104,12 @@ class Stream:
         return self._settled(waiting, None)
 
     def _settled(self, waiting: Item | None, following: Item | None) -> list[Item]:
-        """The message held back, where it continues the one before, or the next one continues it."""
+        """The message held back, where it continues the one before, or is continued."""
         if waiting is None:
             return []
-        before = self._last
-        if before and not waiting.continues(before):
-            if following is None or not following.continues(waiting):
-                self.skip('stamp jumps')
-                return []
+        continuing = waiting.continues(self._last) if self._last else True
+        if not continuing and not (following and following.continues(waiting)):
+            self.skip('stamp jumps')
+            return []
         self._last = waiting
         return [waiting]

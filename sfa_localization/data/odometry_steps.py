@@ -48,4 +48,6 @@ def tolerance(seconds: ArrayLike, noise: float) -> Array:
     `noise` is the standard deviation, m or rad, by which this odometry's steps usually are.
     """
     longest_s = np.asarray(seconds, float)
-    return np.asarray(JUMP + ACCELERATION * np.minimum(longest_s, RAMP_S) * longest_s + NOISE * noise)
+    return np.asarray(
+        JUMP + ACCELERATION * np.minimum(longest_s, RAMP_S) * longest_s + NOISE * noise
+    )
