@@ -359,6 +359,7 @@ class _Survey:
         images = self._values.get(self._image, [])
         stamps = np.array([stamp for stamp, _ in images], np.int64)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
+        report.odometry, report.places = odometry, odometry.trajectory.at(near)
         seen = np.array([yaw for _, (yaw, _) in images], float)
         new = [(stamp, texture) for stamp, (_, texture) in images if texture is not None]
         views = (
@@ -371,8 +372,6 @@ class _Survey:
         report.motion = check_motion(
             odometry, shown, gyro, camera is not None and camera.is_panorama, views
         )
-        report.odometry = report.motion.odometry
-        report.places = report.odometry.trajectory.at(near)
 
 
 def _checked(message: Any) -> None:

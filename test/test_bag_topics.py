@@ -130,21 +130,6 @@ def test_one_transform_of_several_is_named_by_its_frame(tmp_path):
     np.testing.assert_allclose(truth.poses, EXPECTED, atol=1e-12)
 
 
-def test_odometry_that_was_reset_is_joined(tmp_path):
-    entries = []
-    for index in range(20):
-        x, y = (0.1 * index, 50.0) if index < 10 else (0.1 * (index - 10), 0.0)
-        entries.append(('/odom', stamp(index), odometry(stamp(index), x, y, 0.0)))
-    path = record(tmp_path / 'bag', entries)
-    with Bag(path) as bag:
-        read = bag.odometry()
-        assert bag.problems == ['/odom: odometry was reset 1 times; joined by its twist']
-    np.testing.assert_allclose(read.poses[:, 0], 0.1 * np.arange(20), atol=1e-9)
-    np.testing.assert_allclose(read.poses[:, 1], 50.0, atol=1e-9)
-    with pytest.raises(BagError, match='was reset'), Bag(path, strict=True) as bag:
-        bag.odometry()
-
-
 # Which topic is taken.
 
 
@@ -290,9 +275,10 @@ def test_odometry_whose_pose_and_twist_contradict_each_other(tmp_path):
     with Bag(tmp_path / 'constant') as bag:
         assert bag.odometry().poses[:, 0] == pytest.approx(np.arange(100) * PERIOD * 1e-9)
         assert bag.problems == ['/odom: the pose is constant; the twist is integrated instead']
-    refusal = pytest.raises(BagError, match=r'pose and twist disagree in 99 of 100 .* meters')
-    with refusal, Bag(tmp_path / 'millimeters') as bag:
+    with Bag(tmp_path / 'millimeters') as bag:
         bag.odometry()
+        (problem,) = bag.problems
+        assert 'poses drive' in problem and 'are both in meters, radians and seconds?' in problem
 
 
 def test_other_units_are_named(tmp_path):

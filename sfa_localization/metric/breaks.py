@@ -51,7 +51,9 @@ def jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
     here = np.arange(len(step))
     first, last = np.searchsorted(at, at - reach), np.searchsorted(at, at + reach, 'right')
     # Messages may be stamped in bundles, or late: nobody knows how long a step took.
-    longest_s = np.maximum(dt, period) + float(np.percentile(np.abs(dt - period), 90))
+    unsure_s = float(np.percentile(np.abs(dt - period), 90))
+    shortest_s = np.maximum(dt - unsure_s, 0.0)
+    more_s = np.maximum(dt, period) + unsure_s - shortest_s
     single = np.pad(step / np.maximum(dt, period)[:, None], ((1, 1), (0, 0)), 'edge')
     values, found = np.column_stack([step, dt]), np.zeros(len(step), bool)
     for _ in range(2):
@@ -61,11 +63,17 @@ def jumps(odometry: Odometry) -> tuple[Mask, Array, float]:
         usual = (before + after)[:, :3] / np.maximum((before + after)[:, 3:], period) * dt[:, None]
         noise = MEDIAN_TO_STD * float(np.median(np.abs(step - usual)[:, :2].max(1)))
         speeds = [*mean, single[:-2], single[2:]]
-        allowed = tolerance(longest_s, noise)
-        found = np.zeros(len(step), bool)
-        for axes in slice(0, 2), slice(2, 3):
-            parts = [speed[:, axes] for speed in speeds]
-            found |= beyond(step[:, axes], longest_s, parts) > allowed
+        allowed = tolerance(np.maximum(dt, period), noise)
+        missed = [
+            [
+                beyond(
+                    step[:, axes] - speed[:, axes] * shortest_s[:, None], more_s, [speed[:, axes]]
+                )
+                for speed in speeds
+            ]
+            for axes in (slice(0, 2), slice(2, 3))
+        ]
+        found = np.min(missed, axis=1).max(axis=0) > allowed
     return found, usual, noise
 
 
