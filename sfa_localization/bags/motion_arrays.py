@@ -8,9 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import (
     POINT_STD_M,
     Odometry,
@@ -26,12 +24,6 @@ StampedValues = list[tuple[int, Any]]
 """Stamps in ns, each with the value that was read from its message."""
 _DRIVING_MPS = 0.01
 """A robot this fast is driving (m/s): above the noise of wheel encoders at rest."""
-
-_COMPARED_S, _COUNTED = 1.0, 0.05
-"""Motion of poses and twists is compared by the second, from so much on (m, rad): a robot that
-stands for long adds up noise."""
-_ENOUGH, _UNEQUAL = 3.0, 1.5
-"""From such a sum on (m, rad) a larger factor between them is none of wheels or of sampling."""
 
 
 def _stamps(values: StampedValues) -> Stamps:
@@ -75,34 +67,4 @@ def to_odometry(values: StampedValues) -> tuple[Odometry, str]:
     if len(stamps) > 1 and not np.ptp(poses, axis=0).any() and speeds.max() > _DRIVING_MPS:
         integrated = replace(odometry, poses=integrate(stamps, odometry.twists))
         return integrated, 'the pose is constant; the twist is integrated instead'
-    return odometry, _disagreement(odometry) if values else ''
-
-
-def _disagreement(odometry: Odometry) -> str:
-    """How poses and twists drive or turn another way in sum, in words; '' where they agree.
-
-    Twists may lag, and average over any time; one that is always 0 claims nothing.
-    """
-    seconds, at = _by_second(odometry)
-    twisted = integrate(odometry.stamps_ns, odometry.twists)
-    turned = np.cumsum(odometry.twists[1:, 1] * np.diff(seconds))
-    turned = np.concatenate([[0.0], turned])[at]
-    driven = [np.hypot(*np.diff(poses[at, :2], axis=0).T) for poses in (odometry.poses, twisted)]
-    even = np.diff(seconds[at]) < 2 * _COMPARED_S  # odometry that paused shows the motion by poses
-    turns = np.abs([wrap_angle(np.diff(odometry.poses[at, 2])), np.diff(turned)])
-    for verb, unit, steps in ('turn', 'rad', turns), ('drive', 'm', np.array(driven)):
-        counted = steps[:, even & (steps > _COUNTED).any(axis=0)]
-        # Of a usual second: in one, poses may jump.
-        usual = np.median(counted, axis=1) if counted.size else np.zeros(2)
-        by_pose, by_twist = (counted.shape[1] * usual).tolist()
-        least, most = sorted([by_pose, by_twist])
-        if by_twist > 0 and most > _ENOUGH and most > _UNEQUAL * least:
-            differ = f'poses {verb} {by_pose:.3g} {unit}, twists {by_twist:.3g} {unit}'
-            return f'{differ}: are both in meters, radians and seconds?'
-    return ''
-
-
-def _by_second(odometry: Odometry) -> tuple[Array, NDArray[np.int64]]:
-    """Seconds (N,) since the first message, and indices of the first one in each _COMPARED_S."""
-    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
-    return seconds, np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
+    return odometry, ''

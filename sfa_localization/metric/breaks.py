@@ -82,6 +82,8 @@ def parted(odometry: Odometry) -> tuple[Odometry, str]:
 
     Where the twist says that the robot drove on as before, only the pose has jumped: it goes on.
     """
+    if len(odometry.stamps_ns) < 3:
+        return odometry, ''
     gap = pauses(odometry)
     found, usual, noise = jumps(odometry)
     found &= ~gap
@@ -108,7 +110,7 @@ def _sentence(found: Mask, broken: Mask, far: float, seconds: float) -> str:
     times = 'once' if number == 1 else f'{number} times'
     how = ['joined by its motion around'] * (cut < number) + ['cut there'] * (cut > 0)
     text = f'odometry pose jumps {times}, by up to {far:.2f} m: {" or ".join(how)}'
-    if number > max(seconds / 60, 1.0):  # not the reset of a driver
+    if number - cut > max(seconds / 60, 1.0):  # not the reset of a driver
         text += '; if a localization corrects it, record the frame odom instead of map'
     return text
 

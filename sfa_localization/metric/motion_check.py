@@ -202,7 +202,9 @@ def _straightened(odometry: Odometry) -> tuple[Odometry, str]:
         return odometry, ''
     poses = odometry.poses.copy()
     poses[:, 2] = wrap_angle(poses[:, 2] + off)
-    text = f'the heading of the pose lies {np.rad2deg(abs(off)):.1f} degrees beside its way'
+    text = (
+        f'the heading of the pose lies {np.rad2deg(abs(off)):.1f} degrees beside its way: corrected'
+    )
     return replace(odometry, poses=poses), text
 
 

@@ -52,9 +52,9 @@ LARGEST_LOSS, LARGEST_SCALE = 0.3, 1.5
 show something else than a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
-REACH_M, UNEQUAL = (4.0, 15.0), 0.02
-"""m between two places that two drives have passed, much more than closures are apart, and less
-than odometry drifts in; two pairs of wheels of one size differ by less than the second."""
+REACH_M, UNEQUAL = (3.0, 50.0), 0.02
+"""Least m between two places that two drives have passed, many times what closures are apart, and
+most m driven between them; two pairs of wheels of one size differ by less than the second."""
 # Closures of two drives that are paired.
 _PAIRED = 400
 _ROUNDS = 10  # of reweighting, from where the fit hardly changes
