@@ -136,29 +136,25 @@ def check_motion(
     images that are no `panoramas` yet, nobody knows which way around they turn, and how far.
     """
     sources = sources_of(odometry, images, gyro)
-    impossible, changes = list(_impossible(sources)), list[str]()
+    impossible = list(_impossible(sources))
+    check = MotionCheck([], odometry, gyro, list(impossible))
     if not impossible:
-        for change in parted, _straightened:
-            odometry, text = change(odometry)
-            changes += [text] if text else []
-        sources = sources_of(odometry, images, gyro)
-    turns = [compare(a, b, 'turns') for a, b in combinations(sources, 2)]
-    way = [compare(a, b, 'way') for a, b in combinations(sources, 2)]
-    check = MotionCheck([pair for pair in turns + way if pair], odometry, gyro)
+        _correct_poses(check)
+        sources = sources_of(check.odometry, images, gyro)
+    pairs = [compare(*two, what) for what in ('turns', 'way') for two in combinations(sources, 2)]
+    check.pairs = [pair for pair in pairs if pair]
     shown = check.pair(POSE, IMAGES)
     if images is not None and not panoramas and shown and shown.scale < 0:
         return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views)
-    check.corrected += changes
-    check.wrong += impossible
     _judge_way(check)
     if not impossible:
         _judge_axes(check)
         _judge_turns(check)
         _judge_clocks(check)
-    if not impossible and views is not None:
-        late_ns = round(shown.late_s * 1e9) if shown else 0
-        check.odometry, texts = contradicted(odometry, views[0] - late_ns, views[1])
-        check.corrected += texts
+        if views is not None:
+            late_ns = round(shown.late_s * 1e9) if shown else 0
+            check.odometry, texts = contradicted(check.odometry, views[0] - late_ns, views[1])
+            check.corrected += texts
     if images is not None and not any(IMAGES in (pair.a, pair.b) for pair in check.pairs):
         check.notes.append('images: too few of them, or turns, to tell whether they are mirrored')
     if not panoramas:
@@ -187,6 +183,13 @@ def _ahead(odometry: Odometry) -> Complex:
     chord = (step[:, 0] + 1j * step[:, 1]) * np.exp(-0.5j * step[:, 2])
     whole = odometry.part[at[:-1]] == odometry.part[at[1:]]
     return np.asarray(chord[whole & (np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)])
+
+
+def _correct_poses(check: MotionCheck) -> None:
+    """Join or cut where poses jump, and turn them along their way."""
+    for change in parted, _straightened:
+        check.odometry, text = change(check.odometry)
+        check.corrected += [text] if text else []
 
 
 def _straightened(odometry: Odometry) -> tuple[Odometry, str]:

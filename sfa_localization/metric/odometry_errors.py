@@ -207,16 +207,12 @@ def same_scale(runs: Sequence[Run], closures: Closures) -> tuple[Run, ...]:
     """Drives whose wheels count the way alike, as those of the first one: where two drives pass the
     same places, closures show which of them counts more between these.
     """
-    starts = np.cumsum([0, *(len(run.panoramas) for run in runs)])
-    owner = np.searchsorted(starts, closures.images, 'right') - 1
-    even: list[Run] = []
-    for number, run in enumerate(runs):
-        met = [np.flatnonzero((owner == [k, number]).all(axis=1)) for k in range(number)]
-        first = max(range(number), key=lambda k: len(met[k]), default=0)
-        if number and len(met[first]) >= CLOSURES_MIN:
-            images = closures.images[met[first]] - starts[[first, number]]
-            run = _rescaled(even[first], run, images)
-        even.append(run)
+    counts = np.array([len(run.panoramas) for run in runs])
+    even = [runs[0]]
+    for number, run in enumerate(runs[1:], 1):
+        images = closures.images - [0, counts[:number].sum()]
+        images = images[((images >= 0) & (images < counts[[0, number]])).all(axis=1)]
+        even.append(_rescaled(runs[0], run, images) if len(images) >= CLOSURES_MIN else run)
     return tuple(even)
 
 
