@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from sfa_localization.bags import decoding
 from sfa_localization.bags.drives import ODOMETRY_TOLERANCE_S
-from sfa_localization.bags.motion_arrays import StampedValues, to_yaw_rate
+from sfa_localization.bags.motion_arrays import to_yaw_rate
 from sfa_localization.bags.reader import KINDS, Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
 from sfa_localization.bags.topic_stream import Stream
@@ -302,20 +302,22 @@ class _Survey:
         image = self._bag.topics[name].kind in KINDS['image'].found
         return self._bag.any_stream(name, _checked if image else lambda message: None)
 
-    def _sample(self, message: Any) -> float:
+    def _sample(self, message: Any) -> tuple[float, NDArray[np.int8] | None]:
         """Decode an image; keep its size, and every so often the image itself.
 
-        Returns how far images have turned so far, rad.
+        Returns how far images have turned so far, rad, and a small texture; None of repetitions.
         """
         image, samples = decoding.image_of(message), self._report.samples
-        self._repeats += not self._frozen.add(image)
+        new = self._frozen.add(image)
+        self._repeats += not new
         if self._sizes.total() % self._every == 0 and len(samples) < SAMPLES:
             samples.append(_small(image))
         number = self._sizes.total()
         if number % self._looked == 0 and looks_like_panorama(*image.shape[:2]):
             self._textures.append((number, quantized(texture(image)[None])))
         self._sizes[image.shape[:2]] += 1
-        return self._gyro.add(kinds.unrolled(image))
+        yaw = self._gyro.add(kinds.unrolled(image))
+        return yaw, self._gyro.texture if new else None
 
     def _turning(self, message: Any) -> tuple[float, float]:
         """The yaw rate of an Imu, and its variance; notes roll and pitch where it has them."""
@@ -363,30 +365,23 @@ class _Survey:
     def _drive(self, stream: Stream) -> None:
         """The path, and what images and gyroscope, in the order of their stamps, say of it."""
         report, camera = self._report, self._report.camera
-        odometry = self._odometry(stream, self._values[self._driven])
-        turned = sorted(self._values.get(self._image, ()))
-        stamps = np.array([stamp for stamp, _ in turned], np.int64)
+        odometry = self._bag.to_odometry(stream, self._values[self._driven])
+        images = self._values.get(self._image, [])
+        stamps = np.array([stamp for stamp, _ in images], np.int64)
         near = stamps[odometry.trajectory.covers(stamps, int(ODOMETRY_TOLERANCE_S * 1e9))]
         report.odometry, report.places = odometry, odometry.trajectory.at(near)
-        seen = np.array([yaw for _, yaw in turned], float)
+        seen = np.array([yaw for _, (yaw, _) in images], float)
+        new = [(stamp, texture) for stamp, (_, texture) in images if texture is not None]
+        views = (
+            (np.array([at for at, _ in new]), np.stack([one for _, one in new])) if new else None
+        )
         report.tilt = self._tilt(stamps, odometry) if len(stamps) else ''
         shown = (stamps, seen) if camera is not None and camera.shows_turns else None
         rates = self._values.get(self._imu, [])
         gyro = to_yaw_rate(sorted(rates)) if rates else None
         report.motion = check_motion(
-            odometry, shown, gyro, camera is not None and camera.is_panorama
+            odometry, shown, gyro, camera is not None and camera.is_panorama, views
         )
-
-    def _odometry(self, stream: Stream, values: StampedValues) -> Odometry:
-        """As it is recorded where it cannot be joined: then the comparison says what is wrong."""
-        try:
-            return self._bag.to_odometry(stream, values)
-        except BagError as error:
-            self._report.lacks.append(str(error).removeprefix(f'{self._bag.path}: '))
-        stamps = np.array([stamp for stamp, _ in values], np.int64)
-        poses = np.array([pose for _, (pose, _) in values], float)
-        twists = np.array([twist for _, (_, twist) in values], float)
-        return Odometry(stamps, poses, twists[:, :2], twists[:, 2:])
 
 
 def _checked(message: Any) -> None:
@@ -503,15 +498,17 @@ def lacks(report: BagReport, config: InspectionConfig) -> Iterator[str]:
         yield report.camera.lack
     if float(np.mean([sample.mean() for sample in report.samples])) < DARK:
         yield 'the images are dark: open the lens or wait for daylight'
-    yield from _lacks_of_drive(report.places, config) if used > 1 else ()
+    whole = not np.ptp(report.motion.odometry.part)
+    yield from _lacks_of_drive(report.places, config, whole) if used > 1 else ()
 
 
-def _lacks_of_drive(places: Array, config: InspectionConfig) -> Iterator[str]:
+def _lacks_of_drive(places: Array, config: InspectionConfig, whole: bool) -> Iterator[str]:
+    """What images at places (N, 3) by odometry lack, whose parts may be anywhere if not `whole`."""
     if path_length(places) < 1.0:
         yield 'the robot did not move: drive it over the area'
         return
     yield from too_sparse(places, config.max_spacing)
-    if _one_route(places):
+    if not whole or _one_route(places):
         return
     yield from lanes_apart(places, config.reach)
     if directions(places) < MIN_DIRECTIONS:

@@ -12,7 +12,7 @@ from typing import Any
 from sfa_localization.bags.drives import ReadingRecipe
 from sfa_localization.camera.kinds import require_one_view
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.camera.turns import headings
+from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
@@ -28,6 +28,7 @@ from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
 from sfa_localization.metric.mount import Mount
+from sfa_localization.metric.odometry_errors import same_scale
 from sfa_localization.metric.points import points_of
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -68,6 +69,7 @@ class TrainingInput:
         with progress_bar(titled(2, 'find loop closures'), total, shown=progress) as bar:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
+        runs = same_scale(runs, closures)
         points = points_of(runs, recipe.metric.anchors)
         by_tf = [run.camera for run in runs if run.camera is not None]
         measured = complex(*recipe.metric.camera_xy) if recipe.metric.camera_xy else None
@@ -148,8 +150,9 @@ def compared(
     """
     if not force:
         require_one_view(runs)
-    seen = [list(headings(run.panoramas, recipe.panorama.clockwise)) for run in runs]
-    found, checks = check_drives(runs, seen, force)
+    shown = [turns_and_textures(run.panoramas, recipe.panorama.clockwise) for run in runs]
+    seen, textures = zip(*shown, strict=True)
+    found, checks = check_drives(runs, seen, force, textures)
     if recipe.segments.yaw_source == 'gyro':  # that is asked for, also where others contradict it
         found = tuple(
             replace(one, yaw_rate=one.yaw_rate or run.yaw_rate)

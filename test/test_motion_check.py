@@ -20,7 +20,8 @@ from sfa_localization.data.errors import CameraError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.run import Image, Odometry, PanoramaArray, Run, YawRate, integrate
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
-from sfa_localization.metric.motion_check import check_drives, check_motion, without_jumps
+from sfa_localization.metric.breaks import parted
+from sfa_localization.metric.motion_check import check_drives, check_motion
 from sfa_localization.metric.motion_sources import (
     GYRO,
     IMAGES,
@@ -266,7 +267,7 @@ def test_odometry_that_jumps_goes_on_as_before(sample, seconds, meters, text):
 def test_small_jumps_of_slow_odometry_are_found(sample):
     slow = Odometry(*(getattr(sample.odometry, name)[::3] for name in Odometry.__slots__))
     jumping = replace(sample, odometry=slow).jumping(np.arange(3.0, 32.0, 3.0), 0.2)
-    joined, text = without_jumps(jumping.odometry)
+    joined, text = parted(jumping.odometry)
     assert 'jumps 10 times' in text and np.abs(joined.poses - slow.poses)[:, :2].max() < 0.1
 
 
@@ -333,16 +334,16 @@ def test_messages_in_bundles_or_at_a_low_rate_do_not_jump(every):
         odometry = drive(twists, start=start, yaw_noise=0.2, speed_noise=0.2, seed=1).odometry
         part = slice(None, None, every)
         slow = Odometry(*(getattr(odometry, name)[part] for name in odometry.__slots__))
-        assert without_jumps(slow)[1] == ''
+        assert parted(slow)[1] == ''
     bundled = odometry.stamps_ns // 10**8 * 10**8 + np.arange(len(odometry.stamps_ns))
-    assert without_jumps(replace(odometry, stamps_ns=bundled))[1] == ''
+    assert parted(replace(odometry, stamps_ns=bundled))[1] == ''
 
 
 def test_a_jump_of_the_heading_turns_what_follows_back():
     odometry = drive(*DRIVES['wandering'][:1]).odometry
     later = compose(np.array([0.5, -0.3, 0.4]), odometry.poses)
     poses = np.where(np.arange(len(later))[:, None] < 3000, odometry.poses, later)
-    joined, text = without_jumps(replace(odometry, poses=poses))
+    joined, text = parted(replace(odometry, poses=poses))
     assert 'jumps once' in text
     off = joined.poses - odometry.poses
     assert np.abs(wrap_angle(off[:, 2])).max() < 0.02 and np.abs(off[:, :2]).max() < 0.3

@@ -8,9 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, compose, invert, relative, wrap_angle
 from sfa_localization.data.run import (
     POINT_STD_M,
     Odometry,
@@ -24,17 +22,8 @@ from sfa_localization.data.run import (
 
 StampedValues = list[tuple[int, Any]]
 """Stamps in ns, each with the value that was read from its message."""
-RESET_M = 2.0
-"""A pose that moved this much farther than its twist was reset (m): more than a robot drives while
-messages are lost for about a second."""
 _DRIVING_MPS = 0.01
 """A robot this fast is driving (m/s): above the noise of wheel encoders at rest."""
-
-_COMPARED_S, _COUNTED = 1.0, 0.05
-"""Motion of poses and twists is compared by the second, from so much on (m, rad): a robot that
-stands for long adds up noise."""
-_ENOUGH, _UNEQUAL = 3.0, 1.5
-"""From such a sum on (m, rad) a larger factor between them is none of wheels or of sampling."""
 
 
 def _stamps(values: StampedValues) -> Stamps:
@@ -60,8 +49,8 @@ def to_points(values: StampedValues) -> Points:
     ])  # fmt: skip
 
 
-def to_odometry(values: StampedValues) -> tuple[Odometry, int, str]:
-    """Odometry, how many resets in it were joined, and what is odd about it, in words.
+def to_odometry(values: StampedValues) -> tuple[Odometry, str]:
+    """Odometry, and what is odd about it, in words.
 
     The values are a pose, with v, omega and their variances, or with None where the messages hold
     poses only: then twists are the differences of the poses.
@@ -70,53 +59,12 @@ def to_odometry(values: StampedValues) -> tuple[Odometry, int, str]:
     poses = np.array([pose for _, (pose, _) in values], float).reshape(-1, 3)
     if not values or values[0][1][1] is None:
         twists = differences(stamps, poses)
-        odometry, resets = Odometry(stamps, poses, twists, np.zeros_like(twists)), 0
+        odometry = Odometry(stamps, poses, twists, np.zeros_like(twists))
     else:
         motion = np.array([twist for _, (_, twist) in values], float).reshape(-1, 4)
-        poses, resets = _joined(stamps, poses, motion[:, :2])
         odometry = Odometry(stamps, poses, motion[:, :2], motion[:, 2:])
     speeds = np.abs(odometry.twists[:, 0])
     if len(stamps) > 1 and not np.ptp(poses, axis=0).any() and speeds.max() > _DRIVING_MPS:
         integrated = replace(odometry, poses=integrate(stamps, odometry.twists))
-        return integrated, resets, 'the pose is constant; the twist is integrated instead'
-    return odometry, resets, _disagreement(odometry) if values else ''
-
-
-def _disagreement(odometry: Odometry) -> str:
-    """How poses and twists drive or turn another way in sum, in words; '' where they agree.
-
-    Twists may lag, and average over any time; one that is always 0 claims nothing.
-    """
-    seconds, at = _by_second(odometry)
-    twisted = integrate(odometry.stamps_ns, odometry.twists)
-    turned = np.cumsum(odometry.twists[1:, 1] * np.diff(seconds))
-    turned = np.concatenate([[0.0], turned])[at]
-    driven = [np.hypot(*np.diff(poses[at, :2], axis=0).T) for poses in (odometry.poses, twisted)]
-    even = np.diff(seconds[at]) < 2 * _COMPARED_S  # odometry that paused shows the motion by poses
-    turns = np.abs([wrap_angle(np.diff(odometry.poses[at, 2])), np.diff(turned)])
-    for verb, unit, steps in ('turn', 'rad', turns), ('drive', 'm', np.array(driven)):
-        by_pose, by_twist = steps[:, even & (steps > _COUNTED).any(axis=0)].sum(axis=1).tolist()
-        least, most = sorted([by_pose, by_twist])
-        if by_twist > 0 and most > _ENOUGH and most > _UNEQUAL * least:
-            differ = f'poses {verb} {by_pose:.3g} {unit}, twists {by_twist:.3g} {unit}'
-            return f'{differ}: are both in meters, radians and seconds?'
-    return ''
-
-
-def _by_second(odometry: Odometry) -> tuple[Array, NDArray[np.int64]]:
-    """Seconds (N,) since the first message, and indices of the first one in each _COMPARED_S."""
-    seconds = (odometry.stamps_ns - odometry.stamps_ns[0]) * 1e-9
-    return seconds, np.flatnonzero(np.diff(seconds // _COMPARED_S, prepend=-1.0))
-
-
-def _joined(stamps: Stamps, poses: Array, twists: Array) -> tuple[Array, int]:
-    """Poses whose resets are replaced by the motion of the twist, and the number of resets."""
-    step, seconds = relative(poses[:-1], poses[1:]), np.diff(stamps) * 1e-9
-    speed = np.maximum(np.abs(twists[:-1, 0]), np.abs(twists[1:, 0]))
-    resets = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) > speed * seconds + RESET_M) + 1
-    joined = poses.copy()
-    for reset in resets:
-        before = slice(reset - 1, reset + 1)
-        expected = integrate(stamps[before], twists[before], joined[reset - 1])[-1]
-        joined[reset:] = compose(compose(expected, invert(poses[reset])), poses[reset:])
-    return joined, len(resets)
+        return integrated, 'the pose is constant; the twist is integrated instead'
+    return odometry, ''

@@ -30,9 +30,6 @@ OWN_TOPICS = re.compile(r'/(ekf|sfa)/|/panorama(/compressed)?$')
 REMEDY = 'try `mcap recover` on its files, or `ros2 bag reindex`'
 MOST_TOPICS = 8
 """Topics that an error message lists."""
-_RESETS_MIN, _RESETS_SHARE = 20, 0.01
-"""More resets than both the number and the share of messages mean that pose and twist disagree all
-along, as with different units; single restarts of an odometry node stay far below."""
 
 
 class Kind(NamedTuple):
@@ -153,19 +150,8 @@ class Bag:
 
     def to_odometry(self, stream: Stream, values: StampedValues) -> Odometry:
         """Odometry of a stream's values; what is odd about it is noted as a problem."""
-        odometry, resets, oddity = motion.to_odometry(values)
-        if resets > max(_RESETS_MIN, _RESETS_SHARE * len(values)):
-            raise BagError(
-                f'{self.path}: {stream.topic}: pose and twist disagree in {resets} of '
-                f'{len(values)} messages: are both in meters, radians and seconds?'
-            )
-        problems = self.problems
-        problems += [f'{stream.topic}: {oddity}'] if oddity else []
-        if resets:
-            problems.append(
-                f'{stream.topic}: odometry was reset {resets} times; joined by its twist'
-            )
-            self._raise_problems()
+        odometry, oddity = motion.to_odometry(values)
+        self.problems += [f'{stream.topic}: {oddity}'] if oddity else []
         return odometry
 
     def stream(self, name: str, convert: Callable[[Any], Any]) -> Stream:

@@ -26,12 +26,20 @@ class Item(NamedTuple):
     receive_ns: int
     value: Any
 
-    def continues(self, before: Item | None) -> bool:
+    def late_ns(self, before: Item) -> int:
+        """By how much the stamp moved more than the reception since one before."""
+        return self.stamp_ns - before.stamp_ns - (self.receive_ns - before.receive_ns)
+
+    def continues(self, before: Item) -> bool:
         """Whether stamps and receptions differ by about the same time from one before."""
-        if before is None:
-            return False
-        moved, received = self.stamp_ns - before.stamp_ns, self.receive_ns - before.receive_ns
-        return abs(moved - received) <= CLOCK_JUMP_NS
+        return abs(self.late_ns(before)) <= CLOCK_JUMP_NS
+
+    def corrects(self, ahead: Item, before: Item | None) -> bool:
+        """Whether its stamp, earlier than that of one received before, is the likelier of both."""
+        if before is None or self.stamp_ns == ahead.stamp_ns:
+            return self.stamp_ns < ahead.stamp_ns
+        later = self.stamp_ns > before.stamp_ns
+        return later and abs(self.late_ns(before)) < abs(ahead.late_ns(before))
 
 
 @dataclass(eq=False)
@@ -42,9 +50,10 @@ class Stream:
     None. Messages of an opaque stream are not decoded: their value is None. In `strict` reading a
     faulty message is an error, and without a usable one a `required` stream always is.
 
-    Messages pass in strictly increasing order of stamp. A jump ahead is accepted only when the next
-    message continues from it: a single one is skipped, a lasting one is a clock that was set. After
-    a clock was set back, messages are skipped until it has caught up.
+    Messages pass in strictly increasing order of stamp, each when the next one has come: a single
+    stamp that lies ahead of it is skipped, and so is a jump that the next one does not continue;
+    one that lasts is a clock that was set. After a clock was set back, messages are skipped until
+    it has caught up.
     """
 
     bag: Path
@@ -58,7 +67,7 @@ class Stream:
     used: int = 0
     skipped: RejectionCounter = field(default_factory=RejectionCounter)
     _last: Item | None = None
-    _suspect: Item | None = None
+    _waiting: Item | None = None
 
     @property
     def count(self) -> Count:
@@ -72,36 +81,35 @@ class Stream:
         self.skipped.add(reason)
 
     def push(self, item: Item) -> list[Item]:
-        """Messages that can be used now; one may be held back, so call `flush` at the end."""
+        """The message that can be used now, if any; one is held back: call `flush` at the end."""
+        waiting, last = self._waiting, self._last
+        before = waiting or last
         if item.stamp_ns <= 0:
             self.skip(NO_STAMP)
-            return []
-        suspect, self._suspect = self._suspect, None
-        sound, last = item.continues(self._last), self._last
-        if suspect is not None and not sound and item.continues(suspect):
-            self._last = suspect
-            return [suspect, *self._in_order(item)]
-        if suspect is not None:
+        elif before is None or item.stamp_ns > before.stamp_ns:
+            self._waiting = item
+            return self._settled(waiting, item)
+        elif waiting and item.corrects(waiting, last):
+            self._waiting = item
             self.skip('stamp jumps')
-        if sound or (last is not None and item.stamp_ns <= last.stamp_ns):
-            return self._in_order(item)
-        self._suspect = item
+        else:
+            same, sound = item.stamp_ns == before.stamp_ns, item.continues(before)
+            other = 'stamp out of order' if sound else 'clock was set back'
+            self.skip('duplicate stamp' if same else other)
         return []
 
     def flush(self) -> list[Item]:
-        """The message held back; it is used only when nothing came before it."""
-        if self._suspect is None:
-            return []
-        if self._last is None:
-            return self._in_order(self._suspect)
-        self.skip('stamp jumps')
-        return []
+        """The message held back."""
+        waiting, self._waiting = self._waiting, None
+        return self._settled(waiting, None)
 
-    def _in_order(self, item: Item) -> list[Item]:
-        if self._last is None or item.stamp_ns > self._last.stamp_ns:
-            self._last = item
-            return [item]
-        same, sound = item.stamp_ns == self._last.stamp_ns, item.continues(self._last)
-        other = 'stamp out of order' if sound else 'clock was set back'
-        self.skip('duplicate stamp' if same else other)
-        return []
+    def _settled(self, waiting: Item | None, following: Item | None) -> list[Item]:
+        """The message held back, where it continues the one before, or is continued."""
+        if waiting is None:
+            return []
+        continuing = waiting.continues(self._last) if self._last else True
+        if not continuing and not (following and following.continues(waiting)):
+            self.skip('stamp jumps')
+            return []
+        self._last = waiting
+        return [waiting]

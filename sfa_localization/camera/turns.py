@@ -20,6 +20,8 @@ from sfa_localization.data.run import BATCH, Image, Panoramas
 Texture = NDArray[np.float32]
 
 _COLUMNS, _ROWS = 200, 10
+# Of what is kept of each image: enough to see whether it changed.
+_FEW_COLUMNS = 50
 # Structure wider than this part of the panorama is light, not landmarks.
 _WIDEST = 0.2
 # What every image shows alike (the robot, a mask) is the mean of so many that differ so much.
@@ -73,6 +75,14 @@ class VisualGyro:
         self.yaw_rad = float(wrap_angle(self.yaw_rad + turn))
         return self.yaw_rad
 
+    @property
+    def texture(self) -> NDArray[np.int8]:
+        """Local contrast of the last image, small (rows, columns), of zero mean all around."""
+        assert self._before is not None
+        size = _FEW_COLUMNS, _ROWS
+        small = cv2.resize(self._before, size, interpolation=cv2.INTER_AREA)
+        return np.asarray(np.rint(small * (127 / _CONTRAST)), np.int8)
+
     def _learn_static(self, texture: Texture) -> None:
         """Average images that differ: a standing robot's surroundings are not a part of it."""
         assert self._last_static is not None and self._static is not None
@@ -111,6 +121,16 @@ def _shift(before: Texture, after: Texture) -> _Shift:
     columns = top + (0.5 * (left - right) / bend if bend < 0 else 0.0)
     spread, powers = float(score.std()), float((before * before).sum() + (after * after).sum())
     return _Shift(columns, middle / spread if spread > 0 else 0.0, powers - 2 * middle)
+
+
+def turns_and_textures(
+    panoramas: Panoramas, clockwise: bool = True
+) -> tuple[list[float], NDArray[np.int8]]:
+    """Of N panoramas the headings rad, and textures (N, rows, columns), of a `VisualGyro`."""
+    gyro = VisualGyro(clockwise)
+    images = (image for batch in panoramas.batches(BATCH) for image in batch)
+    yaws, textures = zip(*((gyro.add(image), gyro.texture) for image in images), strict=True)
+    return list(yaws), np.stack(textures)
 
 
 def headings(panoramas: Panoramas, clockwise: bool = True) -> Iterator[float]:

@@ -12,7 +12,7 @@ from typing import IO, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, compose, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Indices, compose, relative, wrap_angle
 
 Stamps = NDArray[np.int64]
 Image = NDArray[np.uint8]
@@ -81,12 +81,20 @@ class Odometry:
     Everywhere in this package a twist is the mean over the time since the previous message, as
     drivers of wheel encoders publish it: the pose has moved by this twist. The first twist is not
     used.
+
+    `part` (N,) numbers the unbroken parts, by default one: between two of them nothing is known of
+    the motion, and in a part of one message nothing of where it was.
     """
 
     stamps_ns: Stamps
     poses: Array
     twists: Array
     variances: Array
+    part: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.part) == 0:
+            object.__setattr__(self, 'part', np.zeros(len(self.stamps_ns), np.int64))
 
     @classmethod
     def along(cls, path: Trajectory) -> Odometry:

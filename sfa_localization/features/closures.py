@@ -99,9 +99,13 @@ def views_of(
 
 
 def driven(odometry: Odometry, stamps_ns: Stamps) -> Array:
-    """Distance (N,) m that odometry had driven at each of the stamps (N,) of images."""
+    """Distance (N,) m that odometry had driven at each of the stamps (N,) of images; over a break
+    STRETCH_M, because the place after it may be any."""
     places = odometry.trajectory.at(stamps_ns)[:, :2]
-    return np.cumsum(np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T))
+    steps = np.hypot(*np.diff(places, axis=0, prepend=places[:1]).T)
+    at = np.searchsorted(odometry.stamps_ns, stamps_ns, 'right') - 1
+    part = odometry.part[np.maximum(at, 0)]
+    return np.cumsum(np.where(np.diff(part, prepend=part[:1]) != 0, STRETCH_M, steps))
 
 
 @dataclass(frozen=True, slots=True)

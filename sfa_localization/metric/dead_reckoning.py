@@ -81,9 +81,10 @@ class OdometryTrack:
         stamps, poses, skipped = odometry.stamps_ns, odometry.poses, dict[str, int]()
         if len(stamps) < 2:
             raise DataError('fewer than two usable odometry messages: check the odometry topic')
-        # Some drivers publish poses only.
-        twists = odometry.twists if np.any(odometry.twists) else differences(stamps, poses)
-        breaks = _breaks(stamps, twists, skipped)
+        twists = _twists(odometry)
+        breaks = pauses(odometry)
+        tally(skipped, 'pauses', breaks)
+        breaks |= np.diff(odometry.part) != 0
         variances, yaw = odometry.variances[:, 1], np.unwrap(poses[:, 2])
         gyro = None if config.yaw_source == 'odometry' else yaw_rate
         if gyro is not None and len(gyro.stamps_ns) > 1:
@@ -145,18 +146,23 @@ def seconds_since_start(stamps_ns: Stamps) -> Array:
     return np.asarray((stamps_ns - stamps_ns[0]) * 1e-9)
 
 
-def _breaks(stamps: Stamps, twists: Array, skipped: dict[str, int]) -> Mask:
+def pauses(odometry: Odometry) -> Mask:
     """Mask (N - 1,) of the pauses that odometry does not bridge: it says the same before and after
     short ones. Drivers that repeat a command, or speak only when it changes, pause like that.
     """
-    dt = np.diff(stamps) * 1e-9
+    dt = np.diff(odometry.stamps_ns) * 1e-9
     # Odometry that is always slow does not pause at each message.
     gap = dt > max(GAP_MAX_S, _PERIODS * float(np.median(dt)))
-    unsure = np.abs(np.diff(twists, axis=0)) * dt[:, None]
+    unsure = np.abs(np.diff(_twists(odometry), axis=0)) * dt[:, None]
     alike = (unsure[:, 0] < _UNSURE_M) & (unsure[:, 1] < _UNSURE_RAD)
-    gap &= ~(alike & (dt < _BRIDGE_MAX_S))
-    tally(skipped, 'pauses', gap)
-    return np.asarray(gap)
+    return np.asarray(gap & ~(alike & (dt < _BRIDGE_MAX_S)))
+
+
+def _twists(odometry: Odometry) -> Array:
+    """Twists (N, 2); of drivers that publish poses only, those of the poses."""
+    if np.any(odometry.twists):
+        return odometry.twists
+    return differences(odometry.stamps_ns, odometry.poses)
 
 
 def _gyro_turns(

@@ -14,13 +14,15 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
-from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
+from sfa_localization.data.geometry import Array, Complex, relative, wrap_angle
+from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
-from sfa_localization.metric.dead_reckoning import summed
+from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, quantile
+from sfa_localization.metric.breaks import Textures, contradicted, parted
 from sfa_localization.metric.motion_sources import (
     ENOUGH,
     EQUAL,
@@ -43,16 +45,12 @@ SKIDDING = 5.0
 """Wheels that skid are off by two: a larger factor is that of another unit, axis or source."""
 FASTEST_MPS = 30.0
 """Robots on the ground are slower: numbers beyond are not in meters."""
-JUMP, ACCELERATION = 0.05, 5.0
-"""A pose that moves so much (m, rad) beyond what its motion before and after, and this change of
-speed (m/s^2, rad/s^2), explain has jumped: wheels do not."""
 ASIDE, SLIGHT_TURN = 0.25, 1.0
 """So much of the way ahead no robot slips sideways while it turns by less than this, rad, in a
 second, nor does one whose frame is off its axle; twice that is no slip at all."""
-NOISE = 6.0
-"""Standard deviations of noisy wheels that a jump exceeds, too."""
-# s around a step in which its usual speed is measured.
-_AROUND_S = 0.5
+ASKEW, UNEVEN = np.deg2rad(1.0), np.deg2rad(10.0)
+"""A heading that lies farther beside the way, as of a gyroscope that is mounted askew, is corrected
+where half of the ways lie less than the second from it: those of wheels that slip do not."""
 # Stamps, in all and in each second, of which the unit can be told.
 _STAMPS_MIN, _STAMPS_MIN_PER_S = 20, 3
 _IMAGES_REMEDIES = {
@@ -96,17 +94,23 @@ class MotionCheck:
 
 
 def check_drives(
-    runs: Sequence[Run], seen: Sequence[Sequence[float]], force: bool = False
+    runs: Sequence[Run],
+    seen: Sequence[Sequence[float]],
+    force: bool = False,
+    textures: Sequence[NDArray[np.int8] | None] = (),
 ) -> tuple[tuple[Run, ...], tuple[MotionCheck, ...]]:
     """Drives to learn from, corrected, and what their sources of motion tell.
 
-    `seen` are the headings (N,) rad that the images of each run show. Raises DataError for what
+    `seen` are the headings (N,) rad that the images of each run show, and `textures` (N, rows,
+    columns) small ones of these, to find breaks by. Raises DataError for what
     cannot be right, of which `force` only warns.
     """
     checks = []
-    for run, headings in zip(runs, seen, strict=True):
-        shown = run.panoramas.stamps_ns, np.asarray(headings, float)
-        check = check_motion(run.odometry, shown, run.yaw_rate)
+    for run, headings, views in zip(runs, seen, textures or [None] * len(runs), strict=True):
+        stamps_ns = run.panoramas.stamps_ns
+        shown = stamps_ns, np.asarray(headings, float)
+        given = None if views is None else (stamps_ns, views)
+        check = check_motion(run.odometry, shown, run.yaw_rate, views=given)
         for text in check.corrected + check.notes + (check.wrong if force else []):
             logger.warning('%s: %s', run.name, text)
         if check.wrong and not force:
@@ -124,29 +128,33 @@ def check_motion(
     images: tuple[Stamps, Array] | None = None,
     gyro: YawRate | None = None,
     panoramas: bool = True,
+    views: Textures | None = None,
 ) -> MotionCheck:
     """Compare all sources of a drive: see `sources_of`.
 
-    Of images that are no `panoramas` yet, nobody knows which way around they turn, and how far.
+    `views` are stamps (N,) of images that repeat none, and their small textures; see breaks.py. Of
+    images that are no `panoramas` yet, nobody knows which way around they turn, and how far.
     """
     sources = sources_of(odometry, images, gyro)
-    impossible, jumps = list(_impossible(sources)), ''
+    impossible = list(_impossible(sources))
+    check = MotionCheck([], odometry, gyro, list(impossible))
     if not impossible:
-        odometry, jumps = without_jumps(odometry)
-        sources = sources_of(odometry, images, gyro)
-    turns = [compare(a, b, 'turns') for a, b in combinations(sources, 2)]
-    way = [compare(a, b, 'way') for a, b in combinations(sources, 2)]
-    check = MotionCheck([pair for pair in turns + way if pair], odometry, gyro)
+        _correct_poses(check)
+        sources = sources_of(check.odometry, images, gyro)
+    pairs = [compare(*two, what) for what in ('turns', 'way') for two in combinations(sources, 2)]
+    check.pairs = [pair for pair in pairs if pair]
     shown = check.pair(POSE, IMAGES)
     if images is not None and not panoramas and shown and shown.scale < 0:
-        return check_motion(odometry, (images[0], -images[1]), gyro, panoramas)
-    check.corrected += [jumps] if jumps else []
-    check.wrong += impossible
+        return check_motion(odometry, (images[0], -images[1]), gyro, panoramas, views)
     _judge_way(check)
     if not impossible:
         _judge_axes(check)
         _judge_turns(check)
         _judge_clocks(check)
+        if views is not None:
+            late_ns = round(shown.late_s * 1e9) if shown else 0
+            check.odometry, texts = contradicted(check.odometry, views[0] - late_ns, views[1])
+            check.corrected += texts
     if images is not None and not any(IMAGES in (pair.a, pair.b) for pair in check.pairs):
         check.notes.append('images: too few of them, or turns, to tell whether they are mirrored')
     if not panoramas:
@@ -165,15 +173,48 @@ def _impossible(sources: Sequence[Source]) -> Iterator[str]:
             yield f'{source.name} drives at {speed:.3g} m/s: publish meters, not millimeters'
 
 
-def _judge_axes(check: MotionCheck) -> None:
-    """Whether poses drive ahead or back, second by second, as wheels do."""
-    stamps, poses = check.odometry.stamps_ns, check.odometry.poses
+def _ahead(odometry: Odometry) -> Complex:
+    """The way of each second, m, along (real) and to the left of the mean heading in it, of those
+    with little turn: a chord shows where the robot was heading, where that turned by little.
+    """
+    stamps, poses = odometry.stamps_ns, odometry.poses
     at = np.flatnonzero(np.diff((stamps - stamps[0]) // 1_000_000_000, prepend=-1))
     step = relative(poses[at[:-1]], poses[at[1:]])
     chord = (step[:, 0] + 1j * step[:, 1]) * np.exp(-0.5j * step[:, 2])
-    # A chord shows where the robot was heading, where that turned by little.
-    counted = chord[(np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)]
-    ahead, aside = np.abs(counted.real).sum(), np.abs(counted.imag).sum()
+    whole = odometry.part[at[:-1]] == odometry.part[at[1:]]
+    return np.asarray(chord[whole & (np.abs(chord) > JUMP) & (np.abs(step[:, 2]) < SLIGHT_TURN)])
+
+
+def _correct_poses(check: MotionCheck) -> None:
+    """Join or cut where poses jump, and turn them along their way."""
+    for change in parted, _straightened:
+        check.odometry, text = change(check.odometry)
+        check.corrected += [text] if text else []
+
+
+def _straightened(odometry: Odometry) -> tuple[Odometry, str]:
+    """Odometry that heads along its way, ahead or back, and a sentence; '' for no change."""
+    way = _ahead(odometry)
+    if np.abs(way).sum() < ENOUGH['way']:
+        return odometry, ''
+    beside = np.angle(way * np.where(way.real < 0, -1, 1))
+    off = quantile(beside, 0.5, np.abs(way))
+    spread = MEDIAN_TO_STD * quantile(np.abs(beside - off), 0.5, np.abs(way))
+    chance = NOISE * spread / np.sqrt(len(way))
+    if not max(ASKEW, chance) < abs(off) < np.pi / 4 or spread > UNEVEN:
+        return odometry, ''
+    poses = odometry.poses.copy()
+    poses[:, 2] = wrap_angle(poses[:, 2] + off)
+    text = (
+        f'the heading of the pose lies {np.rad2deg(abs(off)):.1f} degrees beside its way: corrected'
+    )
+    return replace(odometry, poses=poses), text
+
+
+def _judge_axes(check: MotionCheck) -> None:
+    """Whether poses drive ahead or back, second by second, as wheels do."""
+    way = _ahead(check.odometry)
+    ahead, aside = np.abs(way.real).sum(), np.abs(way.imag).sum()
     if aside > max(ENOUGH['way'], ASIDE * ahead):
         text = f'{POSE} drives {aside:.3g} m sideways and {ahead:.3g} m ahead: correct its heading'
         text += ' and axes (x ahead, y to the left, yaw counterclockwise)'
@@ -326,63 +367,3 @@ def _judge_clocks(check: MotionCheck) -> None:
             stamps = check.gyro.stamps_ns - round(pair.late_s * 1e9)
             check.gyro = replace(check.gyro, stamps_ns=stamps)
         check.corrected.append(f'{name}: stamped {late(pair.late_s)}; taken into account')
-
-
-def without_jumps(odometry: Odometry) -> tuple[Odometry, str]:
-    """Odometry whose poses go on through jumps as before and after, and a sentence; '' for none."""
-    if len(odometry.stamps_ns) < 3:
-        return odometry, ''
-    found, usual = _jumps(odometry.stamps_ns, odometry.poses)
-    number = int(found.sum())
-    if not number:
-        return odometry, ''
-    step = relative(odometry.poses[:-1], odometry.poses[1:])
-    far = float(np.hypot(*(step - usual)[found, :2].T).max())
-    step = np.where(found[:, None], usual, step)
-    yaw = odometry.poses[0, 2] + summed(step[:, 2])
-    moved = (step[:, 0] + 1j * step[:, 1]) * np.exp(1j * yaw[:-1])
-    x, y = odometry.poses[0, 0] + summed(moved.real), odometry.poses[0, 1] + summed(moved.imag)
-    minutes = max((odometry.stamps_ns[-1] - odometry.stamps_ns[0]) / 60e9, 1.0)
-    times = 'once' if number == 1 else f'{number} times'
-    text = f'{POSE} jumps {times}, by up to {far:.2f} m: joined by its motion around'
-    if number > minutes:  # not the reset of a driver
-        text += '; if a localization corrects it, record the frame odom instead of map'
-    return replace(odometry, poses=np.column_stack([x, y, wrap_angle(yaw)])), text
-
-
-def _jumps(stamps: Stamps, poses: Array) -> tuple[Mask, Array]:
-    """Mask (N - 1,) of the steps that the motion around them does not explain, and the steps
-    (N - 1, 3) that it does.
-    """
-    step, dt = relative(poses[:-1], poses[1:]), np.diff(stamps) * 1e-9
-    step[:, 2] = wrap_angle(step[:, 2])
-    period = max(float(np.median(dt)), 1e-3)
-    reach = max(_AROUND_S, 3 * period)
-    at = (stamps[:-1] - stamps[0]) * 1e-9 + dt / 2
-    first, last = np.searchsorted(at, at - reach), np.searchsorted(at, at + reach, 'right')
-    values, found = np.column_stack([step, dt]), np.zeros(len(step), bool)
-    # Messages may be stamped in bundles, or late: nobody knows how long a step took.
-    unsure_s = float(np.percentile(np.abs(dt - period), 90))
-    times = np.maximum(dt - unsure_s, 0.0)[:, None], (np.maximum(dt, period) + unsure_s)[:, None]
-    # A jump is a single step: a robot that turns fast, or slips, does so for several.
-    change = np.abs(np.diff(step, axis=0)).max(1)
-    alone = np.minimum(np.append(np.inf, change), np.append(change, np.inf))
-    for _ in range(2):
-        kept = values * ~found[:, None]
-        sums = np.vstack([np.zeros(4), np.cumsum(kept, axis=0)])
-        around = sums[last] - sums[first] - kept
-        speed = around[:, :3] / np.maximum(around[:, 3:], period)
-        beyond = np.maximum(
-            _beyond(step[:, :2], speed[:, :2], *times), _beyond(step[:, 2:], speed[:, 2:], *times)
-        )
-        noise = MEDIAN_TO_STD * float(np.median(np.abs(step - speed * dt[:, None])[:, :2].max(1)))
-        allowed = JUMP + ACCELERATION * np.maximum(dt, period) ** 2 + NOISE * noise
-        found = (dt < reach) & (around[:, 3] > 0) & (np.minimum(beyond, alone) > allowed)
-    return found, speed * dt[:, None]
-
-
-def _beyond(step: Array, speed: Array, shortest_s: Array, longest_s: Array) -> Array:
-    """How far (N,) steps (N, K) lie from where a speed (N, K) leads in one of the times (N, 1)."""
-    square = np.maximum((speed**2).sum(1, keepdims=True), 1e-12)
-    time = np.clip((step * speed).sum(1, keepdims=True) / square, shortest_s, longest_s)
-    return np.asarray(np.linalg.norm(step - speed * time, axis=1))

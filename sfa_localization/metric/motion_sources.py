@@ -289,9 +289,11 @@ def compare_map(odometry: Odometry, stamps_ns: Stamps, poses: Array) -> Pair | N
     a drive that is too short.
     """
     driven = odometry.trajectory.at(stamps_ns)
+    part = odometry.part[np.searchsorted(odometry.stamps_ns[1:-1], stamps_ns, 'right')]
     way = summed(np.hypot(*np.diff(driven[:, :2], axis=0).T))
     last = np.searchsorted(way, way + min(_STRETCH_M, way[-1] / 4))
     first = np.flatnonzero(last < len(way))
+    first = first[part[first] == part[last[first]]]
     if way[-1] < ENOUGH['way'] or not len(first):
         return None
     x, y = (

@@ -16,14 +16,16 @@ and what one m/rad takes from it, L.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfa_localization.data.geometry import Array, Complex, Indices, wrap_angle
-from sfa_localization.data.run import Stamps
-from sfa_localization.features.closures import Closures
+from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
+from sfa_localization.data.run import Run, Stamps
+from sfa_localization.features.closures import Closures, driven
+from sfa_localization.features.image_features import evenly
 from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
@@ -50,8 +52,16 @@ LARGEST_LOSS, LARGEST_SCALE = 0.3, 1.5
 show something else than a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
+REACH_M, UNEQUAL = (3.0, 50.0), 0.02
+"""Least m between two places that two drives have passed, many times what closures are apart, and
+most m driven between them; two pairs of wheels of one size differ by less than the second."""
+# Closures of two drives that are paired.
+_PAIRED = 400
 _ROUNDS = 10  # of reweighting, from where the fit hardly changes
 _HALF = 2.4  # residual, in standard deviations, at which an image counts half
+
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +74,15 @@ class Headings:
     time_s: Array
     track: Array
     seen: Array
+    part: Indices
 
     @classmethod
     def of(cls, track: OdometryTrack, stamps_ns: Stamps, seen: Sequence[float]) -> Headings:
         """At stamps (N,) by the clock of the odometry; `seen` (N,) rad."""
         times = (stamps_ns - track.stamps_ns[0]) * 1e-9
         own = np.interp(times, seconds_since_start(track.stamps_ns), track.yaw)
-        return cls(stamps_ns, times, own, np.unwrap(np.asarray(seen, float)))
+        part = track.part[np.searchsorted(track.stamps_ns[1:], stamps_ns, 'right')]
+        return cls(stamps_ns, times, own, np.unwrap(np.asarray(seen, float)), part)
 
     def correction(self, sign: float, share: float, noise: float) -> TurnCorrection:
         """What to add to the track's yaw, that the images have this share of the mean."""
@@ -99,13 +111,15 @@ def corrections(drives: Sequence[Headings], closures: Closures) -> list[TurnCorr
 
 def _errors(drives: Sequence[Headings], closures: Closures) -> tuple[Array, Array]:
     """By how much odometry, images, and images of the other sign miss the turn (3, L) rad of each
-    closure of a drive with itself, and its time (L,) s.
+    closure of an unbroken part of a drive with itself, and its time (L,) s.
     """
     missed, times, start = [np.zeros((3, 0))], [np.zeros(0)], 0
     for drive in drives:
         own = closures.images - start
         inside = ((own >= 0) & (own < len(drive.time_s))).all(1)
         first, last = own[inside].T
+        whole = drive.part[first] == drive.part[last]
+        first, last, inside = first[whole], last[whole], np.flatnonzero(inside)[whole]
         start += len(drive.time_s)
         turned = [h[last] - h[first] for h in (drive.track, drive.seen, -drive.seen)]
         elapsed = np.abs(drive.time_s[last] - drive.time_s[first])
@@ -187,3 +201,49 @@ def _pairs(driven: Array, part: Indices) -> tuple[Indices, Indices]:
             last.append(k)
             start = k
     return np.array(first, np.int64), np.array(last, np.int64)
+
+
+def same_scale(runs: Sequence[Run], closures: Closures) -> tuple[Run, ...]:
+    """Drives whose wheels count the way alike, as those of the first one: where two drives pass the
+    same places, closures show which of them counts more between these.
+    """
+    counts = np.array([len(run.panoramas) for run in runs])
+    even = [runs[0]]
+    for number, run in enumerate(runs[1:], 1):
+        images = closures.images - [0, counts[:number].sum()]
+        images = images[((images >= 0) & (images < counts[[0, number]])).all(axis=1)]
+        even.append(_rescaled(runs[0], run, images) if len(images) >= CLOSURES_MIN else run)
+    return tuple(even)
+
+
+def _rescaled(first: Run, run: Run, images: Indices) -> Run:
+    """A drive with the scale of a first one, by images (L, 2) that both took at the same places."""
+    pairs = images[evenly(len(images), _PAIRED)].T
+    (there, well), (here, also) = _distances(first, pairs[0]), _distances(run, pairs[1])
+    usable = np.triu(well & also)
+    if not usable.any():
+        return run
+    ratio = np.log(here[usable] / there[usable])
+    middle = float(np.median(ratio))
+    # Pairs share their closures.
+    std = MEDIAN_TO_STD * float(np.median(np.abs(ratio - middle))) / np.sqrt(pairs.shape[1])
+    if abs(middle) < max(UNEQUAL, CHANCE_STDS * std):
+        return run
+    factor = float(np.exp(middle))
+    logger.warning(
+        '%s: its wheels count %.3g times the way of those of %s: taken into account',
+        run.name, factor, first.name,
+    )  # fmt: skip
+    odometry, way = run.odometry, np.array([factor, factor, 1.0])
+    poses, twists = odometry.poses / way, odometry.twists / way[1:]
+    return replace(run, odometry=replace(odometry, poses=poses, twists=twists))
+
+
+def _distances(run: Run, images: Indices) -> tuple[Array, Mask]:
+    """Distances (L, L) m by odometry between images (L,), and which of them it knows well."""
+    odometry, stamps = run.odometry, run.panoramas.stamps_ns[images]
+    x, y, _ = odometry.trajectory.at(stamps).T
+    apart = np.abs(np.subtract.outer(x + 1j * y, x + 1j * y))
+    way = driven(odometry, run.panoramas.stamps_ns)[images]
+    way = np.abs(np.subtract.outer(way, way))
+    return apart, (apart > REACH_M[0]) & (way < REACH_M[1])
