@@ -24,6 +24,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.progress import progress_bar, progress_over
 from sfa_localization.data.run import Odometry, Trajectory
+from sfa_localization.data.statistics import surprise
 from sfa_localization.evaluation import observed
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Update
 from sfa_localization.fusion.replay import replay
@@ -43,7 +44,6 @@ TRIALS = 120
 _LEAST = 1e-9  # stands for a parameter of zero, which has no logarithm
 _FIRST_STEP = 0.7  # of each logarithm: a factor of two
 _PULL = 1e-3  # cost per squared logarithm: holds what the data do not determine at the start
-_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +125,7 @@ def likelihood_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> floa
     updates = [update for drive, of_drive in fused for _, update, _ in drive.fuse(of_drive)]
     innovations = [(one.d2, one.covariance) for one in updates if one.covariance is not None]
     total = sum(
-        np.linalg.slogdet(spread)[1] / 2 + (_TAIL + len(spread)) / 2 * math.log1p(d2 / _TAIL)
-        for d2, spread in innovations
+        np.linalg.slogdet(spread)[1] / 2 + surprise(d2, len(spread)) for d2, spread in innovations
     )
     count = sum(len(spread) for _, spread in innovations)
     return float(total / count) if count else math.inf

@@ -23,9 +23,9 @@ import numpy as np
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.statistics import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
-from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack

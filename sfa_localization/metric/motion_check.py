@@ -19,7 +19,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
+from sfa_localization.data.statistics import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.motion_sources import (
     ENOUGH,

@@ -23,8 +23,8 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array, Complex, Indices, wrap_angle
 from sfa_localization.data.run import Stamps
+from sfa_localization.data.statistics import MEDIAN_TO_STD
 from sfa_localization.features.closures import Closures
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     OdometryTrack,
