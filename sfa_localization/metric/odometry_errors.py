@@ -23,7 +23,7 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array, Complex, Indices, wrap_angle
 from sfa_localization.data.run import Stamps
-from sfa_localization.data.statistics import MEDIAN_TO_STD
+from sfa_localization.data.statistics import MEDIAN_TO_STD, outlier_factor
 from sfa_localization.features.closures import Closures
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
@@ -51,7 +51,6 @@ show something else than a loss in turns."""
 PAIRS_MIN = 50
 """Fewer pairs of images are no evidence."""
 _ROUNDS = 10  # of reweighting, from where the fit hardly changes
-_HALF = 2.4  # residual, in standard deviations, at which an image counts half
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +158,8 @@ def _interpolated(at: Array, seconds: Array, steps: Complex) -> Complex:
 
 
 def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way, float]:
-    """The way, and the standard deviation of its loss, by Cauchy's weights: some places of the
-    images are outliers.
+    """The way, and the standard deviation of its loss, without outliers among the places of the
+    images.
     """
     columns = np.column_stack([by_odometry, by_loss])
     rows = np.vstack([columns.real, columns.imag])
@@ -171,7 +170,7 @@ def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way
         found = np.linalg.lstsq(rows * root[:, None], values * root, rcond=None)[0]
         missed = values - rows @ found
         std = max(MEDIAN_TO_STD * float(np.median(np.abs(missed))), 1e-9)
-        weight = 1 / (1 + (missed / (_HALF * std)) ** 2)
+        weight = 1 / outlier_factor((missed / std) ** 2)
     variance = np.linalg.pinv((rows * weight[:, None]).T @ rows) * std**2
     return Way(float(found[0]), float(found[1])), float(np.sqrt(variance[1, 1]))
 
