@@ -137,8 +137,7 @@ def filter_of(
 ) -> PoseFilter:
     """A filter that begins with what the training of a model found of the robot."""
     fused = kind(config, model.error_correlation)
-    fused.expect_delay(model.camera_delay_s)
-    fused.expect_scale(model.odometry_scale)
+    fused.expect(model.rig)
     return fused
 
 

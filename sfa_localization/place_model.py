@@ -19,8 +19,8 @@ from sfa_localization.data.array_files import Arrays, read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import LocalizationError, ModelError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.rejections import short_line
+from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.image_features import (
@@ -51,11 +51,7 @@ from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.turned_maps import TurnedMaps
 
 FORMAT = 'sfa_localization place model'
-VERSION = 13
-SCALE_STD = 0.01
-"""Of the scale of a map: its meters are those of wheels, seldom known better."""
-_LONGEST_DELAY_S = 10.0
-"""Of a camera: training finds delays of up to half a second."""
+VERSION = 14
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +72,8 @@ class PlaceModel:
 
     `PlaceModel.load(path).locate(panorama)` is all that a robot needs. `quality` holds the
     figures of merit of the training; `error_correlation` is that of the errors of
-    neighboring images. The map reads `turned` maps, or slow features where there are none.
+    neighboring images, `rig` the robot. Map and keyframes hold places of the camera. The map reads
+    `turned` maps, or slow features where there are none.
     """
 
     network: Network
@@ -87,17 +84,7 @@ class PlaceModel:
     turned: TurnedMaps | None = None
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
-
-    @property
-    def camera_delay_s(self) -> float:
-        """Delay of the image stamps in the training drives; 0 where unknown."""
-        known = [delay for delay in self.quality.get('camera_delay_s', ()) if delay is not None]
-        return float(np.median(known)) if known else 0.0
-
-    @property
-    def odometry_scale(self) -> float:
-        """By how much to multiply the way that the wheels count, by measured points."""
-        return float(self.quality.get('odometry_scale', 1.0))
+    rig: Rig = field(default_factory=Rig)
 
     def locate(self, panorama: Image) -> Observation:
         """Position and heading from a panorama (H, W, 3) uint8 BGR.
@@ -150,14 +137,16 @@ class PlaceModel:
     ) -> Observation:
         """Both together, see `combine`, with what is uncertain of both alike: the scale of the map
         about its center, how far beyond the keyframes they are, and what no image has shown yet.
+        The pose is that of base_link.
         """
         noise, center = self.keyframes.noise, self.keyframes.poses[:, :2].mean(0)
         pose, covariance = combine(slow, match, noise, light, doubt)
         novelty = noise.novelty(match.score)
-        by_scale = self.quality.get('scale_std', SCALE_STD) * (pose[:2] - center)
+        by_scale = self.rig.wheel_scale.std * (pose[:2] - center)
         covariance = covariance * max(novelty, 1.0) ** 2
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         covariance[:2, :2] += noise.beyond(match, light) ** 2 * np.eye(2)
+        pose, covariance = self.rig.base(pose, covariance, match.facing)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
         return Observation(pose, covariance, slow.slow_features, novelty, tilt=match.tilt)
 
@@ -199,10 +188,6 @@ class PlaceModel:
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
                 raise ModelError('its covariances are not positive')
-        if not 1 / LARGEST_SCALE <= self.odometry_scale <= LARGEST_SCALE:
-            raise ModelError('its scale of odometry is not that of wheels')
-        if not abs(self.camera_delay_s) <= _LONGEST_DELAY_S:
-            raise ModelError('its camera delay is not that of a camera')
 
     def _header(self) -> dict[str, Any]:
         architecture = dataclasses.asdict(self.network.architecture)
@@ -214,6 +199,7 @@ class PlaceModel:
             'panorama': dataclasses.asdict(self.panorama),
             'quality': self.quality,
             'error_correlation': dataclasses.asdict(self.error_correlation),
+            'rig': self.rig.to_mapping(),
         }
 
     def _arrays(self) -> Arrays:
@@ -241,6 +227,7 @@ class PlaceModel:
             TurnedMaps.from_arrays(turned) if turned else None,
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),
+            Rig.from_mapping(header['rig']),
         )
 
 

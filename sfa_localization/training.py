@@ -29,7 +29,7 @@ from sfa_localization.features.checkpoint import Checkpoint
 from sfa_localization.features.image_features import ImageFeatures, features_of_runs
 from sfa_localization.features.network import Network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
-from sfa_localization.metric.drives import Maps, anchored, compare_with_map, learn_map
+from sfa_localization.metric.drives import Maps, anchored, compare_with_map, learn_map, rig_of
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
@@ -134,9 +134,7 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         given.views, images.disagreement, segments, result, agreement, given.recipe.panorama.sphere
     )
     result = replace(result, forecast=result.forecast.improved(known.improvement))
-    delays = [drive.delay_s for drive in given.drives.items]
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
-    quality['camera_delay_s'] = delays
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
     quality |= segments.anchors.quality(result.points) if segments.anchors else {}
     quality |= {**images.quality, **segments.quality, **result.quality, **known.quality}
@@ -149,5 +147,6 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         turned,
         quality,
         correlation_along_drive(result, segments, TURN_RADIUS_M),
+        rig_of(given.drives, segments),
     )
     return Trained(model, given.runs, images.slow, segments, result)

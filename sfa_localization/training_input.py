@@ -27,6 +27,7 @@ from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
+from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.points import points_of
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 
@@ -68,7 +69,9 @@ class TrainingInput:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         points = points_of(runs, recipe.metric.anchors)
-        drives = Drives(tuple(map(drive_of, runs)), closures, recipe.segments, points=points)
+        mount = Mount.at(recipe.metric.camera_xy)
+        items = tuple(map(drive_of, runs))
+        drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
         drives = drives.measured(views, recipe.panorama.sphere)
         return cls(drives, views, recipe, progress)
 

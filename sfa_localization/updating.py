@@ -149,7 +149,7 @@ def new_views(
     chosen = chosen[_spread(poses[chosen])]
     tilts = np.reshape([one.tilt for one in seen], (-1, 2))
     level = LeveledPanoramas(run.panoramas, tilts, model.keyframes.sphere)
-    return Additions(_textures(level, chosen), poses[chosen])
+    return Additions(_textures(level, chosen), model.rig.camera(poses[chosen]))
 
 
 def familiar_score(model: PlaceModel) -> float:
@@ -168,7 +168,7 @@ def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, N
     states = smoother.smoothed()
     stamps = run.panoramas.stamps_ns
     clock = camera_clock(run.odometry, stamps, headings(run.panoramas))
-    delay_ns = clock.delay_ns if clock.known else round(model.camera_delay_s * 1e9)
+    delay_ns = clock.delay_ns if clock.known else round(model.rig.camera_delay.value * 1e9)
     taken = stamps - delay_ns
     at = np.array([state.stamp_ns for state in states], np.int64)
     track = Trajectory(at, np.reshape([state.pose for state in states], (-1, 3)))

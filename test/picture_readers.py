@@ -13,6 +13,7 @@ from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
+from sfa_localization.data.rig import Rig
 from sfa_localization.features.keyframes import Match, MatchNoise
 from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observation
 
@@ -58,8 +59,7 @@ class PictureReader(WithoutKeyframes):
     panorama: PanoramaConfig = SIZE
     heading: bool = True
     error_correlation: ErrorCorrelation = UNLIKE_DEFAULT
-    camera_delay_s: float = 0.0
-    odometry_scale: float = 1.0
+    rig: Rig = dataclasses.field(default_factory=Rig)
 
     def locate(self, image):
         a, b, novelty = image[0, :3].astype(int)

@@ -315,8 +315,10 @@ def test_points_clicked_on_the_map_of_a_lidar_give_a_model_its_coordinates(tmp_p
     model = PlaceModel.load(tmp_path / 'm.npz')
     found = np.array([model.locate(image).position for image in images[::5]])
     assert np.hypot(*(found - in_lidar_map[::5]).T).mean() < 0.15
-    assert model.odometry_scale * WHEELS == pytest.approx(1.0, abs=3 * model.quality['scale_std'])
-    assert Localizer(model).filter.scale == model.odometry_scale
+    assert model.rig.wheel_scale.value * WHEELS == pytest.approx(
+        1.0, abs=3 * model.rig.wheel_scale.std
+    )
+    assert Localizer(model).filter.scale == model.rig.wheel_scale.value
     assert 'scale: the way of wheels counts 0.9' in summary(trained)
     write_training_report(tmp_path / 'report', trained)
     assert 'missed by' in (tmp_path / 'report' / 'index.html').read_text('utf-8')

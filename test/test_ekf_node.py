@@ -3,6 +3,7 @@
 """ekf_node on real messages: what it publishes, what it survives, how it tells its state."""
 
 import copy
+import json
 import math
 from pathlib import Path as FilePath
 
@@ -23,13 +24,14 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_bench import until
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Float64, Float64MultiArray, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from transform_buffer import AsText, TransformBuffer
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose
 from sfa_localization.data.messages import read_planar, read_stamp, read_yaw
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.nodes import conversions as convert
@@ -90,9 +92,10 @@ def test_live_is_offline_and_stamps_are_the_inputs(bench):
     poses = bench.listen(PoseWithCovarianceStamped, 'ekf/pose')
     transforms = bench.listen(TransformStamped, 'ekf/map_to_odom')
     offline = PoseFilter(FilterConfig(initial_pose=(0.0, 0.0, 0.0)))
-    bench.publish('sfa/odometry_scale', Float64(data=1.02), latched_qos())
-    assert until(lambda: node.monitor('sfa/odometry_scale').used == 1)
-    offline.expect_scale(1.02)
+    rig = Rig(wheel_scale=Quantity(1.02, 0.01))
+    bench.publish('sfa/rig', convert.to_rig(rig, ErrorCorrelation()), latched_qos())
+    assert until(lambda: node.monitor('sfa/rig').used == 1)
+    offline.expect(rig)
     play(bench, node, drive)
     assert until(lambda: len(transforms) == len(heard) == len(drive.stamps_ns))
     assert until(lambda: len(poses) == len(drive.pictures))
@@ -376,15 +379,18 @@ def test_what_the_model_knows_and_what_is_set_live_reaches_the_filter(bench, mon
     node, taken = bench.run(EkfNode, start=False), []
     monkeypatch.setattr(PoseFilter, 'add_turned', lambda _, *turned: taken.append(turned))
     node.trigger_configure()
-    topic = 'sfa/error_correlation'
-    bench.publish(topic, convert.to_error_correlation(ErrorCorrelation(0.1, 3.0)), latched_qos())
+    topic, correlation = 'sfa/rig', ErrorCorrelation(0.1, 3.0)
+    bench.publish(topic, convert.to_rig(Rig(), correlation), latched_qos())
     assert until(lambda: node.monitor(topic).used == 1)
-    for numbers in ([], [0.5], [1.5, 1.0], [0.5, -1.0], [math.nan, 1.0]):
+    correct = json.loads(convert.to_rig(Rig(), correlation).data)
+    wrong = [{'error_correlation': numbers} for numbers in ([], [0.5], [1.5, 1.0], [0.5, -1.0])]
+    wrong += [{'wheel_scale': [math.nan, 1.0]}, {'unknown': [0.0, 0.0]}, {'camera_left': None}]
+    for text in ('', '[]', *(json.dumps({**correct, **values}) for values in wrong)):
         count = node.monitor(topic).received
-        bench.publish(topic, Float64MultiArray(data=numbers), latched_qos())
+        bench.publish(topic, String(data=text), latched_qos())
         assert until(lambda n=count: node.monitor(topic).received > n)
-    assert until(lambda: refused(node, topic) == 5)
-    assert node.filter.correlation == ErrorCorrelation(0.1, 3.0)
+    assert until(lambda: refused(node, topic) == 9)
+    assert node.filter.correlation == correlation
     node.trigger_activate()
     play(bench, node, Drive(seconds=0.5, **NOISY))
     before = node.filter.state.pose

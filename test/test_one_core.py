@@ -64,10 +64,10 @@ def live(recording, monkeypatch):
     try:
         sfa = bench.run(SfaNode, model='reader.npz', **WATCH)
         ekf = bench.run(EkfNode, **FILTER)
-        assert until(lambda: ekf.monitor('sfa/error_correlation').received == 1)
+        assert until(lambda: ekf.monitor('sfa/rig').received == 1)
         seen, fused = bench.listen(PoseStamped, 'sfa/pose'), bench.listen(Odometry, 'ekf/odometry')
-        # The latched correlation of errors is there before the first picture.
-        assert until(lambda: ekf.monitor('sfa/error_correlation').used == 1)
+        # The latched record of the robot is there before the first picture.
+        assert until(lambda: ekf.monitor('sfa/rig').used == 1)
         inputs = [(sfa, 'panorama'), (ekf, SEEN), (ekf, 'odom')]
         for event in recording.events():
             topic, message = message_of(recording, *event)

@@ -12,6 +12,7 @@ from picture_readers import WithoutKeyframes
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.camera.watch import FROZEN_IMAGES, NOVELTY_WARNING
 from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.camera_clock import NEAR_NS
 from sfa_localization.localizer import UNKNOWN_VARIANCE, Observation
 from sfa_localization.place_model import PlaceModel
@@ -23,7 +24,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.parameter import Parameter
 from ros_bench import until
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.data.messages import read_stamp, read_yaw
@@ -49,8 +50,7 @@ class FakeModel(WithoutKeyframes):
     shift: float = 0.0
     panorama: PanoramaConfig = SIZE
     error_correlation: ErrorCorrelation = KNOWN
-    camera_delay_s: float = 0.0
-    odometry_scale: float = 1.0
+    rig: Rig = dataclasses.field(default_factory=Rig)
 
     def locate(self, image):
         pose = np.append(image[0, 0, :2] + self.shift, 0.25)
@@ -170,16 +170,14 @@ def test_an_estimate_that_is_not_finite_is_never_published(bench, models):
 def test_the_model_changes_while_running_and_a_bad_one_is_refused(bench, models, tmp_path):
     """What a model knows of its errors reaches those who come later, too."""
     models['b.npz'].error_correlation = ErrorCorrelation(0.5, 3.0)
-    models['b.npz'].odometry_scale = 1.02
+    models['b.npz'].rig = Rig(wheel_scale=Quantity(1.02, 0.01))
     node = bench.run(SfaNode, model='a.npz')
     heard = bench.listen(PoseStamped, 'sfa/pose')
-    told = bench.listen(Float64MultiArray, 'sfa/error_correlation', latched_qos())
-    assert until(lambda: told) and convert.read_error_correlation(told[0]) == KNOWN
-    assert told[0].layout.dim[0].label == 'share, distance_m'
+    told = bench.listen(String, 'sfa/rig', latched_qos())
+    assert until(lambda: told) and convert.read_rig(told[0]) == (Rig(), KNOWN)
     assert node.set_parameters([Parameter('model', value='b.npz')])[0].successful
-    scales = bench.listen(Float64, 'sfa/odometry_scale', latched_qos())
-    assert until(lambda: len(told) == 2 and scales and scales[-1].data == 1.02)
-    assert convert.read_error_correlation(told[1]) == ErrorCorrelation(0.5, 3.0)
+    assert until(lambda: len(told) == 2)
+    assert convert.read_rig(told[1]) == (models['b.npz'].rig, ErrorCorrelation(0.5, 3.0))
     bench.publish('panorama', message(seed=1))
     assert until(lambda: heard) and heard[0].pose.position.x >= 100
     (tmp_path / 'damaged.npz').write_bytes(b'PK damaged')

@@ -42,7 +42,7 @@ _AT_ONCE = 64  # bounds the memory
 @dataclass(frozen=True, slots=True)
 class Closures:
     """L pairs of images: `images` (L, 2) indices among those of all drives; `turn` (L,) rad is the
-    robot's heading at the second minus that at the first.
+    camera's heading at the second minus that at the first.
     """
 
     images: Indices
@@ -55,6 +55,11 @@ class Closures:
     def none(cls) -> Closures:
         """No closures."""
         return cls(np.zeros((0, 2), np.int64), np.zeros(0))
+
+    def of_robot(self, camera_yaw: Array) -> Closures:
+        """With the turns of the robot, on which the camera is turned by (N,) rad in N images."""
+        first, second = camera_yaw[self.images].T
+        return Closures(self.images, self.turn - second + first)
 
 
 @dataclass(frozen=True, slots=True)

@@ -425,20 +425,23 @@ class Keyframes:
         """The same of a spectrum with its derivatives by tilt (3, rows, F) among the `known` (K,)
         keyframes of one drive; None where they are too few.
         """
-        found, pose, limit = None, start.copy(), 2 * np.pi / self.columns
+        match, pose, limit = None, start.copy(), 2 * np.pi / self.columns
         for _ in range(_REPEATED):
             near = self._around(pose[:2], drive)
-            near = near[known[near]]
+            near = np.sort(near[known[near]])
             if len(near) < _FEWEST:
                 break
-            found = self._near(np.sort(near)).find(seen, self._sign * float(pose[2]))
+            found = self._near(near).find(seen, self._sign * float(pose[2]))
             step = found.pose[:2] - start[:2]
             apart = float(np.hypot(*step))
             pose[:2] = start[:2] + step * min(1.0, reach / max(apart, 1e-9))
             pose[2] += np.clip(self._sign * found.pose[2], -limit, limit)
+            match = found.match()
+            facing = complex(match.shares @ np.exp(1j * self.poses[near, 2]))
+            match = replace(match, facing=facing)
             if apart < _NEARER * reach:
                 break
-        return None if found is None else replace(found.match(), pose=pose)
+        return None if match is None else replace(match, pose=pose)
 
     def place(self, image: Spectra, yaw: float, near: NDArray[np.int64]) -> Match:
         """Where the spectrum (rows, F) of an image with about this yaw rad is among some keyframes:

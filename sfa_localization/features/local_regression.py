@@ -264,6 +264,7 @@ def averaged(parts: Sequence[Match], weights: Sequence[float]) -> Match:
         float(mean([one.aside for one in parts])),
         mean([one.noise for one in parts]),
         (apart.T * share) @ apart,
+        facing=complex(share @ np.array([one.facing for one in parts])),
         left=np.tensordot(share.astype(np.float32), left, 1),
         tilt=mean([one.tilt for one in parts]),
     )

@@ -48,6 +48,7 @@ class Match:
     (2, 2) m^2 how far apart several drives put it (in a map they are shifted), and `elsewhere`
     (3, 3) the scatter of [x, y, yaw] about it of other poses that are as like the image. The
     place is that of the keyframes by `shares` (N,) of sum 1; None where several drives say so.
+    `facing` is the mean of exp(i yaw) of these keyframes by their shares.
 
     `score` is the correlation with the best keyframe, 1 for the same image, and `known` whether it
     is high enough for a known place. `tilt` (2,) rad is the roll and pitch of the robot that the
@@ -63,6 +64,7 @@ class Match:
     elsewhere: Array = field(default_factory=lambda: np.zeros((3, 3)))
     left: Spectra | None = None
     shares: Array | None = None
+    facing: complex = 0j
     score: float = 0.0
     known: bool = False
     tilt: Array = field(default_factory=lambda: np.zeros(2))

@@ -9,7 +9,7 @@ the map is, so that they tie the segments of a drive (metric/loops.py) before th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,11 @@ class Offsets:
         """Of no images."""
         none = np.zeros((0, 1))
         return cls(np.zeros(0, np.int64), none.astype(np.int64), none, none, np.zeros(0))
+
+    def of_robot(self, camera_yaw: Array) -> Offsets:
+        """With the turns of the robot, on which the camera is turned by (N,) rad in N images."""
+        turn = self.turn - camera_yaw[self.images][:, None] + camera_yaw[self.others]
+        return replace(self, turn=turn)
 
 
 def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:

@@ -21,6 +21,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_SCALE
+from sfa_localization.data.rig import Rig
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.ekf import Ekf, measurement_event
@@ -183,6 +184,11 @@ class PoseFilter:
         """
         if stamp_ns > 0 and math.isfinite(yaw_rad):
             self._camera.add_heading(int(stamp_ns), yaw_rad)
+
+    def expect(self, rig: Rig) -> None:
+        """Begin with what training learned of the robot."""
+        self.expect_delay(rig.camera_delay.value)
+        self.expect_scale(rig.wheel_scale.value)
 
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""

@@ -86,11 +86,13 @@ class Anchors:
         drives: Sequence[tuple[Odometry, Stamps]],
         images: Indices,
         settled: Settled | None = None,
+        lever: complex = 0j,
     ) -> Anchors:
         """Points beside the nearest of the used `images`, which are numbered drive after drive.
 
         A drive is its odometry and the stamps of its images; a point is of the first that was under
-        way then. Points that are near no image stay out.
+        way then. Points that are near no image stay out. They are places of base_link, images those
+        of a camera at a `lever`, ahead + i left, m, of it.
         """
         at, offset = np.full(len(points), -1, np.int64), np.full(len(points), np.inf, complex)
         start, left = 0, np.ones(len(points), bool)
@@ -108,7 +110,7 @@ class Anchors:
             start += len(stamps)
         near = np.abs(offset) <= NEAR_M
         settled = settled or Settled(np.zeros(len(points), bool))
-        return cls(points, np.where(near, at, -1), np.where(near, offset, 0.0), settled)
+        return cls(points, np.where(near, at, -1), np.where(near, offset - lever, 0.0), settled)
 
     @property
     def placed(self) -> Mask:
@@ -158,8 +160,6 @@ class Anchors:
         """
         missed, settled = np.abs(places - self.points.places), self.settled
         return {
-            'odometry_scale': settled.scale,
-            'scale_std': settled.scale_std,
             'points': [
                 {'name': name, 'x_m': at.real, 'y_m': at.imag, 'miss_m': miss, 'used': used}
                 for (name, _, at, _), miss, used in zip(

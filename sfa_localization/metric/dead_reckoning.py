@@ -117,6 +117,13 @@ class OdometryTrack:
         sums[1:, LENGTH], sums[1:, MOMENT] = of_way[:, 0], of_way[:, 1:]
         return replace(self, poses=poses, sums=sums)
 
+    def mounted(self, lever: complex) -> OdometryTrack:
+        """The way of a camera that sits at a `lever`, ahead + i left, m, of base_link."""
+        place = self.poses[:, 0] + 1j * self.poses[:, 1] + lever * np.exp(1j * self.poses[:, 2])
+        poses, sums = np.column_stack([place.real, place.imag, self.poses[:, 2]]), self.sums.copy()
+        sums[1:, MOMENT] = _sums_of_way(self.stamps_ns, np.diff(place))[:, 1:]
+        return replace(self, poses=poses, sums=sums)
+
     def steps(self) -> Complex:
         """Displacements (N - 1,) m between the stamps."""
         return _steps(self.poses)

@@ -16,6 +16,7 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import Closures, Views
@@ -27,6 +28,7 @@ from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
+from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.odometry_errors import Headings, corrections, way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import Segments, cut_track, join
@@ -39,6 +41,8 @@ logger = logging.getLogger(__name__)
 
 _POINT_ROUNDS = 3
 """Points that bend the map straight may show other ones to be right, which bend it again."""
+_MOUNT_ROUNDS, _MOUNT_SETTLED_M = 4, 0.02
+"""Offsets are measured anew until the camera's place moves by less than they err."""
 _LOSS_ROUNDS = 2
 """The first map hides a third of the way that wheels lose in turns, the next one a tenth."""
 
@@ -73,6 +77,7 @@ class Drives:
     config: SegmentConfig
     offsets: Offsets = field(default_factory=Offsets.none)
     points: Points | None = None
+    mount: Mount = field(default_factory=Mount)
 
     @property
     def starts(self) -> list[int]:
@@ -93,38 +98,59 @@ class Drives:
             return tracks
         return [track.corrected(own) for track, own in zip(tracks, turns, strict=True)]
 
+    def _driven(self, ways: Sequence[Way | None]) -> Iterator[OdometryTrack]:
+        """Dead reckoning of each drive with the way that was driven."""
+        for track, way in zip(self.tracks(), ways, strict=True):
+            yield track.driven(way) if way else track
+
     def cut(self, ways: Sequence[Way | None] = (), settled: Settled | None = None) -> Segments:
         """The segments of section 3.1, of all drives; `ways` correct what wheels counted, and the
         points are those that `settled` found right.
 
         Raises DataError.
         """
-        ways = ways or [None] * len(self.items)
+        ways, mount = ways or [None] * len(self.items), self.mount.of(len(self.items))
         parts = [
-            cut_track(track.driven(way) if way else track, drive.stamps_ns, self.config)
-            for track, drive, way in zip(self.tracks(), self.items, ways, strict=True)
+            cut_track(track.mounted(mount.lever), drive.stamps_ns, self.config)
+            for track, drive in zip(self._driven(ways), self.items, strict=True)
         ]
-        joined = replace(join(parts, self.starts), offsets=self.offsets, ways=tuple(ways))
-        segments = with_closures(joined, self.closures)
+        offsets = self.offsets.of_robot(self._camera_yaw)
+        joined = replace(join(parts, self.starts), ways=tuple(ways), mount=mount, offsets=offsets)
+        segments = with_closures(joined, self.closures.of_robot(self._camera_yaw))
         if self.points is None:
             return segments
         drives = [(drive.run.odometry, drive.stamps_ns) for drive in self.items]
         images = np.concatenate([one.images for one in segments])
-        return replace(segments, anchors=Anchors.of(self.points, drives, images, settled))
+        anchors = Anchors.of(self.points, drives, images, settled, mount.lever)
+        return replace(segments, anchors=anchors)
+
+    @property
+    def _camera_yaw(self) -> Array:
+        """By how much the camera is turned on the robot, rad, of each image (N,)."""
+        yaw = self.mount.of(len(self.items)).yaw
+        return np.repeat(yaw, [len(drive.run.panoramas) for drive in self.items])
 
     def measured(self, views: Views, sphere: Sphere) -> Drives:
-        """With the offsets of `views`, which the graph of odometry and closures leads to."""
-        poses = graph_poses(Graph.of(self.cut()), int(views.images.max()) + 1)
-        return replace(self, offsets=find_offsets(views, poses[views.images], sphere))
+        """With the offsets of `views`, which the graph of odometry and closures leads to, and the
+        place of the camera, which both show together."""
+        drives, count = self, int(views.images.max()) + 1
+        for _ in range(_MOUNT_ROUNDS):
+            before = drives.mount
+            drives = replace(drives, mount=Graph.of(drives.cut()).mount)
+            poses = graph_poses(Graph.of(drives.cut()), count)
+            drives = replace(drives, offsets=find_offsets(views, poses[views.images], sphere))
+            if not drives.mount.differs(before, _MOUNT_SETTLED_M):
+                break
+        return replace(drives, mount=Graph.of(drives.cut()).mount)
 
     def shown(self, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
         """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (M, 3)
-        of these by the map."""
+        of base_link at these by the map."""
         poses = result.poses - np.pad(result.residuals, ((0, 0), (0, 1)))
-        for drive, start in zip(self.items, self.starts, strict=True):
+        for number, (drive, start) in enumerate(zip(self.items, self.starts, strict=True)):
             rows = result.images - start
             own = (rows >= 0) & (rows < len(drive.stamps_ns))
-            yield drive.stamps_ns[rows[own]], poses[own]
+            yield drive.stamps_ns[rows[own]], result.mount.base(poses[own], number)
 
     def ways(self, segments: Segments, result: MetricResult) -> list[Way | None]:
         """The way of each drive by the map, where its wheels lose some in turns.
@@ -135,6 +161,19 @@ class Drives:
         found = [way_of(track, *shown, way) for track, shown, way in drives]
         scales = [way.scale for way in found if way]
         return [way and way._replace(scale=float(np.mean(scales))) for way in found]
+
+
+def rig_of(drives: Drives, segments: Segments) -> Rig:
+    """What was learned of the robot."""
+    usual, delays = Rig(), [drive.delay_s for drive in drives.items if drive.delay_s is not None]
+    loss = [way.loss for way in segments.ways if way]
+    scale = segments.anchors.settled if segments.anchors else None
+    return Rig(
+        **segments.mount.quantities,
+        camera_delay=usual.camera_delay._replace(value=float(np.median(delays or [0.0]))),
+        wheel_scale=Quantity(scale.scale, scale.scale_std) if scale else usual.wheel_scale,
+        turn_loss=Quantity(float(np.mean(loss or [0.0])), 0.0),
+    )
 
 
 def compare_with_map(checks: Sequence[MotionCheck], drives: Drives, result: MetricResult) -> None:

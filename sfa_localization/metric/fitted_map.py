@@ -118,7 +118,8 @@ def _start_frame(fit: MapFit) -> RigidTransform:
     frame = RigidTransform(shift.real, shift.imag, float(np.angle(turn)))
     if not anchor:
         return frame
-    to_anchor = compose(np.array(anchor), invert(segments[0].start))
+    start = segments.mount.base(segments[0].start[None], 0)[0]
+    to_anchor = compose(np.array(anchor), invert(start))
     moved = compose(to_anchor, np.array([frame.x_m, frame.y_m, frame.yaw_rad]))
     return RigidTransform(*(float(value) for value in moved))
 

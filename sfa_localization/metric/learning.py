@@ -38,6 +38,7 @@ from sfa_localization.metric.fitted_map import (
 )
 from sfa_localization.metric.forecast import Forecast
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
+from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.phases import Certificate, certify, refine
 from sfa_localization.metric.pose_graph import Graph
 from sfa_localization.metric.saved_map import MetricMap
@@ -67,7 +68,7 @@ class MetricResult:
 
     map: MetricMap
     poses: Array
-    """(M, 3) x m, y m, yaw rad: where the certified solution puts each of `images`."""
+    """(M, 3) x m, y m, yaw rad of the camera: where the certified solution puts `images`."""
     angle_covariance: Array
     """(N, N) rad^2, of the directions of the segments."""
     yaw_bias: Array
@@ -93,6 +94,8 @@ class MetricResult:
     diagnostics: Diagnostics
     graph: Graph | None
     """That gave the places, instead of features."""
+    mount: Mount
+    """Where the camera sits on the robot."""
 
     @property
     def left_out_error_m(self) -> float:
@@ -190,7 +193,7 @@ def _result(
     common_m = float(np.sqrt((drive_std**2).mean() / 2))
     turn, shift = np.exp(1j * frame.yaw_rad), frame.x_m + 1j * frame.y_m
     points, points_covariance = places_of_points(fit)
-    yaw = fit.stack.yaws(np.angle(fit.solution.z), fit.solution.bias)
+    yaw = fit.stack.yaws(fit.solution)
     return MetricResult(
         map=metric_map(fit, frame, inflation, common_m),
         poses=np.column_stack([plane(fit.places * turn + shift), wrap_angle(yaw + frame.yaw_rad)]),
@@ -207,6 +210,7 @@ def _result(
         points_covariance=points_covariance,
         diagnostics=diagnostics,
         graph=fit.problem.graph,
+        mount=fit.problem.segments.mount,
     )
 
 

@@ -42,12 +42,14 @@ that slip err by 5 % of it."""
 @dataclass(frozen=True, slots=True)
 class Loops:
     """L mixtures: what is squared of the turns, `turns`, and of the places, `places`, (L, 3N) each,
-    of [o, z, -b z]; expected standard deviations `turn_std` rad and `place_std` m, (L,), and
+    of [o, z, -b z], and by how much `facing` (L, 3N) the latter grows with the camera's place on
+    the robot; expected standard deviations `turn_std` rad and `place_std` m, (L,), and
     `share` (L,), one over how many say the same.
     """
 
     turns: Any
     places: Any
+    facing: Any
     turn_std: Array
     place_std: Array
     share: Array
@@ -60,9 +62,9 @@ class Loops:
         whole = shares.sum(axis=1)
         kept = (row >= 0) & (np.abs(whole - 1.0) < _LEAST)
         shares, unlike = shares[kept] / whole[kept, None], offsets.unlike[kept]
-        turns, places = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
+        rows = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
         place_std = _PLACE_STD_M * np.hypot(_ALIKE, unlike)
-        return cls(turns, places, _TURN_STD * (1 + unlike), place_std, np.ones(len(unlike)))
+        return cls(*rows, _TURN_STD * (1 + unlike), place_std, np.ones(len(unlike)))
 
     @classmethod
     def of_closures(cls, closures: Closures, stack: Stack, tied: Indices) -> Loops:
@@ -78,6 +80,22 @@ class Loops:
     def ties(self, stack: Stack, before: Solution | None) -> Any:
         """What is squared (2 L, 3N) of [o, z, -b z], over its standard deviation: by the residuals
         in the solution `before`."""
+        weight = self._weights(stack, before)
+        return sparse.vstack([self.turns, self.places]).multiply(weight[:, None]).tocsr()
+
+    def by_mount(self, stack: Stack, before: Solution | None, now: Solution) -> Any:
+        """Derivative (2 L, 2 + D) of what is squared in the solution `now`: by the place of the
+        camera ahead and to the left, m, and by its yaw in each of D drives, rad."""
+        x, weight = now.coefficients(stack.period), self._weights(stack, before)
+        ahead, none = self.facing @ x, np.zeros(len(self.share))
+        columns = [np.concatenate([none, ahead]), np.concatenate([none, 1j * ahead])]
+        for drive in range(int(stack.run.max()) + 1):
+            turned = 1j * (self.turns @ (x * np.tile(stack.run == drive, 3)))
+            columns.append(np.concatenate([turned, none]))
+        return np.column_stack(columns) * weight[:, None]
+
+    def _weights(self, stack: Stack, before: Solution | None) -> Array:
+        """(2 L,) one over the standard deviations, by the residuals in the solution `before`."""
         turn_std, place_std, doubt = self.turn_std, self.place_std, np.ones(len(self.share))
         if before is not None and len(doubt):
             x = before.coefficients(stack.period)
@@ -88,8 +106,8 @@ class Loops:
             turn_std, place_std = turn_part * turn_std, place_part * place_std
             squares = (turned / turn_part) ** 2 + (apart / place_part) ** 2
             doubt = outlier_factor(squares, 3)  # a turn and both axes of a place
-        weight = np.sqrt(np.tile(self.share / doubt, 2)) / np.concatenate([turn_std, place_std])
-        return sparse.vstack([self.turns, self.places]).multiply(weight[:, None]).tocsr()
+        shares = np.sqrt(np.tile(self.share / doubt, 2))
+        return np.asarray(shares / np.concatenate([turn_std, place_std]))
 
 
 def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops, Loops]:
@@ -100,15 +118,15 @@ def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops,
 
 def _squares(
     row: Indices, others: Indices, shares: Array, turn: Array, stack: Stack
-) -> tuple[Any, Any]:
-    """Of the turns and of the places, (L, 3N), of rows (L,) of the stack among others (L, K); turns
-    to first order in the biases."""
+) -> tuple[Any, Any, Any]:
+    """Of the turns, of the places and of the headings in the latter, (L, 3N), of rows (L,) of the
+    stack among others (L, K); turns to first order in the biases."""
     rows, none = np.column_stack([row, others]), np.zeros(len(row))
     minus = np.column_stack([none + 1.0, -shares])
     turns = minus * np.exp(1j * (stack.headings[rows] + np.column_stack([none, turn])))
     n, owner = stack.segments, stack.owner[rows]
     turned = (n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)
-    return stack.sparse(*turned), stack.place_rows(rows, minus)
+    return stack.sparse(*turned), stack.place_rows(rows, minus), stack.facing_rows(rows, minus)
 
 
 def with_closures(segments: Segments, closures: Closures) -> Segments:

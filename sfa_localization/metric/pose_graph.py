@@ -12,7 +12,8 @@ H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from sfa_localization.features.image_features import evenly
 from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops, loops_of
+from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.phases import CERTIFICATE_TOLERANCE, Certificate, unit
 from sfa_localization.metric.quadratic_form import YAW_BIAS_STD
 from sfa_localization.metric.segments import Segments
@@ -53,12 +55,15 @@ class Graph:
     solution: Solution
     certificate: Certificate
     factor: SuperLU
+    mount: Mount = field(default_factory=Mount)
+    """Where the camera sits by this solution, a step from where the segments' camera does."""
 
     @classmethod
     def of(cls, segments: Segments) -> Graph:
         """Of segments with closures, offsets and points; loops and links as noisy as they show."""
         stack, stated = Stack.of(segments), Links.of(segments)
-        given: list[Loops | Anchors] = [*loops_of(segments.closures, segments.offsets, stack)]
+        loops = loops_of(segments.closures, segments.offsets, stack)
+        given: list[Loops | Anchors] = [*loops]
         given += [segments.anchors] if segments.anchors else []
         stay = stack.sparse((np.arange(stack.segments), np.full(stack.segments, np.sqrt(_STAY))))
         graph, links = None, stated
@@ -70,7 +75,17 @@ class Graph:
             rows = sparse.csr_array(sparse.vstack([links.ties(stack), *ties, stay]))
             graph = _solved(rows, stack, before)
         assert graph is not None
-        return graph
+        return replace(graph, mount=graph._mount(segments.mount, loops, before))
+
+    def _mount(self, mount: Mount, loops: Sequence[Loops], before: Solution | None) -> Mount:
+        """The mount of the segments a step on, by loops whose weights are those of the solution."""
+        stack, solution = self.stack, self.solution
+        rows = sparse.vstack([one.ties(stack, before) for one in loops])
+        missed = rows @ solution.coefficients(stack.period)
+        by_mount = np.vstack([one.by_mount(stack, before, solution) for one in loops])
+        by = by_unknowns(rows, solution, stack.period)
+        by_rest = np.real(by.conj().T @ by_mount)
+        return mount.stepped(missed, by_mount, by_rest, self.unknown)
 
     def unknown(self, columns: Array) -> Array:
         """The covariance of [Re o, Im o, angles of z, b] (P, P) times columns (P, K)."""
@@ -130,11 +145,11 @@ class Graph:
 
 
 def graph_poses(graph: Graph, count: int) -> Array:
-    """Poses (count, 3) of the images, x m, y m, yaw rad, in a frame of their own; NaN for those of
-    no segment."""
+    """Poses (count, 3) of the camera, x m, y m, yaw rad, at the images, in a frame of their own;
+    NaN for those of no segment."""
     stack, solution = graph.stack, graph.solution
     poses, places = np.full((count, 3), np.nan), solution.places(stack)
-    yaws = stack.yaws(np.angle(solution.z), solution.bias)
+    yaws = stack.yaws(solution)
     poses[stack.images] = np.column_stack([places.real, places.imag, yaws])
     return poses
 

@@ -33,6 +33,7 @@ from sfa_localization.metric.dead_reckoning import (
     summed,
     tally,
 )
+from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.settings import SegmentConfig
 
 PIECE_LENGTH_M = 3.0
@@ -109,8 +110,8 @@ class Segment:
 @dataclass(frozen=True, slots=True)
 class Segments:
     """Segments in driving order, how many images and odometry messages were used, the loop closures
-    between their images, with and without offsets, how the way of each run was corrected, and
-    measured points beside them."""
+    between their images, with and without offsets, how the way of each run was corrected, measured
+    points beside them, and where the camera sits, whose places those of the segments are."""
 
     items: tuple[Segment, ...]
     images: Count = field(default_factory=Count)
@@ -119,6 +120,7 @@ class Segments:
     offsets: Offsets = field(default_factory=Offsets.none)
     ways: tuple[Way | None, ...] = (None,)
     anchors: Anchors | None = None
+    mount: Mount = field(default_factory=Mount)
 
     def __len__(self) -> int:
         return len(self.items)

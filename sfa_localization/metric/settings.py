@@ -53,6 +53,11 @@ class MetricConfig(Settings):
         'pose in the map at the start of the first run: x (m), y (m), yaw (rad); empty: as in the '
         'odometry frame',
     )
+    camera_xy: tuple[float, ...] = setting(
+        (),
+        'where the camera sits on the robot, ahead (m) and left (m) of base_link; empty: learned '
+        'from places that are seen in several headings',
+    )
     anchors: str = setting(
         '', 'file of measured points of the drives, which give the map its place, heading and scale'
     )
@@ -61,3 +66,5 @@ class MetricConfig(Settings):
         Settings.__post_init__(self)
         if len(self.anchor) not in (0, 3):
             raise ConfigError(f'anchor: {self.anchor} is not empty, and not x, y, yaw')
+        if len(self.camera_xy) not in (0, 2):
+            raise ConfigError(f'camera_xy: {self.camera_xy} is not empty, and not ahead, left')

@@ -48,6 +48,10 @@ class Stack:
     """(N,) row of each segment's first image."""
     period: Indices
     """(N,) period of each segment, in which the yaw-rate bias is constant."""
+    run: Indices
+    """(N,) drive of each segment."""
+    camera_yaw: Array
+    """(N,) rad: how far the camera is turned on the robot."""
     starts: Array
     """(N, 3) odometry poses of the segments' frames."""
     track: Indices
@@ -55,7 +59,7 @@ class Stack:
 
     @classmethod
     def of(cls, segments: Segments) -> Stack:
-        sizes = [len(s.images) for s in segments]
+        sizes, run = [len(s.images) for s in segments], np.array([s.run for s in segments])
         return cls(
             np.concatenate([s.images for s in segments]),
             np.repeat(np.arange(len(sizes)), sizes),
@@ -65,6 +69,8 @@ class Stack:
             np.concatenate([s.times_s for s in segments]),
             np.concatenate([[0], np.cumsum(sizes)[:-1]]),
             np.array([s.period for s in segments]),
+            run,
+            np.array(segments.mount.of(int(run.max()) + 1).yaw)[run],
             np.array([s.start for s in segments]),
             tracks(segments),
         )
@@ -84,10 +90,11 @@ class Stack:
         """Paths (M,) without the yaw-rate bias of each period (R,)."""
         return np.asarray(self.path - bias[self.period[self.owner]] * self.drift)
 
-    def yaws(self, angles: Array, bias: Array) -> Array:
-        """Headings (M,) rad without the biases, of segments whose directions are `angles` (N,)."""
-        own = self.headings - bias[self.period[self.owner]] * self.times_s
-        return np.asarray(angles[self.owner] + own)
+    def yaws(self, solution: Solution) -> Array:
+        """Headings (M,) rad of the camera in a solution, without the biases."""
+        own = self.headings - solution.bias[self.period[self.owner]] * self.times_s
+        turned = np.angle(solution.z) + self.camera_yaw
+        return np.asarray(turned[self.owner] + own)
 
     def rows(self, images: Indices) -> Indices:
         """Rows of images (...) of the drives, -1 for those of no segment."""
@@ -108,6 +115,13 @@ class Stack:
         drift = self.drift[rows] + 1j * self.times_s[rows] * ahead
         places = n + owner, shares * (self.path[rows] + ahead)
         return self.sparse((owner, shares), places, (2 * n + owner, shares * drift))
+
+    def facing_rows(self, rows: Indices, shares: Array) -> Any:
+        """The same (L, 3N) of the directions that the images face, exp(i yaw): by how much what is
+        one meter ahead of all images differs from their places."""
+        n, owner, facing = self.segments, self.owner[rows], np.exp(1j * self.headings[rows])
+        drift = 1j * self.times_s[rows] * facing
+        return self.sparse((n + owner, shares * facing), (2 * n + owner, shares * drift))
 
     def sparse(self, *parts: tuple[Indices, Array | Complex]) -> Any:
         """Rows (L, 3N) of [o, z, -b z] from columns and values, (L,) or (L, K); equal columns add

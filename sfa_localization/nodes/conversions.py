@@ -30,13 +30,14 @@ from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError, MessageError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import NANOSECONDS, read_stamp, require_sane
+from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
 
 _FIXED_VARIANCE = 1e-6
 """Variance of what a planar estimate does not hold: z, roll and pitch are fixed, not unknown."""
 _FIXED = np.diag([_FIXED_VARIANCE] * 6)
 _PLANAR, _TWIST = np.ix_([0, 1, 5], [0, 1, 5]), np.ix_([0, 5], [0, 5])
-_CORRELATION = 'share, distance_m'
+_CORRELATION = 'error_correlation'
 
 
 def to_stamp(stamp_ns: int) -> Time:
@@ -83,13 +84,7 @@ def to_info(panorama: PanoramaConfig) -> String:
 def read_info(message: String) -> PanoramaConfig:
     """The settings of a panorama, from panorama/info."""
     try:
-        values = json.loads(message.data)
-    except (ValueError, RecursionError):
-        values = None
-    if not isinstance(values, dict):
-        raise MessageError('is no JSON object')
-    try:
-        return PanoramaConfig.from_mapping(values, 'is no panorama')
+        return PanoramaConfig.from_mapping(_read_json(message), 'is no panorama')
     except ConfigError as error:
         raise MessageError(str(error)) from None
 
@@ -183,19 +178,32 @@ def read_turned(message: geometry.QuaternionStamped) -> tuple[int, float]:
     return read_stamp(message.header.stamp), messages.read_yaw(message.quaternion)
 
 
-def to_error_correlation(correlation: ErrorCorrelation) -> Float64MultiArray:
-    """How the errors of neighboring images correlate: share, and distance in m."""
-    return to_array([correlation.share, correlation.distance_m], _CORRELATION)
+def to_rig(rig: Rig, correlation: ErrorCorrelation) -> String:
+    """What ekf_node needs to know of a model, for sfa/rig, as a JSON object: the robot, and how the
+    errors of neighboring images correlate."""
+    shared = {_CORRELATION: [correlation.share, correlation.distance_m]}
+    return String(data=json.dumps(rig.to_mapping() | shared))
 
 
-def read_error_correlation(message: Float64MultiArray) -> ErrorCorrelation:
-    """How errors correlate, from sfa/error_correlation. Raises MessageError."""
-    if len(message.data) != 2:
-        raise MessageError(f'{len(message.data)} numbers where {_CORRELATION} are expected')
+def read_rig(message: String) -> tuple[Rig, ErrorCorrelation]:
+    """The same from sfa/rig. Raises MessageError."""
+    values = _read_json(message)
     try:
-        return ErrorCorrelation(*message.data)
-    except DataError as error:
-        raise MessageError(str(error)) from None
+        correlation = ErrorCorrelation(*map(float, values.pop(_CORRELATION)))
+        return Rig.from_mapping(values), correlation
+    except (KeyError, TypeError, ValueError, DataError) as error:
+        raise MessageError(f'is no record of a robot: {error}') from None
+
+
+def _read_json(message: String) -> dict[str, Any]:
+    """The JSON object in a message. Raises MessageError."""
+    try:
+        values = json.loads(message.data)
+    except (ValueError, RecursionError):
+        values = None
+    if not isinstance(values, dict):
+        raise MessageError('is no JSON object')
+    return values
 
 
 def _full(covariance: Array, places: Any) -> NDArray[np.float64]:

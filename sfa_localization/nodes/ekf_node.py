@@ -15,12 +15,11 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64, Float64MultiArray, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.messages import require_sane
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.motion import wrap
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
@@ -85,12 +84,7 @@ class EkfNode(LocalizationNode):
         self.subscribe(pose, _IMAGE_POSE, self._receive_pose, sensor_qos(20))
         turned = geometry.QuaternionStamped
         self.subscribe(turned, 'sfa/turned', self._receive_turned, sensor_qos(20))
-        for kind, topic, receive in (
-            (Float64, 'sfa/camera_delay', self._receive_delay),
-            (Float64, 'sfa/odometry_scale', self._receive_scale),
-            (Float64MultiArray, 'sfa/error_correlation', self._receive_correlation),
-        ):
-            self.subscribe(kind, topic, receive, latched_qos())
+        self.subscribe(String, 'sfa/rig', self._receive_rig, latched_qos())
         for topic in ('initialpose', '~/set_pose'):
             self.subscribe(pose, topic, self._set_pose, QoSProfile(depth=1))
         self.service(Trigger, '~/reset', self._reset)
@@ -180,18 +174,12 @@ class EkfNode(LocalizationNode):
     def _receive_turned(self, message: geometry.QuaternionStamped) -> None:
         self.filter.add_turned(*convert.read_turned(message))
 
-    def _receive_delay(self, message: Float64) -> None:
-        require_sane('camera delay', message.data)
-        self.filter.expect_delay(float(message.data))
-
-    def _receive_scale(self, message: Float64) -> None:
-        require_sane('odometry scale', message.data)
-        self.filter.expect_scale(float(message.data))
-        if message.data != 1.0:
-            self.get_logger().info(f'{self.shown(_ODOM)}: its way counts {message.data:.4f} times')
-
-    def _receive_correlation(self, message: Float64MultiArray) -> None:
-        self.filter.reconfigure(correlation=convert.read_error_correlation(message))
+    def _receive_rig(self, message: String) -> None:
+        rig, correlation = convert.read_rig(message)
+        self.filter.expect(rig)
+        self.filter.reconfigure(correlation=correlation)
+        for line in rig.as_text():
+            self.get_logger().info(line)
 
     def _set_pose(self, message: geometry.PoseWithCovarianceStamped) -> None:
         if message.header.stamp.sec == 0 and message.header.stamp.nanosec == 0:

@@ -12,7 +12,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, QuaternionStamped
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Float64, Float64MultiArray, String
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
@@ -50,9 +50,7 @@ class SfaNode(LocalizationNode):
         self._pose = self.publisher(PoseStamped, 'sfa/pose')
         self._uncertain = self.publisher(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
         latched = latched_qos()
-        self._correlation = self.publisher(Float64MultiArray, 'sfa/error_correlation', latched)
-        self._delay = self.publisher(Float64, 'sfa/camera_delay', latched)
-        self._scale = self.publisher(Float64, 'sfa/odometry_scale', latched)
+        self._rig = self.publisher(String, 'sfa/rig', latched)
         self._turned = self.publisher(QuaternionStamped, 'sfa/turned')
         self.service(Trigger, '~/reload_model', self._reload)
         self._declared: PanoramaConfig | None = None
@@ -66,7 +64,7 @@ class SfaNode(LocalizationNode):
         self.discovery = Discovery(self, self._topic, kinds, ['panorama'])
 
     def started(self) -> None:
-        self._publish_correlation()
+        self._publish_rig()
 
     def teardown(self) -> None:
         self._observer = None
@@ -104,20 +102,18 @@ class SfaNode(LocalizationNode):
         """Go on with another model; an unconfigured node reads its own when it is configured."""
         if self._observer is not None:
             self._observer.use(model)
-            self._publish_correlation()
+            self._publish_rig()
 
     def _reload(self, _: Any, response: Any) -> Any:
         self._use(self._load(self._config.model))
         response.success, response.message = True, f'loaded {self._config.model}'
         return response
 
-    def _publish_correlation(self) -> None:
+    def _publish_rig(self) -> None:
         """Publish what ekf_node needs to know of the model."""
         assert self._observer is not None
         model = self._observer.model
-        self._correlation.publish(convert.to_error_correlation(model.error_correlation))
-        self._delay.publish(Float64(data=float(model.camera_delay_s)))
-        self._scale.publish(Float64(data=float(model.odometry_scale)))
+        self._rig.publish(convert.to_rig(model.rig, model.error_correlation))
 
     # Images.
 

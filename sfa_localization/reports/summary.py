@@ -43,7 +43,7 @@ def summary(trained: Trained) -> str:
         lines.append(
             f'heading: expect {quality["expected_yaw_error_deg"]:.1f} degrees mean error there'
         )
-    lines += point_lines(quality)
+    lines += [*trained.model.rig.as_text(), *point_lines(quality)]
     for run, check in zip(trained.runs, trained.checks, strict=False):
         lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]
     for run, loss in zip(trained.runs, quality['turn_loss'], strict=True):
@@ -84,13 +84,11 @@ def judgment(trained: Trained) -> tuple[str, str]:
 
 
 def point_lines(quality: Mapping[str, Any]) -> list[str]:
-    """By how much the map misses each measured point, and what these say of the wheels."""
+    """By how much the map misses each measured point."""
     if 'points' not in quality:
         return []
-    lines = [
+    return [
         f'{one["name"]}: x {one["x_m"]:.2f} m, y {one["y_m"]:.2f} m: missed by '
         f'{one["miss_m"]:.3f} m' + ('' if one['used'] else ', left out')
         for one in quality['points']
     ]
-    scale, std = quality['odometry_scale'], quality['scale_std']
-    return [*lines, f'scale: the way of wheels counts {scale:.4f} times, +- {std:.4f}']

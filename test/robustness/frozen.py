@@ -19,6 +19,7 @@ from robustness.replay import Robot, replayed
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import RigidTransform
+from sfa_localization.data.rig import Quantity, Rig
 
 FILE = Path(__file__).with_name('frozen.npz.xz')
 MEANS = Path(__file__).with_name('frozen_means.json')
@@ -74,7 +75,7 @@ def record(tell):
             arrays.update(packed(f'{light[0]}/{name}', robot.messages, world.start_ns))
             tell(f'{light[0]}: {name}')
         correlation = model().error_correlation
-        known = [correlation.share, correlation.distance_m, model().camera_delay_s]
+        known = [correlation.share, correlation.distance_m, model().rig.camera_delay.value]
         arrays[light[0]] = np.array([*known, *astuple(to_truth())])
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
@@ -119,8 +120,7 @@ class Frozen:
         share, distance_m, delay_s, *transform = self._arrays[light].tolist()
         known = SimpleNamespace(
             error_correlation=ErrorCorrelation(share, distance_m),
-            camera_delay_s=delay_s,
-            odometry_scale=1.0,
+            rig=Rig(camera_delay=Quantity(delay_s, 0.05)),
             panorama=PanoramaConfig(),
             keyframes=None,
         )

@@ -83,8 +83,7 @@ class Chain:
             and listeners(self.nodes['omnicam_node'], PANORAMA) == 1
             and listeners(self.nodes['sfa_node'], SEEN) == 1
             and listeners(self.nodes['sfa_node'], 'sfa/turned') == 1
-            and ekf.monitor('sfa/error_correlation').used > 0
-            and ekf.monitor('sfa/camera_delay').used > 0
+            and ekf.monitor('sfa/rig').used > 0
         )
 
     def take(self, message):

@@ -1,0 +1,144 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The robot itself: where its camera sits, how late its images are stamped, how its wheels count.
+
+Training learns these with the map, once; a model holds them, and the filter begins with them.
+Frames are those of REP 103: base_link between the wheels, x ahead, y to the left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.messages import LARGEST_SCALE
+
+CAMERA_STD_M = 0.5
+"""Of each coordinate of a camera on a robot of which nothing is known: robots are about as long."""
+LARGEST_LEVER_M = 5.0
+"""No camera of a ground robot sits farther from the middle of its axle."""
+
+LONGEST_DELAY_S = 10.0
+"""Of a camera: training finds delays of up to half a second."""
+
+
+class Quantity(NamedTuple):
+    """A value with its standard deviation, in one unit."""
+
+    value: float
+    std: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """What training learned of a robot, or what is assumed without any training.
+
+    The camera sits `camera_ahead` and `camera_left` m of base_link, and looks `camera_yaw` rad to
+    the left of where it did in the first drive; its images are stamped `camera_delay` s late. The
+    robot drives `wheel_scale` times the way that its odometry counts, less `turn_loss` m per
+    radian of its turns. Raises DataError for what no robot has.
+    """
+
+    camera_ahead: Quantity = Quantity(0.0, 0.0)
+    camera_left: Quantity = Quantity(0.0, 0.0)
+    camera_yaw: Quantity = Quantity(0.0, 0.0)
+    camera_delay: Quantity = Quantity(0.0, 0.05)
+    wheel_scale: Quantity = Quantity(1.0, 0.01)
+    turn_loss: Quantity = Quantity(0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, (value, std) in self.items():
+            if not (math.isfinite(value) and 0.0 <= std < math.inf):
+                raise DataError(f'{name} is {value} +- {std}')
+        if abs(self.lever) > LARGEST_LEVER_M:
+            raise DataError(f'a camera {abs(self.lever):.3g} m beside base_link is on no robot')
+        if not 1 / LARGEST_SCALE <= self.wheel_scale.value <= LARGEST_SCALE:
+            raise DataError(f'wheels that drive {self.wheel_scale.value:.3g} times their way')
+        if abs(self.camera_delay.value) > LONGEST_DELAY_S:
+            raise DataError(f'images stamped {self.camera_delay.value:.3g} s late')
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Sequence[float]]) -> Rig:
+        """Of pairs of value and standard deviation by name. Raises DataError."""
+        try:
+            return cls(**{name: Quantity(*map(float, pair)) for name, pair in values.items()})
+        except (TypeError, ValueError) as error:
+            raise DataError(f'no record of a robot: {error}') from None
+
+    def to_mapping(self) -> dict[str, list[float]]:
+        """The pairs of `from_mapping`."""
+        return {name: [*pair] for name, pair in self.items()}
+
+    def items(self) -> list[tuple[str, Quantity]]:
+        """Names and quantities."""
+        return [*asdict(self).items()]
+
+    @property
+    def lever(self) -> complex:
+        """Where the camera sits, ahead + i left, m."""
+        return complex(self.camera_ahead.value, self.camera_left.value)
+
+    @property
+    def lever_variance(self) -> float:
+        """Of each coordinate of it, m^2."""
+        return (self.camera_ahead.std**2 + self.camera_left.std**2) / 2
+
+    def base(self, pose: Array, covariance: Array, facing: complex) -> tuple[Array, Array]:
+        """Pose (3,) and covariance (3, 3) of base_link by those of the camera.
+
+            base = camera - exp(i yaw) l
+
+        of which the mean over an uncertain yaw is taken. An error of l has moved the labels of
+        training as well, by the mean `facing` of exp(i yaw) of those that the image is compared
+        with: at the heading of training it moves nothing. Variances: see a wrapped normal's.
+        """
+        lever, turn = self.lever, float(pose[2] - self.camera_yaw.value)
+        variance = float(covariance[2, 2]) + self.camera_yaw.std**2
+        seen = np.exp(1j * turn - variance / 2)
+        across = -1j * lever * seen
+        jacobian = np.eye(3)
+        jacobian[:2, 2] = across.real, across.imag
+        based = np.asarray(covariance, float).copy()
+        based[2, 2] = variance
+        based = jacobian @ based @ jacobian.T
+        # Of a yaw that is hardly known, the whole lever is uncertain, along it as well as across.
+        along = (abs(lever) * -math.expm1(-variance)) ** 2 / 2
+        labels = facing * np.exp(-1j * self.camera_yaw.value)
+        based[:2, :2] += (along + self.lever_variance * abs(labels - seen) ** 2) * np.eye(2)
+        x, y = pose[0] - (lever * seen).real, pose[1] - (lever * seen).imag
+        return np.array([x, y, wrap_angle(turn)]), based
+
+    def camera(self, poses: Array) -> Array:
+        """Poses (N, 3) of the camera by those (N, 3) of base_link."""
+        moved = self.lever * np.exp(1j * poses[:, 2])
+        yaw = wrap_angle(poses[:, 2] + self.camera_yaw.value)
+        return np.column_stack([poses[:, 0] + moved.real, poses[:, 1] + moved.imag, yaw])
+
+    def as_text(self) -> list[str]:
+        """Lines for a terminal: what is worth a word."""
+        ahead, left = self.camera_ahead, self.camera_left
+        turned, delay = self.camera_yaw, self.camera_delay
+        scale, loss = self.wheel_scale, self.turn_loss
+        lines = [
+            f'camera: {_apart(ahead, "ahead of", "behind")} and '
+            f'{_apart(left, "left of", "right of")} base_link'
+        ]
+        if turned.value or turned.std:
+            degrees = math.degrees(turned.value), math.degrees(turned.std)
+            lines.append('camera turned by {:.1f} deg (+- {:.1f})'.format(*degrees))
+        lines.append(f'images stamped {delay.value:.3f} s late (+- {delay.std:.3f})')
+        lines.append(f'wheels: {scale.value:.4f} times the way counted (+- {scale.std:.4f})')
+        if loss.value or loss.std:
+            lines[-1] += f', less {loss.value:.3f} m per radian (+- {loss.std:.3f})'
+        return lines
+
+
+def _apart(quantity: Quantity, positive: str, negative: str) -> str:
+    side = positive if quantity.value >= 0 else negative
+    return f'{abs(quantity.value):.2f} m (+- {quantity.std:.2f}) {side}'

@@ -1,0 +1,146 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera beside the axle is learned with the map, and poses are those of base_link."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from metric_worlds import drive, meander, mixtures, straight
+
+from sfa_localization.data.errors import DataError
+from sfa_localization.data.geometry import align, wrap_angle
+from sfa_localization.data.rig import CAMERA_STD_M, Quantity, Rig
+from sfa_localization.metric.dead_reckoning import OdometryTrack
+from sfa_localization.metric.mount import Mount
+from sfa_localization.metric.pose_graph import Graph, graph_poses
+from sfa_localization.metric.segments import cut_track, join
+from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.metric.stack import Stack
+
+CONFIG = SegmentConfig()
+LEVER = 0.3 - 0.2j
+KNOWN = Rig(Quantity(0.3, 0.0), Quantity(-0.2, 0.0))
+
+
+def camera_poses(poses, lever=LEVER, yaw=0.0):
+    moved = lever * np.exp(1j * poses[:, 2])
+    return np.column_stack([poses[:, 0] + moved.real, poses[:, 1] + moved.imag, poses[:, 2] + yaw])
+
+
+def world(twists, start, cameras, mount=None, aside=0.0, noise_m=0.02):
+    """Segments of drives with offsets between images of cameras, and the poses of these."""
+    mount, parts, starts, poses = mount or Mount(), [], [], []
+    for number, camera in enumerate(cameras):
+        beside = (start[0], start[1] + number * aside, start[2])
+        run = drive(twists, start=beside, yaw_noise=0.02, seed=number)
+        starts.append(sum(map(len, poses)))
+        poses.append(camera(run.poses))
+        track = OdometryTrack.of(run.odometry, CONFIG).mounted(mount.lever)
+        parts.append(cut_track(track, run.stamps_ns, CONFIG))
+    poses = np.concatenate(poses)
+    segments = dataclasses.replace(join(parts, starts), mount=mount)
+    offsets = mixtures(Stack.of(segments), poses, noise_m, count=600)
+    yaws = np.repeat(mount.of(len(cameras)).yaw, len(poses) // len(cameras))
+    return dataclasses.replace(segments, offsets=offsets.of_robot(yaws)), poses
+
+
+def learned(twists, start, cameras, mount=None, aside=0.0):
+    """The mount after some steps, each from segments of the one before."""
+    for _ in range(3):
+        segments, poses = world(twists, start, cameras, mount, aside)
+        graph = Graph.of(segments)
+        mount = graph.mount
+    return mount, graph, poses
+
+
+@pytest.mark.parametrize('lever', [LEVER, 0j, -0.6 + 0.1j])
+def test_the_place_of_the_camera_is_learned_with_the_graph(lever):
+    mount, graph, poses = learned(*meander(150.0), [lambda base: camera_poses(base, lever)])
+    error, std = abs(mount.lever - lever), np.sqrt(np.diag(mount.known)[:2])
+    assert error < 0.02 and error < 3 * np.hypot(*std) and np.all(std < 0.02)
+    assert graph.certificate.certified
+    stack, found = graph.stack, graph_poses(graph, len(poses))
+    frame = align(found[stack.images, :2], poses[stack.images, :2])
+    apart = frame.apply(found[stack.images, :2]) - poses[stack.images, :2]
+    assert np.hypot(*apart.T).mean() < 0.06
+
+
+def test_a_drive_that_turns_nowhere_shows_no_place_of_the_camera():
+    """All images of a place are taken at one heading: any lever only moves the map."""
+    mount, _, _ = learned(straight(12.0), (0.0, 0.0, 0.0), [camera_poses] * 4, aside=0.3)
+    assert np.sqrt(np.diag(mount.known)[:2]) == pytest.approx(CAMERA_STD_M, rel=0.15)
+    assert abs(mount.lever) < 0.2
+
+
+def test_a_place_that_was_measured_stays():
+    given = Mount.at((0.3, -0.2))
+    mount, _, _ = learned(*meander(150.0), [camera_poses], given)
+    assert abs(mount.lever - LEVER) < 0.02
+
+
+def test_a_camera_that_was_turned_between_two_drives_is_learned():
+    turned = np.radians(45.0)
+    cameras = [camera_poses, lambda base: camera_poses(base, yaw=turned)]
+    mount, graph, _ = learned(*meander(120.0), cameras)
+    assert mount.yaw[0] == 0.0 and mount.yaw[1] == pytest.approx(turned, abs=np.radians(1.0))
+    assert abs(mount.lever - LEVER) < 0.02 and graph.certificate.certified
+    assert mount.quantities['camera_yaw'].std > 0.5
+
+
+def test_base_and_camera_are_inverse():
+    rng = np.random.default_rng(0)
+    poses = rng.uniform(-3, 3, (20, 3))
+    rig = dataclasses.replace(KNOWN, camera_yaw=Quantity(0.4, 0.0))
+    for pose, seen in zip(poses, rig.camera(poses), strict=True):
+        back, _ = rig.base(seen, np.zeros((3, 3)), 0j)
+        assert np.hypot(*(back - pose)[:2]) < 1e-9 and abs(wrap_angle(back[2] - pose[2])) < 1e-9
+    mount = Mount(LEVER, (0.0, 0.4))
+    np.testing.assert_allclose(mount.base(camera_poses(poses, yaw=0.4), 1), poses)
+
+
+@pytest.mark.parametrize('yaw_std', [0.05, 0.5, 1.5])
+def test_the_covariance_of_the_base_is_that_of_its_samples(yaw_std):
+    rng = np.random.default_rng(0)
+    pose, stds = np.array([1.0, 2.0, 0.7]), np.array([0.05, 0.1, yaw_std])
+    drawn = pose + rng.normal(size=(200_000, 3)) * stds
+    places = drawn[:, 0] + 1j * drawn[:, 1] - LEVER * np.exp(1j * drawn[:, 2])
+    base, covariance = KNOWN.base(pose, np.diag(stds**2), 0j)
+    assert abs(places.mean() - complex(*base[:2])) < 2e-3
+    true = np.trace(np.cov(places.real, places.imag))
+    assert np.trace(covariance[:2, :2]) == pytest.approx(true, rel=0.25)
+    if yaw_std == 0.05:
+        samples = np.column_stack([places.real, places.imag, drawn[:, 2]])
+        np.testing.assert_allclose(covariance, np.cov(samples.T), atol=2e-4)
+
+
+def test_an_uncertain_lever_matters_where_the_robot_heads_elsewhere_than_in_training():
+    unsure = Rig(Quantity(0.0, 0.3), Quantity(0.0, 0.3))
+    pose, spread = np.array([0.0, 0.0, 1.0]), np.diag([0.01, 0.01, 1e-6])
+    _, same = unsure.base(pose, spread, complex(np.exp(1j)))
+    _, opposite = unsure.base(pose, spread, complex(-np.exp(1j)))
+    assert same[0, 0] == pytest.approx(0.01, abs=1e-6)
+    assert opposite[0, 0] == pytest.approx(0.01 + (2 * 0.3) ** 2, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'camera_ahead': Quantity(np.nan, 0.1)},
+        {'camera_left': Quantity(9.0, 0.1)},
+        {'wheel_scale': Quantity(0.0, 0.01)},
+        {'camera_delay': Quantity(60.0, 0.01)},
+        {'turn_loss': Quantity(0.0, -1.0)},
+    ],
+)
+def test_what_no_robot_has_is_refused(values):
+    with pytest.raises(DataError):
+        Rig(**values)
+
+
+def test_a_record_comes_back_as_it_was():
+    rig = dataclasses.replace(KNOWN, camera_delay=Quantity(0.12, 0.03))
+    assert Rig.from_mapping(rig.to_mapping()) == rig
+    for wrong in ({'camera_ahead': [1.0]}, {'unknown': [0.0, 0.0]}, {'camera_ahead': 'ab'}):
+        with pytest.raises(DataError):
+            Rig.from_mapping(wrong)
