@@ -4,13 +4,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
+
+import numpy as np
 
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.run import Odometry, Stamps
-from sfa_localization.fusion.pose_filter import PoseFilter, Update
+from sfa_localization.data.run import Odometry, Stamps, Trajectory
+from sfa_localization.fusion.pose_filter import PoseFilter, State, Update
 
 
 class Measurement(Protocol):
@@ -24,6 +27,22 @@ class Measurement(Protocol):
     def covariance(self) -> Array: ...
     @property
     def turned(self) -> float: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Estimates in the map: `poses` with their `covariances` (N, 3, 3)."""
+
+    poses: Trajectory
+    covariances: Array
+
+    @classmethod
+    def of(cls, states: Sequence[State]) -> Track:
+        """The estimates of a filter."""
+        stamps = np.array([state.stamp_ns for state in states], np.int64)
+        poses = np.reshape([state.pose for state in states], (-1, 3))
+        covariances = np.reshape([state.pose_covariance for state in states], (-1, 3, 3))
+        return cls(Trajectory(stamps, poses), covariances)
 
 
 M = TypeVar('M', bound=Measurement)
