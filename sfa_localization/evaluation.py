@@ -127,7 +127,8 @@ def evaluate(
     bags = ', '.join(map(str, align_bags or [bag]))
     aligned_on = 'nothing: the transform was given' if transform else bags
     transform = transform or fit_transform(*((one.truth, one.images) for one in trained or [drive]))
-    estimates = _in_truth(drive, transform)
+    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
+    estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
     return Evaluation(
         drive.truth,
         estimates,
@@ -137,12 +138,6 @@ def evaluate(
         aligned_on,
         transform,
     )
-
-
-def _in_truth(drive: _Drive, transform: RigidTransform) -> dict[str, Trajectory]:
-    """All estimates in the frame of the truth."""
-    own = {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
-    return {'odometry': odometry_from_start(drive.truth, drive.run), **own}
 
 
 def _scores(
@@ -165,8 +160,8 @@ def observed(
     Raises BagError or DataError, also without a wanted truth.
     """
     run = _read(bag, recipe, progress, want_truth)
-    title, images = _title(run), len(run.panoramas)
-    return run, [*progress_over(observer.observe_run(run), title, images, shown=progress)]
+    images, title = observer.observe_run(run), f'locate the images of {run.name}'
+    return run, [*progress_over(images, title, len(run.panoramas), shown=progress)]
 
 
 def _present(path: Path, recipe: Recipe) -> Recipe:
@@ -187,10 +182,6 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
     if truth and (run.ground_truth is None or len(run.ground_truth) < 2):
         raise DataError(f'{bag}: no ground truth to judge by; name it with --ground-truth-topic')
     return run
-
-
-def _title(run: Run) -> str:
-    return f'locate the images of {run.name}'
 
 
 def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Drive:
@@ -233,7 +224,8 @@ def _replayed(
 ) -> tuple[list[Observation], list[tuple[int, Level, State | None]]]:
     """Observations of all images; stamp, level and estimate at each odometry message."""
     observations, moments = list[Observation](), list[tuple[int, Level, State | None]]()
-    with progress_bar(_title(run), len(run.panoramas), shown=progress) as bar:
+    title = f'locate the images of {run.name}'
+    with progress_bar(title, len(run.panoramas), shown=progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
             if observation is None:
                 moments.append((stamp_ns, localizer.status.level, state))

@@ -34,20 +34,20 @@ def quantile(values: Array, share: float, weight: Array | None = None) -> float:
 
 
 def outlier_factor(squares: Array, axes: int = 1) -> Array:
-    """Factor on the variance of errors whose normalized squares, summed over so many axes, are
-    known: by Student's distribution, 1 on average where the variance is right. One over it is the
-    weight in least squares.
+    """Factor (M,) on the variance of errors, by their `squares` (M,): normalized, and summed over
+    so many axes. By Student's distribution it is 1 on average where the variance is right. One over
+    it is the weight in least squares.
     """
     return np.asarray((TAIL + squares) / (TAIL + axes))
 
 
 def surprise(squares: Array | float, axes: int) -> Array:
-    """Negative log-likelihood of the same squares, up to a constant and the normalization."""
+    """Negative log-likelihood (M,) of such squares (M,), up to a constant and the normalization."""
     return np.asarray((TAIL + axes) / 2 * np.log1p(squares / TAIL))
 
 
 def parabola_peak(before: NDArray[F], middle: NDArray[F], after: NDArray[F]) -> NDArray[F]:
-    """Where a parabola through three values at -1, 0 and 1 is largest, of which the middle one is
+    """Where parabolas through values (...) at -1, 0 and 1 are largest, of which the middle one is
     the largest: -0.5 to 0.5; 0 where all are equal.
     """
     bend = np.minimum(before - 2 * middle + after, -1e-9)

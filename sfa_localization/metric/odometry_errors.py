@@ -132,12 +132,8 @@ def way_of(
     turn = np.exp(1j * (yaw - np.interp(time_s, seconds, track.yaw)))
     turn = turn[first] + turn[last]
     turn /= np.maximum(np.abs(turn), 1e-9)
-    by_odometry, by_loss = (
-        turn * (way[last] - way[first])
-        for way in (
-            _interpolated(time_s, seconds, steps) for steps in (track.steps(), track.way_per_loss())
-        )
-    )
+    ways = (np.interp(time_s, seconds, summed(s)) for s in (track.steps(), track.way_per_loss()))
+    by_odometry, by_loss = (turn * (way[last] - way[first]) for way in ways)
     moved = places[last] - places[first]
     way, std = _fitted(moved, by_odometry, -by_loss)
     if not 1 / LARGEST_SCALE < way.scale < LARGEST_SCALE:
@@ -149,12 +145,6 @@ def way_of(
         way, std = Way(scale, way.loss / way.scale * scale), std * scale / way.scale
     clear = CHANCE_STDS * std < abs(way.loss) < LARGEST_LOSS
     return way if clear else None
-
-
-def _interpolated(at: Array, seconds: Array, steps: Complex) -> Complex:
-    """The sum of steps (N - 1,) until some times (M,)."""
-    total = summed(steps)
-    return np.asarray(np.interp(at, seconds, total.real) + 1j * np.interp(at, seconds, total.imag))
 
 
 def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way, float]:
