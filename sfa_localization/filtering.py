@@ -23,7 +23,7 @@ from sfa_localization.data.rejections import short_line
 from sfa_localization.data.run import Odometry, Stamps
 from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
-from sfa_localization.fusion.replay import replay
+from sfa_localization.fusion.replay import Track, replay
 from sfa_localization.fusion.settings import FilterConfig
 
 SECOND_NS = 1_000_000_000
@@ -140,10 +140,11 @@ def run_filter(
             moved_ns = stamp_ns
         if stamp_ns == moved_ns and (state := fused.at(stamp_ns)):
             states[stamp_ns] = state
+    track = Track.of([*states.values()])
     return Filtered(
-        np.array([*states], np.int64) - shift,
-        np.reshape([state.pose for state in states.values()], (-1, 3)),
-        np.reshape([state.pose_covariance for state in states.values()], (-1, 3, 3)),
+        track.poses.stamps_ns - shift,
+        track.poses.poses,
+        track.covariances,
         tuple(update._replace(stamp_ns=update.stamp_ns - shift) for update in updates),
         fused.counts,
         fused.status,

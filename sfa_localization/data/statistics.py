@@ -47,7 +47,7 @@ def surprise(squares: Array | float, axes: int) -> Array:
 
 
 def parabola_peak(before: NDArray[F], middle: NDArray[F], after: NDArray[F]) -> NDArray[F]:
-    """Where parabolas through values (...) at -1, 0 and 1 are largest, of which the middle one is
+    """Where parabolas through values (N,) at -1, 0 and 1 are largest, of which the middle one is
     the largest: -0.5 to 0.5; 0 where all are equal.
     """
     bend = np.minimum(before - 2 * middle + after, -1e-9)
