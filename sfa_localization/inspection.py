@@ -30,12 +30,13 @@ from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import FrozenWatch
 from sfa_localization.data.errors import BagError, MessageError
 from sfa_localization.data.events import DELAY_LIMIT_NS
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.closures import Views, driven
+from sfa_localization.features.closures import STRETCH_M, Views, driven
+from sfa_localization.features.image_features import evenly
 from sfa_localization.features.keyframes import quantized, texture
 from sfa_localization.features.leveling import links_between
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
@@ -59,6 +60,13 @@ STANDING_M = 0.02  # images nearer to each other were taken standing
 GRID = 100  # points per axis at which coverage is evaluated: steps of 1 % of the area's extent
 VIEWS, FEWEST_LINKS = 400, 50  # images that show how the ground tilts the camera, and their pairs
 DARK = 12.0  # mean gray level of 255 below which an image is dark
+
+# Images at one place in other headings, which show where the camera sits; how many are compared.
+SAME_PLACE_M, OTHER_HEADING_RAD, PAIRS_MIN, COMPARED = 0.5, math.radians(30.0), 10, 2000
+ONE_HEADING = (
+    'no place is seen in two headings, so nothing shows where the camera sits on the robot: turn '
+    'on the spot where you have been, or set camera_xy'
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,6 +239,8 @@ def inspect(
         report.problems, report.notes = bag.problems, bag.recording.notes
     if _one_route(report.places):
         report.notes.append(ROUTE)
+    if path_length(report.places) >= 1.0 and not headings_differ(report.places):
+        report.notes.append(ONE_HEADING)
     if report.lacks and report.motion:
         report.lacks += report.motion.wrong
     report.lacks += [] if report.lacks else lacks(report, config or InspectionConfig())
@@ -437,6 +447,17 @@ def _one_route(places: Array) -> bool:
     """Whether training will learn one route, and no area, from images at places (M, 3)."""
     moved = len(places) > 1 and path_length(places) >= 1.0
     return moved and is_one_route(places[:, 0] + 1j * places[:, 1], PIECE_LENGTH_M)
+
+
+def headings_differ(places: Array) -> bool:
+    """Whether a robot came back to some of its places (N, 3) with another heading."""
+    moved = np.hypot(*np.diff(places[:, :2], axis=0, prepend=places[:1, :2]).T)
+    rows = evenly(len(places), COMPARED)
+    driven, places = np.cumsum(moved)[rows], places[rows]
+    first, last = cKDTree(places[:, :2]).query_pairs(SAME_PLACE_M, output_type='ndarray').T
+    again = np.abs(driven[first] - driven[last]) >= STRETCH_M
+    turned = np.abs(wrap_angle(places[first, 2] - places[last, 2])) >= OTHER_HEADING_RAD
+    return int((again & turned).sum()) >= PAIRS_MIN
 
 
 def lanes_apart(places: Array, reach_m: float) -> list[str]:

@@ -69,7 +69,9 @@ class TrainingInput:
             views = views_of(runs, bar.update)
         closures = find_closures(views, recipe.panorama.clockwise)
         points = points_of(runs, recipe.metric.anchors)
-        mount = Mount.at(recipe.metric.camera_xy)
+        by_tf = [run.camera for run in runs if run.camera is not None]
+        measured = complex(*recipe.metric.camera_xy) if recipe.metric.camera_xy else None
+        mount = Mount.at(by_tf[0] if by_tf and measured is None else measured)
         items = tuple(map(drive_of, runs))
         drives = Drives(items, closures, recipe.segments, points=points, mount=mount)
         drives = drives.measured(views, recipe.panorama.sphere)

@@ -21,6 +21,7 @@ from sfa_localization.inspection import (
     InspectionConfig,
     covered_share,
     directions,
+    headings_differ,
     hull_area,
     inspect,
     path_length,
@@ -137,6 +138,17 @@ def test_it_gives_the_reason_why_a_drive_is_not_enough(options, reason, tmp_path
 def test_one_route_is_enough_for_a_model_of_the_route_and_says_so(route, tmp_path):
     report = inspect(write(tmp_path / 'bag', route=route), config=ENOUGH)
     assert report.lacks == [] and ROUTE in report.notes
+
+
+def test_only_places_that_are_seen_again_in_other_headings_show_where_the_camera_sits():
+    angle = np.linspace(0, 4 * np.pi, 400)
+    loop = np.column_stack([4 * np.cos(angle), 4 * np.sin(angle), angle + np.pi / 2])
+    assert not headings_differ(loop)
+    back = np.column_stack([loop[:200, :2][::-1], loop[:200, 2][::-1] + np.pi])
+    assert headings_differ(np.concatenate([loop[:200], back]))
+    turning = np.column_stack([np.zeros((200, 2)), angle[:200]])
+    assert not headings_differ(turning)
+    assert headings_differ(np.concatenate([loop[:200], turning + [4.0, 0.0, 0.0]]))
 
 
 def test_a_missing_topic_is_reported_not_raised(tmp_path):

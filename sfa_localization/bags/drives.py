@@ -18,6 +18,7 @@ from sfa_localization.bags import decoding
 from sfa_localization.bags.motion_arrays import StampedValues, to_points, to_trajectory, to_yaw_rate
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.settings import BagConfig, TopicNames
+from sfa_localization.bags.static_transforms import camera_place
 from sfa_localization.bags.topic_stream import Stream
 from sfa_localization.camera.leveling import LeveledPanoramas, tilts_at
 from sfa_localization.camera.panorama import Unwrapper, looks_like_panorama
@@ -142,6 +143,8 @@ def read_drive(
     recipe = recipe or ReadingRecipe()
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
+        odometry_name = bag.find('odometry', recipe.topics.odometry)
+        camera = camera_place(bag, name, odometry_name.partition(':')[0])
         try:
             stored = _Images(Path(cache), recipe)
             streams = {'images': bag.stream(name, stored.panorama)}
@@ -164,7 +167,7 @@ def read_drive(
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None
     points = to_points(values['points']) if values.get('points') else None
-    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts)
+    return Run(bag.path.name, panoramas, odometry, yaw_rate, truth, points, counts, camera)
 
 
 class _Images:

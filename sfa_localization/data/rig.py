@@ -21,6 +21,8 @@ from sfa_localization.data.messages import LARGEST_SCALE
 
 CAMERA_STD_M = 0.5
 """Of each coordinate of a camera on a robot of which nothing is known: robots are about as long."""
+UNKNOWN_YAW_STD = math.pi / math.sqrt(3)
+"""rad, of an angle of which nothing is known."""
 LARGEST_LEVER_M = 5.0
 """No camera of a ground robot sits farther from the middle of its axle."""
 
@@ -129,7 +131,9 @@ class Rig:
             f'camera: {_apart(ahead, "ahead of", "behind")} and '
             f'{_apart(left, "left of", "right of")} base_link'
         ]
-        if turned.value or turned.std:
+        if turned.std >= UNKNOWN_YAW_STD:
+            lines.append('camera turned between the drives: headings of images are not used')
+        elif turned.value or turned.std:
             degrees = math.degrees(turned.value), math.degrees(turned.std)
             lines.append('camera turned by {:.1f} deg (+- {:.1f})'.format(*degrees))
         lines.append(f'images stamped {delay.value:.3f} s late (+- {delay.std:.3f})')

@@ -213,6 +213,8 @@ class Run:
     ground_truth: Trajectory | None = None
     points: Points | None = None
     counts: dict[str, Count] = field(default_factory=dict)
+    camera: complex | None = None
+    """Where the camera sits on the robot, ahead + i left of base_link, m, if the bag says so."""
 
 
 def integrate(stamps_ns: Stamps, twists: Array, start: Array | None = None) -> Array:

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.rig import UNKNOWN_YAW_STD
 from sfa_localization.data.run import Image
 
 Spectra = NDArray[np.complex64]
 
-UNKNOWN_YAW_VARIANCE = float(np.pi**2 / 3)
+UNKNOWN_YAW_VARIANCE = UNKNOWN_YAW_STD**2
 """rad^2, of an angle of which nothing is known."""
 # Correlations that unknown places do not reach (foreign gardens: 0.35, mirrored ones: 0.35, one
 # image 0.43).

@@ -9,6 +9,7 @@ way was lost in turns (odometry_errors.py).
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -28,7 +29,7 @@ from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.motion_sources import compare_map
-from sfa_localization.metric.mount import Mount
+from sfa_localization.metric.mount import MOUNTED_ANEW_RAD, Mount
 from sfa_localization.metric.odometry_errors import Headings, corrections, way_of
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import Segments, cut_track, join
@@ -141,7 +142,17 @@ class Drives:
             drives = replace(drives, offsets=find_offsets(views, poses[views.images], sphere))
             if not drives.mount.differs(before, _MOUNT_SETTLED_M):
                 break
-        return replace(drives, mount=Graph.of(drives.cut()).mount)
+        drives = replace(drives, mount=Graph.of(drives.cut()).mount)
+        if drives.mount.contradiction:
+            logger.warning(drives.mount.contradiction)
+        for drive, yaw in zip(drives.items, drives.mount.of(len(drives.items)).yaw, strict=True):
+            if abs(yaw) > MOUNTED_ANEW_RAD:
+                logger.warning(
+                    '%s: its camera is turned by %.1f degrees against %s: the headings of images '
+                    'are not used; train drives of one mount alone',
+                    drive.run.name, math.degrees(yaw), drives.items[0].run.name,
+                )  # fmt: skip
+        return drives
 
     def shown(self, result: MetricResult) -> Iterator[tuple[Stamps, Array]]:
         """Of each drive the stamps (M,) of its images in the segments, and x m, y m, yaw rad (M, 3)

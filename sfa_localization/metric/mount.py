@@ -8,61 +8,69 @@ it. Image m of segment n lies at
     x_nm = o_n + z_n (q_nm + l exp(i h_nm)),
 
 and in drive d it looks kappa_d to the left of where it did in the first drive, so that closures
-turn by kappa_d more. For the best [o, z, b] at some l and kappa, what is squared of the closures is
-r, with derivatives A by [o, z, b] and B by [l, kappa]. Gauss and Newton's step for all together is
-for [l, kappa] alone
+turn by kappa_d more. With v = [l, kappa], for the best [o, z, b] at some v what is squared of the
+closures is r, with derivatives A by [o, z, b] and B by v. To first order the closures say of v
 
-    S = B^T B + P - B^T A N^-1 A^T B,    step = -S^-1 (B^T r + P (value - prior)),
+    S = B^T B - B^T A N^-1 A^T B,    h = S v - B^T r,
 
-with N the normal equations of [o, z, b], P the inverse of the prior's covariance, and S^-1 the
-covariance. A drive that never turns where it is seen again does not show l: its variance stays that
-of the prior.
+with N the normal equations of [o, z, b]. Beside them stands what is known of robots: the camera
+sits above base_link, or where it was measured, to a centimeter; or, as probable, anywhere on the
+robot. With the prior's covariance C, either has the posterior covariance (S + C^-1)^-1 = D, the
+mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2), by which both are mixed. A drive that
+never turns where it is seen again does not show l: its variance stays large.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
 from sfa_localization.data.geometry import Array, Complex
-from sfa_localization.data.rig import CAMERA_STD_M, Quantity
+from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
 
 GIVEN_STD_M = 0.01
 """Of a camera's place that was measured on the robot."""
 CAMERA_TURN_STD = 1.0
 """rad, of the yaw of a camera in a later drive: it may have been taken off and put back anyhow."""
 
+CONTRADICTS = 4.0
+"""Standard deviations by which two measurements of a place never differ by chance, in the plane."""
+MOUNTED_ANEW_RAD = 0.05
+"""A camera turned by more between two drives was taken off: how it looks now, nobody knows. What a
+drive of 100 m shows of it errs by 0.01."""
+
 
 @dataclass(frozen=True, slots=True)
 class Mount:
     """The camera at a `lever`, ahead + i left of base_link, m, turned by `yaw` (D,) rad in each of
-    D drives, with their `covariance` (2 + D, 2 + D); `given` is a lever that was measured."""
+    D drives, with their `covariance` (2 + D, 2 + D); `given` is a lever that was measured, and
+    `learned` what the closures say of it."""
 
     lever: complex = 0j
     yaw: tuple[float, ...] = (0.0,)
     given: complex | None = None
     covariance: Array | None = None
+    learned: tuple[complex, float] | None = None
+    """The lever by closures alone, and the standard deviation of its coordinates, m."""
 
     @classmethod
-    def at(cls, place: Sequence[float]) -> Mount:
-        """Of a camera's measured place, ahead and left, m; empty for an unknown one."""
-        if not place:
-            return cls()
-        return cls(complex(*place), given=complex(*place))
+    def at(cls, place: complex | None) -> Mount:
+        """Of a camera at a measured place, ahead + i left, m; None for an unknown one."""
+        return cls(place or 0j, given=place)
 
     @property
     def known(self) -> Array:
         """The covariance, or that of the prior."""
         if self.covariance is not None:
             return self.covariance
-        return np.diag(self.prior_variances)
+        return np.diag(self._variances(CAMERA_STD_M if self.given is None else GIVEN_STD_M))
 
-    @property
-    def prior_variances(self) -> Array:
-        """(2 + D,) m^2, m^2, rad^2: of the first drive's yaw 0, by definition."""
-        lever_std = CAMERA_STD_M if self.given is None else GIVEN_STD_M
+    def _variances(self, lever_std: float) -> Array:
+        """(2 + D,) of a prior, m^2, m^2, rad^2: of the first drive's yaw 0, by definition."""
         later = [CAMERA_TURN_STD**2] * (len(self.yaw) - 1)
         return np.array([lever_std**2, lever_std**2, 0.0, *later])
 
@@ -82,21 +90,45 @@ class Mount:
         columns `solve` gives.
         """
         mount = self.of(by_mount.shape[1] - 2)
-        variances = mount.prior_variances
-        free = np.flatnonzero(variances)
-        prior = 0j if self.given is None else self.given
-        value = np.array([mount.lever.real, mount.lever.imag, *mount.yaw])
-        center = np.zeros(len(value))
-        center[:2] = prior.real, prior.imag
-        columns = by_mount[:, free]
-        inverse = np.real(columns.conj().T @ columns) - by_rest[:, free].T @ solve(by_rest[:, free])
-        inverse += np.diag(1 / variances[free])
-        pull = np.real(columns.conj().T @ missed) + (value - center)[free] / variances[free]
-        covariance = np.zeros((len(value), len(value)))
-        covariance[np.ix_(free, free)] = np.linalg.inv(inverse)
-        value[free] -= covariance[np.ix_(free, free)] @ pull
-        lever, yaw = complex(value[0], value[1]), tuple(value[2:].tolist())
-        return replace(self, lever=lever, yaw=yaw, covariance=covariance)
+        center, tight = self.given or 0j, self.given is not None
+        moved = self.lever - center
+        value = np.array([moved.real, moved.imag, *mount.yaw])
+        free = np.flatnonzero(np.arange(len(value)) != 2)
+        columns, value = by_mount[:, free], value[free]
+        shown = np.real(columns.conj().T @ columns) - by_rest[:, free].T @ solve(by_rest[:, free])
+        pull = shown @ value - np.real(columns.conj().T @ missed)
+        means, spreads, evidence = [], [], []
+        for std in (GIVEN_STD_M, CAMERA_STD_M):
+            prior = mount._variances(std)[free]
+            spread = np.linalg.inv(shown + np.diag(1 / prior))
+            size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
+            means.append(spread @ pull)
+            spreads.append(spread)
+            evidence.append((size + pull @ means[-1]) / 2)
+        learned = center + complex(*means[1][:2]), float(np.sqrt(spreads[1].diagonal()[:2].mean()))
+        share = np.array([1.0, 0.0]) if tight else special.softmax(evidence)
+        mean = share @ np.array(means)
+        covariance = np.zeros((len(value) + 1, len(value) + 1))
+        covariance[np.ix_(free, free)] = sum(
+            part * (spread + np.outer(one - mean, one - mean))
+            for part, spread, one in zip(share, spreads, means, strict=True)
+        )
+        lever, yaw = center + complex(mean[0], mean[1]), (0.0, *mean[2:].tolist())
+        return replace(self, lever=lever, yaw=yaw, covariance=covariance, learned=learned)
+
+    @property
+    def contradiction(self) -> str:
+        """How the closures contradict a measured place, in words; '' where they do not."""
+        if self.given is None or self.learned is None:
+            return ''
+        (lever, std), given = self.learned, self.given
+        if abs(lever - given) < CONTRADICTS * math.hypot(std, GIVEN_STD_M):
+            return ''
+        return (
+            f'the camera is said to sit {given.real:.2f} m ahead and {given.imag:.2f} m left of '
+            f'base_link, the images show {lever.real:.2f} and {lever.imag:.2f} m (+- {std:.2f}): '
+            'check camera_xy, or /tf_static'
+        )
 
     def differs(self, other: Mount, least_m: float) -> bool:
         """Whether another one is so far off, or turned by as much of a meter away."""
@@ -108,6 +140,8 @@ class Mount:
         """Of `Rig`: where the camera sits, and how it looks on average of the drives."""
         ahead, left = np.sqrt(np.diag(self.known)[:2]).tolist()
         spread = float(np.std(self.yaw, ddof=1)) if len(self.yaw) > 1 else 0.0
+        # A filter takes an angle that stays for noise that does not.
+        spread = spread if max(map(abs, self.yaw)) < MOUNTED_ANEW_RAD else UNKNOWN_YAW_STD
         return {
             'camera_ahead': Quantity(self.lever.real, ahead),
             'camera_left': Quantity(self.lever.imag, left),
