@@ -8,7 +8,6 @@ drive and applied unchanged to the drive that is judged; the error is the Euclid
 
 from __future__ import annotations
 
-import json
 import math
 import tempfile
 from collections import Counter
@@ -26,7 +25,6 @@ from sfa_localization.bags.reader import Bag
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.files import atomic_write
 from sfa_localization.data.geometry import (
     Array,
     RigidTransform,
@@ -44,6 +42,7 @@ from sfa_localization.fusion.inputs import OpenLoop
 from sfa_localization.fusion.motion import State
 from sfa_localization.fusion.odometry import COAST_S
 from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.fusion.replay import Track
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -79,22 +78,6 @@ class Evaluation:
 
 
 @dataclass(frozen=True, slots=True)
-class _Track:
-    """Estimates in the map: `poses` with their `covariances` (N, 3, 3)."""
-
-    poses: Trajectory
-    covariances: Array
-
-    @classmethod
-    def of(cls, states: Sequence[State]) -> _Track:
-        """The estimates of the filter."""
-        stamps = np.array([state.stamp_ns for state in states], np.int64)
-        poses = np.reshape([state.pose for state in states], (-1, 3))
-        covariances = np.reshape([state.pose_covariance for state in states], (-1, 3, 3))
-        return cls(Trajectory(stamps, poses), covariances)
-
-
-@dataclass(frozen=True, slots=True)
 class _Drive:
     """What model and filter make of a drive.
 
@@ -105,7 +88,7 @@ class _Drive:
 
     run: Run
     truth: Trajectory
-    tracks: dict[str, _Track]
+    tracks: dict[str, Track]
     features: Array
     sure: NDArray[np.bool_]
     counts: dict[str, Any]
@@ -144,7 +127,8 @@ def evaluate(
     bags = ', '.join(map(str, align_bags or [bag]))
     aligned_on = 'nothing: the transform was given' if transform else bags
     transform = transform or fit_transform(*((one.truth, one.images) for one in trained or [drive]))
-    estimates = _in_truth(drive, transform)
+    estimates = {'odometry': odometry_from_start(drive.truth, drive.run)}
+    estimates |= {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
     return Evaluation(
         drive.truth,
         estimates,
@@ -154,12 +138,6 @@ def evaluate(
         aligned_on,
         transform,
     )
-
-
-def _in_truth(drive: _Drive, transform: RigidTransform) -> dict[str, Trajectory]:
-    """All estimates in the frame of the truth."""
-    own = {name: moved(track.poses, transform) for name, track in drive.tracks.items()}
-    return {'odometry': odometry_from_start(drive.truth, drive.run), **own}
 
 
 def _scores(
@@ -182,8 +160,8 @@ def observed(
     Raises BagError or DataError, also without a wanted truth.
     """
     run = _read(bag, recipe, progress, want_truth)
-    title, images = _title(run), len(run.panoramas)
-    return run, [*progress_over(observer.observe_run(run), title, images, shown=progress)]
+    images, title = observer.observe_run(run), f'locate the images of {run.name}'
+    return run, [*progress_over(images, title, len(run.panoramas), shown=progress)]
 
 
 def _present(path: Path, recipe: Recipe) -> Recipe:
@@ -206,14 +184,10 @@ def _read(bag: Path, recipe: Recipe, progress: bool, truth: bool = True) -> Run:
     return run
 
 
-def _title(run: Run) -> str:
-    return f'locate the images of {run.name}'
-
-
 def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> _Drive:
     """Run model and filter over a bag. Raises BagError or DataError."""
     run = _read(bag, recipe, progress)
-    observations, fused, states = _replayed(localizer, run, progress)
+    observations, moments = _replayed(localizer, run, progress)
     clock = camera_clock(run.odometry, run.panoramas.stamps_ns, headings(run.panoramas))
     usable = [one for one in observations if not one.problem]
     if not usable:
@@ -221,16 +195,25 @@ def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
     skipped = Counter(one.problem for one in observations if one.problem)
     counts: dict[str, Any] = {name: count.as_dict() for name, count in run.counts.items()}
     counts['observations'] = Count(len(usable), dict(skipped)).as_dict()
-    counts |= {'fusion': dict(localizer.filter.counts), 'states_s': states}
+    stamps, levels, states = zip(*moments, strict=True) if moments else ((), (), ())
+    lasted_s = _lasted_s(np.array([run.odometry.stamps_ns[0], *stamps]))[1:]
+    counts['fusion'], counts['states_s'] = (
+        dict(localizer.filter.counts),
+        {
+            level.name: float(lasted_s[np.array(levels) == level].sum())
+            for level in dict.fromkeys(levels)
+        },
+    )
     counts['nis'] = None if math.isnan(localizer.filter.nis) else localizer.filter.nis
     if clock.delay_ns:
         counts['camera_delay_s'] = round(clock.delay_s, 3)
     if OpenLoop.of(run.odometry.twists).found:  # the robot is late, not the images
         clock = CameraClock()
-    tracks = {'sfa': _images(usable, clock), 'ekf': _Track.of([state for state, _ in fused])}
+    located = [(state, level) for level, state in zip(levels, states, strict=True) if state]
+    tracks = {'sfa': _images(usable, clock), 'ekf': Track.of([state for state, _ in located])}
     if isinstance(localizer.filter, Smoother):
-        tracks['smoothed'] = _Track.of(localizer.filter.smoothed())
-    sure = np.array([level is Level.LOCALISED for _, level in fused], bool)
+        tracks['smoothed'] = Track.of(localizer.filter.smoothed())
+    sure = np.array([level is Level.LOCALISED for _, level in located], bool)
     assert run.ground_truth is not None
     features = np.array([one.slow_features for one in usable])
     return _Drive(run, run.ground_truth, tracks, features, sure, counts)
@@ -238,37 +221,35 @@ def _driven(bag: Path, localizer: Localizer, recipe: Recipe, progress: bool) -> 
 
 def _replayed(
     localizer: Localizer, run: Run, progress: bool
-) -> tuple[list[Observation], list[tuple[State, Level]], dict[str, float]]:
-    """Observations of all images, the filter at each odometry message, seconds by state.
-
-    A state lasts for COAST_S at most: in a pause of the recording nobody says anything.
-    """
-    observations: list[Observation] = []
-    fused, states = [], dict[str, float]()
-    before_ns = int(run.odometry.stamps_ns[0])
-    with progress_bar(_title(run), len(run.panoramas), shown=progress) as bar:
+) -> tuple[list[Observation], list[tuple[int, Level, State | None]]]:
+    """Observations of all images; stamp, level and estimate at each odometry message."""
+    observations, moments = list[Observation](), list[tuple[int, Level, State | None]]()
+    title = f'locate the images of {run.name}'
+    with progress_bar(title, len(run.panoramas), shown=progress) as bar:
         for stamp_ns, observation, state in localizer.replay(run):
-            if observation is not None:
-                observations.append(observation)
-                bar.update()
+            if observation is None:
+                moments.append((stamp_ns, localizer.status.level, state))
                 continue
-            level = localizer.status.level
-            lasted_s = min((stamp_ns - before_ns) * 1e-9, COAST_S)
-            states[level.name] = states.get(level.name, 0.0) + lasted_s
-            before_ns = stamp_ns
-            if state is not None:
-                fused.append((state, level))
-    return observations, fused, states
+            observations.append(observation)
+            bar.update()
+    return observations, moments
 
 
-def _images(usable: list[Observation], clock: CameraClock) -> _Track:
+def _lasted_s(stamps_ns: Stamps) -> Array:
+    """Seconds (N,) until each stamp from the one before, at most COAST_S: in a pause of the
+    recording nobody says anything.
+    """
+    return np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, COAST_S)
+
+
+def _images(usable: list[Observation], clock: CameraClock) -> Track:
     """The usable images in the map.
 
     The map is judged where images were taken, by `clock`; the filter has to find out by itself.
     """
     stamps = np.array([one.stamp_ns for one in usable], np.int64) - clock.delay_ns
     poses = np.array([[*one.position, one.yaw] for one in usable])
-    return _Track(Trajectory(stamps, poses), np.array([one.covariance for one in usable]))
+    return Track(Trajectory(stamps, poses), np.array([one.covariance for one in usable]))
 
 
 def known(truth: Trajectory, stamps_ns: Stamps) -> Any:
@@ -356,8 +337,7 @@ def _false_localised_s(drive: _Drive, ekf: Trajectory) -> float:
     stamps, truth = ekf.stamps_ns, drive.truth
     apart = np.hypot(*(ekf.poses - truth.at(stamps))[:, :2].T)
     wrong = drive.sure & known(truth, stamps) & (apart > WRONG_M)
-    lasted_s = np.minimum(np.diff(stamps, prepend=stamps[:1]) * 1e-9, COAST_S)
-    return float(lasted_s[wrong].sum())
+    return float(_lasted_s(stamps)[wrong].sum())
 
 
 def moved(estimate: Trajectory, transform: RigidTransform) -> Trajectory:
@@ -406,10 +386,3 @@ def _summary(values: Array) -> dict[str, float]:
         'median': float(np.median(values)),
         'p95': float(np.percentile(values, 95)),
     }
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON, at once or not at all. Raises LocalizationError."""
-    text = json.dumps(content, indent=2) + '\n'
-    with atomic_write(path) as file:
-        file.write(text.encode())

@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from decimal import Decimal
-from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,14 +16,14 @@ import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.progress import progress_over
 from sfa_localization.data.rejections import short_line
-from sfa_localization.data.run import Stamps
+from sfa_localization.data.run import Odometry, Stamps
 from sfa_localization.fusion.inputs import POSITION_STD
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
+from sfa_localization.fusion.replay import Track, replay
 from sfa_localization.fusion.settings import FilterConfig
 
 SECOND_NS = 1_000_000_000
@@ -128,41 +127,49 @@ def run_filter(
     # Logs may count from zero, but to the filter zero means no stamp.
     shift = max(0, SECOND_NS - min(a, c))
     fused, twists = PoseFilter(config, ErrorCorrelation(share=0.0)), np.nan_to_num(odometry.values)
-    states, updates = list[State](), list[Update]()
-    events = merge_by_stamp(odometry.stamps_ns + shift, positions.stamps_ns + shift)
+    no_poses = np.full((len(twists), 3), np.nan)
+    driven = Odometry(odometry.stamps_ns + shift, no_poses, twists[:, :2], twists[:, 2:])
+    rows = positions.stamps_ns + shift, map(_Position.of, positions.values)
+    steps = replay(fused, driven, *rows)
     total = len(twists) + len(positions.values)
-    shown = progress_over(events, 'filter', total, 'rows', shown=progress)
-    for stamp_ns, simultaneous in groupby(shown, key=lambda event: event[0]):
-        moved = False
-        for _, kind, i in simultaneous:
-            if kind == IMAGE:
-                updates.append(fused.add_measurement(stamp_ns, *_measurement(positions.values[i])))
-            else:
-                v, omega, *variances = twists[i].tolist()
-                moved |= not fused.add_odometry(stamp_ns, v, omega, variances)
-        if moved and (state := fused.at(stamp_ns)):
-            states.append(state)
+    moved_ns, states, updates = None, dict[int, State](), list[Update]()
+    for stamp_ns, _, update in progress_over(steps, 'filter', total, 'rows', shown=progress):
+        if update is not None:
+            updates.append(update)
+        else:
+            moved_ns = stamp_ns
+        if stamp_ns == moved_ns and (state := fused.at(stamp_ns)):
+            states[stamp_ns] = state
+    track = Track.of([*states.values()])
     return Filtered(
-        np.array([state.stamp_ns - shift for state in states], np.int64),
-        np.reshape([state.pose for state in states], (-1, 3)),
-        np.reshape([state.pose_covariance for state in states], (-1, 3, 3)),
+        track.poses.stamps_ns - shift,
+        track.poses.poses,
+        track.covariances,
         tuple(update._replace(stamp_ns=update.stamp_ns - shift) for update in updates),
         fused.counts,
         fused.status,
     )
 
 
-def _measurement(row: Array) -> tuple[Array, Array]:
-    """Position or pose, and its covariance, of a row (7,); an empty or zero variance is unknown."""
-    x, y, var_x, var_y, xy, yaw, var_yaw = np.nan_to_num(row).tolist()
-    known = bool(var_x or var_y)
-    covariance = np.array([[var_x or var_y, xy], [xy, var_y or var_x]]) * known
-    if not (var_yaw > 0 and math.isfinite(row[5])):
-        return np.array([x, y]), covariance
-    full = np.diag([POSITION_STD**2, POSITION_STD**2, var_yaw])
-    if known:
-        full[:2, :2] = covariance
-    return np.array([x, y, yaw]), full
+class _Position(NamedTuple):
+    """A position (2,) or pose (3,) with its covariance; it shows no turns."""
+
+    pose: Array
+    covariance: Array
+    turned: float = math.nan
+
+    @classmethod
+    def of(cls, row: Array) -> _Position:
+        """From a row (7,); an empty or zero variance is unknown."""
+        x, y, var_x, var_y, xy, yaw, var_yaw = np.nan_to_num(row).tolist()
+        known = bool(var_x or var_y)
+        covariance = np.array([[var_x or var_y, xy], [xy, var_y or var_x]]) * known
+        if not (var_yaw > 0 and math.isfinite(row[5])):
+            return cls(np.array([x, y]), covariance)
+        full = np.diag([POSITION_STD**2, POSITION_STD**2, var_yaw])
+        if known:
+            full[:2, :2] = covariance
+        return cls(np.array([x, y, yaw]), full)
 
 
 def write(filtered: Filtered, path: Path, beside: Path) -> None:

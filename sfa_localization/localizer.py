@@ -20,7 +20,6 @@ from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.camera.turns import VisualGyro
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
-from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
@@ -29,6 +28,7 @@ from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, distance
 from sfa_localization.features.observation import Observation as Observation
 from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
+from sfa_localization.fusion.replay import replay
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.place_model import PlaceModel, View, require_panorama
 
@@ -132,6 +132,15 @@ def unusable_covariance() -> Array:
     return np.diag([UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_YAW_VARIANCE])
 
 
+def filter_of(
+    model: PlaceModel, config: FilterConfig | None = None, kind: type[PoseFilter] = PoseFilter
+) -> PoseFilter:
+    """A filter that begins with what the training of a model found of the robot."""
+    fused = kind(config, model.error_correlation)
+    fused.expect(model.rig)
+    return fused
+
+
 class Localizer:
     """Online localization: feed it odometry and panoramas as they come, in any order.
 
@@ -149,8 +158,7 @@ class Localizer:
         kind: type[PoseFilter] = PoseFilter,
     ) -> None:
         self.observer = Observer(model, watch)
-        self.filter = kind(config, model.error_correlation)
-        self.filter.expect(model.rig)
+        self.filter = filter_of(model, config, kind)
 
     def add_odometry(
         self,
@@ -195,16 +203,9 @@ class Localizer:
     def replay(self, run: Run) -> Iterator[tuple[int, Observation | None, State | None]]:
         """Feed a recorded run in the order of its stamps: (stamp, observation, state at it).
 
-        The observation is None at odometry messages. The state is what the nodes would have
-        published then: later messages have no part in it.
+        The observation is None at the odometry messages that were used. The state is what the nodes
+        would have published then.
         """
-        odometry, observations = run.odometry, self.observer.observe_run(run)
-        for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, run.panoramas.stamps_ns):
-            if kind == ODOMETRY:
-                v, omega = odometry.twists[i].tolist()
-                noise, pose = odometry.variances[i], odometry.poses[i].tolist()
-                yield stamp_ns, None, self.add_odometry(stamp_ns, v, omega, noise, pose)
-                continue
-            observation = next(observations)
-            self.add_observation(observation)
+        images = run.panoramas.stamps_ns, self.observer.observe_run(run)
+        for stamp_ns, observation, _ in replay(self.filter, run.odometry, *images):
             yield stamp_ns, observation, self.filter.at(stamp_ns)

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +20,16 @@ from scipy.optimize import minimize
 
 from sfa_localization.bags.drives import as_live
 from sfa_localization.camera.settings import WatchConfig
-from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, align
 from sfa_localization.data.progress import progress_bar, progress_over
-from sfa_localization.data.run import Odometry, Stamps, Trajectory
+from sfa_localization.data.run import Odometry, Trajectory
+from sfa_localization.data.statistics import surprise
 from sfa_localization.evaluation import observed
-from sfa_localization.fusion.pose_filter import PoseFilter, Update
+from sfa_localization.fusion.pose_filter import PoseFilter, State, Update
+from sfa_localization.fusion.replay import replay
 from sfa_localization.fusion.settings import FilterConfig
-from sfa_localization.localizer import Observer
+from sfa_localization.localizer import Observation, Observer, filter_of
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.training import Recipe
 
@@ -43,35 +44,27 @@ TRIALS = 120
 _LEAST = 1e-9  # stands for a parameter of zero, which has no logarithm
 _FIRST_STEP = 0.7  # of each logarithm: a factor of two
 _PULL = 1e-3  # cost per squared logarithm: holds what the data do not determine at the start
-_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
 
 
 @dataclass(frozen=True, slots=True)
 class TuningDrive:
-    """One drive: odometry, and stamps (N,), poses (N, 3), covariances (N, 3, 3) of usable images.
+    """One drive: odometry, and what the model makes of all images, the unusable ones too.
 
-    `truth` is for the grid search only; `correlation` and the odometry's `scale` are the model's.
+    `truth` is for the grid search only; `filter_for` makes the filter that begins with what the
+    training found of the robot.
     """
 
     odometry: Odometry
-    stamps_ns: Stamps
-    poses: Array
-    covariances: Array
+    observations: Sequence[Observation]
     truth: Trajectory | None = None
-    correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
-    scale: float = 1.0
+    filter_for: Callable[[FilterConfig], PoseFilter] = PoseFilter
 
-    def fuse(self, fused: PoseFilter) -> Iterator[Update]:
-        """Feed the drive in the order of time; yields an update for each image."""
-        odometry = self.odometry
-        fused.expect_scale(self.scale)
-        for stamp_ns, kind, i in merge_by_stamp(odometry.stamps_ns, self.stamps_ns):
-            if kind == ODOMETRY:
-                v, omega = odometry.twists[i]
-                pose = odometry.poses[i].tolist()
-                fused.add_odometry(stamp_ns, v, omega, odometry.variances[i], pose)
-            else:
-                yield fused.add_measurement(stamp_ns, self.poses[i], self.covariances[i])
+    def fuse(self, fused: PoseFilter) -> Iterator[tuple[Observation, Update, State | None]]:
+        """Feed a filter; yields what it made of each usable image, and its state there."""
+        stamps = np.array([image.stamp_ns for image in self.observations])
+        for stamp_ns, image, update in replay(fused, self.odometry, stamps, self.observations):
+            if image is not None and update is not None and not image.problem:
+                yield image, update, fused.at(stamp_ns)
 
 
 def read_drive(
@@ -80,22 +73,12 @@ def read_drive(
     """A bag's odometry, and the poses of its images by the model. Raises BagError, DataError."""
     live = as_live(recipe, model.panorama)
     run, observations = observed(bag, Observer(model, watch), live, True, want_truth)
-    usable = [one for one in observations if not one.problem]
-    if len(usable) < MIN_IMAGES:
-        raise DataError(
-            f'{bag}: {len(usable)} images are too few to tune on: {MIN_IMAGES} at least'
-        )
+    usable = sum(not one.problem for one in observations)
+    if usable < MIN_IMAGES:
+        raise DataError(f'{bag}: {usable} images are too few to tune on: {MIN_IMAGES} at least')
     if want_truth and run.ground_truth is None:
         raise DataError(f'{bag}: the grid search needs ground truth; use the likelihood')
-    return TuningDrive(
-        run.odometry,
-        np.array([one.stamp_ns for one in usable], np.int64),
-        np.array([one.pose for one in usable]),
-        np.array([one.covariance for one in usable]),
-        run.ground_truth,
-        model.error_correlation,
-        model.rig.wheel_scale.value,
-    )
+    return TuningDrive(run.odometry, observations, run.ground_truth, partial(filter_of, model))
 
 
 def tune_by_likelihood(drives: Sequence[TuningDrive], config: FilterConfig) -> FilterConfig:
@@ -138,12 +121,11 @@ def likelihood_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> floa
     Its tails let the gate's outliers count without ruling; under a Gaussian cut at the gate the
     best filter would be one that rejects everything.
     """
-    fused = [(drive, PoseFilter(config, drive.correlation)) for drive in drives]
-    updates = [update for drive, pose_filter in fused for update in drive.fuse(pose_filter)]
+    fused = [(drive, drive.filter_for(config)) for drive in drives]
+    updates = [update for drive, of_drive in fused for _, update, _ in drive.fuse(of_drive)]
     innovations = [(one.d2, one.covariance) for one in updates if one.covariance is not None]
     total = sum(
-        np.linalg.slogdet(spread)[1] / 2 + (_TAIL + len(spread)) / 2 * math.log1p(d2 / _TAIL)
-        for d2, spread in innovations
+        np.linalg.slogdet(spread)[1] / 2 + surprise(d2, len(spread)) for d2, spread in innovations
     )
     count = sum(len(spread) for _, spread in innovations)
     return float(total / count) if count else math.inf
@@ -151,13 +133,16 @@ def likelihood_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> floa
 
 def error_cost(drives: Sequence[TuningDrive], config: FilterConfig) -> float:
     """Mean position error, m, after rigid alignment of the poses from images alone (paper)."""
-    errors = []
+    errors = [np.zeros(0)]
     for drive in drives:
         assert drive.truth is not None
-        fused, true = PoseFilter(config, drive.correlation), drive.truth.at(drive.stamps_ns)[:, :2]
-        to_truth = align(drive.poses[:, :2], true)
-        for update, position in zip(drive.fuse(fused), true, strict=True):
-            if (state := fused.at(update.stamp_ns)) is not None:
-                estimate = to_truth.apply(state.pose[None, :2])[0]
-                errors.append(math.hypot(*(estimate - position)))
-    return float(np.mean(errors)) if errors else math.inf
+        fused = drive.filter_for(config)
+        images, _, states = zip(*drive.fuse(fused), strict=True)
+        stamps = np.array([image.stamp_ns for image in images])
+        taken = drive.truth.at(stamps - fused.camera_clock.delay_ns)[:, :2]
+        to_truth = align(np.array([image.position for image in images]), taken)
+        believed = np.array([np.full(3, np.nan) if one is None else one.pose for one in states])
+        apart = to_truth.apply(believed[:, :2]) - drive.truth.at(stamps)[:, :2]
+        errors.append(np.hypot(*apart[np.isfinite(apart[:, 0])].T))
+    every = np.concatenate(errors)
+    return float(every.mean()) if len(every) else math.inf

@@ -26,11 +26,12 @@ from sfa_localization.camera.turns import headings
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.progress import progress_bar
-from sfa_localization.data.run import Panoramas, Run, Trajectory
+from sfa_localization.data.run import Panoramas, Run
 from sfa_localization.data.threads import one_core
 from sfa_localization.features.image_features import evenly
 from sfa_localization.features.keyframes import Keyframes, encoded, parts_of, quantized, texture
 from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.fusion.replay import Track
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
@@ -165,14 +166,12 @@ def familiar_score(model: PlaceModel) -> float:
 
 def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, NDArray[np.bool_]]:
     """Smoothed poses (N, 3) where the images were taken, and which of them are certain (N,)."""
-    states = smoother.smoothed()
+    smoothed = Track.of(smoother.smoothed())
+    track, spreads, at = smoothed.poses, smoothed.covariances, smoothed.poses.stamps_ns
     stamps = run.panoramas.stamps_ns
     clock = camera_clock(run.odometry, stamps, headings(run.panoramas))
     delay_ns = clock.delay_ns if clock.known else round(model.rig.camera_delay.value * 1e9)
     taken = stamps - delay_ns
-    at = np.array([state.stamp_ns for state in states], np.int64)
-    track = Trajectory(at, np.reshape([state.pose for state in states], (-1, 3)))
-    spreads = np.reshape([state.pose_covariance for state in states], (-1, 3, 3))
     place_std = np.sqrt(np.linalg.eigvalsh(spreads[:, :2, :2])[:, 1])
     sharp = (place_std <= CERTAIN_M) & (spreads[:, 2, 2] <= CERTAIN_RAD**2)
     after = np.clip(np.searchsorted(at, taken), 0, len(at) - 1)

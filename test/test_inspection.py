@@ -148,7 +148,7 @@ def test_only_places_that_are_seen_again_in_other_headings_show_where_the_camera
     assert headings_differ(np.concatenate([loop[:200], back]))
     turning = np.column_stack([np.zeros((200, 2)), angle[:200]])
     assert not headings_differ(turning)
-    assert headings_differ(np.concatenate([loop[:200], turning + [4.0, 0.0, 0.0]]))
+    assert headings_differ(np.concatenate([loop[:200], turning + np.array([4.0, 0.0, 0.0])]))
 
 
 def test_a_missing_topic_is_reported_not_raised(tmp_path):

@@ -27,7 +27,7 @@ from sfa_localization.metric import map_fit, paper_solver, selection
 from sfa_localization.metric.basis import expand, missing, monomials
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.map_fit import MetricProblem
-from sfa_localization.metric.paper_solver import Lines, Parameters, odometry_start
+from sfa_localization.metric.paper_solver import Lines, mirrored, odometry_start
 from sfa_localization.metric.phases import Certificate
 from sfa_localization.metric.segments import assignment, cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -326,8 +326,7 @@ def test_the_papers_cosine_cannot_tell_a_mirror_image_but_the_signs_can():
     regressors = monomials(exact_features(run.poses)[stack.images])
     lines = Lines(regressors, stack.path.real, stack.owner, turns)
     theta = odometry_start(lines, stack.starts)
-    mirror = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
-    assert lines.cost(mirror) == pytest.approx(lines.cost(theta), rel=1e-9)
+    assert lines.cost(mirrored(lines, theta)) == pytest.approx(lines.cost(theta), rel=1e-9)
     # Odometry that starts mirrored would lead the descent there; learn_metric() turns it back.
     flipped = dataclasses.replace(
         segments,

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tuning: the likelihood finds the noise that is there, the grid the least error."""
 
-import dataclasses
+import math
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from filter_drives import Drive
 from sfa_localization import tuning
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.run import Odometry, Trajectory
+from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.localizer import Observation, unusable_covariance
 from sfa_localization.tuning import TuningDrive
 
 
@@ -21,12 +25,16 @@ def tuning_drive(claimed=0.2, true=0.2, truth=True):
                   position_std=true, yaw_std=0.05, share=0.7)  # fmt: skip
     variances = np.tile([4e-4, 1e-4], (len(drive.stamps_ns), 1))
     spread = np.diag([claimed**2, claimed**2, 0.05**2])
+    images = [
+        Observation(pose, spread, np.zeros(1), stamp_ns=stamp_ns, turned=yaw_rad)
+        for stamp_ns, pose, yaw_rad in zip(
+            drive.stamps_ns[drive.pictures].tolist(), drive.seen, drive.poses[drive.pictures, 2],
+            strict=True,
+        )
+    ]  # fmt: skip
+    odometry = Odometry(drive.stamps_ns, drive.poses, drive.read, variances)
     return TuningDrive(
-        Odometry(drive.stamps_ns, drive.poses, drive.read, variances),
-        drive.stamps_ns[drive.pictures],
-        drive.seen,
-        np.tile(spread, (len(drive.pictures), 1, 1)),
-        Trajectory(drive.stamps_ns, drive.poses) if truth else None,
+        odometry, images, Trajectory(drive.stamps_ns, drive.poses) if truth else None
     )
 
 
@@ -64,10 +72,41 @@ def test_the_error_is_measured_after_alignment_and_the_models_error_correlation_
     """Errors that neighbors share are no surprise to a filter that expects them."""
     plain, config = tuning_drive(), FilterConfig()
     there = Trajectory(plain.truth.stamps_ns, plain.truth.poses + np.array([100.0, -50.0, 0.0]))
-    moved = tuning.error_cost([dataclasses.replace(plain, truth=there)], config)
+    moved = tuning.error_cost([replace(plain, truth=there)], config)
     assert moved == pytest.approx(tuning.error_cost([plain], config))
     white, shared = (
-        tuning.likelihood_cost([dataclasses.replace(plain, correlation=one)], config)
+        tuning.likelihood_cost(
+            [replace(plain, filter_for=partial(PoseFilter, correlation=one))], config
+        )
         for one in (ErrorCorrelation(0.0, 1.0), ErrorCorrelation(0.7, 0.6))
     )
     assert shared < white
+
+
+def test_images_that_are_stamped_late_are_no_noise_and_unusable_ones_do_not_count():
+    """Training and turns of the images show the delay in a trial as they do live."""
+    plain, config = tuning_drive(claimed=0.05, true=0.02), FilterConfig()
+    late = [replace(one, stamp_ns=one.stamp_ns + 300_000_000) for one in plain.observations]
+    by_turns = replace(plain, observations=late)
+    unturned = replace(plain, observations=[replace(one, turned=math.nan) for one in late])
+    by_training = replace(unturned, filter_for=late_filter)
+    drives = plain, by_training, by_turns, unturned
+    costs = [tuning.likelihood_cost([one], config) for one in drives]
+    errors = [tuning.error_cost([one], config) for one in drives]
+    assert costs == sorted(costs) and costs[3] > costs[2] + 0.05 and costs[2] > costs[1] + 0.05
+    assert errors[1] < 0.02 and errors[2] < 0.8 * errors[3] and errors[3] > 0.1
+    dark = [
+        replace(one, problem='dark', covariance=unusable_covariance(), stamp_ns=one.stamp_ns + 1)
+        for one in plain.observations
+    ]
+    images = sorted([*plain.observations, *dark], key=lambda one: one.stamp_ns)
+    with_dark = replace(plain, observations=images)
+    for cost in (tuning.likelihood_cost, tuning.error_cost):
+        assert cost([with_dark], config) == pytest.approx(cost([plain], config))
+
+
+def late_filter(config):
+    """A filter whose model was trained with a camera that is 0.3 s late."""
+    fused = PoseFilter(config)
+    fused.expect_delay(0.3)
+    return fused

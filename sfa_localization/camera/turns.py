@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import BATCH, Image, Panoramas
+from sfa_localization.data.statistics import parabola_peak
 
 Texture = NDArray[np.float32]
 
@@ -116,11 +117,11 @@ def _shift(before: Texture, after: Texture) -> _Shift:
     product = np.conj(np.fft.rfft(before, axis=1)) * np.fft.rfft(after, axis=1)
     score = np.fft.irfft(product.sum(0), width)
     top = int(np.argmax(score))
-    left, middle, right = map(float, (score[top - 1], score[top], score[(top + 1) % width]))
-    bend = left - 2 * middle + right
-    columns = top + (0.5 * (left - right) / bend if bend < 0 else 0.0)
+    left, middle, right = score[[top - 1, top, (top + 1) % width]].astype(float)
+    columns = top + float(parabola_peak(left, middle, right))
     spread, powers = float(score.std()), float((before * before).sum() + (after * after).sum())
-    return _Shift(columns, middle / spread if spread > 0 else 0.0, powers - 2 * middle)
+    top_score = float(middle)
+    return _Shift(columns, top_score / spread if spread > 0 else 0.0, powers - 2 * top_score)
 
 
 def turns_and_textures(

@@ -108,7 +108,7 @@ def _write_results(out: Path, result: Evaluation, trained: Trained) -> None:
     import numpy as np
 
     from sfa_localization.bags.reader import Bag
-    from sfa_localization.evaluation import write_json
+    from sfa_localization.data.files import write_json
     from sfa_localization.reports.evaluation import write_report
 
     write_json(out / 'results.json', result.as_dict())

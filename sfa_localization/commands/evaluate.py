@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands import options
+from sfa_localization.data.files import write_json
 from sfa_localization.data.geometry import RigidTransform
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -82,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         _write_report(arguments, result)
     if arguments.json:
-        evaluation.write_json(arguments.json, result.as_dict())
+        write_json(arguments.json, result.as_dict())
     return 0
 
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from sfa_localization.bags.settings import TopicNames
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import BagError
-from sfa_localization.data.files import atomic_write
+from sfa_localization.data.files import write_json
 from sfa_localization.inspection import BagReport, InspectionConfig, inspect
 
 WRITES = """\
@@ -60,20 +59,13 @@ def run(arguments: argparse.Namespace) -> int:
         except BagError as error:
             reports.append(BagReport(str(path), error=str(error)))
     if arguments.json:
-        write_json(arguments.json, reports)
+        write_json(arguments.json, {'bags': [report.as_dict() for report in reports]})
     if arguments.report:
         _write_report(arguments.report, reports)
     for report in reports:
         print(report.as_text(), file=sys.stderr if report.error else sys.stdout)
     unreadable = [one for one in reports if one.error or any(t.unreadable for t in one.topics)]
     return 1 if unreadable else 0
-
-
-def write_json(path: Path, reports: Sequence[BagReport]) -> None:
-    """Write all reports to one file. Raises BagError when that is not possible."""
-    text = json.dumps({'bags': [report.as_dict() for report in reports]}, indent=2)
-    with atomic_write(path, BagError) as file:
-        file.write(f'{text}\n'.encode())
 
 
 def _write_report(folder: Path, reports: Sequence[BagReport]) -> None:

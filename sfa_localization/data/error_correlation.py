@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.statistics import LENGTH_TO_STD
 
 LEAST_M = 0.01
 """Images nearer to each other than this show one place: no errors change over less."""
@@ -31,8 +32,6 @@ _ENOUGH_PAIRS = 200
 """With fewer pairs the estimate scatters more than the default is wrong."""
 _OUTLYING = 3.0
 """Errors are limited to this many typical ones."""
-_MEDIAN_OF_RAYLEIGH = 1.1774
-"""Median length of a planar vector with unit variance per axis: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +76,7 @@ def _standardized(errors: Array, variances: Array) -> Array:
     """Errors (M, 2) over their standard deviations, outliers limited, scaled to unit variance."""
     ratio = errors / np.sqrt(variances)[:, None]
     size = np.hypot(*ratio.T)
-    limit = _OUTLYING * float(np.median(size)) / _MEDIAN_OF_RAYLEIGH
+    limit = _OUTLYING * LENGTH_TO_STD * float(np.median(size))
     ratio = ratio * np.minimum(1.0, limit / np.maximum(size, 1e-12))[:, None]
     return np.asarray(ratio / max(math.sqrt(float(np.mean(ratio**2))), 1e-12))
 

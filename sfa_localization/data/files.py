@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from sfa_localization.data.errors import LocalizationError
 
@@ -92,6 +93,12 @@ def atomic_write(
     finally:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON, at once or not at all. Raises LocalizationError."""
+    with atomic_write(path) as file:
+        file.write(f'{json.dumps(content, indent=2)}\n'.encode())
 
 
 def replaced_mode(path: Path) -> int:

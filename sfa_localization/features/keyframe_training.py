@@ -15,15 +15,11 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.sphere import Sphere
+from sfa_localization.data.statistics import LENGTH_TO_STD, MEDIAN_TO_STD, quantile, surprise
 from sfa_localization.features.image_features import evenly
 from sfa_localization.features.keyframes import NEIGHBORS, Keyframes
 from sfa_localization.features.observation import LOWEST, Match, MatchNoise
-from sfa_localization.features.rotation_spread import (
-    LENGTH_TO_STD,
-    MEDIAN_TO_STD,
-    needed_factor,
-    quantile,
-)
+from sfa_localization.features.rotation_spread import needed_factor
 
 Correlations = tuple[int, NDArray[np.float32], NDArray[np.float32]]
 
@@ -40,7 +36,6 @@ _LOWEST_SHARE = 0.5
 _TEMPERATURES = np.geomspace(0.003, 0.1, 12)
 _FLOORS_M = np.geomspace(0.01, 1.0, 15)
 _SLOPES_M = np.geomspace(0.03, 3.0, 13)
-_HEAVY_TAIL = 4.0  # degrees of freedom of Student's distribution: moderate tails
 _USUAL_SHARE = 0.05
 # Images between keyframes on both sides are more alike than most that are left out.
 _ALIKE_SHARE = 0.25
@@ -240,8 +235,7 @@ def _likeliest(trials: Sequence[_Trial]) -> tuple[MatchNoise, Array]:
     for temperature, scatter in reversed([*zip(_TEMPERATURES.tolist(), scatters, strict=True)]):
         for floor, slope in itertools.product(_FLOORS_M.tolist(), _SLOPES_M.tolist()):
             variance = scatter + floor**2 + (slope * unlike) ** 2
-            tails = (_HEAVY_TAIL + 2) / 2 * np.log1p(squared / (variance * _HEAVY_TAIL))
-            surprise = float(np.mean(tails + np.log(variance)))
-            if surprise < best:
-                best, found = surprise, (MatchNoise(temperature, floor, slope), variance)
+            cost = float(np.mean(surprise(squared / variance, 2) + np.log(variance)))
+            if cost < best:
+                best, found = cost, (MatchNoise(temperature, floor, slope), variance)
     return found

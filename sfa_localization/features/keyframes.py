@@ -28,6 +28,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
 from sfa_localization.data.sphere import Sphere
+from sfa_localization.data.statistics import parabola_peak
 from sfa_localization.features.local_regression import Neighbors, averaged, columns_of, turned
 from sfa_localization.features.observation import Leveled, Match, MatchNoise, Spectra, unlikeness
 from sfa_localization.features.tilt import derivatives, find_tilt, visible
@@ -150,8 +151,7 @@ def _peaks(products: Spectra, columns: int) -> Scores:
     top = curves.argmax(0)
     around = (top + np.arange(-1, 2)[:, None, None]) % len(curves)
     left, middle, right = np.take_along_axis(curves, around, 0)
-    bend = np.minimum(left - 2 * middle + right, -1e-9)
-    part = 0.5 * (left - right) / bend
+    part = parabola_peak(left, middle, right)
     return (2 * middle - (left - right) * part / 2).T, np.asarray((top + part) / 2, np.float32).T
 
 

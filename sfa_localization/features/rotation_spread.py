@@ -17,15 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.statistics import quantile, surprise
 from sfa_localization.features.rotation import Map
 
-MEDIAN_TO_STD = 1.4826
-"""Standard deviation of a normal variable over the median of its absolute value."""
-LENGTH_TO_STD = float(1.0 / np.sqrt(2.0 * np.log(2.0)))
-"""The same of a vector in the plane: along each axis, over the median of its length."""
 _EXPONENTS = np.linspace(0.0, 6.0, 25)
-# Degrees of freedom of Student's t, for the few images with large errors.
-_HEAVY_TAIL = 4.0
 # Of the relative disagreement: beyond these the left-out images are too few to learn from.
 _LIMITS = (0.2, 30.0)
 # Shares of the left-out errors that must lie within the regions of that probability.
@@ -92,7 +87,7 @@ def _surprise(squared_error: Array, variance: Array, axes: int, weight: Array | 
     """Mean negative log-likelihood of heavy-tailed errors at their best common scale."""
     ratio = squared_error / variance
     scale = quantile(ratio, 0.5, weight) / chi_square(0.5, axes) + 1e-300
-    tails = (_HEAVY_TAIL + axes) / 2 * np.log1p(ratio / (scale * _HEAVY_TAIL))
+    tails = surprise(ratio / scale, axes)
     return float(np.average(tails + axes / 2 * np.log(variance * scale), weights=weight))
 
 
@@ -119,15 +114,3 @@ def chi_square(share: float, axes: int) -> float:
     from scipy.special import gammaincinv  # for training alone
 
     return float(2 * gammaincinv(axes / 2, share))
-
-
-def quantile(values: Array, share: float, weight: Array | None = None) -> float:
-    """Smallest of the values (M,) that at least this share, by weight (M,), does not exceed.
-
-    Without `weight`, all count alike.
-    """
-    weight = np.ones(len(values)) if weight is None else weight
-    order = np.argsort(values, kind='stable')
-    below = np.cumsum(weight[order])
-    at = int(np.searchsorted(below, share * below[-1]))
-    return float(values[order[min(at, len(values) - 1)]])

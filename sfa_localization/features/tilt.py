@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.sphere import Sphere, rotation
+from sfa_localization.data.statistics import parabola_peak
 from sfa_localization.features.local_regression import columns_of, turned
 from sfa_localization.features.observation import Spectra
 
@@ -148,7 +149,6 @@ def _peaks(scores: Texture, steps: Array) -> Array:
     for at, ahead in ((roll, (1, 0)), (pitch, (0, 1))):
         before = scores[which, roll - ahead[0], pitch - ahead[1]]
         after = scores[which, roll + ahead[0], pitch + ahead[1]]
-        bend = np.minimum(before - 2 * scores[which, roll, pitch] + after, -1e-9)
-        part = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
+        part = parabola_peak(before, scores[which, roll, pitch], after)
         found.append(steps[at] + part * (steps[1] - steps[0]))
     return np.column_stack(found)

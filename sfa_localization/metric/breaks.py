@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, Indices, Mask, relative, wrap_angle
 from sfa_localization.data.odometry_steps import beyond, tolerance
 from sfa_localization.data.run import Odometry, Stamps
+from sfa_localization.data.statistics import MEDIAN_TO_STD
 from sfa_localization.features.closures import LIKE
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import pauses, summed
 
 Textures = tuple[Stamps, NDArray[np.int8]]

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices
-from sfa_localization.features.rotation_spread import quantile
+from sfa_localization.data.statistics import quantile
 from sfa_localization.metric.fitted_map import angle_covariance
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.map_fit import MapFit

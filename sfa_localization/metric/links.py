@@ -22,11 +22,10 @@ import numpy as np
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array, Complex, Indices
+from sfa_localization.data.statistics import outlier_factor
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
 
-# Degrees of freedom of Student's distribution: wheels slip now and then, by far more than usual.
-_TAIL = 4.0
 # Of a run's factor and the doubts of its links in turn: far more than they need.
 _STEPS = 10
 # The variances that are stated or assumed count as so many links that miss by just as much: those
@@ -100,12 +99,6 @@ class Links:
         return replace(self, **shown)
 
 
-def _doubt(ratio: Array, axes: int) -> Array:
-    """What the variance grows by of a link whose squared error along each axis is so many times it:
-    1 on average where it is right."""
-    return np.asarray((_TAIL + axes * ratio) / (_TAIL + axes))
-
-
 def _grown(
     stated: Array, assumed: Array, squares: Array, left: Array, run: Indices, axes: int
 ) -> Array:
@@ -122,7 +115,7 @@ def _grown(
     error, miss = (squares + left) / of, known * squares / of
     factor = np.ones(len(freedom))
     for _ in range(_STEPS):
-        doubt = _doubt(error / factor[run], axes)
+        doubt = outlier_factor(axes * error / factor[run], axes)
         factor = (np.bincount(run, miss / doubt) + _PRIOR_LINKS) / freedom
         factor = np.maximum(factor, 1.0)
-    return np.asarray(stated * factor[run] * _doubt(error / factor[run], axes))
+    return np.asarray(stated * factor[run] * outlier_factor(axes * error / factor[run], axes))

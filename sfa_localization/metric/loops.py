@@ -10,7 +10,7 @@ and is turned by t_k from each; h are the headings in the segments:
 
 Offsets (features/offsets.py) are such mixtures; closures, of which the distance is unknown, tie two
 images with c = 1 where there are none. How well they hold is estimated with the map. A few may be
-wrong: places can look alike. What does not fit loses its weight (Cauchy's), so that the form stays
+wrong: places can look alike. What does not fit loses its weight, so that the form stays
 quadratic and its solution certified.
 """
 
@@ -23,9 +23,9 @@ import numpy as np
 from scipy import sparse
 
 from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.statistics import LENGTH_TO_STD, MEDIAN_TO_STD, outlier_factor
 from sfa_localization.features.closures import Closures
 from sfa_localization.features.offsets import Offsets
-from sfa_localization.features.rotation_spread import LENGTH_TO_STD, MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack
@@ -37,8 +37,6 @@ _LEAST = 0.2
 _SURE_M, _DRIFT = 1.0, 0.1
 """Odometry that errs by more than this, and this part of the distance driven, is of no use: wheels
 that slip err by 5 % of it."""
-# Residual, in standard deviations, at which a closure counts half.
-_HALF = 2.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +104,8 @@ class Loops:
             turn_part = max(MEDIAN_TO_STD * float(np.median(turned)), _LEAST)
             place_part = max(LENGTH_TO_STD * float(np.median(apart)), _LEAST)
             turn_std, place_std = turn_part * turn_std, place_part * place_std
-            doubt += (turned / (_HALF * turn_part)) ** 2 + (apart / (_HALF * place_part)) ** 2 / 2
+            squares = (turned / turn_part) ** 2 + (apart / place_part) ** 2
+            doubt = outlier_factor(squares, 3)  # a turn and both axes of a place
         shares = np.sqrt(np.tile(self.share / doubt, 2))
         return np.asarray(shares / np.concatenate([turn_std, place_std]))
 

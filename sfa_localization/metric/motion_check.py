@@ -21,7 +21,7 @@ from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array, Complex, relative, wrap_angle
 from sfa_localization.data.odometry_steps import JUMP, NOISE
 from sfa_localization.data.run import Odometry, Run, Stamps, YawRate
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, quantile
+from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
 from sfa_localization.metric.breaks import Textures, contradicted, parted
 from sfa_localization.metric.motion_sources import (
     ENOUGH,

@@ -15,7 +15,7 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array, Mask, relative, wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, YawRate
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD, quantile
+from sfa_localization.data.statistics import MEDIAN_TO_STD, parabola_peak, quantile
 from sfa_localization.metric.dead_reckoning import summed
 
 IMAGES, POSE, TWIST, GYRO = 'images', 'odometry pose', 'odometry twist', 'gyroscope'
@@ -258,7 +258,8 @@ def _fitted(what: str, a: str, b: str, x: Array, y: Array) -> Pair | None:
     as_good = _GRID[alike >= alike[best] - chance - 1e-3]
     inside = 0 < best < len(_GRID) - 1
     known = inside and np.ptp(as_good) / 4 < _STD_MAX_S
-    delay_s = float(_GRID[best]) + (_summit(alike[best - 1 : best + 2]) if inside else 0.0)
+    part = float(parabola_peak(*alike[best - 1 : best + 2])) if inside else 0.0
+    delay_s = float(_GRID[best]) + part * (_GRID[1] - _GRID[0])
     return Pair(what, a, b, scale, delay_s, bool(known), float(alike[best]), 0.0)
 
 
@@ -267,13 +268,6 @@ def _cosines(u: Array, v: Array) -> Array:
     power = np.sqrt((u * u).sum(1) * (v * v).sum(1))
     found = np.divide(np.abs((u * v).sum(1)), power, out=np.zeros(len(u)), where=power > 0)
     return np.asarray(found)
-
-
-def _summit(around: Array) -> float:
-    """Where the parabola through three values of the grid is highest, s from the middle one."""
-    below, middle, above = around
-    bend = below - 2 * middle + above
-    return float(0.5 * (below - above) / bend * (_GRID[1] - _GRID[0])) if bend < 0 else 0.0
 
 
 def _slope(x: Array, y: Array) -> float:

@@ -24,9 +24,9 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Run, Stamps
+from sfa_localization.data.statistics import MEDIAN_TO_STD, outlier_factor
 from sfa_localization.features.closures import Closures, driven
 from sfa_localization.features.image_features import evenly
-from sfa_localization.features.rotation_spread import MEDIAN_TO_STD
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     OdometryTrack,
@@ -58,7 +58,6 @@ most m driven between them; two pairs of wheels of one size differ by less than 
 # Closures of two drives that are paired.
 _PAIRED = 400
 _ROUNDS = 10  # of reweighting, from where the fit hardly changes
-_HALF = 2.4  # residual, in standard deviations, at which an image counts half
 
 
 logger = logging.getLogger(__name__)
@@ -147,12 +146,8 @@ def way_of(
     turn = np.exp(1j * (yaw - np.interp(time_s, seconds, track.yaw)))
     turn = turn[first] + turn[last]
     turn /= np.maximum(np.abs(turn), 1e-9)
-    by_odometry, by_loss = (
-        turn * (way[last] - way[first])
-        for way in (
-            _interpolated(time_s, seconds, steps) for steps in (track.steps(), track.way_per_loss())
-        )
-    )
+    ways = (np.interp(time_s, seconds, summed(s)) for s in (track.steps(), track.way_per_loss()))
+    by_odometry, by_loss = (turn * (way[last] - way[first]) for way in ways)
     moved = places[last] - places[first]
     way, std = _fitted(moved, by_odometry, -by_loss)
     if not 1 / LARGEST_SCALE < way.scale < LARGEST_SCALE:
@@ -166,15 +161,9 @@ def way_of(
     return way if clear else None
 
 
-def _interpolated(at: Array, seconds: Array, steps: Complex) -> Complex:
-    """The sum of steps (N - 1,) until some times (M,)."""
-    total = summed(steps)
-    return np.asarray(np.interp(at, seconds, total.real) + 1j * np.interp(at, seconds, total.imag))
-
-
 def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way, float]:
-    """The way, and the standard deviation of its loss, by Cauchy's weights: some places of the
-    images are outliers.
+    """The way, and the standard deviation of its loss, without outliers among the places of the
+    images.
     """
     columns = np.column_stack([by_odometry, by_loss])
     rows = np.vstack([columns.real, columns.imag])
@@ -185,7 +174,7 @@ def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way
         found = np.linalg.lstsq(rows * root[:, None], values * root, rcond=None)[0]
         missed = values - rows @ found
         std = max(MEDIAN_TO_STD * float(np.median(np.abs(missed))), 1e-9)
-        weight = 1 / (1 + (missed / (_HALF * std)) ** 2)
+        weight = 1 / outlier_factor((missed / std) ** 2)
     variance = np.linalg.pinv((rows * weight[:, None]).T @ rows) * std**2
     return Way(float(found[0]), float(found[1])), float(np.sqrt(variance[1, 1]))
 

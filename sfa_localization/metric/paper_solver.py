@@ -11,10 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, Complex, Indices
 from sfa_localization.metric.basis import PAPER_FEATURES, Monomials, monomials
 from sfa_localization.metric.map_fit import MapFit, MetricProblem, residual_variance
 from sfa_localization.metric.quadratic_form import Ridge
@@ -29,107 +28,91 @@ MOMENTUM = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class Parameters:
-    """theta of eq. 1: alpha (N,) rad, origins o (N, 2) m, weights W (J, 2)."""
-
-    alpha: Array
-    origins: Array
-    weights: Array
-
-    def flat(self) -> Array:
-        """All in one vector (N + 2N + 2J,)."""
-        return np.concatenate([self.alpha, self.origins.ravel(), self.weights.ravel()])
-
-    @classmethod
-    def of(cls, flat: Array, lines: int) -> Parameters:
-        alpha, origins, weights = np.split(flat, [lines, 3 * lines])
-        return cls(alpha, origins.reshape(lines, 2), weights.reshape(-1, 2))
-
-
-@dataclass(frozen=True, slots=True)
 class Lines:
-    """M points on N lines: regressors (M, J), distances (M,), the line of each, N - 1 turns."""
+    """M points on N lines: regressors (M, J), distances (M,), the line of each, N - 1 turns.
+
+    theta of eq. 1 is one vector (2 N + J,): angles alpha rad, origins o and weights W, x + i y m.
+    """
 
     regressors: Array
     distances: Array
-    line: NDArray[np.int64]
+    line: Indices
     turns: Array
     """(N - 1,) rad, NaN where unknown; empty for the cost C without turns."""
 
-    def cost(self, theta: Parameters) -> float:
+    def parts(self, theta: Complex) -> tuple[Array, Complex, Complex]:
+        """alpha (N,), o (N,) and W (J,) of theta."""
+        lines = (len(theta) - self.regressors.shape[1]) // 2
+        return theta[:lines].real, theta[lines : 2 * lines], theta[2 * lines :]
+
+    def cost(self, theta: Complex) -> float:
         """C of eq. 1, or C' of eq. 5 when there are turns."""
-        cost = 0.5 * float((self._misfit(theta) ** 2).sum())
+        cost = float((np.abs(self._misfit(theta)) ** 2).sum())
         if len(self.turns):
-            cost += 0.5 * float(np.nansum(self._turn_misfit(theta) ** 2))
-        return cost
+            cost += float(np.nansum(self._turn_misfit(theta) ** 2))
+        return 0.5 * cost
 
-    def gradient(self, theta: Parameters) -> Parameters:
+    def gradient(self, theta: Complex) -> Complex:
         """By alpha: eq. 2, or eq. 6 with turns; by o: eq. 3; by W: eq. 4."""
-        lines = len(theta.alpha)
-        misfit = self._misfit(theta)
-        predicted = self.regressors @ theta.weights - theta.origins[self.line]
-        sine, cosine = np.sin(theta.alpha)[self.line], np.cos(theta.alpha)[self.line]
-        lever = self.distances * (sine * predicted[:, 0] - cosine * predicted[:, 1])
-        alpha: Array = np.bincount(self.line, lever, lines).astype(float)
+        alpha, misfit = self.parts(theta)[0], self._misfit(theta)
+        lever = self.distances * np.imag(np.exp(-1j * alpha)[self.line] * misfit)
+        by_alpha, by_x, by_y = (
+            np.asarray(np.bincount(self.line, pull, len(alpha)), float)
+            for pull in (lever, misfit.real, misfit.imag)
+        )
         if len(self.turns):
-            alpha = alpha + self._turn_gradient(theta)
-        origins: Array = np.zeros((lines, 2))
-        np.add.at(origins, self.line, misfit)
-        return Parameters(alpha, origins, -self.regressors.T @ misfit)
+            pull = -np.sin(alpha[:-1] - alpha[1:]) * self._turn_misfit(theta)
+            by_alpha = by_alpha + np.diff(np.nan_to_num(pull), prepend=0.0, append=0.0)
+        return np.concatenate([by_alpha, by_x + 1j * by_y, -self.regressors.T @ misfit])
 
-    def _misfit(self, theta: Parameters) -> Array:
-        """The vectors inside the norm of eq. 1, (M, 2)."""
-        direction = np.column_stack([np.cos(theta.alpha), np.sin(theta.alpha)])[self.line]
-        placed = theta.origins[self.line] + self.distances[:, None] * direction
-        return np.asarray(placed - self.regressors @ theta.weights)
+    def _misfit(self, theta: Complex) -> Complex:
+        """The vectors inside the norm of eq. 1, (M,)."""
+        alpha, origins, weights = self.parts(theta)
+        placed = origins[self.line] + self.distances * np.exp(1j * alpha)[self.line]
+        return np.asarray(placed - self.regressors @ weights)
 
-    def _turn_misfit(self, theta: Parameters) -> Array:
+    def _turn_misfit(self, theta: Complex) -> Array:
         """The terms inside the second square of eq. 5, (N - 1,)."""
-        return np.asarray(np.cos(theta.alpha[:-1] - theta.alpha[1:]) - np.cos(self.turns))
-
-    def _turn_gradient(self, theta: Parameters) -> Array:
-        """What eq. 6 adds to eq. 2, (N,)."""
-        step = theta.alpha[:-1] - theta.alpha[1:]
-        pull = np.nan_to_num(np.sin(step) * -self._turn_misfit(theta))
-        gradient = np.zeros(len(theta.alpha))
-        gradient[:-1] += pull
-        gradient[1:] -= pull
-        return gradient
+        alpha, _, _ = self.parts(theta)
+        return np.asarray(np.cos(alpha[:-1] - alpha[1:]) - np.cos(self.turns))
 
 
 def descend(
     lines: Lines,
-    start: Parameters,
+    start: Complex,
     iterations: int = ITERATIONS,
     learning_rate: float = LEARNING_RATE,
     momentum: float = MOMENTUM,
-) -> tuple[Parameters, Array]:
+) -> tuple[Complex, Array]:
     """Momentum descent.
 
     By eq. 7, v_t = gamma v_{t-1} + beta dC/dtheta, and eq. 8, theta_t = theta_{t-1} - v_t.
 
-    Returns the parameters and the cost (I,) before each iteration and after the last. Raises
-    DataError when the descent diverges.
+    Returns theta and the cost (I,) before each iteration and after the last. Raises DataError when
+    the descent diverges.
     """
-    count, theta = len(start.alpha), start.flat()
-    velocity, history = np.zeros_like(theta), [lines.cost(start)]
+    theta, velocity, history = start, np.zeros_like(start), [lines.cost(start)]
     for _ in range(iterations):
-        slope = lines.gradient(Parameters.of(theta, count)).flat()
-        velocity = momentum * velocity + learning_rate * slope
+        velocity = momentum * velocity + learning_rate * lines.gradient(theta)
         theta = theta - velocity
-        history.append(lines.cost(Parameters.of(theta, count)))
+        history.append(lines.cost(theta))
         if not np.isfinite(history[-1]):
             raise DataError("the paper's descent diverges on this drive: set solver: certified")
-    return Parameters.of(theta, count), np.array(history)
+    return theta, np.array(history)
 
 
-def odometry_start(lines: Lines, starts: Array) -> Parameters:
+def odometry_start(lines: Lines, starts: Array) -> Complex:
     """The paper's start on the robot: lines (N, 3) of odometry, weights regressed on them."""
-    alpha, origins = starts[:, 2], starts[:, :2]
-    direction = np.column_stack([np.cos(alpha), np.sin(alpha)])[lines.line]
-    placed = origins[lines.line] + lines.distances[:, None] * direction
+    origins, alpha = starts[:, 0] + 1j * starts[:, 1], starts[:, 2]
+    placed = origins[lines.line] + lines.distances * np.exp(1j * alpha)[lines.line]
     weights = np.linalg.lstsq(lines.regressors, placed, rcond=None)[0]
-    return Parameters(np.array(alpha), np.array(origins), weights)
+    return np.concatenate([alpha, origins, weights])
+
+
+def mirrored(lines: Lines, theta: Complex) -> Complex:
+    """theta of the mirror image, which costs the same."""
+    alpha, origins, weights = lines.parts(theta)
+    return np.concatenate([-alpha, origins.conj(), weights.conj()])
 
 
 def learn(problem: MetricProblem) -> MapFit:
@@ -146,24 +129,20 @@ def learn(problem: MetricProblem) -> MapFit:
     turns[links.at] = links.turn_rad
     lines = Lines(regressors, stack.path.real, stack.owner, turns)
     theta, _ = descend(lines, odometry_start(lines, stack.starts))
-    if _mirrored(theta.alpha, turns):
-        theta = Parameters(-theta.alpha, theta.origins * [1, -1], theta.weights * [1, -1])
-    return _fit(theta, regressors, count, problem)
+    step = np.diff(lines.parts(theta)[0])
+    # The cosines of eq. 5 do not tell a turn from its mirror image.
+    if np.nansum(np.cos(step - turns)) < np.nansum(np.cos(-step - turns)):
+        theta = mirrored(lines, theta)
+    return _fit(lines, theta, count, problem)
 
 
-def _mirrored(alpha: Array, turns: Array) -> bool:
-    """Whether the signed turns (N - 1,) fit the mirror image better: no cosine can decide."""
-    step = np.diff(alpha)
-    return bool(np.nansum(np.cos(step - turns)) < np.nansum(np.cos(-step - turns)))
-
-
-def _fit(theta: Parameters, regressors: Array, count: int, problem: MetricProblem) -> MapFit:
+def _fit(lines: Lines, theta: Complex, count: int, problem: MetricProblem) -> MapFit:
     """The result of the descent as a fit."""
-    stack, terms = problem.stack, regressors.shape[1]
+    stack, terms = problem.stack, lines.regressors.shape[1]
     basis = Monomials(np.zeros(terms - 1), np.eye(terms - 1), np.zeros(terms), count)
     ridge, bias = Ridge.of(basis, problem.features), np.zeros(stack.period[-1] + 1)
-    weights = np.roll(theta.weights, -1, axis=0) @ np.array([1.0, 1.0j])
-    solution = Solution(np.exp(1j * theta.alpha), theta.origins @ np.array([1.0, 1.0j]), bias)
+    alpha, origins, weights = lines.parts(theta)
+    weights, solution = np.roll(weights, -1), Solution(np.exp(1j * alpha), origins, bias)
     residuals = solution.places(stack) - ridge.expanded @ weights
     variance = residual_variance(residuals, ridge.freedom - 1.5 * stack.segments)
     fit = MapFit(problem, ridge, solution, variance, residuals, weights, problem.links)

@@ -17,6 +17,7 @@ biases, z^H H z with |z_n| = 1 remains, see phases.py. Where eq. 2 to eq. 4 are 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -65,16 +66,17 @@ class Ridge:
 
     def fitted(self, places: Complex) -> Complex:
         """The weights w (m,) for places (M,)."""
-        return _solve(self.factor, self.expanded.T @ (self.weights * places))
+        right = self.expanded.T @ (self.weights * places)
+        return np.asarray(scipy.linalg.cho_solve((self.factor, True), right))
 
-    def whitened(self, expanded: Array) -> Array:
+    def whitened(self, expanded: Array | Complex) -> Any:
         """factor^-1 phi (m, M) of expanded features (M, m)."""
         return np.asarray(scipy.linalg.solve_triangular(self.factor, expanded.T, lower=True))
 
     @property
     def root(self) -> Array:
         """factor^-1 (m, m), lower triangular."""
-        return self.whitened(np.eye(len(self.factor)))
+        return np.asarray(self.whitened(np.eye(len(self.factor))))
 
     @property
     def freedom(self) -> float:
@@ -89,18 +91,12 @@ class Ridge:
 
     def gram(self, stack: Stack) -> Complex:
         """The quadratic form (3N, 3N) in [o, z, -b z] that eq. 1 leaves of the images' places."""
-        columns = np.column_stack([np.ones(len(self.weights)), stack.path, stack.drift])
-        weighted = self.expanded * self.weights[:, None]
-        cross = np.vstack([_products(weighted, column, stack) for column in columns.T]).T
-        real, imag = np.hsplit(
-            scipy.linalg.solve_triangular(
-                self.factor, np.hstack([cross.real, cross.imag]), lower=True, overwrite_b=True
-            ),
-            2,
-        )
-        mixed = real.T @ imag
-        own = real.T @ real + imag.T @ imag + 1j * (mixed - mixed.T)
-        return np.asarray(_moments(columns, self.weights, stack) - own)
+        count = len(self.weights)
+        places = stack.place_rows(np.arange(count), np.ones(count))
+        weighted = places.T.multiply(self.weights).tocsr()
+        explained = self.whitened(weighted @ self.expanded)
+        moments = (weighted.conj() @ places).toarray()
+        return np.asarray(moments - explained.conj().T @ explained)
 
 
 def _cholesky(matrix: Array) -> Array:
@@ -110,29 +106,6 @@ def _cholesky(matrix: Array) -> Array:
     except np.linalg.LinAlgError:
         held = matrix + 1e-12 * max(np.trace(matrix), 1e-300) / len(matrix) * np.eye(len(matrix))
         return np.asarray(scipy.linalg.cholesky(held, lower=True))
-
-
-def _products(weighted: Array, column: Complex, stack: Stack) -> Complex:
-    """Sums (N, m) of rows times a complex column, real arithmetic throughout."""
-    real = stack.sums(weighted * column.real[:, None])
-    if not np.any(column.imag):
-        return np.asarray(real, complex)
-    return np.asarray(real + 1j * stack.sums(weighted * column.imag[:, None]))
-
-
-def _moments(columns: Complex, weights: Array, stack: Stack) -> Complex:
-    """Block-diagonal second moments (3N, 3N) of [1, path, drift] within each segment."""
-    n = stack.segments
-    blocks = stack.sums(columns.conj()[:, :, None] * columns[:, None, :] * weights[:, None, None])
-    moments = np.zeros((3, n, 3, n), complex)
-    at = np.arange(n)
-    moments[:, at, :, at] = blocks
-    return moments.reshape(3 * n, 3 * n)
-
-
-def _solve(factor: Array, right: Array | Complex) -> Complex:
-    real = scipy.linalg.cho_solve((factor, True), right.real)
-    return np.asarray(real + 1j * scipy.linalg.cho_solve((factor, True), right.imag))
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +190,6 @@ def schur(form: Complex, n: int) -> tuple[Complex, Complex]:
     level = max(float(np.trace(own)) / n, 1e-300)
     # Moving all origins together costs nothing: fix the mean.
     own += level / n
-    origins = -np.asarray(_solve(_cholesky(own), form[:n, n:]))
+    origins = -np.asarray(scipy.linalg.cho_solve((_cholesky(own), True), form[:n, n:]))
     h = form[n:, n:] + form[n:, :n] @ origins
     return np.asarray((h + h.conj().T) / 2), origins

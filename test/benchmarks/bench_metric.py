@@ -26,7 +26,7 @@ from sfa_localization.data.geometry import align
 from sfa_localization.metric.basis import Monomials, monomials
 from sfa_localization.metric.drive_check import check, diagnose
 from sfa_localization.metric.map_fit import MapFit, MetricProblem
-from sfa_localization.metric.paper_solver import Lines, Parameters, descend, odometry_start
+from sfa_localization.metric.paper_solver import Lines, descend, odometry_start
 from sfa_localization.metric.phases import phase_cost
 from sfa_localization.metric.segments import Segments, cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
@@ -122,15 +122,14 @@ def descents(trial: Problem, seed: int, iterations: int) -> dict[str, float]:
     }
 
 
-def random_start(lines: Lines, seed: int) -> Parameters:
+def random_start(lines: Lines, seed: int) -> np.ndarray:
     """The paper's start in its simulator: everything uniform."""
     rng = np.random.default_rng(seed)
     count = int(lines.line[-1]) + 1
-    return Parameters(
-        rng.uniform(0.0, 2.0 * np.pi, count),
-        rng.uniform(-HALF_AREA_M, HALF_AREA_M, (count, 2)),
-        rng.uniform(-1.0, 1.0, (lines.regressors.shape[1], 2)),
-    )
+    alpha = rng.uniform(0.0, 2.0 * np.pi, count)
+    origins = rng.uniform(-HALF_AREA_M, HALF_AREA_M, (count, 2)) @ [1, 1j]
+    weights = rng.uniform(-1.0, 1.0, (lines.regressors.shape[1], 2)) @ [1, 1j]
+    return np.concatenate([alpha, origins, weights])
 
 
 def bench_metric(problems: int = 1000) -> dict[str, object]:

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.data.geometry import Array, RigidTransform, align
+from sfa_localization.data.geometry import Array, Complex, RigidTransform, align
 from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import evaluate, odometry_from_start
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.basis import PAPER_FEATURES, monomials
 from sfa_localization.metric.learning import correlation_along_drive, learn_metric
-from sfa_localization.metric.paper_solver import Lines, Parameters, descend
+from sfa_localization.metric.paper_solver import Lines, descend
 from sfa_localization.metric.segments import assignment
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
@@ -134,10 +134,11 @@ def _random_start(
     panels = []
     for iterations, column in SNAPSHOTS.items():
         try:
-            weights = descend(lines, start, iterations)[0].weights
+            learned = lines.parts(descend(lines, start, iterations)[0])[2]
         except DataError as error:
             columns |= {column: {'problem': str(error)}} if column else {}
             continue
+        weights = np.column_stack([learned.real, learned.imag])
         side, transform = _nearest_frame(training @ weights, truth)
         found, unseen = (transform.apply(t @ weights * [1, side]) for t in (training, test))
         places = study.test_truth.poses[:, :2]
@@ -147,13 +148,14 @@ def _random_start(
     return panels
 
 
-def random_parameters(lines: int, terms: int, size: Array, seed: int) -> Parameters:
+def random_parameters(lines: int, terms: int, size: Array, seed: int) -> Complex:
     """The start of the simulator experiment: angles in [0, 2 pi), origins in an area of `size`
     (2,) m about 0, weights in [-1, 1].
     """
     rng = np.random.default_rng(seed)
     alpha, weights = rng.uniform(0, 2 * np.pi, lines), rng.uniform(-1, 1, (terms, 2))
-    return Parameters(alpha, rng.uniform(-size / 2, size / 2, (lines, 2)), weights)
+    origins = rng.uniform(-size / 2, size / 2, (lines, 2))
+    return np.concatenate([alpha, origins @ [1, 1j], weights @ [1, 1j]])
 
 
 def _nearest_frame(places: Array, truth: Array) -> tuple[float, RigidTransform]:

@@ -20,8 +20,8 @@ from typing import Any
 from sfa_localization import __version__
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import LocalizationError
+from sfa_localization.data.files import write_json
 from sfa_localization.data.settings import Settings, setting
-from sfa_localization.evaluation import write_json
 from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
 

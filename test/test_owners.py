@@ -1,0 +1,66 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""One owner for each quantity and rule: the table of CONTRIBUTING.md is true; twins fail."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / 'sfa_localization'
+SOURCES = {
+    path.relative_to(PACKAGE).as_posix(): path.read_text('utf-8') for path in PACKAGE.rglob('*.py')
+}
+ROW = re.compile(r'^\| ([^|]+) \| `([\w/]+\.py)` `(\w+)` \| [^|]+ \|$', re.MULTILINE)
+OWNERS = ROW.findall((ROOT / 'CONTRIBUTING.md').read_text('utf-8'))
+"""Quantity, module and name of each row."""
+STATISTICS = {'data/statistics.py'}
+TWINS = {
+    'standard deviation over median': (r'\b1\.48\d*|\b0\.67[45]\d*|\b1\.177\d*', STATISTICS),
+    'peak of a parabola': (r'0\.5 \* \(\w+ - \w+\) / \w+', STATISTICS),
+    'heavy tails': (r'(?i)_tail\b|degrees of freedom of student|cauchy|huber|tukey', STATISTICS),
+    'quantile by weight': (r'def \w*(quantile|weighted_median)\w*\(', STATISTICS),
+    'alignment': (r'def _?align(_\w+)?\(|procrustes|umeyama|kabsch', {'data/geometry.py'}),
+    'events of a drive': (
+        r'merge_by_stamp\(', {'data/events.py', 'fusion/replay.py', 'fusion/camera_clock.py'},
+    ),
+    'feeding a filter': (
+        r'\.add_measurement\(', {'fusion/replay.py', 'localizer.py', 'nodes/ekf_node.py'},
+    ),
+    'a filter for a model': (
+        r'(fused|filter)\.expect\(', {'localizer.py', 'nodes/ekf_node.py'},
+    ),
+}  # fmt: skip
+"""A pattern that stands for a rule, and the modules that may hold it."""
+
+
+def defined(source: str) -> Iterator[str]:
+    """Names that a module defines at its top."""
+    for node in ast.parse(source).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            yield node.name
+        for target in node.targets if isinstance(node, ast.Assign) else ():
+            yield from (part.id for part in ast.walk(target) if isinstance(part, ast.Name))
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            yield node.target.id
+
+
+def test_every_owner_exists_and_no_other_module_defines_its_name():
+    assert len(OWNERS) > 20
+    assert len({quantity for quantity, _, _ in OWNERS}) == len(OWNERS)
+    homes = {
+        name: [module for module, source in SOURCES.items() if name in defined(source)]
+        for _, _, name in OWNERS
+    }
+    assert homes == {name: [module] for _, module, name in OWNERS}
+
+
+@pytest.mark.parametrize('rule', TWINS)
+def test_what_would_be_a_twin_stands_in_its_owner_alone(rule):
+    pattern, owners = TWINS[rule]
+    holders = {module for module, source in SOURCES.items() if re.search(pattern, source)}
+    assert holders - owners == set()
+    assert holders, f'{rule}: the pattern finds nothing any more'
