@@ -18,9 +18,9 @@ from sfa_localization.data.geometry import Array
 
 JUMP = 0.05
 """m or rad that quantized and rounded poses may move beyond any speed."""
-ACCELERATION, RAMP_S = 5.0, 0.1
+ACCELERATION, RAMP_S = 5.0, 0.2
 """Change of speed (m/s^2, rad/s^2) that wheels on the ground reach, and the time for which it may
-act unseen: longer ramps appear in the speeds around the step."""
+act unseen, which changes the speed by 1 m/s: longer ramps appear in the speeds around."""
 NOISE = 6.0
 """Standard deviations of the odometry's usual noise that a break exceeds, too."""
 
@@ -48,4 +48,6 @@ def tolerance(seconds: ArrayLike, noise: float) -> Array:
     `noise` is the standard deviation, m or rad, by which this odometry's steps usually are.
     """
     longest_s = np.asarray(seconds, float)
-    return np.asarray(JUMP + ACCELERATION * np.minimum(longest_s, RAMP_S) * longest_s + NOISE * noise)
+    return np.asarray(
+        JUMP + ACCELERATION * np.minimum(longest_s, RAMP_S) * longest_s + NOISE * noise
+    )

@@ -18,8 +18,10 @@ from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
     Event,
+    Jump,
     MeasurementEvent,
     Memory,
+    Odometer,
     OdometryEvent,
     PoseEvent,
     Update,
@@ -27,9 +29,10 @@ from sfa_localization.fusion.belief import (
 from sfa_localization.fusion.filterpy_ekf import ExtendedKalmanFilter
 from sfa_localization.fusion.inputs import root
 from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
-from sfa_localization.fusion.odometry import COAST_S, Interval, interval
+from sfa_localization.fusion.odometry import COAST_S, Interval, interval, jump, received, repeats
 from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import DEGRADED_YAW_RAD
 from sfa_localization.fusion.track import Image, Track, remembered
 
 STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
@@ -121,7 +124,7 @@ class Ekf:
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
         return Belief(
-            stamp_ns, np.zeros(SIZE), covariance, False, nowhere, 0.0, twist, None, Memory()
+            stamp_ns, np.zeros(SIZE), covariance, False, nowhere, 0.0, twist, Odometer(), Memory()
         )
 
     def step(self, belief: Belief, event: Event) -> Belief:
@@ -139,13 +142,17 @@ class Ekf:
 
     def _driven(self, belief: Belief, event: OdometryEvent) -> Belief:
         """The belief after an odometry reading, which held since the one before it."""
-        if belief.odometry_ns is None and belief.stamp_ns == 0:
+        last = belief.odometry
+        if last.stamp_ns is None and belief.stamp_ns == 0:
             return belief._replace(
-                stamp_ns=event.stamp_ns,
-                twist=event.twist,
-                odometry_ns=event.stamp_ns,
-                odometry_pose=event.pose,
+                stamp_ns=event.stamp_ns, twist=event.twist, odometry=received(belief, event)
             )
+        if repeats(belief, event):
+            return belief
+        if made := jump(belief, event):
+            if last.suspect is None:
+                return belief._replace(odometry=last._replace(suspect=event))
+            return self._broken(belief, event, made)
         held, reading = interval(belief, event), event.twist
         if held is None:
             belief = self.coast(belief, event.stamp_ns)
@@ -154,13 +161,25 @@ class Ekf:
         step = motion.drive(belief.mean, held.twist, dt, self._noise, held.now)
         return self._moved(belief, event.stamp_ns, step, event, held)
 
+    def _broken(self, belief: Belief, event: OdometryEvent, made: Jump) -> Belief:
+        """The belief after a break: nothing tells a slip of the wheels' counts from a robot that
+        was moved, so the pose is expected where its speed leads, and is known no better than one
+        that is DEGRADED, until an image places it.
+        """
+        odometry = received(belief, event)._replace(jump=made)
+        belief = self.coast(belief, event.stamp_ns)
+        covariance, std_m = belief.covariance.copy(), self._config.degraded_std
+        covariance[:3, :3] += np.diag(np.square([std_m, std_m, DEGRADED_YAW_RAD]))
+        twist = event.twist if odometry.fills_twist else belief.twist
+        return belief._replace(covariance=covariance, twist=twist, odometry=odometry)
+
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
         """The belief at a later stamp without new odometry: at the last speed, then unknown."""
         if belief.stamp_ns == 0:
             return belief._replace(stamp_ns=stamp_ns)
         coasted_ns = belief.stamp_ns
-        if belief.odometry_ns is not None:
-            coasted_ns = max(coasted_ns, belief.odometry_ns + round(COAST_S * 1e9))
+        if belief.odometry.stamp_ns is not None:
+            coasted_ns = max(coasted_ns, belief.odometry.stamp_ns + round(COAST_S * 1e9))
         for end_ns, move in ((min(stamp_ns, coasted_ns), motion.coast), (stamp_ns, motion.halt)):
             if end_ns > belief.stamp_ns:
                 dt = (end_ns - belief.stamp_ns) * 1e-9
@@ -195,9 +214,8 @@ class Ekf:
             reckoned,
             belief.traveled_m + math.hypot(dx, dy),
             held.now if held else belief.twist,
-            event.stamp_ns if event else belief.odometry_ns,
+            received(belief, event) if event else belief.odometry,
             belief.memory,
-            event.pose if event else belief.odometry_pose,
             belief.track.driven(stamp_ns, reckoned, oldest_ns),
             held.omega if held else belief.omega,
         )

@@ -149,7 +149,8 @@ class PoseFilter:
         self._open_loop.add(twist.v, twist.omega)
         event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
         driven = self._history.add((stamp_ns, ODOMETRY), event)
-        self._camera.add_odometry(stamp_ns, driven.omega)
+        if driven.odometry.stamp_ns == stamp_ns:
+            self._camera.add_odometry(stamp_ns, driven.omega)
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -271,7 +272,7 @@ class PoseFilter:
     @property
     def state(self) -> State | None:
         """The estimate at the newest message; None before there is any."""
-        return self._at(self._history.newest.stamp_ns)
+        return self._at(self._newest.stamp_ns)
 
     def at(self, stamp_ns: int) -> State | None:
         """The estimate at a stamp: predicted beyond the newest message, recalled within history.
@@ -280,7 +281,7 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         if self._history.newest_ns is None or not self._history.reaches(stamp_ns):
-            return self.state if stamp_ns == self._history.newest.stamp_ns else None
+            return self.state if stamp_ns == self._newest.stamp_ns else None
         return self._at(stamp_ns)
 
     def _at(self, stamp_ns: int) -> State | None:
@@ -301,6 +302,12 @@ class PoseFilter:
         return state._replace(covariance=covariance)
 
     @property
+    def _newest(self) -> Belief:
+        """At the newest message, also where it adds nothing."""
+        newest, newest_ns = self._history.newest, self._history.newest_ns
+        return self._ekf.coast(newest, newest_ns) if newest_ns else newest
+
+    @property
     def health(self) -> Health:
         """What the last images show of the estimate."""
         belief = self._history.newest
@@ -313,7 +320,7 @@ class PoseFilter:
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
-        newest = self._history.newest
+        newest = self._newest
         state = newest.state and self._widened(newest.state)
         status = status_of(newest, state, self.health, self.config)
         doubts, delay_s = self._timeline.problems, self._camera.clock.delay_s

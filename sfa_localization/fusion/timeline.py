@@ -40,7 +40,7 @@ class Timeline:
         """
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
-        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry_ns
+        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry.stamp_ns
         if newest_ns is None:
             return
         ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
@@ -87,7 +87,7 @@ class Timeline:
         elif stamp_ns < last_ns or last_ns == 0:
             self._again = 0, stamp_ns, stamp_ns
         else:
-            among += (history.before(stamp_ns).odometry_ns or 0) > last_ns
+            among += (history.before(stamp_ns).odometry.stamp_ns or 0) > last_ns
             self._again = among, first_ns, stamp_ns
             if among >= FEW_BEHIND and stamp_ns - first_ns >= _AGAIN_NS:
                 raise ClockWentBack
