@@ -166,12 +166,12 @@ class Ekf:
         was moved, so the pose is expected where its speed leads, and is known no better than one
         that is DEGRADED, until an image places it.
         """
-        odometry = received(belief, event)._replace(jump=made)
-        belief = self.coast(belief, event.stamp_ns)
-        covariance, std_m = belief.covariance.copy(), self._config.degraded_std
-        covariance[:3, :3] += np.diag(np.square([std_m, std_m, DEGRADED_YAW_RAD]))
-        twist = event.twist if odometry.fills_twist else belief.twist
-        return belief._replace(covariance=covariance, twist=twist, odometry=odometry)
+        belief, std_m = self.coast(belief, event.stamp_ns), self._config.degraded_std
+        noise = np.zeros((SIZE, SIZE))
+        noise[:3, :3] = np.diag(np.square([std_m, std_m, DEGRADED_YAW_RAD]))
+        moved = self._moved(belief, event.stamp_ns, Step(belief.mean, np.eye(SIZE), noise), event)
+        twist = event.twist if moved.odometry.fills_twist else belief.twist
+        return moved._replace(twist=twist, odometry=moved.odometry._replace(jump=made))
 
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
         """The belief at a later stamp without new odometry: at the last speed, then unknown."""

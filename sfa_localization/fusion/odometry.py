@@ -23,6 +23,9 @@ COAST_S = 2.0
 """Silence for which the last speed is assumed to go on: about how long robots keep a speed."""
 _LEARNING, _LEAST_NOISE = 0.1, 1e-3
 """Relative change per message of the usual noise of steps, learned over about twenty; m or rad."""
+_LONGEST_S = math.pi / motion.UNKNOWN_RATE
+"""After a longer silence a robot may be headed anywhere: no step is impossible, and none is shown.
+"""
 _ROUNDED_M = 2e-3
 """A pose moves less than this sideways by its rounding."""
 _JUMP = 0.05
@@ -97,6 +100,8 @@ def jump(belief: Belief, event: OdometryEvent) -> Jump | None:
     if last.pose is None or after is None or _is_askew(belief, event):
         return None
     seconds = (event.stamp_ns - (last.stamp_ns or belief.stamp_ns)) * 1e-9
+    if seconds > _LONGEST_S:
+        return None
     beyond_m, beyond_rad = _beyond(belief, event)
     allowed = tolerance(seconds, last.noise)
     if max(beyond_m, beyond_rad) <= allowed:
@@ -140,7 +145,7 @@ def _shown(belief: Belief, event: OdometryEvent, seconds: float) -> Twist | None
     before, after = belief.odometry.pose, event.pose
     if before is None or after is None or before == after or seconds <= 0:
         return None
-    if _is_askew(belief, event):
+    if seconds > _LONGEST_S or _is_askew(belief, event):
         return None
     turn, ahead, _ = _moved(before, after)
     return _twist(turn, ahead, seconds, event.twist)

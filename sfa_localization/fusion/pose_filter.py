@@ -141,13 +141,13 @@ class PoseFilter:
         try:
             v, commands = self.scale * v, self._open_loop.found
             twist = read_twist(v, omega, variances, self.config, commands)
-            self._require_place(stamp_ns, ODOMETRY)
+            event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
+            self._require_place(event, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
         self._open_loop.add(twist.v, twist.omega)
-        event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
         driven = self._history.add((stamp_ns, ODOMETRY), event)
         if driven.odometry.stamp_ns == stamp_ns:
             self._camera.add_odometry(stamp_ns, driven.omega)
@@ -163,9 +163,9 @@ class PoseFilter:
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
             taken_ns = self._taken(stamp_ns)
-            self._require_place(taken_ns, MEASUREMENT)
             noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
             event = measurement_event(taken_ns, fused, noise, self.correlation.share)
+            self._require_place(event, MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
@@ -233,12 +233,13 @@ class PoseFilter:
         moved = np.array([twist.v * math.cos(yaw), twist.v * math.sin(yaw), twist.omega])
         return noise + np.outer(moved, moved) * std_s**2
 
-    def _require_place(self, stamp_ns: int, kind: int) -> None:
+    def _require_place(self, event: Event, kind: int) -> None:
         """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
+        stamp_ns = event.stamp_ns
         if self._waiting is not None and stamp_ns > 0:
             self._begin(stamp_ns)
         try:
-            self._timeline.require_place(stamp_ns, kind, self._history)
+            self._timeline.require_place(event, kind, self._history)
         except ClockWentBack:
             self.counts['clock went back'] += 1
             self.reset()

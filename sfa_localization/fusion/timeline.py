@@ -4,17 +4,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.belief import Belief, Event
-from sfa_localization.fusion.history import History
+from sfa_localization.fusion.history import History, Key
 
 ODOMETRY, POSE, MEASUREMENT = range(3)
 """Kinds of events, in the order in which those of one stamp follow each other."""
 HISTORY_NS = 5_000_000_000
 """How late a measurement may come: many times what any camera, network and model take."""
+LEAP_NS = 500_000_000
+"""A stamp that is ahead of all before it by more leaves the order of reception, or follows a pause:
+as much as a gap of the odometry."""
 FEW_AHEAD, FEW_BEHIND = 3, 5
-"""So many images in a row that lie ahead, and messages in a row that are too late, are no accident:
-the odometry has ended, and the clock has gone back."""
+"""So many messages of a kind in a row that leap ahead, and messages in a row that are too late, are
+no accident: there was a pause, and the clock has gone back."""
 _AGAIN_NS = 300_000_000
 """Time that odometry has to cover once more until the clock is taken to have gone back."""
 
@@ -27,17 +32,22 @@ class Timeline:
     """Feed it the stamps of all messages; it says which can be used."""
 
     def __init__(self) -> None:
-        self._behind = self._ahead = 0
+        self._behind = 0
+        # By the kind of messages: how many in a row leap ahead, and those that wait for the next.
+        self._leaps = Counter[int]()
+        self._held: dict[int, list[tuple[Key, Event]]] = {ODOMETRY: [], MEASUREMENT: []}
         self._apart = 0, 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
         self._again = 0, 0, 0
 
-    def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
+    def require_place(self, event: Event, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack.
 
-        Odometry keeps the time: an image of a clock ahead would make all that follows too old.
+        A stamp ahead of those before would make what follows too old, or wait: its message is held
+        until the next of its kind are no earlier, and left out where one is.
         """
+        stamp_ns = event.stamp_ns
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
         newest_ns, odometry_ns = history.newest_ns, history.newest.odometry.stamp_ns
@@ -47,11 +57,21 @@ class Timeline:
         if kind == MEASUREMENT:
             apart = abs(ahead_ns) > HISTORY_NS
             self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
-        self._ahead = 0 if keeps_time else self._ahead + (ahead_ns > HISTORY_NS)
+        held = self._held[kind]
+        if held and stamp_ns < held[-1][0][0]:
+            held.clear()
+        leaps = ahead_ns > LEAP_NS and odometry_ns is not None
+        self._leaps[kind] = self._leaps[kind] + 1 if leaps else 0
+        if kind == ODOMETRY:  # it keeps the time: while it goes on, images ahead are wrong
+            self._leaps[MEASUREMENT] = 0
+        if 0 < self._leaps[kind] < FEW_AHEAD:
+            del held[: -FEW_AHEAD + 2]
+            held.append(((stamp_ns, kind), event))
+            raise DataError('stamp ahead of those before')
+        while held:
+            history.add(*held.pop(0))
         reason = ''
-        if not keeps_time and ahead_ns > HISTORY_NS and self._ahead < FEW_AHEAD:
-            reason = 'stamp ahead of the odometry'
-        elif ahead_ns <= 0 and not history.reaches(stamp_ns):
+        if ahead_ns <= 0 and not history.reaches(stamp_ns):
             reason = 'too old'
         elif ahead_ns <= 0 and history.holds((stamp_ns, kind)):
             reason = 'duplicate stamp'
