@@ -62,8 +62,9 @@ class PoseEvent(NamedTuple):
 class MeasurementEvent(NamedTuple):
     """A position (2,) or pose (3,) from an image, with its covariance.
 
-    `jacobian` (2 or 3, 11) and `white`, the part of the noise that is this image's own, follow
-    from the covariance: see ekf.measurement_event.
+    It is fused `late_s` earlier than expected of its stamp. `jacobian` (2 or 3, 12) and `white`,
+    the part of the noise that is this image's own, follow from the covariance: see
+    ekf.measurement_event.
     """
 
     stamp_ns: int
@@ -71,6 +72,7 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
+    late_s: float = 0.0
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent

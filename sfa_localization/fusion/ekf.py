@@ -28,7 +28,17 @@ from sfa_localization.fusion.belief import (
 )
 from sfa_localization.fusion.filterpy_ekf import ExtendedKalmanFilter
 from sfa_localization.fusion.inputs import root
-from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
+from sfa_localization.fusion.motion import (
+    DELAY,
+    ERROR,
+    SIZE,
+    YAW,
+    MotionNoise,
+    Step,
+    Twist,
+    V,
+    wrap,
+)
 from sfa_localization.fusion.odometry import COAST_S, Interval, interval, jump, received, repeats
 from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
@@ -51,7 +61,7 @@ _OBSERVED = np.eye(3, SIZE)
 
 
 def measurement_event(
-    stamp_ns: int, value: Array, covariance: Array, share: float
+    stamp_ns: int, value: Array, covariance: Array, share: float, late_s: float = 0.0
 ) -> MeasurementEvent:
     """A position (2,) or pose (3,), its covariance split into what neighboring images share.
 
@@ -62,7 +72,7 @@ def measurement_event(
     for i, row in enumerate(root(covariance.tolist())):
         for j, entry in enumerate(row, ERROR):
             jacobian[i, j] = shared * entry
-    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
+    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance, late_s)
 
 
 class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -73,7 +83,7 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self._next_mean: Array = np.zeros(SIZE)
 
     def predicted(self, belief: Belief, step: Step) -> Array:
-        """Covariance (11, 11) after a prediction: F P F^T + Q."""
+        """Covariance (12, 12) after a prediction: F P F^T + Q."""
         self.x, self.P, self._next_mean = belief.mean, belief.covariance, step.mean
         self.F, self.Q = step.jacobian, step.noise
         self.predict()
@@ -84,7 +94,7 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self._next_mean
 
     def corrected(self, belief: Belief, event: MeasurementEvent) -> tuple[Array, Array, float]:
-        """Mean (11,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
+        """Mean (12,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
         which stays in `y`, its covariance in `S`.
         """
         self.x, self.P = belief.mean, belief.covariance
@@ -248,7 +258,8 @@ class Ekf:
     def _gated(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """Accept what lies inside the gate; what is outlying within loses weight."""
         kalman, memory, size = self._kalman, belief.memory, event.value.size
-        mean, covariance, d2 = kalman.corrected(belief, event)
+        delayed = _delayed(belief, event)
+        mean, covariance, d2 = kalman.corrected(belief, delayed)
         inside = d2 <= GATE[size]
         reason = 'accepted' if inside else 'outside the gate'
         update = Update(event.stamp_ns, inside, d2, GATE[size], reason, kalman.y, kalman.S)
@@ -258,7 +269,7 @@ class Ekf:
             return self._rejected(belief._replace(memory=memory), event)
         outlying = d2 / (memory.scatter * OUTLYING[size])
         if outlying > 1 and self._alike:
-            lighter = event._replace(white=event.white * outlying**2)
+            lighter = delayed._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
         # At most 1: an image that claims too little is not believed more than it claims.
         scatter = min(max(_nearer(memory.scatter, d2 / MEDIAN[size]), _LEAST_SCATTER), 1.0)
@@ -293,7 +304,20 @@ class Ekf:
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
+        moving, late_s = motion.velocity(placed.mean), placed.mean[DELAY] - event.late_s
+        variance = placed.covariance[DELAY, DELAY]
+        placed.mean[:3] += moving * late_s
+        placed.covariance[:3, :3] += variance * np.outer(moving, moving)
+        placed.covariance[:3, DELAY] = placed.covariance[DELAY, :3] = variance * moving
         return placed._replace(memory=memory, track=track)
+
+
+def _delayed(belief: Belief, event: MeasurementEvent) -> MeasurementEvent:
+    """As a measurement linear in the state: z = x - velocity (DELAY - late_s) + errors."""
+    moving = motion.velocity(belief.mean)[: len(event.value)]
+    jacobian = event.jacobian.copy()
+    jacobian[:, DELAY] = -moving
+    return event._replace(value=event.value - event.late_s * moving, jacobian=jacobian)
 
 
 def _images(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Image, ...]:

@@ -64,7 +64,7 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
         self.scale, self._shift, self._counted = self.config.odometry_scale, (0.0, 0.0), (0.0, 0.0)
-        self._camera = CameraClockFinder(_CLOCK_MEMORY)
+        self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
         self._ekf = Ekf(self.config, self.correlation)
         self._history = self._fresh(self._ekf.blank(0))
         self._forget()
@@ -163,8 +163,8 @@ class PoseFilter:
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
             taken_ns = self._taken(stamp_ns)
-            noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
-            event = measurement_event(taken_ns, fused, noise, self.correlation.share)
+            late_s = self._camera.clock_at(stamp_ns).delay_ns * 1e-9 - self._expected_s
+            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late_s)
             self._require_place(event, MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
@@ -188,6 +188,7 @@ class PoseFilter:
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
+            self._expected_s = delay_s
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
 
     def expect_scale(self, scale: float) -> None:
@@ -220,18 +221,6 @@ class PoseFilter:
         taken_ns = max(stamp_ns - delay_ns, 1)
         earlier, later = self._history.before(taken_ns), self._history.before(stamp_ns)
         return stamp_ns if stalled(earlier, later, taken_ns, stamp_ns) else taken_ns
-
-    def _with_time_noise(self, taken_ns: int, stamp_ns: int, pose: Array, noise: Array) -> Array:
-        """With what a moving robot's pose (2,) or (3,) errs by because the time is uncertain."""
-        std_s = self._camera.clock_at(stamp_ns).std_s
-        if not math.isfinite(std_s):
-            return noise
-        twist = self._history.before(taken_ns).twist
-        if len(pose) == 2:
-            return noise + np.eye(2) * (std_s * twist.v) ** 2
-        yaw = float(pose[2])
-        moved = np.array([twist.v * math.cos(yaw), twist.v * math.sin(yaw), twist.omega])
-        return noise + np.outer(moved, moved) * std_s**2
 
     def _require_place(self, event: Event, kind: int) -> None:
         """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
