@@ -84,7 +84,7 @@ def test_shuffled_and_late_messages_give_what_messages_in_time_give(heading, lat
 @pytest.mark.parametrize(('later_ns', 'moved_m', 'decided'), [
     (lambda kind: 1000, 0.0, 0),
     (lambda kind: 1000 * kind, 5e-6, 0),  # at 1 m/s, the robot drives a micrometer
-    (lambda kind: -1000 * kind, 0.01, 1),  # fused by the motion of the message before
+    (lambda kind: -1000 * kind, 0.05, 1),  # fused by the motion of the message before
 ])  # fmt: skip
 def test_no_decision_hangs_on_a_microsecond_and_another_start_of_time_changes_no_bit(
     later_ns, moved_m, decided

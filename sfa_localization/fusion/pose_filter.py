@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -139,15 +140,17 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         try:
-            v, commands = self.scale * v, self._open_loop.found
-            twist = read_twist(v, omega, variances, self.config, commands)
-            event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
-            self._require_place(event, ODOMETRY)
+            commands = self._open_loop.found
+            twist = read_twist(self.scale * v, omega, variances, self.config, commands)
+            again = partial(self.add_odometry, stamp_ns, v, omega, variances, pose)
+            self._timeline.require_order(stamp_ns, ODOMETRY, self._history, again)
+            self._require_place(stamp_ns, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
             return str(error)
         self.counts['odometry: used'] += 1
         self._open_loop.add(twist.v, twist.omega)
+        event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
         driven = self._history.add((stamp_ns, ODOMETRY), event)
         if driven.odometry.stamp_ns == stamp_ns:
             self._camera.add_odometry(stamp_ns, driven.omega)
@@ -162,10 +165,12 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
+            again = partial(self.add_measurement, stamp_ns, value, covariance)
+            self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             taken_ns = self._taken(stamp_ns)
+            self._require_place(taken_ns, MEASUREMENT)
             late_s = self._camera.clock_at(stamp_ns).delay_ns * 1e-9 - self._expected_s
             event = measurement_event(taken_ns, fused, noise, self.correlation.share, late_s)
-            self._require_place(event, MEASUREMENT)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
@@ -222,13 +227,12 @@ class PoseFilter:
         earlier, later = self._history.before(taken_ns), self._history.before(stamp_ns)
         return stamp_ns if stalled(earlier, later, taken_ns, stamp_ns) else taken_ns
 
-    def _require_place(self, event: Event, kind: int) -> None:
+    def _require_place(self, stamp_ns: int, kind: int) -> None:
         """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
-        stamp_ns = event.stamp_ns
         if self._waiting is not None and stamp_ns > 0:
             self._begin(stamp_ns)
         try:
-            self._timeline.require_place(event, kind, self._history)
+            self._timeline.require_place(stamp_ns, kind, self._history)
         except ClockWentBack:
             self.counts['clock went back'] += 1
             self.reset()

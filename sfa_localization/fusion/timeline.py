@@ -4,11 +4,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Callable
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.belief import Belief, Event
-from sfa_localization.fusion.history import History, Key
+from sfa_localization.fusion.history import History
 
 ODOMETRY, POSE, MEASUREMENT = range(3)
 """Kinds of events, in the order in which those of one stamp follow each other."""
@@ -18,8 +18,9 @@ LEAP_NS = 500_000_000
 """A stamp that is ahead of all before it by more leaves the order of reception, or follows a pause:
 as much as a gap of the odometry."""
 FEW_AHEAD, FEW_BEHIND = 3, 5
-"""So many messages of a kind in a row that leap ahead, and messages in a row that are too late, are
+"""So many messages in a row that leap ahead, and messages in a row that are too late, are
 no accident: there was a pause, and the clock has gone back."""
+AHEAD = 'stamp ahead of those before'
 _AGAIN_NS = 300_000_000
 """Time that odometry has to cover once more until the clock is taken to have gone back."""
 
@@ -33,43 +34,47 @@ class Timeline:
 
     def __init__(self) -> None:
         self._behind = 0
-        # By the kind of messages: how many in a row leap ahead, and those that wait for the next.
-        self._leaps = Counter[int]()
-        self._held: dict[int, list[tuple[Key, Event]]] = {ODOMETRY: [], MEASUREMENT: []}
+        # Messages in a row that leap ahead; the kinds of those that wait, and what takes them.
+        self._leaps, self._held = 0, list[tuple[int, Callable[[], object]]]()
         self._apart = 0, 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
         self._again = 0, 0, 0
 
-    def require_place(self, event: Event, kind: int, history: History[Event, Belief]) -> None:
-        """Raises DataError for a stamp that cannot be used, and ClockWentBack.
-
-        A stamp ahead of those before would make what follows too old, or wait: its message is held
-        until the next of its kind are no earlier, and left out where one is.
+    def require_order(
+        self, stamp_ns: int, kind: int, history: History[Event, Belief], again: Callable[[], object]
+    ) -> None:
+        """Raises DataError for a stamp ahead of those before, which would make what follows too
+        old, or wait. Its message waits until the next ones are ahead as well, which calls `again`
+        to take it; it is left out where odometry, which keeps the time, is not ahead.
         """
-        stamp_ns = event.stamp_ns
+        newest_ns = history.newest_ns
+        if newest_ns is None or history.newest.odometry.stamp_ns is None:
+            return
+        ahead_ns = stamp_ns - newest_ns
+        if kind == MEASUREMENT:
+            apart = abs(ahead_ns) > HISTORY_NS
+            self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
+        if ahead_ns <= LEAP_NS:
+            self._held = [held for held in self._held if held[0] != kind != ODOMETRY]
+            self._leaps = len(self._held)
+            return
+        self._leaps += 1
+        if self._leaps < FEW_AHEAD:
+            self._held.append((kind, again))
+            raise DataError(AHEAD)
+        held, self._held = self._held, []
+        for _, take in held:
+            take()
+
+    def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
+        """Raises DataError for a stamp that cannot be used, and ClockWentBack."""
         if stamp_ns <= 0:
             raise DataError('zero or negative stamp')
         newest_ns, odometry_ns = history.newest_ns, history.newest.odometry.stamp_ns
         if newest_ns is None:
             return
         ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
-        if kind == MEASUREMENT:
-            apart = abs(ahead_ns) > HISTORY_NS
-            self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
-        held = self._held[kind]
-        if held and stamp_ns < held[-1][0][0]:
-            held.clear()
-        leaps = ahead_ns > LEAP_NS and odometry_ns is not None
-        self._leaps[kind] = self._leaps[kind] + 1 if leaps else 0
-        if kind == ODOMETRY:  # it keeps the time: while it goes on, images ahead are wrong
-            self._leaps[MEASUREMENT] = 0
-        if 0 < self._leaps[kind] < FEW_AHEAD:
-            del held[: -FEW_AHEAD + 2]
-            held.append(((stamp_ns, kind), event))
-            raise DataError('stamp ahead of those before')
-        while held:
-            history.add(*held.pop(0))
         reason = ''
         if ahead_ns <= 0 and not history.reaches(stamp_ns):
             reason = 'too old'
@@ -89,6 +94,8 @@ class Timeline:
         """How images and odometry are apart in time, in words."""
         if self._again[0] > 1:
             return ['odometry is stamped with times that it had passed: did the clock go back?']
+        if self._held:
+            return [AHEAD]
         count, apart_ns = self._apart
         if count < FEW_AHEAD:
             return []
