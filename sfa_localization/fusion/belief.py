@@ -27,6 +27,30 @@ class OdometryEvent(NamedTuple):
     pose: Pose | None = None
 
 
+class Jump(NamedTuple):
+    """A step of the odometry, m and rad beyond what a robot can do."""
+
+    stamp_ns: int
+    way_m: float
+    turn_rad: float
+
+
+class Odometer(NamedTuple):
+    """What is remembered of the odometry: the stamp and pose of its last message, the stamps at
+    which position and heading were last renewed (0 where never), whether its twist is filled, and
+    the standard deviation `noise` (m, rad) of its steps. A `suspect` is a message after an
+    impossible step, which the next one confirms, or not; `jump` is the last one confirmed.
+    """
+
+    stamp_ns: int | None = None
+    pose: Pose | None = None
+    renewed_ns: tuple[int, int] = (0, 0)
+    fills_twist: bool = True
+    noise: float = 0.01
+    suspect: OdometryEvent | None = None
+    jump: Jump | None = None
+
+
 class PoseEvent(NamedTuple):
     """A pose (3,) set from outside, with its covariance (3, 3)."""
 
@@ -38,8 +62,9 @@ class PoseEvent(NamedTuple):
 class MeasurementEvent(NamedTuple):
     """A position (2,) or pose (3,) from an image, with its covariance.
 
-    `jacobian` (2 or 3, 11) and `white`, the part of the noise that is this image's own, follow
-    from the covariance: see ekf.measurement_event.
+    It is fused `late_s` earlier than expected of its stamp. `jacobian` (2 or 3, 12) and `white`,
+    the part of the noise that is this image's own, follow from the covariance: see
+    ekf.measurement_event.
     """
 
     stamp_ns: int
@@ -47,6 +72,7 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
+    late_s: float = 0.0
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent
@@ -100,9 +126,8 @@ class Belief(NamedTuple):
     dead_reckoned: Pose
     traveled_m: float
     twist: Twist
-    odometry_ns: int | None
+    odometry: Odometer
     memory: Memory
-    odometry_pose: Pose | None = None
     track: Track = Track()
     omega: float = 0.0
 

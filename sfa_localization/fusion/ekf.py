@@ -18,18 +18,31 @@ from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
     Event,
+    Jump,
     MeasurementEvent,
     Memory,
+    Odometer,
     OdometryEvent,
     PoseEvent,
     Update,
 )
 from sfa_localization.fusion.filterpy_ekf import ExtendedKalmanFilter
 from sfa_localization.fusion.inputs import root
-from sfa_localization.fusion.motion import ERROR, SIZE, YAW, MotionNoise, Step, Twist, V, wrap
-from sfa_localization.fusion.odometry import COAST_S, Interval, interval
+from sfa_localization.fusion.motion import (
+    DELAY,
+    ERROR,
+    SIZE,
+    YAW,
+    MotionNoise,
+    Step,
+    Twist,
+    V,
+    wrap,
+)
+from sfa_localization.fusion.odometry import COAST_S, Interval, interval, jump, received, repeats
 from sfa_localization.fusion.relocation import Relocation, relocate
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.fusion.status import DEGRADED_YAW_RAD
 from sfa_localization.fusion.track import Image, Track, remembered
 
 STARTED, ELSEWHERE = STARTS = 'started', 'restarted elsewhere'
@@ -48,7 +61,7 @@ _OBSERVED = np.eye(3, SIZE)
 
 
 def measurement_event(
-    stamp_ns: int, value: Array, covariance: Array, share: float
+    stamp_ns: int, value: Array, covariance: Array, share: float, late_s: float = 0.0
 ) -> MeasurementEvent:
     """A position (2,) or pose (3,), its covariance split into what neighboring images share.
 
@@ -59,7 +72,7 @@ def measurement_event(
     for i, row in enumerate(root(covariance.tolist())):
         for j, entry in enumerate(row, ERROR):
             jacobian[i, j] = shared * entry
-    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance)
+    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance, late_s)
 
 
 class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -70,7 +83,7 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self._next_mean: Array = np.zeros(SIZE)
 
     def predicted(self, belief: Belief, step: Step) -> Array:
-        """Covariance (11, 11) after a prediction: F P F^T + Q."""
+        """Covariance (12, 12) after a prediction: F P F^T + Q."""
         self.x, self.P, self._next_mean = belief.mean, belief.covariance, step.mean
         self.F, self.Q = step.jacobian, step.noise
         self.predict()
@@ -81,7 +94,7 @@ class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
         self.x = self._next_mean
 
     def corrected(self, belief: Belief, event: MeasurementEvent) -> tuple[Array, Array, float]:
-        """Mean (11,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
+        """Mean (12,), covariance (Joseph form) and squared Mahalanobis distance of the innovation,
         which stays in `y`, its covariance in `S`.
         """
         self.x, self.P = belief.mean, belief.covariance
@@ -121,7 +134,7 @@ class Ekf:
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
         return Belief(
-            stamp_ns, np.zeros(SIZE), covariance, False, nowhere, 0.0, twist, None, Memory()
+            stamp_ns, np.zeros(SIZE), covariance, False, nowhere, 0.0, twist, Odometer(), Memory()
         )
 
     def step(self, belief: Belief, event: Event) -> Belief:
@@ -139,13 +152,17 @@ class Ekf:
 
     def _driven(self, belief: Belief, event: OdometryEvent) -> Belief:
         """The belief after an odometry reading, which held since the one before it."""
-        if belief.odometry_ns is None and belief.stamp_ns == 0:
+        last = belief.odometry
+        if last.stamp_ns is None and belief.stamp_ns == 0:
             return belief._replace(
-                stamp_ns=event.stamp_ns,
-                twist=event.twist,
-                odometry_ns=event.stamp_ns,
-                odometry_pose=event.pose,
+                stamp_ns=event.stamp_ns, twist=event.twist, odometry=received(belief, event)
             )
+        if repeats(belief, event):
+            return belief
+        if made := jump(belief, event):
+            if last.suspect is None:
+                return belief._replace(odometry=last._replace(suspect=event))
+            return self._broken(belief, event, made)
         held, reading = interval(belief, event), event.twist
         if held is None:
             belief = self.coast(belief, event.stamp_ns)
@@ -154,13 +171,25 @@ class Ekf:
         step = motion.drive(belief.mean, held.twist, dt, self._noise, held.now)
         return self._moved(belief, event.stamp_ns, step, event, held)
 
+    def _broken(self, belief: Belief, event: OdometryEvent, made: Jump) -> Belief:
+        """The belief after a break: nothing tells a slip of the wheels' counts from a robot that
+        was moved, so the pose is expected where its speed leads, and is known no better than one
+        that is DEGRADED, until an image places it.
+        """
+        belief, std_m = self.coast(belief, event.stamp_ns), self._config.degraded_std
+        noise = np.zeros((SIZE, SIZE))
+        noise[:3, :3] = np.diag(np.square([std_m, std_m, DEGRADED_YAW_RAD]))
+        moved = self._moved(belief, event.stamp_ns, Step(belief.mean, np.eye(SIZE), noise), event)
+        twist = event.twist if moved.odometry.fills_twist else belief.twist
+        return moved._replace(twist=twist, odometry=moved.odometry._replace(jump=made))
+
     def coast(self, belief: Belief, stamp_ns: int) -> Belief:
         """The belief at a later stamp without new odometry: at the last speed, then unknown."""
         if belief.stamp_ns == 0:
             return belief._replace(stamp_ns=stamp_ns)
         coasted_ns = belief.stamp_ns
-        if belief.odometry_ns is not None:
-            coasted_ns = max(coasted_ns, belief.odometry_ns + round(COAST_S * 1e9))
+        if belief.odometry.stamp_ns is not None:
+            coasted_ns = max(coasted_ns, belief.odometry.stamp_ns + round(COAST_S * 1e9))
         for end_ns, move in ((min(stamp_ns, coasted_ns), motion.coast), (stamp_ns, motion.halt)):
             if end_ns > belief.stamp_ns:
                 dt = (end_ns - belief.stamp_ns) * 1e-9
@@ -195,9 +224,8 @@ class Ekf:
             reckoned,
             belief.traveled_m + math.hypot(dx, dy),
             held.now if held else belief.twist,
-            event.stamp_ns if event else belief.odometry_ns,
+            received(belief, event) if event else belief.odometry,
             belief.memory,
-            event.pose if event else belief.odometry_pose,
             belief.track.driven(stamp_ns, reckoned, oldest_ns),
             held.omega if held else belief.omega,
         )
@@ -230,7 +258,8 @@ class Ekf:
     def _gated(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """Accept what lies inside the gate; what is outlying within loses weight."""
         kalman, memory, size = self._kalman, belief.memory, event.value.size
-        mean, covariance, d2 = kalman.corrected(belief, event)
+        delayed = _delayed(belief, event)
+        mean, covariance, d2 = kalman.corrected(belief, delayed)
         inside = d2 <= GATE[size]
         reason = 'accepted' if inside else 'outside the gate'
         update = Update(event.stamp_ns, inside, d2, GATE[size], reason, kalman.y, kalman.S)
@@ -240,7 +269,7 @@ class Ekf:
             return self._rejected(belief._replace(memory=memory), event)
         outlying = d2 / (memory.scatter * OUTLYING[size])
         if outlying > 1 and self._alike:
-            lighter = event._replace(white=event.white * outlying**2)
+            lighter = delayed._replace(white=event.white * outlying**2)
             mean, covariance, _ = kalman.corrected(belief, lighter)
         # At most 1: an image that claims too little is not believed more than it claims.
         scatter = min(max(_nearer(memory.scatter, d2 / MEDIAN[size]), _LEAST_SCATTER), 1.0)
@@ -275,7 +304,20 @@ class Ekf:
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
+        moving, late_s = motion.velocity(placed.mean), placed.mean[DELAY] - event.late_s
+        variance = placed.covariance[DELAY, DELAY]
+        placed.mean[:3] += moving * late_s
+        placed.covariance[:3, :3] += variance * np.outer(moving, moving)
+        placed.covariance[:3, DELAY] = placed.covariance[DELAY, :3] = variance * moving
         return placed._replace(memory=memory, track=track)
+
+
+def _delayed(belief: Belief, event: MeasurementEvent) -> MeasurementEvent:
+    """As a measurement linear in the state: z = x - velocity (DELAY - late_s) + errors."""
+    moving = motion.velocity(belief.mean)[: len(event.value)]
+    jacobian = event.jacobian.copy()
+    jacobian[:, DELAY] = -moving
+    return event._replace(value=event.value - event.late_s * moving, jacobian=jacobian)
 
 
 def _images(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Image, ...]:

@@ -8,7 +8,7 @@ constant v and omega leads from (x, y, yaw) to (`arc`)
 
     x' = x + c cos(yaw + h)    y' = y + c sin(yaw + h)    yaw' = yaw + omega dt
 
-and its derivatives fill the Jacobian (`_advance`). The state has eight components more than a pose:
+and its derivatives fill the Jacobian (`_advance`). The state has nine components more than a pose:
 
 - V, OMEGA: speed m/s and turn rate rad/s of the robot, as in CTRV. Odometry replaces them:
   v = (1 + scale) v_odometry - loss |omega_odometry|, omega = omega_odometry - bias (`drive`).
@@ -17,6 +17,8 @@ and its derivatives fill the Jacobian (`_advance`). The state has eight componen
   odometry while driving (augmented Kalman filter: Larsen et al., ICRA 1998).
 - LOSS: way that is lost in a turn, m per radian; a random walk over the angle. Wheels of real
   robots push less where they turn, and controllers slow down: four small ones lost 0.07 to 0.1.
+- DELAY: by how much images are stamped later than expected, s; a random walk in time. An image
+  shows the robot of so long ago (`velocity`), which turns tell from an error of the pose.
 - ERROR (3): the error that images of one place share, in standard deviations of the measurement.
   Images of neighboring places err alike, because the map is wrong there: e' = f e + sqrt(1 - f^2) n
   with f = exp(-distance / decorrelation) and n white of unit variance (Gauss-Markov process as
@@ -33,35 +35,35 @@ import numpy as np
 
 from sfa_localization.data.geometry import SPOT_RADIUS_M, Array
 
-X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, ERROR = range(9)
-SIZE = 11
+X, Y, YAW, V, OMEGA, BIAS, SCALE, LOSS, DELAY, ERROR = range(10)
+SIZE = 12
 TURN_RADIUS_M = 0.25
 """Distance that one radian of turning counts as: about half the track of a small robot."""
 YAW_PER_METER = 0.005
 """Heading error that grows with the distance, rad per sqrt(m): turns the wheels do not show."""
 ODOMETRY_CORRELATION_S = 0.1
 """Time for which odometry readings err alike: about the time constant of a wheel controller."""
-BIAS_WALK, SCALE_WALK, LOSS_WALK = 1e-4, 1e-3, 1e-3
+BIAS_WALK, SCALE_WALK, LOSS_WALK, DELAY_WALK = 1e-4, 1e-3, 1e-3, 1e-3
 """Random walks: of the turn-rate bias, rad/s per sqrt(s), that of a cheap warm gyroscope; of the
 wheel scale, 1/sqrt(m), a percent over 100 m, as load and ground change; of the way lost in turns,
-m/rad per sqrt(rad)."""
+m/rad per sqrt(rad); of the camera's delay, s per sqrt(s): clocks 50 ppm apart in 1000 s."""
 ACCELERATION = 1.0
 """Change of speed (m/s) and turn rate (rad/s) per sqrt(s) without new odometry."""
 UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
 """Speed (m/s) and turning (rad per sqrt(s)) of a robot whose odometry is silent for long."""
 STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
-CALIBRATION_STDS = (0.01, 0.03, 0.05)
-"""Standard deviations of turn-rate bias (rad/s), wheel scale and way lost in turns (m/rad) before
-any is learned: data sheets of cheap gyroscopes, the tolerance of a tire's diameter, and a third of
-the half track of a small robot."""
+CALIBRATION_STDS = (0.01, 0.03, 0.05, 0.2)
+"""Standard deviations of turn-rate bias (rad/s), wheel scale, way lost in turns (m/rad) and delay
+of the camera (s) before any is learned: data sheets of cheap gyroscopes, the tolerance of a tire's
+diameter, a third of the half track of a small robot, and what clocks differ by after each start."""
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
 _DIAGONAL = slice(0, None, SIZE + 1)  # of flat matrices
 
 
 class State(NamedTuple):
-    """Estimate at one stamp: `mean` (11,) and `covariance` (11, 11), in the order of X to ERROR."""
+    """Estimate at one stamp: `mean` (12,) and `covariance` (12, 12), in the order of X to ERROR."""
 
     stamp_ns: int
     mean: Array
@@ -119,7 +121,7 @@ def largest_std(covariance: Array) -> float:
 
 
 class Step(NamedTuple):
-    """A prediction: the new mean (11,), its Jacobian (11, 11), the noise it adds (11, 11)."""
+    """A prediction: the new mean (12,), its Jacobian (12, 12), the noise it adds (12, 12)."""
 
     mean: Array
     jacobian: Array
@@ -203,7 +205,7 @@ def drive(
     moved, twists = slice(X, OMEGA + 1), slice(V, OMEGA + 1)
     gain = step.jacobian[moved, twists].copy()
     step.jacobian[moved, twists] = 0.0
-    step.jacobian[moved, BIAS:ERROR] = gain.dot(((0.0, twist.v, by_loss), (-1.0, 0.0, 0.0)))
+    step.jacobian[moved, BIAS:DELAY] = gain.dot(((0.0, twist.v, by_loss), (-1.0, 0.0, 0.0)))
     step.noise[moved, moved] += (gain * twist[2:]).dot(gain.T)
     if now is not None and now is not twist:
         step.mean[V], step.mean[OMEGA], slowed = _corrected(mean, now)
@@ -265,15 +267,15 @@ def _advance(
     mean: Array, v: float, omega: float, twist: Twist, dt: float, noise: MotionNoise
 ) -> Step:
     """CTRV at v and omega over dt: mean, full Jacobian, and the noise that driving itself adds."""
-    x, y, yaw, _, _, bias, scale, loss, *errors = mean.tolist()
+    x, y, yaw, _, _, bias, scale, loss, delay, *errors = mean.tolist()
     way = arc(yaw, v, omega, dt)
     fade = math.exp(-(abs(v) * dt + TURN_RADIUS_M * abs(omega) * dt) / noise.decorrelation_m)
     after = np.array(
-        [x + way.dx, y + way.dy, wrap(yaw + way.dyaw), v, omega, bias, scale, loss]
+        [x + way.dx, y + way.dy, wrap(yaw + way.dyaw), v, omega, bias, scale, loss, delay]
         + [fade * error for error in errors]
     )
     jacobian = np.zeros((SIZE, SIZE))
-    jacobian.flat[_DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
+    jacobian.flat[_DIAGONAL] = (1, 1, 1, 1, 1, 1, 1, 1, 1, fade, fade, fade)
     jacobian[X, YAW], jacobian[Y, YAW] = -way.dy, way.dx
     jacobian[X, V], jacobian[Y, V] = way.dx_dv, way.dy_dv
     jacobian[X, OMEGA], jacobian[Y, OMEGA] = way.dx_domega, way.dy_domega
@@ -288,13 +290,21 @@ def _advance(
 
 
 def _drift(meters: float, radians: float, dt: float, fade: float, noise: MotionNoise) -> Array:
-    """Slip in proportion to the distance, and the random walks of BIAS to ERROR, (11, 11)."""
+    """Slip in proportion to the distance, and the random walks of BIAS to ERROR, (12, 12)."""
     slip, fresh = noise.slip_per_meter**2 * meters, 1 - fade * fade
     yaw = YAW_PER_METER**2 * meters + noise.yaw_per_radian**2 * radians
-    walks = BIAS_WALK**2 * dt, SCALE_WALK**2 * meters, LOSS_WALK**2 * radians
+    walks = (
+        BIAS_WALK**2 * dt, SCALE_WALK**2 * meters, LOSS_WALK**2 * radians, DELAY_WALK**2 * dt
+    )  # fmt: skip
     covariance = np.zeros((SIZE, SIZE))
     covariance.flat[_DIAGONAL] = (slip, slip, yaw, 0, 0, *walks, fresh, fresh, fresh)
     return covariance
+
+
+def velocity(mean: Array) -> Array:
+    """Of x m/s, y m/s and yaw rad/s (3,)."""
+    yaw, v, omega = mean[YAW : OMEGA + 1].tolist()
+    return np.array([v * math.cos(yaw), v * math.sin(yaw), omega])
 
 
 def wrap(angle: float) -> float:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,7 +66,7 @@ class PoseFilter:
         self.counts: Counter[str] = Counter()
         self._nis = 0.0, 0
         self.scale, self._shift, self._counted = self.config.odometry_scale, (0.0, 0.0), (0.0, 0.0)
-        self._camera = CameraClockFinder(_CLOCK_MEMORY)
+        self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
         self._ekf = Ekf(self.config, self.correlation)
         self._history = self._fresh(self._ekf.blank(0))
         self._forget()
@@ -140,8 +141,10 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         try:
-            v, commands = self.scale * v, self._open_loop.found
-            twist = read_twist(v, omega, variances, self.config, commands)
+            commands = self._open_loop.found
+            twist = read_twist(self.scale * v, omega, variances, self.config, commands)
+            again = partial(self.add_odometry, stamp_ns, v, omega, variances, pose)
+            self._timeline.require_order(stamp_ns, ODOMETRY, self._history, again)
             self._require_place(stamp_ns, ODOMETRY)
         except DataError as error:
             self.counts[f'odometry: {error}'] += 1
@@ -150,7 +153,8 @@ class PoseFilter:
         self._open_loop.add(twist.v, twist.omega)
         event = OdometryEvent(stamp_ns, twist, self._scaled(pose))
         driven = self._history.add((stamp_ns, ODOMETRY), event)
-        self._camera.add_odometry(stamp_ns, driven.omega)
+        if driven.odometry.stamp_ns == stamp_ns:
+            self._camera.add_odometry(stamp_ns, driven.omega)
         return ''
 
     def add_measurement(self, stamp_ns: int, value: ArrayLike, covariance: ArrayLike) -> Update:
@@ -162,10 +166,12 @@ class PoseFilter:
         stamp_ns = int(stamp_ns)
         try:
             fused, noise = read_measurement(value, covariance, self.config.measurement_factor)
+            again = partial(self.add_measurement, stamp_ns, value, covariance)
+            self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             taken_ns = self._taken(stamp_ns)
             self._require_place(taken_ns, MEASUREMENT)
-            noise = self._with_time_noise(taken_ns, stamp_ns, fused, noise)
-            event = measurement_event(taken_ns, fused, noise, self.correlation.share)
+            late_s = self._camera.clock_at(stamp_ns).delay_ns * 1e-9 - self._expected_s
+            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late_s)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
@@ -193,6 +199,7 @@ class PoseFilter:
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
+            self._expected_s = delay_s
             self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
 
     def expect_scale(self, scale: float) -> None:
@@ -225,18 +232,6 @@ class PoseFilter:
         taken_ns = max(stamp_ns - delay_ns, 1)
         earlier, later = self._history.before(taken_ns), self._history.before(stamp_ns)
         return stamp_ns if stalled(earlier, later, taken_ns, stamp_ns) else taken_ns
-
-    def _with_time_noise(self, taken_ns: int, stamp_ns: int, pose: Array, noise: Array) -> Array:
-        """With what a moving robot's pose (2,) or (3,) errs by because the time is uncertain."""
-        std_s = self._camera.clock_at(stamp_ns).std_s
-        if not math.isfinite(std_s):
-            return noise
-        twist = self._history.before(taken_ns).twist
-        if len(pose) == 2:
-            return noise + np.eye(2) * (std_s * twist.v) ** 2
-        yaw = float(pose[2])
-        moved = np.array([twist.v * math.cos(yaw), twist.v * math.sin(yaw), twist.omega])
-        return noise + np.outer(moved, moved) * std_s**2
 
     def _require_place(self, stamp_ns: int, kind: int) -> None:
         """Raise DataError when a stamp cannot be used; start anew when the clock went back."""
@@ -277,7 +272,7 @@ class PoseFilter:
     @property
     def state(self) -> State | None:
         """The estimate at the newest message; None before there is any."""
-        return self._at(self._history.newest.stamp_ns)
+        return self._at(self._newest.stamp_ns)
 
     def at(self, stamp_ns: int) -> State | None:
         """The estimate at a stamp: predicted beyond the newest message, recalled within history.
@@ -286,7 +281,7 @@ class PoseFilter:
         """
         stamp_ns = int(stamp_ns)
         if self._history.newest_ns is None or not self._history.reaches(stamp_ns):
-            return self.state if stamp_ns == self._history.newest.stamp_ns else None
+            return self.state if stamp_ns == self._newest.stamp_ns else None
         return self._at(stamp_ns)
 
     def _at(self, stamp_ns: int) -> State | None:
@@ -307,6 +302,12 @@ class PoseFilter:
         return state._replace(covariance=covariance)
 
     @property
+    def _newest(self) -> Belief:
+        """At the newest message, also where it adds nothing."""
+        newest, newest_ns = self._history.newest, self._history.newest_ns
+        return self._ekf.coast(newest, newest_ns) if newest_ns else newest
+
+    @property
     def health(self) -> Health:
         """What the last images show of the estimate."""
         belief = self._history.newest
@@ -319,7 +320,7 @@ class PoseFilter:
     @property
     def status(self) -> Status:
         """How far the estimate at the newest message can be trusted, and why not further."""
-        newest = self._history.newest
+        newest = self._newest
         state = newest.state and self._widened(newest.state)
         status = status_of(newest, state, self.health, self.config)
         doubts, delay_s = self._timeline.problems, self._camera.clock.delay_s

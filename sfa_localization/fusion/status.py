@@ -89,21 +89,29 @@ def _known_to(state: State, std_m: float, std_rad: float) -> list[str]:
 def _missing(belief: Belief) -> str:
     if belief.memory.images:
         return 'images show no heading yet: drive on'
-    return 'no odometry and no images yet' if belief.odometry_ns is None else 'no usable image yet'
+    return (
+        'no odometry and no images yet'
+        if belief.odometry.stamp_ns is None
+        else 'no usable image yet'
+    )
 
 
 def _silences(belief: Belief) -> list[str]:
     reasons, memory = [], belief.memory
     images_s, odometry_s = (
         math.inf if last_ns is None else (belief.stamp_ns - last_ns) * 1e-9
-        for last_ns in (memory.accepted_ns, belief.odometry_ns)
+        for last_ns in (memory.accepted_ns, belief.odometry.stamp_ns)
     )
+    jump = belief.odometry.jump
+    if jump and jump.stamp_ns > (memory.accepted_ns or 0):
+        far = f'{jump.way_m:.1f} m and {math.degrees(jump.turn_rad):.0f} deg'
+        reasons.append(f'odometry jumped by {far}: no image has confirmed the pose since')
     if memory.accepted_ns is None:
         reasons.append('no image has confirmed the start yet')
     elif images_s > silence_limit_s(memory.period_s):
         fits = 'fitting' if memory.rejected else 'usable'
         reasons.append(f'no {fits} image for {images_s:.0f} s')
-    if belief.odometry_ns is None:
+    if belief.odometry.stamp_ns is None:
         reasons.append('no odometry')
     elif odometry_s > ODOMETRY_TIMEOUT_S:
         reasons.append(f'no odometry for {odometry_s:.1f} s')

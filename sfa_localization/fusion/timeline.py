@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from sfa_localization.data.errors import DataError
 from sfa_localization.fusion.belief import Belief, Event
 from sfa_localization.fusion.history import History
@@ -12,9 +14,13 @@ ODOMETRY, POSE, MEASUREMENT = range(3)
 """Kinds of events, in the order in which those of one stamp follow each other."""
 HISTORY_NS = 5_000_000_000
 """How late a measurement may come: many times what any camera, network and model take."""
+LEAP_NS = 500_000_000
+"""A stamp that is ahead of all before it by more leaves the order of reception, or follows a pause:
+as much as a gap of the odometry."""
 FEW_AHEAD, FEW_BEHIND = 3, 5
-"""So many images in a row that lie ahead, and messages in a row that are too late, are no accident:
-the odometry has ended, and the clock has gone back."""
+"""So many messages in a row that leap ahead, and messages in a row that are too late, are
+no accident: there was a pause, and the clock has gone back."""
+AHEAD = 'stamp ahead of those before'
 _AGAIN_NS = 300_000_000
 """Time that odometry has to cover once more until the clock is taken to have gone back."""
 
@@ -27,31 +33,50 @@ class Timeline:
     """Feed it the stamps of all messages; it says which can be used."""
 
     def __init__(self) -> None:
-        self._behind = self._ahead = 0
+        self._behind = 0
+        # Messages in a row that leap ahead; the kinds of those that wait, and what takes them.
+        self._leaps, self._held = 0, list[tuple[int, Callable[[], object]]]()
         self._apart = 0, 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
         self._again = 0, 0, 0
 
-    def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
-        """Raises DataError for a stamp that cannot be used, and ClockWentBack.
-
-        Odometry keeps the time: an image of a clock ahead would make all that follows too old.
+    def require_order(
+        self, stamp_ns: int, kind: int, history: History[Event, Belief], again: Callable[[], object]
+    ) -> None:
+        """Raises DataError for a stamp ahead of those before, which would make what follows too
+        old, or wait. Its message waits until the next ones are ahead as well, which calls `again`
+        to take it; it is left out where odometry, which keeps the time, is not ahead.
         """
-        if stamp_ns <= 0:
-            raise DataError('zero or negative stamp')
-        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry_ns
-        if newest_ns is None:
+        newest_ns = history.newest_ns
+        if newest_ns is None or history.newest.odometry.stamp_ns is None:
             return
-        ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
+        ahead_ns = stamp_ns - newest_ns
         if kind == MEASUREMENT:
             apart = abs(ahead_ns) > HISTORY_NS
             self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
-        self._ahead = 0 if keeps_time else self._ahead + (ahead_ns > HISTORY_NS)
+        if ahead_ns <= LEAP_NS:
+            self._held = [held for held in self._held if held[0] != kind != ODOMETRY]
+            self._leaps = len(self._held)
+            return
+        self._leaps += 1
+        if self._leaps < FEW_AHEAD:
+            self._held.append((kind, again))
+            raise DataError(AHEAD)
+        held, self._held = self._held, []
+        for _, take in held:
+            take()
+
+    def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
+        """Raises DataError for a stamp that cannot be used, and ClockWentBack."""
+        if stamp_ns <= 0:
+            raise DataError('zero or negative stamp')
+        newest_ns, odometry_ns = history.newest_ns, history.newest.odometry.stamp_ns
+        if newest_ns is None:
+            return
+        ahead_ns, keeps_time = stamp_ns - newest_ns, kind == ODOMETRY or odometry_ns is None
         reason = ''
-        if not keeps_time and ahead_ns > HISTORY_NS and self._ahead < FEW_AHEAD:
-            reason = 'stamp ahead of the odometry'
-        elif ahead_ns <= 0 and not history.reaches(stamp_ns):
+        if ahead_ns <= 0 and not history.reaches(stamp_ns):
             reason = 'too old'
         elif ahead_ns <= 0 and history.holds((stamp_ns, kind)):
             reason = 'duplicate stamp'
@@ -69,6 +94,8 @@ class Timeline:
         """How images and odometry are apart in time, in words."""
         if self._again[0] > 1:
             return ['odometry is stamped with times that it had passed: did the clock go back?']
+        if self._held:
+            return [AHEAD]
         count, apart_ns = self._apart
         if count < FEW_AHEAD:
             return []
@@ -87,7 +114,7 @@ class Timeline:
         elif stamp_ns < last_ns or last_ns == 0:
             self._again = 0, stamp_ns, stamp_ns
         else:
-            among += (history.before(stamp_ns).odometry_ns or 0) > last_ns
+            among += (history.before(stamp_ns).odometry.stamp_ns or 0) > last_ns
             self._again = among, first_ns, stamp_ns
             if among >= FEW_BEHIND and stamp_ns - first_ns >= _AGAIN_NS:
                 raise ClockWentBack
