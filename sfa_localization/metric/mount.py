@@ -14,7 +14,7 @@ closures is r, with derivatives A by [o, z, b] and B by v. To first order the cl
     S = B^T B - B^T A N^-1 A^T B,    h = S v - B^T r,
 
 with N the normal equations of [o, z, b]. Beside them stands what is known of robots: the camera
-sits above base_link, or where it was measured, to a centimeter; or, as probable, anywhere on the
+sits above base_link, or where it was measured, to 5 mm; or, as probable, anywhere on the
 robot. With the prior's covariance C, either has the posterior covariance (S + C^-1)^-1 = D, the
 mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2), by which both are mixed. A drive that
 never turns where it is seen again does not show l: its variance stays large.
@@ -32,7 +32,7 @@ from scipy import special
 from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
 
-GIVEN_STD_M = 0.01
+GIVEN_STD_M = 0.005
 """Of a camera's place that was measured on the robot."""
 CAMERA_TURN_STD = 1.0
 """rad, of the yaw of a camera in a later drive: it may have been taken off and put back anyhow."""
