@@ -304,9 +304,11 @@ class Ekf:
             period_s=belief.memory.period_s,
         )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
-        moving, late_s = motion.velocity(placed.mean), placed.mean[DELAY] - event.late_s
-        variance = placed.covariance[DELAY, DELAY]
-        placed.mean[:3] += moving * late_s
+        # The pose is that of the delay before.
+        moving, variance = motion.velocity(placed.mean), placed.covariance[DELAY, DELAY]
+        placed.mean[:3] += moving * (placed.mean[DELAY] - event.late_s)
+        placed.covariance[DELAY] = placed.covariance[:, DELAY] = 0.0
+        placed.covariance[DELAY, DELAY] = variance
         placed.covariance[:3, :3] += variance * np.outer(moving, moving)
         placed.covariance[:3, DELAY] = placed.covariance[DELAY, :3] = variance * moving
         return placed._replace(memory=memory, track=track)
@@ -322,7 +324,8 @@ def _delayed(belief: Belief, event: MeasurementEvent) -> MeasurementEvent:
 
 def _images(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Image, ...]:
     """The images remembered, with a measurement beside the pose by dead reckoning."""
-    variances, (x, y, *yaw) = event.covariance.diagonal().tolist(), event.value.tolist()
+    late = motion.velocity(belief.mean)[: len(event.value)] ** 2 * belief.covariance[DELAY, DELAY]
+    variances, (x, y, *yaw) = (event.covariance.diagonal() + late).tolist(), event.value.tolist()
     newest = Image(
         event.stamp_ns,
         complex(x, y),

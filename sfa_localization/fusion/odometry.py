@@ -97,7 +97,7 @@ def jump(belief: Belief, event: OdometryEvent) -> Jump | None:
     before was suspected of it, that after it: see data.odometry_steps.
     """
     last, after = belief.odometry, event.pose
-    if last.pose is None or after is None or _is_askew(belief, event):
+    if last.pose is None or after is None or _gives_way(belief, event):
         return None
     seconds = (event.stamp_ns - (last.stamp_ns or belief.stamp_ns)) * 1e-9
     if seconds > _LONGEST_S:
@@ -145,17 +145,21 @@ def _shown(belief: Belief, event: OdometryEvent, seconds: float) -> Twist | None
     before, after = belief.odometry.pose, event.pose
     if before is None or after is None or before == after or seconds <= 0:
         return None
-    if seconds > _LONGEST_S or _is_askew(belief, event):
+    if seconds > _LONGEST_S or _gives_way(belief, event):
         return None
     turn, ahead, _ = _moved(before, after)
     return _twist(turn, ahead, seconds, event.twist)
 
 
-def _is_askew(belief: Belief, event: OdometryEvent) -> bool:
-    """Whether poses move more sideways than ahead, which no robot on wheels does."""
+def _gives_way(belief: Belief, event: OdometryEvent) -> bool:
+    """Whether a pose gives way to the twist: it moves more sideways than ahead, which no robot on
+    wheels does, or for the first time after twists that count already.
+    """
     assert belief.odometry.pose is not None and event.pose is not None
     seconds = (event.stamp_ns - (belief.odometry.stamp_ns or belief.stamp_ns)) * 1e-9
     _, ahead, aside = _moved(belief.odometry.pose, event.pose)
+    if not any(belief.odometry.renewed_ns) and (belief.twist.v or belief.twist.omega):
+        return True
     drives = abs(event.twist.v) * seconds > abs(aside) / 2
     return seconds <= ODOMETRY_TIMEOUT_S and drives and abs(aside) > max(abs(ahead), _ROUNDED_M)
 

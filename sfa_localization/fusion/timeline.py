@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from sfa_localization.data.errors import DataError
@@ -34,8 +35,8 @@ class Timeline:
 
     def __init__(self) -> None:
         self._behind = 0
-        # Messages in a row that leap ahead; the kinds of those that wait, and what takes them.
-        self._leaps, self._held = 0, list[tuple[int, Callable[[], object]]]()
+        # Messages in a row that leap ahead; kind and stamp of those that wait, and what takes them.
+        self._leaps, self._held = 0, list[tuple[int, int, Callable[[], object]]]()
         self._apart = 0, 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
@@ -56,15 +57,16 @@ class Timeline:
             apart = abs(ahead_ns) > HISTORY_NS
             self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
         if ahead_ns <= LEAP_NS:
-            self._held = [held for held in self._held if held[0] != kind != ODOMETRY]
+            far_ns = HISTORY_NS if kind == ODOMETRY else math.inf
+            self._held = [h for h in self._held if h[0] != kind and h[1] - stamp_ns <= far_ns]
             self._leaps = len(self._held)
             return
         self._leaps += 1
         if self._leaps < FEW_AHEAD:
-            self._held.append((kind, again))
+            self._held.append((kind, stamp_ns, again))
             raise DataError(AHEAD)
         held, self._held = self._held, []
-        for _, take in held:
+        for *_, take in held:
             take()
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:

@@ -1,0 +1,153 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry that jumps, repeats its pose or leaps ahead in time; images later than expected."""
+
+import math
+
+import numpy as np
+import pytest
+from filter_drives import SECOND, START_NS, Drive, from_rest, known, winding
+
+from sfa_localization.data.odometry_steps import beyond, tolerance
+from sfa_localization.fusion.pose_filter import Level, PoseFilter
+
+SURE = np.diag([0.0025, 0.0025, 0.0004])
+
+
+@pytest.mark.parametrize(('step', 'speeds', 'far'), [
+    ([0.04, 0.0], [[1.0, 0.0]], 0.0),
+    ([0.01, 0.0], [[1.0, 0.0]], 0.0),  # it stopped within the step
+    ([0.64, 0.0], [[1.0, 0.0]], 0.6),
+    ([-0.5, 0.0], [[1.0, 0.0]], 0.5),
+    ([0.04, 0.3], [[1.0, 0.0]], 0.3),
+    ([0.64, 0.0], [[1.0, 0.0], [16.0, 0.0]], 0.0),  # it goes on so
+    ([0.3], [[0.0]], 0.3),
+])  # fmt: skip
+def test_a_step_is_beyond_the_nearest_speed_by_hand(step, speeds, far):
+    assert beyond(step, 0.04, speeds) == pytest.approx(far, abs=1e-9)
+    assert np.allclose(beyond([step] * 3, [0.04] * 3, [[each] * 3 for each in speeds]), far)
+
+
+def test_longer_steps_and_noisier_odometry_are_allowed_more():
+    assert tolerance(0.0, 0.0) == pytest.approx(0.05)
+    assert tolerance(0.04, 0.0) == pytest.approx(0.05 + 5 * 0.04**2)
+    assert tolerance([1.0, 2.0], 0.01) == pytest.approx([1.11, 2.11])
+
+
+def fused_over(poses, twists, drive, images=True, stamps_ns=None):
+    """(second, error m, level, reasons) at each odometry message; images every fifth are exact."""
+    fused, outputs = known(std=0.02), []
+    stamps_ns = drive.stamps_ns if stamps_ns is None else stamps_ns
+    for i, stamp_ns in enumerate(stamps_ns.tolist()):
+        fused.add_odometry(stamp_ns, *twists[i], (4e-4, 1e-4), poses[i])
+        if images and i % 5 == 0:
+            fused.add_measurement(int(drive.stamps_ns[i]), drive.poses[i], SURE)
+        error = math.dist(fused.state.pose[:2], drive.poses[i, :2])
+        outputs.append((i / drive.rate_hz, error, fused.status.level, fused.status.reasons))
+    return fused, outputs
+
+
+def jumped(poses, at, way_m, turn_rad=0.0):
+    """Poses (N, 3) that go on from a step ahead, and a turn, from a message on."""
+    pivot = poses[at]
+    z = (poses[:, 0] - pivot[0] + 1j * (poses[:, 1] - pivot[1])) * np.exp(1j * turn_rad)
+    z += pivot[0] + 1j * pivot[1] + way_m * np.exp(1j * (pivot[2] + turn_rad))
+    later = np.column_stack([z.real, z.imag, poses[:, 2] + turn_rad])
+    return np.where(np.arange(len(poses))[:, None] < at, poses, later)
+
+
+@pytest.mark.parametrize('with_twist', [True, False])
+@pytest.mark.parametrize(('way_m', 'turn_rad'), [
+    (0.3, 0.0), (0.38, 0.0), (0.6, 0.0), (2.0, 0.0), (-0.5, 0.0), (0.0, 0.3), (0.3, 1.0),
+])  # fmt: skip
+def test_odometry_that_jumps_moves_nothing_and_is_told_until_an_image_comes(
+    way_m, turn_rad, with_twist
+):
+    drive = Drive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    twists = drive.read.copy()
+    if with_twist:
+        twists[251] += [way_m * 25, turn_rad * 25]
+    _, outputs = fused_over(jumped(drive.reckoned, 251, way_m, turn_rad), twists, drive)
+    assert max(error for _, error, *_ in outputs) < 0.05
+    told = [t for t, _, level, why in outputs if 'odometry jumped' in ' '.join(why)]
+    assert told == [252 / 25, 253 / 25, 254 / 25]
+    assert all(level is Level.DEGRADED for t, _, level, _ in outputs if t in told)
+    assert outputs[-1][2] is Level.LOCALISED
+
+
+def test_speed_that_changes_within_a_message_is_no_jump():
+    """As of commands that are repeated, at 10 Hz: 0 to 2 m/s, and 0 to 2 rad/s."""
+    twists = np.repeat([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, -2.0]], 10, axis=0)
+    drive = Drive(twists=np.tile(twists, (2, 1)), rate_hz=10)
+    _, outputs = fused_over(drive.reckoned, drive.read, drive)
+    assert not any('jumped' in reason for *_, why in outputs for reason in why)
+
+
+def test_noisy_poses_are_no_jumps_once_their_noise_is_learned():
+    drive = Drive(twists=winding(20, 25.0, speed=0.4), rate_hz=25)
+    noise = np.random.default_rng(0).normal(0.0, 0.03, drive.reckoned.shape) * [1.0, 1.0, 0.1]
+    _, outputs = fused_over(drive.reckoned + noise, drive.read, drive)
+    assert not any('jumped' in ' '.join(why) for t, *_, why in outputs if t > 4)
+
+
+@pytest.mark.parametrize('times', [2, 5, 12])
+@pytest.mark.parametrize('twist', ['fresh', 'stale', 'zero'])
+def test_a_pose_that_is_repeated_adds_nothing(times, twist):
+    rate_hz = 25
+    drive = Drive(twists=from_rest(winding(20, rate_hz, speed=0.4), rate_hz), rate_hz=rate_hz)
+    renewed = np.arange(len(drive.stamps_ns)) // times * times
+    twists = {'fresh': drive.read, 'stale': drive.read[renewed], 'zero': 0 * drive.read}[twist]
+    _, outputs = fused_over(drive.reckoned[renewed], twists, drive, images=False)
+    last = renewed[-1]  # beyond it, nobody knows
+    assert outputs[last][1] < 0.02
+    assert np.mean([error for _, error, *_ in outputs]) < 0.06
+
+
+def test_poses_that_are_never_filled_and_a_robot_that_stands_go_on_by_the_twist():
+    drive = Drive(twists=from_rest(winding(10)))
+    _, outputs = fused_over(np.zeros((500, 3)), drive.read, drive, images=False)
+    assert max(error for _, error, *_ in outputs) < 1e-6
+    drive = Drive(twists=np.repeat([[0.5, 0.0], [0.0, 0.0], [0.5, 0.3]], 100, axis=0))
+    _, outputs = fused_over(drive.reckoned, drive.read, drive, images=False)
+    assert max(error for _, error, *_ in outputs) < 1e-6
+    assert not any('no odometry' in reason for *_, why in outputs for reason in why)
+
+
+@pytest.mark.parametrize('ahead_s', [0.6, 1.0, 4.0, 30.0])
+@pytest.mark.parametrize('kind', [0, 1])
+def test_a_single_stamp_ahead_is_left_out_and_blocks_nothing(ahead_s, kind):
+    drive, errors = Drive(seconds=10, omega_std=0.01), []
+    fused = known()
+    for k, (stamp_ns, of, index) in enumerate(drive.events()):
+        wrong = of == kind and index % 45 == 20
+        event = stamp_ns + round(wrong * ahead_s * SECOND), of, index
+        drive.give(fused, event, heading=True)
+        errors.append(0 if of or wrong else drive.error(fused, index)[0])
+        assert k < 50 or wrong or fused.status.level is not Level.LOST
+    name = ['odometry', 'measurement'][kind]
+    many = [sum(i % 45 == 20 for i in range(len(drive.stamps_ns))), 3][kind]
+    assert fused.counts[f'{name}: stamp ahead of those before'] in (many, many - 1)
+    assert max(errors) < 0.1 and fused.counts['clock went back'] == 0
+
+
+def test_a_clock_that_is_set_ahead_is_followed_from_the_third_message_on():
+    drive, fused = Drive(seconds=10), known()
+    for stamp_ns, kind, index in drive.events():
+        later_ns = round(3e5 * SECOND) * (stamp_ns - START_NS > 5 * SECOND)
+        drive.give(fused, (stamp_ns + later_ns, kind, index), heading=True)
+    assert fused.state.stamp_ns == int(drive.stamps_ns[-1]) + round(3e5 * SECOND)
+    assert drive.error(fused, -1)[0] < 0.1
+
+
+@pytest.mark.parametrize('late_s', [-0.2, 0.1, 0.3])
+def test_a_delay_other_than_expected_is_estimated_from_the_first_turn(late_s):
+    """No visual turns are given: the images' poses show it, against the motion by the wheels."""
+    drive = Drive(seconds=20, rate_hz=50)
+    fused, late_ns, errors = PoseFilter(), round(late_s * SECOND), []
+    fused.expect_delay(0.0)
+    arrives = lambda event: event[0] + event[1] * late_ns  # noqa: E731
+    for stamp_ns, kind, index in sorted(drive.events(), key=arrives):
+        drive.give(fused, (stamp_ns + kind * late_ns, kind, index), heading=True)
+        if kind == 0 and stamp_ns - START_NS > 6 * SECOND:
+            errors.append(math.dist(fused.at(stamp_ns).pose[:2], drive.poses[index, :2]))
+    assert np.mean(errors) < abs(late_s) / 3  # meters at 1 m/s, all of it without the estimate
