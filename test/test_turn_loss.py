@@ -95,8 +95,9 @@ def errors(loss):
 def test_wheels_that_lose_way_in_turns_give_nearly_as_good_a_map(monkeypatch):
     exact, plain = errors(0.0)
     lost, trained = errors(0.15)
-    assert plain.model.quality['turn_loss'] == [0.0]
-    assert trained.model.quality['turn_loss'] == [pytest.approx(0.15, abs=0.06)]
+    assert plain.model.rig.turn_loss.value == 0.0
+    assert trained.model.rig.turn_loss.value == pytest.approx(0.15, abs=0.06)
+    assert trained.model.rig.turn_loss.std < plain.model.rig.turn_loss.std
     assert 'm per radian in turns: taken into account' in summary(trained)
     monkeypatch.setattr('sfa_localization.metric.drives.way_of', lambda *_: None)
     bent, _ = errors(0.15)

@@ -143,8 +143,6 @@ def read_drive(
     recipe = recipe or ReadingRecipe()
     with Bag(path, strict=strict, config=recipe.bag) as bag:
         name = bag.find('image', recipe.topics.image)
-        odometry_name = bag.find('odometry', recipe.topics.odometry)
-        camera = camera_place(bag, name, odometry_name.partition(':')[0])
         try:
             stored = _Images(Path(cache), recipe)
             streams = {'images': bag.stream(name, stored.panorama)}
@@ -161,6 +159,7 @@ def read_drive(
                 panoramas = _leveled(panoramas, by, tilts, recipe.panorama.sphere)
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
+        camera = camera_place(bag, name, streams['odometry'].topic)
         for problem in bag.problems:
             logger.warning('%s: %s', path, problem)
     counts = {use: stream.count for use, stream in streams.items()}

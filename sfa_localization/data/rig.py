@@ -39,7 +39,8 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """What training learned of a robot, or what is assumed without any training.
+    """What training learned of a robot, or what is assumed without any training: clocks that start
+    anew each day, the tolerance of a tire's diameter, a third of the half track of a small robot.
 
     The camera sits `camera_ahead` and `camera_left` m of base_link, and looks `camera_yaw` rad to
     the left of where it did in the first drive; its images are stamped `camera_delay` s late. The
@@ -50,9 +51,9 @@ class Rig:
     camera_ahead: Quantity = Quantity(0.0, 0.0)
     camera_left: Quantity = Quantity(0.0, 0.0)
     camera_yaw: Quantity = Quantity(0.0, 0.0)
-    camera_delay: Quantity = Quantity(0.0, 0.05)
-    wheel_scale: Quantity = Quantity(1.0, 0.01)
-    turn_loss: Quantity = Quantity(0.0, 0.0)
+    camera_delay: Quantity = Quantity(0.0, 0.2)
+    wheel_scale: Quantity = Quantity(1.0, 0.03)
+    turn_loss: Quantity = Quantity(0.0, 0.05)
 
     def __post_init__(self) -> None:
         for name, (value, std) in self.items():

@@ -49,11 +49,16 @@ class TurnCorrection:
 
 class Way(NamedTuple):
     """The way of a drive by that which its wheels counted: `scale` times it, less a `loss`, m per
-    radian, in turns.
+    radian, in turns, which is known to `loss_std`.
     """
 
     scale: float = 1.0
     loss: float = 0.0
+    loss_std: float = 0.0
+
+    def scaled(self, factor: float) -> Way:
+        """The same in meters that are longer by a factor."""
+        return Way(*(factor * each for each in self))
 
 
 @dataclass(frozen=True, slots=True)

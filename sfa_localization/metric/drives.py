@@ -42,6 +42,8 @@ logger = logging.getLogger(__name__)
 
 _POINT_ROUNDS = 3
 """Points that bend the map straight may show other ones to be right, which bend it again."""
+SCALE_STD = 0.01
+"""Of a map: its meters are those of wheels, seldom known better."""
 _MOUNT_ROUNDS, _MOUNT_SETTLED_M = 4, 0.02
 """Offsets are measured anew until the camera's place moves by less than they err."""
 _LOSS_ROUNDS = 2
@@ -177,13 +179,14 @@ class Drives:
 def rig_of(drives: Drives, segments: Segments) -> Rig:
     """What was learned of the robot."""
     usual, delays = Rig(), [drive.delay_s for drive in drives.items if drive.delay_s is not None]
-    loss = [way.loss for way in segments.ways if way]
-    scale = segments.anchors.settled if segments.anchors else None
+    ways = np.array([way or Way(loss_std=usual.turn_loss.std) for way in segments.ways])
+    scale_std = segments.anchors.settled.scale_std if segments.anchors else SCALE_STD
+    scale, loss, _ = ways.mean(axis=0).tolist()
     return Rig(
         **segments.mount.quantities,
         camera_delay=usual.camera_delay._replace(value=float(np.median(delays or [0.0]))),
-        wheel_scale=Quantity(scale.scale, scale.scale_std) if scale else usual.wheel_scale,
-        turn_loss=Quantity(float(np.mean(loss or [0.0])), 0.0),
+        wheel_scale=Quantity(scale, scale_std),
+        turn_loss=Quantity(loss, math.hypot(float(ways[:, 1].std()), float(ways[:, 2].max()))),
     )
 
 
@@ -235,8 +238,7 @@ def anchored(
         now = settle(segments.anchors, result.points, result.points_covariance)
         if (now.used == before.used).all():
             break
-        old = [way or Way() for way in segments.ways]
-        ways = [Way(way.scale * now.scale, way.loss * now.scale) for way in old]
+        ways = [(way or Way()).scaled(now.scale) for way in segments.ways]
         segments = drives.cut(ways, replace(now, scale=before.scale * now.scale))
         maps = again(segments)
     if segments.anchors is not None:

@@ -149,22 +149,20 @@ def way_of(
     ways = (np.interp(time_s, seconds, summed(s)) for s in (track.steps(), track.way_per_loss()))
     by_odometry, by_loss = (turn * (way[last] - way[first]) for way in ways)
     moved = places[last] - places[first]
-    way, std = _fitted(moved, by_odometry, -by_loss)
+    way = _fitted(moved, by_odometry, -by_loss)
     if not 1 / LARGEST_SCALE < way.scale < LARGEST_SCALE:
         return None
     if before is not None:
         shape = by_odometry - way.loss / way.scale * by_loss
         whole = before.scale * by_odometry - before.loss * by_loss
         scale = float(np.real(np.vdot(shape, whole)) / np.real(np.vdot(shape, shape)))
-        way, std = Way(scale, way.loss / way.scale * scale), std * scale / way.scale
-    clear = CHANCE_STDS * std < abs(way.loss) < LARGEST_LOSS
+        way = way.scaled(scale / way.scale)
+    clear = CHANCE_STDS * way.loss_std < abs(way.loss) < LARGEST_LOSS
     return way if clear else None
 
 
-def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way, float]:
-    """The way, and the standard deviation of its loss, without outliers among the places of the
-    images.
-    """
+def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> Way:
+    """The way without outliers among the places of the images."""
     columns = np.column_stack([by_odometry, by_loss])
     rows = np.vstack([columns.real, columns.imag])
     values = np.concatenate([moved.real, moved.imag])
@@ -176,7 +174,7 @@ def _fitted(moved: Complex, by_odometry: Complex, by_loss: Complex) -> tuple[Way
         std = max(MEDIAN_TO_STD * float(np.median(np.abs(missed))), 1e-9)
         weight = 1 / outlier_factor((missed / std) ** 2)
     variance = np.linalg.pinv((rows * weight[:, None]).T @ rows) * std**2
-    return Way(float(found[0]), float(found[1])), float(np.sqrt(variance[1, 1]))
+    return Way(float(found[0]), float(found[1]), float(np.sqrt(variance[1, 1])))
 
 
 def _pairs(driven: Array, part: Indices) -> tuple[Indices, Indices]:

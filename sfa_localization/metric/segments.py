@@ -128,8 +128,7 @@ class Segments:
     @property
     def quality(self) -> dict[str, Any]:
         """Figures that are stored in the model."""
-        losses = [way.loss if way else 0.0 for way in self.ways]
-        return {'segments': len(self), 'turn_loss': losses}
+        return {'segments': len(self)}
 
     def __iter__(self) -> Iterator[Segment]:
         return iter(self.items)

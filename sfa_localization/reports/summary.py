@@ -46,10 +46,10 @@ def summary(trained: Trained) -> str:
     lines += [*trained.model.rig.as_text(), *point_lines(quality)]
     for run, check in zip(trained.runs, trained.checks, strict=False):
         lines += [f'{run.name}: {text}' for text in check.wrong + check.corrected]
-    for run, loss in zip(trained.runs, quality['turn_loss'], strict=True):
-        if loss:
+    for run, way in zip(trained.runs, trained.segments.ways, strict=True):
+        if way and way.loss:
             lines.append(
-                f'{run.name}: wheels lose {loss:.2f} m per radian in turns: taken into account'
+                f'{run.name}: wheels lose {way.loss:.2f} m per radian in turns: taken into account'
             )
     used = {f'{run.name}: {name}': n for run in trained.runs for name, n in run.counts.items()}
     used['metric learning: images'] = trained.segments.images
