@@ -17,9 +17,10 @@ from scipy.stats import chi2
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import compose, wrap_angle
+from sfa_localization.data.rig import Rig
 from sfa_localization.fusion import ekf, filterpy_ekf
 from sfa_localization.fusion.motion import (
-    CALIBRATION_STDS,
+    BIAS_STD,
     ODOMETRY_CORRELATION_S,
     TURN_RADIUS_M,
     YAW_PER_METER,
@@ -74,7 +75,8 @@ class Robot:
                     strict=True)  # fmt: skip
         omega = sum(size * np.sin(rate * t + phase) for size, rate, phase in turns)
         planned = np.stack([np.full(count, world.speed), omega], 1)
-        bias, scale = CALIBRATION_STDS[:2] * rng.standard_normal(2) + [0.0, 1.0]
+        stds = BIAS_STD, Rig().wheel_scale.std
+        bias, scale = stds * rng.standard_normal(2) + [0.0, 1.0]
         self.stamps_ns = stamps(count, world.rate_hz)
         self.read = planned
         error = lasting(rng, count, dt) * [V_STD, OMEGA_STD]

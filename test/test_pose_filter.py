@@ -13,6 +13,8 @@ from filter_drives import NOISY, SECOND, START_NS, Drive, fed, known, seconds_of
 from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
+from sfa_localization.data.rig import Quantity, Rig
+from sfa_localization.fusion.motion import LOSS, SCALE
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -500,3 +502,19 @@ def test_the_state_machine_reports_why():
     assert 'no usable image for 4 s' in fused.status.reasons
     drive.feed(fused, heading=True, start=14)
     assert fused.status.level is Level.LOCALISED
+
+
+def test_the_filter_begins_with_the_robot_that_training_learned():
+    rig = Rig(wheel_scale=Quantity(1.05, 0.01), turn_loss=Quantity(0.08, 0.004))
+    fused = PoseFilter()
+    fused.expect(rig)
+    fused.set_pose(START_NS, (0.0, 0.0, 0.0), np.diag([1e-4] * 3))
+    state = fused.state
+    assert state.turn_loss == 0.08
+    assert state.covariance[LOSS, LOSS] == pytest.approx(0.004**2)
+    assert state.covariance[SCALE, SCALE] == pytest.approx((0.01 / 1.05) ** 2)
+    for k in range(1, 51):  # in an arc: 1 m counted, less 0.08 m per radian
+        fused.add_odometry(START_NS + k * 20_000_000, 1.0, 0.5)
+    moved = np.hypot(*fused.state.pose[:2])
+    arc = 1.05 - 0.08 * 0.5
+    assert moved == pytest.approx(arc * np.sin(0.25) / 0.25, abs=0.002)

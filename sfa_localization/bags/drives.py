@@ -149,10 +149,9 @@ def read_drive(
             streams |= _other_streams(bag, recipe, want_truth)
             values = _read(bag, streams, stored, progress)
             odometry = bag.to_odometry(streams['odometry'], values['odometry'])
-            stamps_ns = np.array(stored.stamps, np.int64)
-            near_ns = int(recipe.odometry_tolerance_s * 1e9)
-            covered = odometry.trajectory.covers(stamps_ns, near_ns)
-            _require_covered(streams['images'], covered, recipe.odometry_tolerance_s)
+            stamps_ns, near_s = np.array(stored.stamps, np.int64), recipe.odometry_tolerance_s
+            covered = odometry.trajectory.covers(stamps_ns, int(near_s * 1e9))
+            _require_covered(streams['images'], covered, near_s)
             panoramas: Panoramas = stored.finish(stamps_ns, covered)
             if recipe.camera.level_by_imu:
                 by, tilts = streams['orientation'], values['orientation']
@@ -160,8 +159,8 @@ def read_drive(
         except OSError as error:
             raise BagError(f'{cache}: no space for the images: {error.strerror}') from None
         camera = camera_place(bag, name, streams['odometry'].topic)
-        for problem in bag.problems:
-            logger.warning('%s: %s', path, problem)
+    for problem in bag.problems:
+        logger.warning('%s: %s', path, problem)
     counts = {use: stream.count for use, stream in streams.items()}
     yaw_rate = to_yaw_rate(values['imu']) if values.get('imu') else None
     truth = to_trajectory(values['ground_truth']) if values.get('ground_truth') else None

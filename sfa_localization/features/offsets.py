@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, Indices
+from sfa_localization.data.geometry import Array, Indices, wrap_angle
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import STRETCH_M, Views
 from sfa_localization.features.keyframes import Keyframes
 from sfa_localization.features.observation import MatchNoise
 
-# Of the views that are located, along a drive: nearer ones err alike.
-_APART_M = 0.5
+# Of the views that are located, along a drive or in a turn, which shows where the camera sits:
+# nearer ones err alike.
+_APART_M, _APART_RAD = 0.5, 0.5
 # Views that one is located among, the least number, and of how many the own track's are left out.
 _AMONG, _FEWEST, _NEAREST = 64, 12, 256
 # An image of which more than this part is unlike all around is of another place, or beside them.
@@ -62,7 +63,7 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
     own = views.textures[known], poses[known]
     among = Keyframes.of(*own, MatchNoise(), sphere, drives, rounded=False)
     path, found = views.path_m[known], []
-    for row in _spaced(path, drives):
+    for row in _spaced(path, among.poses[:, 2], drives):
         apart = np.hypot(*(among.poses[:, :2] - among.poses[row, :2]).T)
         near = np.argsort(apart, kind='stable')[:_NEAREST]
         own = (drives[near] == drives[row]) & (np.abs(path[near] - path[row]) < STRETCH_M)
@@ -82,10 +83,12 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
     return Offsets(views.images[known][rows], views.images[known][others], shares, turn, unlike)
 
 
-def _spaced(path_m: Array, drives: NDArray[np.int32]) -> list[int]:
-    """Rows of views (S,) in driving order, each so far from the one before."""
+def _spaced(path_m: Array, yaw: Array, drives: NDArray[np.int32]) -> list[int]:
+    """Rows of views (S,) in driving order, each so far from the one before, or turned so far."""
     rows = [0]
     for row in range(1, len(path_m)):
-        if drives[row] != drives[rows[-1]] or path_m[row] - path_m[rows[-1]] >= _APART_M:
+        driven = path_m[row] - path_m[rows[-1]]
+        turned = abs(wrap_angle(yaw[row] - yaw[rows[-1]]))
+        if drives[row] != drives[rows[-1]] or driven >= _APART_M or turned >= _APART_RAD:
             rows.append(row)
     return rows

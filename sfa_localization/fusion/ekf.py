@@ -14,6 +14,7 @@ import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.rig import Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
@@ -31,6 +32,7 @@ from sfa_localization.fusion.inputs import root
 from sfa_localization.fusion.motion import (
     DELAY,
     ERROR,
+    LOSS,
     SIZE,
     YAW,
     MotionNoise,
@@ -117,9 +119,13 @@ class Ekf:
     """The filter's step under some settings."""
 
     def __init__(
-        self, config: FilterConfig, correlation: ErrorCorrelation, kalman: Kalman | None = None
+        self,
+        config: FilterConfig,
+        correlation: ErrorCorrelation,
+        rig: Rig | None = None,
+        kalman: Kalman | None = None,
     ) -> None:
-        self._config, self._correlation = config, correlation
+        self._config, self._correlation, self._rig = config, correlation, rig or Rig()
         self._noise = MotionNoise(
             config.slip_per_metre, config.yaw_per_radian, correlation.distance_m
         )
@@ -127,15 +133,16 @@ class Ekf:
         self._alike = correlation.share >= ALIKE_SHARE
 
     def blank(self, stamp_ns: int) -> Belief:
-        """The belief before the first message, without a pose."""
-        speed_std, rate_std = self._config.speed_std, self._config.rate_std
-        stds = [1, 1, 1, speed_std, rate_std, *motion.CALIBRATION_STDS, 1, 1, 1]
-        covariance = np.diag(np.square(stds))
+        """The belief before the first message, without a pose: the robot is that of the rig. Its
+        scale and delay have been applied to what comes in."""
+        speed_std, rate_std, rig = self._config.speed_std, self._config.rate_std, self._rig
+        known = rig.wheel_scale.std / rig.wheel_scale.value, rig.turn_loss.std, rig.camera_delay.std
+        stds = [1, 1, 1, speed_std, rate_std, motion.BIAS_STD, *known, 1, 1, 1]
+        mean, covariance = np.zeros(SIZE), np.diag(np.square(stds))
+        mean[LOSS] = rig.turn_loss.value
         twist = Twist(0.0, 0.0, speed_std**2, rate_std**2)
         nowhere = (0.0, 0.0, 0.0)
-        return Belief(
-            stamp_ns, np.zeros(SIZE), covariance, False, nowhere, 0.0, twist, Odometer(), Memory()
-        )
+        return Belief(stamp_ns, mean, covariance, False, nowhere, 0.0, twist, Odometer(), Memory())
 
     def step(self, belief: Belief, event: Event) -> Belief:
         """The belief after an event no earlier than it."""

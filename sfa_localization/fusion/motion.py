@@ -53,10 +53,9 @@ UNKNOWN_SPEED, UNKNOWN_RATE = 0.5, 0.5
 """Speed (m/s) and turning (rad per sqrt(s)) of a robot whose odometry is silent for long."""
 STANDSTILL_SPEED, STANDSTILL_RATE = 1e-3, 2e-3
 """A robot slower (m/s) and turning slower (rad/s) than this stands: encoders and gyros flicker."""
-CALIBRATION_STDS = (0.01, 0.03, 0.05, 0.2)
-"""Standard deviations of turn-rate bias (rad/s), wheel scale, way lost in turns (m/rad) and delay
-of the camera (s) before any is learned: data sheets of cheap gyroscopes, the tolerance of a tire's
-diameter, a third of the half track of a small robot, and what clocks differ by after each start."""
+BIAS_STD = 0.01
+"""Standard deviation of the turn-rate bias, rad/s, before any is learned: data sheets of cheap
+gyroscopes. What is known of wheels and of the camera's clock is a matter of `Rig`."""
 _HELD_VARIANCE = 1e-8  # of v and omega at a standstill: positive, to keep the covariance so
 _STRAIGHT_RAD = 1e-4  # half turns below this are summed as series, exact to rounding
 _DIAGONAL = slice(0, None, SIZE + 1)  # of flat matrices

@@ -67,7 +67,8 @@ class PoseFilter:
         self._nis = 0.0, 0
         self.scale, self._shift, self._counted = self.config.odometry_scale, (0.0, 0.0), (0.0, 0.0)
         self._camera, self._expected_s = CameraClockFinder(_CLOCK_MEMORY), 0.0
-        self._ekf = Ekf(self.config, self.correlation)
+        self._rig = Rig()
+        self._ekf = Ekf(self.config, self.correlation, self._rig)
         self._history = self._fresh(self._ekf.blank(0))
         self._forget()
 
@@ -83,9 +84,11 @@ class PoseFilter:
         before = self.config, self.correlation
         self.config, self.correlation = config or self.config, correlation or self.correlation
         if (self.config, self.correlation) != before:
-            belief, newest_ns = self._history.newest, self._history.newest_ns
-            self._ekf = Ekf(self.config, self.correlation)
-            self._history = self._fresh(belief, newest_ns)
+            self._ekf = Ekf(self.config, self.correlation, self._rig)
+            self._go_on(self._history.newest)
+
+    def _go_on(self, belief: Belief) -> None:
+        self._history = self._fresh(belief, self._history.newest_ns)
 
     def _forget(self) -> None:
         # Stamps may start anew; the camera's delay stays what it was.
@@ -192,9 +195,14 @@ class PoseFilter:
             self._camera.add_heading(int(stamp_ns), yaw_rad)
 
     def expect(self, rig: Rig) -> None:
-        """Begin with what training learned of the robot."""
+        """Begin with what training learned of the robot; what was learned under way stays."""
+        self._rig, self._ekf = rig, Ekf(self.config, self.correlation, rig)
         self.expect_delay(rig.camera_delay.value)
         self.expect_scale(rig.wheel_scale.value)
+        belief, prior = self._history.newest, self._ekf.blank(0)
+        if not belief.located:
+            belief = belief._replace(mean=prior.mean, covariance=prior.covariance)
+        self._go_on(belief)
 
     def expect_delay(self, delay_s: float) -> None:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""

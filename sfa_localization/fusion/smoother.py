@@ -95,7 +95,7 @@ class Smoother(PoseFilter):
     def _replayed(self, belief: Belief, events: list[Event]) -> list[_Stage]:
         """The stages of a drive whose messages are all in their places."""
         kalman, stages = _Recording(), list[_Stage]()
-        ekf = Ekf(self.config, self.correlation, kalman)
+        ekf = Ekf(self.config, self.correlation, self._rig, kalman)
         for event in events:
             kalman.links.clear()
             belief = ekf.step(belief, event)

@@ -22,8 +22,9 @@ from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.features.closures import Closures, Views
 from sfa_localization.features.offsets import Offsets, find_offsets
+from sfa_localization.features.turning import lever_square
 from sfa_localization.metric.anchors import Anchors, Settled, settle
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
+from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, seconds_since_start
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
@@ -127,6 +128,12 @@ class Drives:
         anchors = Anchors.of(self.points, drives, images, settled, mount.lever)
         return replace(segments, anchors=anchors)
 
+    def _yaws(self) -> Iterator[Array]:
+        """Headings rad of the odometry at the images of each drive."""
+        for track, drive in zip(self.tracks(), self.items, strict=True):
+            times = (drive.stamps_ns - track.stamps_ns[0]) * 1e-9
+            yield np.interp(times, seconds_since_start(track.stamps_ns), track.yaw)
+
     @property
     def _camera_yaw(self) -> Array:
         """By how much the camera is turned on the robot, rad, of each image (N,)."""
@@ -136,7 +143,9 @@ class Drives:
     def measured(self, views: Views, sphere: Sphere) -> Drives:
         """With the offsets of `views`, which the graph of odometry and closures leads to, and the
         place of the camera, which both show together."""
-        drives, count = self, int(views.images.max()) + 1
+        turns = np.concatenate(list(self._yaws()))[views.images]
+        mount = replace(self.mount, turning=lever_square(views, turns))
+        drives, count = replace(self, mount=mount), int(views.images.max()) + 1
         for _ in range(_MOUNT_ROUNDS):
             before = drives.mount
             drives = replace(drives, mount=Graph.of(drives.cut()).mount)

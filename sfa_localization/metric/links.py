@@ -70,6 +70,16 @@ class Links:
         std = np.sqrt(np.concatenate([self.turn_variance, self.displacement_variance]))
         return sparse.vstack(self.rows(stack)).multiply(1 / std[:, None]).tocsr()
 
+    def by_mount(self, stack: Stack, now: Solution) -> Any:
+        """Derivative (2 L, 4 + D) of the same in a solution: by how far base_link slips ahead and
+        to the left, m, where it turns by a radian, and by nothing else of the camera's mount."""
+        slip = -now.z[self.at] * (np.exp(1j * self.turn_rad) - 1)
+        columns = np.zeros((2 * len(slip), 5 + int(stack.run.max())), complex)
+        known = np.isfinite(self.displacement_variance)
+        weighted = np.where(known, slip, 0.0) / np.sqrt(self.displacement_variance)
+        columns[len(slip) :, 2], columns[len(slip) :, 3] = weighted, 1j * weighted
+        return columns
+
     def alike(self, other: Links, tolerance: float) -> bool:
         """Whether the variances of the same links differ by less than a part, on average."""
         for name in ('turn_variance', 'displacement_variance'):

@@ -42,14 +42,16 @@ that slip err by 5 % of it."""
 @dataclass(frozen=True, slots=True)
 class Loops:
     """L mixtures: what is squared of the turns, `turns`, and of the places, `places`, (L, 3N) each,
-    of [o, z, -b z], and by how much `facing` (L, 3N) the latter grows with the camera's place on
-    the robot; expected standard deviations `turn_std` rad and `place_std` m, (L,), and
-    `share` (L,), one over how many say the same.
+    of [o, z, -b z]. By how much the latter grow with the camera's place on the robot is `facing`
+    (L, 3N); less the directions of the segments, `along` (L, 3N), it is that with slip. Expected
+    standard deviations `turn_std` rad and `place_std` m, (L,), and `share` (L,), one over how many
+    say the same.
     """
 
     turns: Any
     places: Any
     facing: Any
+    along: Any
     turn_std: Array
     place_std: Array
     share: Array
@@ -84,11 +86,14 @@ class Loops:
         return sparse.vstack([self.turns, self.places]).multiply(weight[:, None]).tocsr()
 
     def by_mount(self, stack: Stack, before: Solution | None, now: Solution) -> Any:
-        """Derivative (2 L, 2 + D) of what is squared in the solution `now`: by the place of the
-        camera ahead and to the left, m, and by its yaw in each of D drives, rad."""
+        """Derivative (2 L, 4 + D) of what is squared in the solution `now`: by the place of the
+        camera ahead and to the left, m, by slip, and by its yaw in each of D drives, rad."""
         x, weight = now.coefficients(stack.period), self._weights(stack, before)
         ahead, none = self.facing @ x, np.zeros(len(self.share))
-        columns = [np.concatenate([none, ahead]), np.concatenate([none, 1j * ahead])]
+        slip = ahead - self.along @ x
+        columns = [
+            np.concatenate([none, each * axis]) for each in (ahead, slip) for axis in (1, 1j)
+        ]
         for drive in range(int(stack.run.max()) + 1):
             turned = 1j * (self.turns @ (x * np.tile(stack.run == drive, 3)))
             columns.append(np.concatenate([turned, none]))
@@ -118,15 +123,16 @@ def loops_of(closures: Closures, offsets: Offsets, stack: Stack) -> tuple[Loops,
 
 def _squares(
     row: Indices, others: Indices, shares: Array, turn: Array, stack: Stack
-) -> tuple[Any, Any, Any]:
-    """Of the turns, of the places and of the headings in the latter, (L, 3N), of rows (L,) of the
-    stack among others (L, K); turns to first order in the biases."""
+) -> tuple[Any, Any, Any, Any]:
+    """Of the turns, of the places, and of the headings of images and of segments in the latter,
+    (L, 3N), of rows (L,) of the stack among others (L, K); turns to first order in the biases."""
     rows, none = np.column_stack([row, others]), np.zeros(len(row))
     minus = np.column_stack([none + 1.0, -shares])
     turns = minus * np.exp(1j * (stack.headings[rows] + np.column_stack([none, turn])))
     n, owner = stack.segments, stack.owner[rows]
     turned = (n + owner, turns), (2 * n + owner, 1j * stack.times_s[rows] * turns)
-    return stack.sparse(*turned), stack.place_rows(rows, minus), stack.facing_rows(rows, minus)
+    places, facing = stack.place_rows(rows, minus), stack.facing_rows(rows, minus)
+    return stack.sparse(*turned), places, facing, stack.sparse((n + owner, minus))
 
 
 def with_closures(segments: Segments, closures: Closures) -> Segments:

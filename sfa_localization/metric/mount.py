@@ -8,16 +8,18 @@ it. Image m of segment n lies at
     x_nm = o_n + z_n (q_nm + l exp(i h_nm)),
 
 and in drive d it looks kappa_d to the left of where it did in the first drive, so that closures
-turn by kappa_d more. With v = [l, kappa], for the best [o, z, b] at some v what is squared of the
-closures is r, with derivatives A by [o, z, b] and B by v. To first order the closures say of v
+turn by kappa_d more. Wheels may slip in turns: a turn by t moves base_link by s (exp(i t) - 1)
+beside, which links take for a lever. With v = [l, s, kappa], for the best [o, z, b] at some v what
+is squared of links and closures is r, with derivatives A by [o, z, b] and B by v. To first order
 
     S = B^T B - B^T A N^-1 A^T B,    h = S v - B^T r,
 
 with N the normal equations of [o, z, b]. Beside them stands what is known of robots: the camera
-sits above base_link, or where it was measured, to 5 mm; or, as probable, anywhere on the
-robot. With the prior's covariance C, either has the posterior covariance (S + C^-1)^-1 = D, the
-mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2), by which both are mixed. A drive that
-never turns where it is seen again does not show l: its variance stays large.
+sits above base_link, or where it was measured, to 5 mm, and wheels may slip; or, as probable, they
+do not, and it sits anywhere on the robot. With the prior's covariance C, either has the posterior
+covariance (S + C^-1)^-1 = D, the mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2),
+times the likelihood of how images change in turns on the spot (features/turning.py); by these both
+are mixed. A drive that never turns where it is seen again does not show l: it stays uncertain.
 """
 
 from __future__ import annotations
@@ -31,9 +33,16 @@ from scipy import special
 
 from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
+from sfa_localization.features.turning import UNSURE
 
 GIVEN_STD_M = 0.005
 """Of a camera's place that was measured on the robot."""
+SLIP_STD_M = 0.1
+"""How far base_link may be from the point about which wheels turn the robot: a third of the track
+of a small one that slips on one side."""
+LEVEL_M2 = 0.03**2
+"""Images of a camera above base_link may change in turns as if it were 3 cm beside it: robots sway
+(two gardens: 0 and 4 cm)."""
 CAMERA_TURN_STD = 1.0
 """rad, of the yaw of a camera in a later drive: it may have been taken off and put back anyhow."""
 
@@ -54,6 +63,8 @@ class Mount:
     yaw: tuple[float, ...] = (0.0,)
     given: complex | None = None
     covariance: Array | None = None
+    turning: Quantity | None = None
+    """|l|^2, m^2, by how images change in turns on the spot."""
     learned: tuple[complex, float] | None = None
     """The lever by closures alone, and the standard deviation of its coordinates, m."""
 
@@ -67,12 +78,17 @@ class Mount:
         """The covariance, or that of the prior."""
         if self.covariance is not None:
             return self.covariance
-        return np.diag(self._variances(CAMERA_STD_M if self.given is None else GIVEN_STD_M))
+        lever_std = CAMERA_STD_M if self.given is None else GIVEN_STD_M
+        return np.diag([lever_std**2] * 2 + [CAMERA_TURN_STD**2] * len(self.yaw))
 
-    def _variances(self, lever_std: float) -> Array:
-        """(2 + D,) of a prior, m^2, m^2, rad^2: of the first drive's yaw 0, by definition."""
+    def _priors(self) -> tuple[Array, Array]:
+        """Variances (3 + D,) of [l, s, kappa], of all but the first drive's yaw, which is 0 by
+        definition: of a camera above base_link, or measured, and of one anywhere.
+        """
         later = [CAMERA_TURN_STD**2] * (len(self.yaw) - 1)
-        return np.array([lever_std**2, lever_std**2, 0.0, *later])
+        placed, anywhere, slip = GIVEN_STD_M**2, CAMERA_STD_M**2, SLIP_STD_M**2
+        above = [placed, placed, slip, slip, *later]
+        return np.array(above), np.array([anywhere, anywhere, placed, placed, *later])
 
     def of(self, drives: int) -> Mount:
         """The same of so many drives; nothing is known of the yaw in later ones."""
@@ -85,36 +101,51 @@ class Mount:
         return np.column_stack([place.real, place.imag, yaw])
 
     def stepped(self, missed: Complex, by_mount: Complex, by_rest: Array, solve: Solve) -> Mount:
-        """After a step from what the closures miss (L,) by, its derivative (L, 2 + D), and the
-        products (P, 2 + D) of that with the derivative by the rest, whose covariance (P, P) times
-        columns `solve` gives.
+        """After a step from what links and closures miss (L,) by, its derivative (L, 4 + D), and
+        the products (P, 4 + D) of that with the derivative by the rest, whose covariance (P, P)
+        times columns `solve` gives.
         """
-        mount = self.of(by_mount.shape[1] - 2)
-        center, tight = self.given or 0j, self.given is not None
+        mount, center = self.of(by_mount.shape[1] - 4), self.given or 0j
         moved = self.lever - center
-        value = np.array([moved.real, moved.imag, *mount.yaw])
-        free = np.flatnonzero(np.arange(len(value)) != 2)
-        columns, value = by_mount[:, free], value[free]
-        shown = np.real(columns.conj().T @ columns) - by_rest[:, free].T @ solve(by_rest[:, free])
+        value = np.array([moved.real, moved.imag, 0.0, 0.0, *mount.yaw[1:]])
+        free = np.flatnonzero(np.arange(len(value) + 1) != 4)
+        columns, rest = by_mount[:, free], by_rest[:, free]
+        shown = np.real(columns.conj().T @ columns) - rest.T @ solve(rest)
         pull = shown @ value - np.real(columns.conj().T @ missed)
         means, spreads, evidence = [], [], []
-        for std in (GIVEN_STD_M, CAMERA_STD_M):
-            prior = mount._variances(std)[free]
+        for prior in mount._priors():
             spread = np.linalg.inv(shown + np.diag(1 / prior))
             size = np.linalg.slogdet(spread)[1] - np.log(prior).sum()
             means.append(spread @ pull)
             spreads.append(spread)
-            evidence.append((size + pull @ means[-1]) / 2)
-        learned = center + complex(*means[1][:2]), float(np.sqrt(spreads[1].diagonal()[:2].mean()))
-        share = np.array([1.0, 0.0]) if tight else special.softmax(evidence)
+            lever = center + complex(*means[-1][:2])
+            evidence.append((size + pull @ means[-1]) / 2 + self._by_turns(lever))
+        share = np.array([1.0, 0.0]) if self.given is not None else special.softmax(evidence)
         mean = share @ np.array(means)
-        covariance = np.zeros((len(value) + 1, len(value) + 1))
-        covariance[np.ix_(free, free)] = sum(
-            part * (spread + np.outer(one - mean, one - mean))
-            for part, spread, one in zip(share, spreads, means, strict=True)
+        spread = sum(
+            part * (each + np.outer(one - mean, one - mean))
+            for part, each, one in zip(share, spreads, means, strict=True)
         )
-        lever, yaw = center + complex(mean[0], mean[1]), (0.0, *mean[2:].tolist())
-        return replace(self, lever=lever, yaw=yaw, covariance=covariance, learned=learned)
+        # Of the lever and all yaws, the first of which is 0.
+        kept = np.r_[0, 1, 4 : len(mean)]
+        rows = np.r_[0, 1, 3 : len(kept) + 1]
+        covariance = np.zeros((2 + len(mount.yaw), 2 + len(mount.yaw)))
+        covariance[np.ix_(rows, rows)] = spread[np.ix_(kept, kept)]
+        return replace(
+            self,
+            lever=center + complex(mean[0], mean[1]),
+            yaw=(0.0, *mean[4:].tolist()),
+            covariance=covariance,
+            learned=(lever, float(np.sqrt(spreads[1].diagonal()[:2].mean()))),
+        )
+
+    def _by_turns(self, lever: complex) -> float:
+        """Logarithm of the likelihood of the changes of images in turns, for a lever."""
+        if self.turning is None:
+            return 0.0
+        square, (seen, std) = abs(lever) ** 2, self.turning
+        variance = std**2 + LEVEL_M2**2 + (UNSURE * square) ** 2
+        return -(((square - seen) ** 2) / variance + math.log(variance)) / 2
 
     @property
     def contradiction(self) -> str:

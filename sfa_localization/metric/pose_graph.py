@@ -75,14 +75,17 @@ class Graph:
             rows = sparse.csr_array(sparse.vstack([links.ties(stack), *ties, stay]))
             graph = _solved(rows, stack, before)
         assert graph is not None
-        return replace(graph, mount=graph._mount(segments.mount, loops, before))
+        return replace(graph, mount=graph._mount(segments.mount, links, loops, before))
 
-    def _mount(self, mount: Mount, loops: Sequence[Loops], before: Solution | None) -> Mount:
-        """The mount of the segments a step on, by loops whose weights are those of the solution."""
+    def _mount(
+        self, mount: Mount, links: Links, loops: Sequence[Loops], before: Solution | None
+    ) -> Mount:
+        """The mount of the segments a step on, by links and loops that are weighed alike."""
         stack, solution = self.stack, self.solution
-        rows = sparse.vstack([one.ties(stack, before) for one in loops])
+        rows = sparse.vstack([links.ties(stack), *(one.ties(stack, before) for one in loops)])
         missed = rows @ solution.coefficients(stack.period)
-        by_mount = np.vstack([one.by_mount(stack, before, solution) for one in loops])
+        shown = [one.by_mount(stack, before, solution) for one in loops]
+        by_mount = np.vstack([links.by_mount(stack, solution), *shown])
         by = by_unknowns(rows, solution, stack.period)
         by_rest = np.real(by.conj().T @ by_mount)
         return mount.stepped(missed, by_mount, by_rest, self.unknown)
