@@ -40,8 +40,8 @@ _UNTIED = 1e-3
 _STEPS, _HALVED, _CONVERGED = 50, 20, 1e-9
 # Columns that are solved for at a time: memory.
 _AT_ONCE = 256
-# Links of which is found how well the others tell them: neighbors are told alike.
-_SHOWN = 500
+SHOWN = 500
+"""Links, or images, of which is found how well the others tell them: neighbors are told alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,17 +88,22 @@ class Graph:
         apart = own - own.mean(0)
         return np.asarray(apart - apart.mean(1)[:, None])
 
-    def modes(self, count: int) -> tuple[Complex, Complex]:
-        """The largest changes of origins and directions (N, count), one standard deviation each."""
-        n, size = self.stack.segments, self.factor.shape[0]
-        inverse = LinearOperator((size, size), self.factor.solve, dtype=float)
-        values, vectors = eigsh(inverse, min(count, size - 1), v0=np.ones(size))
-        vectors = vectors * np.sqrt(np.maximum(values, 0.0))
-        real, imag, angle = vectors[:n], vectors[n : 2 * n], vectors[2 * n : 3 * n]
-        return real + 1j * imag, 1j * self.solution.z[:, None] * angle
-
     def covariance(self, rows: Complex) -> Complex:
         """Per axis (K, K) of rows (K, 3N) times [o, z, -b z], without a motion of the whole map."""
+        moved = self._moved(rows)
+        unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
+        return np.asarray(moved @ unknown / 2)
+
+    def variance(self, shares: Array) -> Array:
+        """Of sums of the images' places by shares (K, M) of sum 1, (K,) m^2 over both axes, without
+        a motion of the whole map."""
+        count = len(self.stack.images)
+        moved = self._moved(shares @ self.stack.place_rows(np.arange(count), np.ones(count)))
+        return self._variance(moved.real) + self._variance(moved.imag)
+
+    def _moved(self, rows: Any) -> Complex:
+        """Derivative (K, P) of rows (K, 3N) times [o, z, -b z] by [Re o, Im o, angles of z, b],
+        without that of a motion of the whole map."""
         stack, solution = self.stack, self.solution
         images = stack.place_rows(np.arange(len(stack.images)), np.ones(len(stack.images)))
         own, whole = (by_unknowns(one, solution, stack.period) for one in (rows, images))
@@ -107,9 +112,7 @@ class Graph:
         mean = np.asarray(whole.mean(axis=0))
         turn = np.real(-1j * (around.conj() @ whole)) / np.sum(np.abs(around) ** 2)
         here = rows @ solution.coefficients(stack.period) - places.mean()
-        moved = own.toarray() - mean[None] - 1j * np.outer(here, turn)
-        unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
-        return np.asarray(moved @ unknown / 2)
+        return np.asarray(sparse.csr_array(own).toarray() - mean[None] - 1j * np.outer(here, turn))
 
     def _unknown_links(self, links: Links) -> tuple[Array, Array]:
         """Variances (L,) that the solution leaves of turns and, per axis, displacements."""
@@ -122,11 +125,15 @@ class Graph:
         """Variance (L,) that the solution leaves of the real parts of rows (L, 3N) times
         [o, z, -b z], summed over the sides: of some rows, and as those nearby of the others."""
         count = sides[0].shape[0]
-        shown, total = evenly(count, _SHOWN), np.zeros(min(count, _SHOWN))
+        shown, total = evenly(count, SHOWN), np.zeros(min(count, SHOWN))
         for rows in sides:
             by = by_unknowns(rows[shown], self.solution, self.stack.period).real.toarray()
-            total += (self.unknown(by.T).T * by).sum(axis=1)
+            total += self._variance(by)
         return np.interp(np.arange(count), shown, total) if count else total
+
+    def _variance(self, by: Array) -> Array:
+        """That the solution leaves (K,), by derivatives (K, P)."""
+        return np.asarray((self.unknown(by.T).T * by).sum(axis=1))
 
 
 def graph_poses(graph: Graph, count: int) -> Array:
