@@ -12,6 +12,7 @@ H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,9 +98,8 @@ class Graph:
     def variance(self, shares: Array) -> Array:
         """Of sums of the images' places by shares (K, M) of sum 1, (K,) m^2 over both axes, without
         a motion of the whole map."""
-        count = len(self.stack.images)
-        moved = self._moved(shares @ self.stack.place_rows(np.arange(count), np.ones(count)))
-        return self._variance(moved.real) + self._variance(moved.imag)
+        rows = self.stack.place_rows(np.arange(shares.shape[1]), np.ones(shares.shape[1]))
+        return self._variance(self._moved(shares @ rows))
 
     def _moved(self, rows: Any) -> Complex:
         """Derivative (K, P) of rows (K, 3N) times [o, z, -b z] by [Re o, Im o, angles of z, b],
@@ -119,21 +119,19 @@ class Graph:
         turns, moves = links.rows(self.stack)
         # Along the turn: of its complex square the other part is none of the angles'.
         along = sparse.diags_array(-1j * self.solution.z[links.at + 1].conj()) @ turns
-        return self._left(along), self._left(moves, -1j * moves) / 2
+        return self._left(along, np.real), self._left(moves) / 2
 
-    def _left(self, *sides: Any) -> Array:
-        """Variance (L,) that the solution leaves of the real parts of rows (L, 3N) times
-        [o, z, -b z], summed over the sides: of some rows, and as those nearby of the others."""
-        count = sides[0].shape[0]
-        shown, total = evenly(count, SHOWN), np.zeros(min(count, SHOWN))
-        for rows in sides:
-            by = by_unknowns(rows[shown], self.solution, self.stack.period).real.toarray()
-            total += self._variance(by)
-        return np.interp(np.arange(count), shown, total) if count else total
+    def _left(self, rows: Any, part: Callable[[Complex], Any] = np.asarray) -> Array:
+        """Variance (L,) that the solution leaves of a part of rows (L, 3N) times [o, z, -b z]: of
+        some rows, and as those nearby of the others."""
+        shown, count = evenly(rows.shape[0], SHOWN), rows.shape[0]
+        by = part(by_unknowns(rows[shown], self.solution, self.stack.period).toarray())
+        return np.interp(np.arange(count), shown, self._variance(by)) if count else np.zeros(0)
 
-    def _variance(self, by: Array) -> Array:
-        """That the solution leaves (K,), by derivatives (K, P)."""
-        return np.asarray((self.unknown(by.T).T * by).sum(axis=1))
+    def _variance(self, by: Complex) -> Array:
+        """Of derivatives (K, P): (K,), that of the real and of the imaginary part together."""
+        parts = [(self.unknown(one.T).T * one).sum(axis=1) for one in (by.real, by.imag)]
+        return np.asarray(parts[0] + parts[1])
 
 
 def graph_poses(graph: Graph, count: int) -> Array:
