@@ -125,9 +125,14 @@ def garden_features(places, *, noise=0.0, count=12, seed=0, world=0):
     return values + noise * np.random.default_rng(seed).standard_normal(values.shape)
 
 
-def mixtures(stack, poses, noise_m=0.0, count=400, seed=0):
-    """Offsets of images among six others within 1.5 m, whose places explain theirs."""
+def mixtures(stack, poses, noise_m=0.0, count=400, seed=0, lasting=False):
+    """Offsets of images among six others within 1.5 m, whose places explain theirs; `lasting`
+    errors fade within 1 m along the drive. Turns err by 0.1 rad per meter of these."""
     rng, found = np.random.default_rng(seed), []
+    errors = noise_m * rng.standard_normal((len(stack.images), 2))
+    fades = np.exp(-stack.steps) if lasting else np.zeros(len(errors))
+    for row, part in enumerate(fades[1:], 1):
+        errors[row] = part * errors[row - 1] + np.sqrt(1 - part**2) * errors[row]
     places = poses[stack.images]
     for row in rng.permutation(len(places))[:count]:
         apart = np.hypot(*(places - places[row])[:, :2].T)
@@ -135,9 +140,9 @@ def mixtures(stack, poses, noise_m=0.0, count=400, seed=0):
         if len(near) >= 12:
             near = rng.permutation(near)[:6]
             design = np.column_stack([places[near, :2], np.ones(6)]).T
-            wanted = np.append(places[row, :2] + noise_m * rng.standard_normal(2), 1.0)
+            wanted = np.append(places[row, :2] + errors[row], 1.0)
             shares = np.linalg.lstsq(design, wanted, rcond=0.02)[0]
-            turn = wrap_angle(places[row, 2] - places[near, 2])
+            turn = wrap_angle(places[row, 2] - places[near, 2] + 0.1 * errors[row, 0])
             if np.allclose(design @ shares, wanted):  # not where they lie on a line
                 found.append((stack.images[row], stack.images[near], shares, turn, 0.1))
     return Offsets(*map(np.array, zip(*found, strict=True)))

@@ -51,6 +51,15 @@ def test_errors_of_different_stretches_are_not_compared_and_too_few_say_nothing(
     assert ErrorCorrelation.fit(*few) == ErrorCorrelation()
 
 
+def test_errors_that_are_alike_count_as_fewer():
+    """By hand: 0.5 of errors fades to a half in 1 m; what is far apart has nothing in common."""
+    correlation = ErrorCorrelation(0.5, 1.0 / math.log(2.0))
+    alike = correlation.alike(np.array([1.0, 0.0, 100.0, 2.0]))
+    np.testing.assert_allclose(alike, [1.5, 1.375, 1.0, 1.375])
+    np.testing.assert_allclose(correlation.alike(np.zeros(5)), 3.0)
+    assert correlation.alike(np.zeros(0)).shape == (0,)
+
+
 def test_numbers_that_cannot_be_are_refused():
     for share, distance in (
         (1.0, 1.0), (-0.1, 1.0), (math.nan, 1.0), (0.5, LEAST_M / 2), (0.5, math.inf),

@@ -71,6 +71,20 @@ class ErrorCorrelation:
         correlation = np.bincount(at, product)[filled] / count[filled]
         return cls(*_exponential(distance, correlation, count[filled].astype(float)))
 
+    def alike(self, driven_m: Array) -> Array:
+        """How many (M,) of the errors of images, driven_m (M,) m along the path, count as one: the
+        sum of the correlations of each with all."""
+        order = np.argsort(driven_m, kind='stable')
+        path, total = driven_m[order], np.ones(len(driven_m))
+        for lag in range(1, len(path)):
+            apart = path[lag:] - path[:-lag]
+            if apart.min() > _FARTHEST_M:
+                break
+            correlation = self.share * np.exp(-apart / self.distance_m)
+            total[lag:] += correlation
+            total[:-lag] += correlation
+        return np.asarray(total[np.argsort(order)])
+
 
 def _standardized(errors: Array, variances: Array) -> Array:
     """Errors (M, 2) over their standard deviations, outliers limited, scaled to unit variance."""

@@ -18,13 +18,12 @@ from sfa_localization.data.geometry import (
     compose,
     invert,
 )
+from sfa_localization.features.image_features import evenly
 from sfa_localization.metric import phases
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.map_fit import MapFit
+from sfa_localization.metric.pose_graph import SHOWN
 from sfa_localization.metric.saved_map import MetricMap
-
-# Joint changes of the segments that count: a map averages over smaller ones.
-_JOINT = 24
 
 
 def plane(points: Complex) -> Array:
@@ -40,18 +39,29 @@ def angle_covariance(fit: MapFit) -> Array:
 
 
 def place_variance(fit: MapFit) -> Array:
-    """How uncertain the segments' origins and directions leave the place of each image, (M,) m^2
-    over both axes, without a motion of the whole map, which is a matter of its frame."""
-    stack, places, graph = fit.stack, fit.places, fit.problem.graph
-    # Three are the motions of the whole map.
-    origins, directions = graph.modes(_JOINT + 3) if graph else _uncertain_segments(fit)
+    """How uncertain the segments leave the map at the place of each image, (M,) m^2 over both axes,
+    without a motion of the whole map, which is a matter of its frame.
+
+    The map is a regression to the places of all images: it repeats the errors that neighbors have
+    in common. What a stretch errs alone it averages out; images that are left out show that.
+    """
+    shown = evenly(len(fit.places), SHOWN)
+    repeated = fit.ridge.averages(shown)
+    graph = fit.problem.graph
+    variance = graph.variance(repeated) if graph else _variance(fit, repeated)
+    return np.interp(np.arange(len(fit.places)), shown, variance)
+
+
+def _variance(fit: MapFit, shares: Array) -> Array:
+    """Of the sums of the images' places by shares (K, M), without a graph: (K,) m^2."""
+    stack, places = fit.stack, fit.places
+    origins, directions = _uncertain_segments(fit)
     path = stack.corrected(fit.solution.bias)
     moved = origins[stack.owner] + directions[stack.owner] * path[:, None]
     around_center = 1j * (places - places.mean())
     turn = np.real(np.conj(around_center) @ moved) / np.sum(np.abs(around_center) ** 2)
     moved = moved - moved.mean(0) - around_center[:, None] * turn
-    largest = np.linalg.eigh(np.real(moved.conj().T @ moved))[1][:, -_JOINT:]
-    return np.asarray((np.abs(moved @ largest) ** 2).sum(1))
+    return np.asarray((np.abs(shares @ moved) ** 2).sum(1))
 
 
 def _uncertain_segments(fit: MapFit) -> tuple[Complex, Complex]:

@@ -9,9 +9,9 @@ and is turned by t_k from each; h are the headings in the segments:
     |o_j + z_j q_b - sum_k c_k (o_ik + z_ik q_ak)|^2                 the place
 
 Offsets (features/offsets.py) are such mixtures; closures, of which the distance is unknown, tie two
-images with c = 1 where there are none. How well they hold is estimated with the map. A few may be
-wrong: places can look alike. What does not fit loses its weight, so that the form stays
-quadratic and its solution certified.
+images with c = 1 where there are none. How well they hold is estimated with the map; neighbors err
+alike, and count for as many as they are worth. A few may be wrong: places can look alike. What does
+not fit loses its weight, so that the form stays quadratic and its solution certified.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.statistics import LENGTH_TO_STD, MEDIAN_TO_STD, outlier_factor
 from sfa_localization.features.closures import Closures
@@ -45,7 +46,7 @@ class Loops:
     of [o, z, -b z]. By how much the latter grow with the camera's place on the robot is `facing`
     (L, 3N); less the directions of the segments, `along` (L, 3N), it is that with slip. Expected
     standard deviations `turn_std` rad and `place_std` m, (L,), and `share` (L,), one over how many
-    say the same.
+    of the errors along the drive are alike.
     """
 
     turns: Any
@@ -66,7 +67,8 @@ class Loops:
         shares, unlike = shares[kept] / whole[kept, None], offsets.unlike[kept]
         rows = _squares(row[kept], others[kept], shares, offsets.turn[kept], stack)
         place_std = _PLACE_STD_M * np.hypot(_ALIKE, unlike)
-        return cls(*rows, _TURN_STD * (1 + unlike), place_std, np.ones(len(unlike)))
+        alike = ErrorCorrelation().alike(np.cumsum(stack.steps)[row[kept]])
+        return cls(*rows, _TURN_STD * (1 + unlike), place_std, 1.0 / alike)
 
     @classmethod
     def of_closures(cls, closures: Closures, stack: Stack, tied: Indices) -> Loops:
@@ -75,9 +77,7 @@ class Loops:
         kept = (rows >= 0).all(1) & (owner[:, 0] != owner[:, 1]) & ~np.isin(owner, tied).all(1)
         images, turn = closures.images[kept], closures.turn[kept, None]
         one, unknown = np.ones_like(turn), np.full(len(turn), _UNKNOWN)
-        loops = cls.of(Offsets(images[:, 1], images[:, :1], one, turn, unknown), stack)
-        _, same, count = np.unique(owner[kept], axis=0, return_inverse=True, return_counts=True)
-        return replace(loops, share=1.0 / count[same.reshape(-1)])
+        return cls.of(Offsets(images[:, 1], images[:, :1], one, turn, unknown), stack)
 
     def ties(self, stack: Stack, before: Solution | None) -> Any:
         """What is squared (2 L, 3N) of [o, z, -b z], over its standard deviation: by the residuals

@@ -12,7 +12,7 @@ H is what S leaves of z. A sparse factor shows it by the signs of its pivots.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -42,8 +42,8 @@ _UNTIED = 1e-3
 _STEPS, _HALVED, _CONVERGED = 50, 20, 1e-9
 # Columns that are solved for at a time: memory.
 _AT_ONCE = 256
-# Links of which is found how well the others tell them: neighbors are told alike.
-_SHOWN = 500
+SHOWN = 500
+"""Links, or images, of which is found how well the others tell them: neighbors are told alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,17 +106,21 @@ class Graph:
         apart = own - own.mean(0)
         return np.asarray(apart - apart.mean(1)[:, None])
 
-    def modes(self, count: int) -> tuple[Complex, Complex]:
-        """The largest changes of origins and directions (N, count), one standard deviation each."""
-        n, size = self.stack.segments, self.factor.shape[0]
-        inverse = LinearOperator((size, size), self.factor.solve, dtype=float)
-        values, vectors = eigsh(inverse, min(count, size - 1), v0=np.ones(size))
-        vectors = vectors * np.sqrt(np.maximum(values, 0.0))
-        real, imag, angle = vectors[:n], vectors[n : 2 * n], vectors[2 * n : 3 * n]
-        return real + 1j * imag, 1j * self.solution.z[:, None] * angle
-
     def covariance(self, rows: Complex) -> Complex:
         """Per axis (K, K) of rows (K, 3N) times [o, z, -b z], without a motion of the whole map."""
+        moved = self._moved(rows)
+        unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
+        return np.asarray(moved @ unknown / 2)
+
+    def variance(self, shares: Array) -> Array:
+        """Of sums of the images' places by shares (K, M) of sum 1, (K,) m^2 over both axes, without
+        a motion of the whole map."""
+        rows = self.stack.place_rows(np.arange(shares.shape[1]), np.ones(shares.shape[1]))
+        return self._variance(self._moved(shares @ rows))
+
+    def _moved(self, rows: Any) -> Complex:
+        """Derivative (K, P) of rows (K, 3N) times [o, z, -b z] by [Re o, Im o, angles of z, b],
+        without that of a motion of the whole map."""
         stack, solution = self.stack, self.solution
         images = stack.place_rows(np.arange(len(stack.images)), np.ones(len(stack.images)))
         own, whole = (by_unknowns(one, solution, stack.period) for one in (rows, images))
@@ -125,26 +129,26 @@ class Graph:
         mean = np.asarray(whole.mean(axis=0))
         turn = np.real(-1j * (around.conj() @ whole)) / np.sum(np.abs(around) ** 2)
         here = rows @ solution.coefficients(stack.period) - places.mean()
-        moved = own.toarray() - mean[None] - 1j * np.outer(here, turn)
-        unknown = self.unknown(moved.real.T) - 1j * self.unknown(moved.imag.T)
-        return np.asarray(moved @ unknown / 2)
+        return np.asarray(sparse.csr_array(own).toarray() - mean[None] - 1j * np.outer(here, turn))
 
     def _unknown_links(self, links: Links) -> tuple[Array, Array]:
         """Variances (L,) that the solution leaves of turns and, per axis, displacements."""
         turns, moves = links.rows(self.stack)
         # Along the turn: of its complex square the other part is none of the angles'.
         along = sparse.diags_array(-1j * self.solution.z[links.at + 1].conj()) @ turns
-        return self._left(along), self._left(moves, -1j * moves) / 2
+        return self._left(along, np.real), self._left(moves) / 2
 
-    def _left(self, *sides: Any) -> Array:
-        """Variance (L,) that the solution leaves of the real parts of rows (L, 3N) times
-        [o, z, -b z], summed over the sides: of some rows, and as those nearby of the others."""
-        count = sides[0].shape[0]
-        shown, total = evenly(count, _SHOWN), np.zeros(min(count, _SHOWN))
-        for rows in sides:
-            by = by_unknowns(rows[shown], self.solution, self.stack.period).real.toarray()
-            total += (self.unknown(by.T).T * by).sum(axis=1)
-        return np.interp(np.arange(count), shown, total) if count else total
+    def _left(self, rows: Any, part: Callable[[Complex], Any] = np.asarray) -> Array:
+        """Variance (L,) that the solution leaves of a part of rows (L, 3N) times [o, z, -b z]: of
+        some rows, and as those nearby of the others."""
+        shown, count = evenly(rows.shape[0], SHOWN), rows.shape[0]
+        by = part(by_unknowns(rows[shown], self.solution, self.stack.period).toarray())
+        return np.interp(np.arange(count), shown, self._variance(by)) if count else np.zeros(0)
+
+    def _variance(self, by: Complex) -> Array:
+        """Of derivatives (K, P): (K,), that of the real and of the imaginary part together."""
+        parts = [(self.unknown(one.T).T * one).sum(axis=1) for one in (by.real, by.imag)]
+        return np.asarray(parts[0] + parts[1])
 
 
 def graph_poses(graph: Graph, count: int) -> Array:

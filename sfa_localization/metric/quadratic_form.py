@@ -69,6 +69,12 @@ class Ridge:
         right = self.expanded.T @ (self.weights * places)
         return np.asarray(scipy.linalg.cho_solve((self.factor, True), right))
 
+    def averages(self, rows: Indices) -> Array:
+        """Shares (K, M), of sum 1, of the places of all images in the map's at some of them."""
+        shares = scipy.linalg.cho_solve((self.factor, True), self.expanded[rows].T)
+        shares = (self.expanded @ shares * self.weights[:, None]).T
+        return np.asarray(shares / shares.sum(axis=1, keepdims=True))
+
     def whitened(self, expanded: Array | Complex) -> Any:
         """factor^-1 phi (m, M) of expanded features (M, m)."""
         return np.asarray(scipy.linalg.solve_triangular(self.factor, expanded.T, lower=True))
