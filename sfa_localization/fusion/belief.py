@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.rig import Quantity
 from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import State, Twist
 from sfa_localization.fusion.track import Image, Pose, Track
@@ -17,6 +19,8 @@ ENOUGH_IMAGES = 5
 """Images in a row that overrule an established estimate: half a second to a second of a camera."""
 DOUBT_STDS = 2.0
 """While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
+NOT_LATE = Quantity(0.0, math.inf)
+"""Of images whose turns show no delay."""
 
 
 class OdometryEvent(NamedTuple):
@@ -62,7 +66,7 @@ class PoseEvent(NamedTuple):
 class MeasurementEvent(NamedTuple):
     """A position (2,) or pose (3,) from an image, with its covariance.
 
-    It is fused `late_s` earlier than expected of its stamp. `jacobian` (2 or 3, 12) and `white`,
+    It is fused `late`, s, earlier than expected of its stamp, as turns of the images show. `jacobian` (2 or 3, 12) and `white`,
     the part of the noise that is this image's own, follow from the covariance: see
     ekf.measurement_event.
     """
@@ -72,7 +76,7 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
-    late_s: float = 0.0
+    late: Quantity = NOT_LATE
 
 
 Event = OdometryEvent | PoseEvent | MeasurementEvent

@@ -22,7 +22,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_SCALE
-from sfa_localization.data.rig import Rig
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.ekf import Ekf, measurement_event
@@ -47,8 +47,6 @@ __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
-# Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
-_EXPECTED_STD_S = 0.05
 
 
 class PoseFilter:
@@ -173,8 +171,9 @@ class PoseFilter:
             self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             taken_ns = self._taken(stamp_ns)
             self._require_place(taken_ns, MEASUREMENT)
-            late_s = self._camera.clock_at(stamp_ns).delay_ns * 1e-9 - self._expected_s
-            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late_s)
+            clock = self._camera.clock_at(stamp_ns)
+            late = Quantity(clock.delay_ns * 1e-9 - self._expected_s, clock.std_s)
+            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
@@ -208,7 +207,7 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._expected_s = delay_s
-            self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+            self._camera.expect(CameraClock(delay_s, assumed=True))
 
     def expect_scale(self, scale: float) -> None:
         """Multiply the way of all odometry from now on by the factor of a model, and by that of the
