@@ -20,7 +20,6 @@ ENOUGH_IMAGES = 5
 DOUBT_STDS = 2.0
 """While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
 NOT_LATE = Quantity(0.0, math.inf)
-"""Of images whose turns show no delay."""
 
 
 class OdometryEvent(NamedTuple):
@@ -66,8 +65,9 @@ class PoseEvent(NamedTuple):
 class MeasurementEvent(NamedTuple):
     """A position (2,) or pose (3,) from an image, with its covariance.
 
-    It is fused `late`, s, earlier than expected of its stamp, as turns of the images show. `jacobian` (2 or 3, 12) and `white`,
-    the part of the noise that is this image's own, follow from the covariance: see
+    It is fused `late`, s, earlier than expected of its stamp: what turns of the images show, with
+    an infinite standard deviation where they show nothing. `jacobian` (2 or 3, 12) and `white`, the
+    part of the noise that is this image's own, follow from the covariance: see
     ekf.measurement_event.
     """
 
@@ -79,7 +79,14 @@ class MeasurementEvent(NamedTuple):
     late: Quantity = NOT_LATE
 
 
-Event = OdometryEvent | PoseEvent | MeasurementEvent
+class DelayEvent(NamedTuple):
+    """An image `late` by more than is compensated, s: where it shows the robot is left out."""
+
+    stamp_ns: int
+    late: Quantity
+
+
+Event = OdometryEvent | PoseEvent | MeasurementEvent | DelayEvent
 
 
 class Update(NamedTuple):

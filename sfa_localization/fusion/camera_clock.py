@@ -38,8 +38,8 @@ class CameraClock:
 
     @property
     def known(self) -> bool:
-        """Whether the drive shows the delay at all."""
-        return bool(np.isfinite(self.std_s))
+        """Whether the delay is assumed, or the drive shows it at all."""
+        return self.assumed or bool(np.isfinite(self.std_s))
 
     @property
     def delay_ns(self) -> int:

@@ -19,6 +19,7 @@ from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     NOT_LATE,
     Belief,
+    DelayEvent,
     Event,
     Jump,
     MeasurementEvent,
@@ -155,6 +156,9 @@ class Ekf:
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
             trusted = Track(belief.track.knots, since_m=-math.inf)
             return placed._replace(memory=Memory(), track=trusted)
+        belief = _overruled(belief, event.late)
+        if isinstance(event, DelayEvent):  # which is why images in a row contradicted the estimate
+            return belief._replace(memory=belief.memory._replace(rejected=0))
         return self._measured(belief, event)
 
     # Predict.
@@ -243,7 +247,6 @@ class Ekf:
 
     def _measured(self, belief: Belief, event: MeasurementEvent) -> Belief:
         """The belief, predicted to the event's stamp before, after a measurement."""
-        belief = _overruled(belief, event.late)
         lost = belief.covariance[YAW, YAW] > self._config.lost_yaw_std**2
         if belief.located and (event.value.size == 3 or not lost):
             return self._gated(belief, event)

@@ -23,7 +23,14 @@ from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_SCALE
 from sfa_localization.data.rig import Quantity, Rig
-from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
+from sfa_localization.fusion.belief import (
+    Belief,
+    DelayEvent,
+    Event,
+    OdometryEvent,
+    PoseEvent,
+    Update,
+)
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.ekf import Ekf, measurement_event
 from sfa_localization.fusion.health import Health, health_of
@@ -173,6 +180,9 @@ class PoseFilter:
             self._require_place(taken_ns, MEASUREMENT)
             clock = self._camera.clock_at(stamp_ns)
             late = Quantity(clock.delay_ns * 1e-9 - self._expected_s, clock.std_s)
+            if abs(clock.delay_ns) > DELAY_LIMIT_NS:
+                self._history.add((taken_ns, MEASUREMENT), DelayEvent(taken_ns, late))
+                raise DataError('clocks of camera and odometry are more than 0.5 s apart')
             event = measurement_event(taken_ns, fused, noise, self.correlation.share, late)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
@@ -232,8 +242,6 @@ class PoseFilter:
         in the delay than it takes, as after a network's stall, the order of the stamps says more.
         """
         delay_ns = self._camera.clock_at(stamp_ns).delay_ns if stamp_ns > 0 else 0
-        if abs(delay_ns) > DELAY_LIMIT_NS:
-            raise DataError('clocks of camera and odometry are more than 0.5 s apart')
         if delay_ns == 0:
             return stamp_ns
         taken_ns = max(stamp_ns - delay_ns, 1)
