@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ ENOUGH_IMAGES = 5
 """Images in a row that overrule an established estimate: half a second to a second of a camera."""
 DOUBT_STDS = 2.0
 """While lost, the difference from the images is taken as an error of so many sigma (95 %)."""
-NOT_LATE = Quantity(0.0, math.inf)
 
 
 class OdometryEvent(NamedTuple):
@@ -76,7 +74,7 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
-    late: Quantity = NOT_LATE
+    late: Quantity
 
 
 class DelayEvent(NamedTuple):

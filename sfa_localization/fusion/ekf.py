@@ -17,7 +17,6 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
-    NOT_LATE,
     Belief,
     DelayEvent,
     Event,
@@ -66,7 +65,7 @@ _OBSERVED = np.eye(3, SIZE)
 
 
 def measurement_event(
-    stamp_ns: int, value: Array, covariance: Array, share: float, late: Quantity = NOT_LATE
+    stamp_ns: int, value: Array, covariance: Array, share: float, late: Quantity
 ) -> MeasurementEvent:
     """A position (2,) or pose (3,), its covariance split into what neighboring images share.
 
@@ -318,12 +317,11 @@ class Ekf:
         )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
         # The pose is that of the delay before.
-        moving, variance = motion.velocity(placed.mean), placed.covariance[DELAY, DELAY]
-        placed.mean[:3] += moving * (placed.mean[DELAY] - event.late.value)
+        variance, by_delay = placed.covariance[DELAY, DELAY], np.zeros(SIZE)
+        by_delay[:3], by_delay[DELAY] = motion.velocity(placed.mean), 1.0
+        placed.mean[:3] += by_delay[:3] * (placed.mean[DELAY] - event.late.value)
         placed.covariance[DELAY] = placed.covariance[:, DELAY] = 0.0
-        placed.covariance[DELAY, DELAY] = variance
-        placed.covariance[:3, :3] += variance * np.outer(moving, moving)
-        placed.covariance[:3, DELAY] = placed.covariance[DELAY, :3] = variance * moving
+        placed.covariance[:] += variance * np.outer(by_delay, by_delay)
         return placed._replace(memory=memory, track=track)
 
 
