@@ -14,7 +14,9 @@ from sfa_localization.data.error_correlation import LEAST_M, ErrorCorrelation
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import compose, wrap_angle
 from sfa_localization.data.rig import Quantity, Rig
-from sfa_localization.fusion.motion import LOSS, SCALE
+from sfa_localization.fusion.belief import DelayEvent
+from sfa_localization.fusion.ekf import Ekf
+from sfa_localization.fusion.motion import DELAY, LOSS, SCALE, SIZE
 from sfa_localization.fusion.pose_filter import Level, PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
 
@@ -158,6 +160,7 @@ def test_images_of_another_clock_neither_end_the_odometry_nor_go_unnoticed(apart
 @pytest.mark.parametrize('late_s', [0.3, -0.3, 0.9])
 def test_turns_show_by_how_much_images_are_stamped_late(late_s):
     drive, fused, errors = Drive(seconds=90, rate_hz=25, every=4, **NOISY), PoseFilter(), []
+    fused.expect(Rig(camera_delay=Quantity(0.0, 0.05)))
     late_ns = round(late_s * 1e9)
     order = sorted(drive.events(), key=lambda event: event[0] + event[1] * max(late_ns, 0))
     for stamp_ns, kind, index in order:
@@ -168,11 +171,27 @@ def test_turns_show_by_how_much_images_are_stamped_late(late_s):
             drive.give(fused, (stamp_ns, kind, index))
             errors.append(drive.error(fused, index)[0])
     assert fused.camera_clock.delay_s == pytest.approx(late_s, abs=0.05)
+    assert fused.state.mean[DELAY] == pytest.approx(late_s, abs=0.1)
     if abs(late_s) > 0.5:
         assert fused.status.level is not Level.LOCALISED
         assert any('synchronize the clocks' in reason for reason in fused.status.reasons)
     else:
         assert np.mean(errors[-500:]) < 0.15 and fused.status.level is Level.LOCALISED
+
+
+def test_a_delay_that_turns_contradict_gives_way_and_the_pose_follows():
+    ekf = Ekf(FilterConfig(), ErrorCorrelation())
+    mean, covariance = np.zeros(SIZE), np.eye(SIZE)
+    covariance[DELAY, DELAY] = covariance[0, DELAY] = covariance[DELAY, 0] = 0.05**2  # at 1 m/s
+    belief = ekf.blank(SECOND)._replace(mean=mean, covariance=covariance, located=True)
+    agreed = ekf.step(belief, DelayEvent(SECOND, Quantity(0.1, 0.05)))  # 1.4 standard deviations
+    assert np.array_equal(agreed.mean, mean) and np.array_equal(agreed.covariance, covariance)
+    after = ekf.step(belief, DelayEvent(SECOND, Quantity(-0.3, 0.02)))
+    assert after.mean[[0, DELAY]] == pytest.approx([-0.3, -0.3])
+    assert after.covariance[[0, 0, DELAY], [0, DELAY, DELAY]] == pytest.approx(
+        [1 + 0.02**2 - 0.05**2, 0.02**2, 0.02**2]
+    )
+    assert np.array_equal(after.covariance[1:3], covariance[1:3])
 
 
 # Consistency; as many drives as chi-square tests need are in test_filter_consistency.py.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfa_localization.data.geometry import Array
+from sfa_localization.data.rig import Quantity
 from sfa_localization.fusion.inputs import symmetric
 from sfa_localization.fusion.motion import State, Twist
 from sfa_localization.fusion.track import Image, Pose, Track
@@ -62,8 +63,9 @@ class PoseEvent(NamedTuple):
 class MeasurementEvent(NamedTuple):
     """A position (2,) or pose (3,) from an image, with its covariance.
 
-    It is fused `late_s` earlier than expected of its stamp. `jacobian` (2 or 3, 12) and `white`,
-    the part of the noise that is this image's own, follow from the covariance: see
+    It is fused `late`, s, earlier than expected of its stamp: what turns of the images show, with
+    an infinite standard deviation where they show nothing. `jacobian` (2 or 3, 12) and `white`, the
+    part of the noise that is this image's own, follow from the covariance: see
     ekf.measurement_event.
     """
 
@@ -72,10 +74,17 @@ class MeasurementEvent(NamedTuple):
     covariance: Array
     jacobian: Array
     white: Array
-    late_s: float = 0.0
+    late: Quantity
 
 
-Event = OdometryEvent | PoseEvent | MeasurementEvent
+class DelayEvent(NamedTuple):
+    """An image `late` by more than is compensated, s: where it shows the robot is left out."""
+
+    stamp_ns: int
+    late: Quantity
+
+
+Event = OdometryEvent | PoseEvent | MeasurementEvent | DelayEvent
 
 
 class Update(NamedTuple):

@@ -38,23 +38,23 @@ class CameraClock:
 
     @property
     def known(self) -> bool:
-        """Whether the drive shows the delay at all."""
-        return bool(np.isfinite(self.std_s))
+        """Whether the delay is assumed, or the drive shows it at all."""
+        return self.assumed or bool(np.isfinite(self.std_s))
 
     @property
     def delay_ns(self) -> int:
         """What to subtract from the images' stamps: 0 for a delay that is not significant."""
-        significant = self.assumed or abs(self.delay_s) > _SIGNIFICANT_STDS * self.std_s
+        significant = self.assumed or abs(self.delay_s) > SIGNIFICANT_STDS * self.std_s
         return round(self.delay_s * 1e9) if significant else 0
 
     def unless(self, found: CameraClock) -> CameraClock:
         """This delay, where it is assumed and another one that was found agrees; else that."""
-        if not self.assumed or abs(found.delay_s - self.delay_s) > _SIGNIFICANT_STDS * found.std_s:
+        if not self.assumed or abs(found.delay_s - self.delay_s) > SIGNIFICANT_STDS * found.std_s:
             return found
         return CameraClock(self.delay_s, min(self.std_s, found.std_s), True)
 
 
-_SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.0, 0.798  # of |x|: sqrt(2 / pi)
+SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.0, 0.798  # of |x|: sqrt(2 / pi)
 _STEP_S = 0.02
 _GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
 # Images farther apart in time, or with a pause of the odometry between, are not compared. An

@@ -14,10 +14,11 @@ import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array
-from sfa_localization.data.rig import Rig
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion import motion
 from sfa_localization.fusion.belief import (
     Belief,
+    DelayEvent,
     Event,
     Jump,
     MeasurementEvent,
@@ -27,6 +28,7 @@ from sfa_localization.fusion.belief import (
     PoseEvent,
     Update,
 )
+from sfa_localization.fusion.camera_clock import SIGNIFICANT_STDS
 from sfa_localization.fusion.filterpy_ekf import ExtendedKalmanFilter
 from sfa_localization.fusion.inputs import root
 from sfa_localization.fusion.motion import (
@@ -63,7 +65,7 @@ _OBSERVED = np.eye(3, SIZE)
 
 
 def measurement_event(
-    stamp_ns: int, value: Array, covariance: Array, share: float, late_s: float = 0.0
+    stamp_ns: int, value: Array, covariance: Array, share: float, late: Quantity
 ) -> MeasurementEvent:
     """A position (2,) or pose (3,), its covariance split into what neighboring images share.
 
@@ -74,7 +76,7 @@ def measurement_event(
     for i, row in enumerate(root(covariance.tolist())):
         for j, entry in enumerate(row, ERROR):
             jacobian[i, j] = shared * entry
-    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance, late_s)
+    return MeasurementEvent(stamp_ns, value, covariance, jacobian, (1 - share) * covariance, late)
 
 
 class Kalman(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -153,6 +155,9 @@ class Ekf:
             placed = _at_pose(belief, event.pose, event.covariance, 0.0)
             trusted = Track(belief.track.knots, since_m=-math.inf)
             return placed._replace(memory=Memory(), track=trusted)
+        belief = _overruled(belief, event.late)
+        if isinstance(event, DelayEvent):  # which is why images in a row contradicted the estimate
+            return belief._replace(memory=belief.memory._replace(rejected=0))
         return self._measured(belief, event)
 
     # Predict.
@@ -312,21 +317,36 @@ class Ekf:
         )
         placed = _at_pose(belief, pose, covariance, self._correlation.share)
         # The pose is that of the delay before.
-        moving, variance = motion.velocity(placed.mean), placed.covariance[DELAY, DELAY]
-        placed.mean[:3] += moving * (placed.mean[DELAY] - event.late_s)
+        variance, by_delay = placed.covariance[DELAY, DELAY], np.zeros(SIZE)
+        by_delay[:3], by_delay[DELAY] = motion.velocity(placed.mean), 1.0
+        placed.mean[:3] += by_delay[:3] * (placed.mean[DELAY] - event.late.value)
         placed.covariance[DELAY] = placed.covariance[:, DELAY] = 0.0
-        placed.covariance[DELAY, DELAY] = variance
-        placed.covariance[:3, :3] += variance * np.outer(moving, moving)
-        placed.covariance[:3, DELAY] = placed.covariance[DELAY, :3] = variance * moving
+        placed.covariance[:] += variance * np.outer(by_delay, by_delay)
         return placed._replace(memory=memory, track=track)
 
 
+def _overruled(belief: Belief, late: Quantity) -> Belief:
+    """The delay that turns of the images contradict gives way to theirs. What the filter learned
+    with it follows by its regression on the delay (Jeffrey's rule for one Gaussian marginal).
+    """
+    variance = max(float(belief.covariance[DELAY, DELAY]), motion.DELAY_WALK**2)
+    change = late.value - float(belief.mean[DELAY])
+    if abs(change) <= SIGNIFICANT_STDS * math.hypot(late.std, math.sqrt(variance)):
+        return belief
+    by_delay = belief.covariance[DELAY] / variance
+    by_delay[DELAY] = 1.0
+    mean = belief.mean + by_delay * change
+    mean[YAW] = wrap(float(mean[YAW]))
+    covariance = belief.covariance + (late.std**2 - variance) * np.outer(by_delay, by_delay)
+    return belief._replace(mean=mean, covariance=covariance)
+
+
 def _delayed(belief: Belief, event: MeasurementEvent) -> MeasurementEvent:
-    """As a measurement linear in the state: z = x - velocity (DELAY - late_s) + errors."""
+    """As a measurement linear in the state: z = x - velocity (DELAY - late) + errors."""
     moving = motion.velocity(belief.mean)[: len(event.value)]
     jacobian = event.jacobian.copy()
     jacobian[:, DELAY] = -moving
-    return event._replace(value=event.value - event.late_s * moving, jacobian=jacobian)
+    return event._replace(value=event.value - event.late.value * moving, jacobian=jacobian)
 
 
 def _images(belief: Belief, event: MeasurementEvent, accepted: bool) -> tuple[Image, ...]:

@@ -22,8 +22,15 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_SCALE
-from sfa_localization.data.rig import Rig
-from sfa_localization.fusion.belief import Belief, Event, OdometryEvent, PoseEvent, Update
+from sfa_localization.data.rig import Quantity, Rig
+from sfa_localization.fusion.belief import (
+    Belief,
+    DelayEvent,
+    Event,
+    OdometryEvent,
+    PoseEvent,
+    Update,
+)
 from sfa_localization.fusion.camera_clock import CameraClock, CameraClockFinder
 from sfa_localization.fusion.ekf import Ekf, measurement_event
 from sfa_localization.fusion.health import Health, health_of
@@ -47,8 +54,6 @@ __all__ = ['Level', 'PoseFilter', 'State', 'Status', 'Update']
 
 # Image pairs, some minutes of them, over which the camera's clock is averaged: clocks drift.
 _CLOCK_MEMORY = 1000.0
-# Standard deviation, s, of a delay learned with the model: clocks differ from day to day.
-_EXPECTED_STD_S = 0.05
 
 
 class PoseFilter:
@@ -173,8 +178,12 @@ class PoseFilter:
             self._timeline.require_order(stamp_ns, MEASUREMENT, self._history, again)
             taken_ns = self._taken(stamp_ns)
             self._require_place(taken_ns, MEASUREMENT)
-            late_s = self._camera.clock_at(stamp_ns).delay_ns * 1e-9 - self._expected_s
-            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late_s)
+            clock = self._camera.clock_at(stamp_ns)
+            late = Quantity(clock.delay_ns * 1e-9 - self._expected_s, clock.std_s)
+            if abs(clock.delay_ns) > DELAY_LIMIT_NS:
+                self._history.add((taken_ns, MEASUREMENT), DelayEvent(taken_ns, late))
+                raise DataError('clocks of camera and odometry are more than 0.5 s apart')
+            event = measurement_event(taken_ns, fused, noise, self.correlation.share, late)
         except DataError as error:
             self.counts[f'measurement: {error}'] += 1
             return Update(stamp_ns, False, math.nan, math.nan, str(error))
@@ -208,7 +217,7 @@ class PoseFilter:
         """Begin with the camera's delay of the training drives; turns under way overrule it."""
         if abs(delay_s) * 1e9 <= DELAY_LIMIT_NS and not self._camera.clock.known:
             self._expected_s = delay_s
-            self._camera.expect(CameraClock(delay_s, _EXPECTED_STD_S, True))
+            self._camera.expect(CameraClock(delay_s, assumed=True))
 
     def expect_scale(self, scale: float) -> None:
         """Multiply the way of all odometry from now on by the factor of a model, and by that of the
@@ -233,8 +242,6 @@ class PoseFilter:
         in the delay than it takes, as after a network's stall, the order of the stamps says more.
         """
         delay_ns = self._camera.clock_at(stamp_ns).delay_ns if stamp_ns > 0 else 0
-        if abs(delay_ns) > DELAY_LIMIT_NS:
-            raise DataError('clocks of camera and odometry are more than 0.5 s apart')
         if delay_ns == 0:
             return stamp_ns
         taken_ns = max(stamp_ns - delay_ns, 1)

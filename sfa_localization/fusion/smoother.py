@@ -19,7 +19,7 @@ import numpy as np
 
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array
-from sfa_localization.fusion.belief import Belief, Event, MeasurementEvent, OdometryEvent
+from sfa_localization.fusion.belief import Belief, Event, MeasurementEvent, OdometryEvent, PoseEvent
 from sfa_localization.fusion.ekf import STARTS, Ekf, Kalman
 from sfa_localization.fusion.history import History
 from sfa_localization.fusion.inputs import symmetric
@@ -108,7 +108,7 @@ def _follows(event: Event, belief: Belief) -> bool:
     if isinstance(event, MeasurementEvent):
         update = belief.memory.update
         return update is None or update.reason not in STARTS
-    return isinstance(event, OdometryEvent)
+    return not isinstance(event, PoseEvent)
 
 
 def _smoothed(stages: list[_Stage]) -> list[State]:
