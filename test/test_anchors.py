@@ -319,7 +319,7 @@ def test_points_clicked_on_the_map_of_a_lidar_give_a_model_its_coordinates(tmp_p
         1.0, abs=3 * model.rig.wheel_scale.std
     )
     assert Localizer(model).filter.scale == model.rig.wheel_scale.value
-    assert 'scale: the way of wheels counts 0.9' in summary(trained)
+    assert 'wheels: 0.9' in summary(trained)
     write_training_report(tmp_path / 'report', trained)
     assert 'missed by' in (tmp_path / 'report' / 'index.html').read_text('utf-8')
 

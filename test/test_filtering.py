@@ -143,7 +143,7 @@ def test_disorder_is_sorted_and_bad_rows_are_counted(tmp_path):
 
 
 def test_a_heading_with_its_variance_starts_the_filter(tmp_path):
-    odometry = Table(np.array([1, 2]) * 10**9, np.zeros((2, 4)))
+    odometry = Table(np.array([10, 14]) * 10**8, np.zeros((2, 4)))
     for columns, cells, started in (('', '', 0), (',yaw_rad', ',1.5', 0),
                                     (',yaw_rad,var_yaw', ',1.5,0.01', 2)):  # fmt: skip
         (tmp_path / 'p.csv').write_text(f'stamp_s,x_m,y_m{columns}\n1,5,6{cells}\n')

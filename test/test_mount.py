@@ -3,6 +3,7 @@
 """A camera beside the axle is learned with the map, and poses are those of base_link."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from metric_worlds import drive, meander, mixtures, straight
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from sfa_localization.bags.drives import read_drives
 from sfa_localization.bags.reader import Bag
 from sfa_localization.bags.static_transforms import camera_place
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.data.errors import DataError
+from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity, Rig
 from sfa_localization.features.closures import Views
@@ -24,8 +26,9 @@ from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.pose_graph import Graph, graph_poses
 from sfa_localization.metric.segments import cut_track, join
-from sfa_localization.metric.settings import SegmentConfig
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
+from sfa_localization.training_input import Recipe, TrainingInput
 
 CONFIG = SegmentConfig()
 PANORAMA = PanoramaConfig(width=240, height=24)
@@ -273,3 +276,14 @@ def test_images_change_in_turns_as_far_as_the_camera_moves(lever):
     assert abs(np.sqrt(seen.value) - abs(lever)) < 0.05 + 0.5 * abs(lever)
     few = Views(textures[:20], count[:20], np.zeros(20, int), path[:20])
     assert lever_square(few, base[:20, 2]) is None
+
+
+@pytest.mark.slow
+def test_a_place_that_is_set_is_kept_and_compared_with_the_images(tmp_path, caplog):
+    """The camera of the sample is above the axle."""
+    recipe = Recipe(metric=MetricConfig(camera_xy=(0.4, 0.0)))
+    runs = read_drives([Path('bags/sample')], tmp_path, recipe)
+    mount = TrainingInput.of(runs, recipe).drives.mount
+    assert abs(mount.lever - 0.4) < 0.05 and 'check camera_xy' in caplog.text
+    with pytest.raises(ConfigError, match='camera_xy'):
+        MetricConfig(camera_xy=(0.4,))

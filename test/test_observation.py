@@ -13,6 +13,7 @@ from picture_readers import PictureReader, panorama
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
+from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
 from sfa_localization.features.observation import (
     Match,
@@ -163,6 +164,7 @@ class Matched(PictureReader):
     def __init__(self, slow: Observation, match: Match, noise: MatchNoise, center=(0.0, 0.0)):
         super().__init__()
         self.slow, self.found, self.quality = slow, match, {}
+        self.rig = Rig(wheel_scale=Quantity(1.0, 0.01))
         self.keyframes = SimpleNamespace(noise=noise, poses=np.array([[*center, 0.0]]))
 
     def match(self, view, pattern=None):

@@ -93,8 +93,9 @@ def test_images_that_are_stamped_late_are_no_noise_and_unusable_ones_do_not_coun
     drives = plain, by_training, by_turns, unturned
     costs = [tuning.likelihood_cost([one], config) for one in drives]
     errors = [tuning.error_cost([one], config) for one in drives]
-    assert costs == sorted(costs) and costs[3] > costs[2] + 0.05 and costs[2] > costs[1] + 0.05
-    assert errors[1] < 0.02 and errors[2] < 0.8 * errors[3] and errors[3] > 0.1
+    # Without turns the filter learns the delay from the way alone, later.
+    assert costs == sorted(costs)
+    assert errors[1] < 1.2 * errors[0] and errors[2] < 0.5 * errors[3], errors
     dark = [
         replace(one, problem='dark', covariance=unusable_covariance(), stamp_ns=one.stamp_ns + 1)
         for one in plain.observations

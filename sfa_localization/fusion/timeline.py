@@ -18,6 +18,8 @@ HISTORY_NS = 5_000_000_000
 LEAP_NS = 500_000_000
 """A stamp that is ahead of all before it by more leaves the order of reception, or follows a pause:
 as much as a gap of the odometry."""
+PERIODS = 2.5
+"""Periods of the odometry that are no pause, however slow it is."""
 FEW_AHEAD, FEW_BEHIND = 3, 5
 """So many messages in a row that leap ahead, and messages in a row that are too late, are
 no accident: there was a pause, and the clock has gone back."""
@@ -37,7 +39,7 @@ class Timeline:
         self._behind = 0
         # Messages in a row that leap ahead; kind and stamp of those that wait, and what takes them.
         self._leaps, self._held = 0, list[tuple[int, int, Callable[[], object]]]()
-        self._apart = 0, 0
+        self._apart, self._period_ns = (0, 0), 0
         # Odometry in a row that is no newer than what came before it: how many of its messages lie
         # among those, and the first and last stamp.
         self._again = 0, 0, 0
@@ -56,7 +58,9 @@ class Timeline:
         if kind == MEASUREMENT:
             apart = abs(ahead_ns) > HISTORY_NS
             self._apart = (self._apart[0] + 1, ahead_ns) if apart else (0, 0)
-        if ahead_ns <= LEAP_NS:
+        if ahead_ns <= max(LEAP_NS, PERIODS * self._period_ns):
+            if kind == ODOMETRY and ahead_ns > 0:
+                self._period_ns = ahead_ns
             far_ns = HISTORY_NS if kind == ODOMETRY else math.inf
             self._held = [h for h in self._held if h[0] != kind and h[1] - stamp_ns <= far_ns]
             self._leaps = len(self._held)
@@ -68,6 +72,7 @@ class Timeline:
         held, self._held = self._held, []
         for *_, take in held:
             take()
+        self._period_ns = stamp_ns - (history.newest_ns or stamp_ns)
 
     def require_place(self, stamp_ns: int, kind: int, history: History[Event, Belief]) -> None:
         """Raises DataError for a stamp that cannot be used, and ClockWentBack."""

@@ -189,8 +189,8 @@ def read_rig(message: String) -> tuple[Rig, ErrorCorrelation]:
     """The same from sfa/rig. Raises MessageError."""
     values = _read_json(message)
     try:
-        correlation = ErrorCorrelation(*map(float, values.pop(_CORRELATION)))
-        return Rig.from_mapping(values), correlation
+        share, distance_m = map(float, values.pop(_CORRELATION))
+        return Rig.from_mapping(values), ErrorCorrelation(share, distance_m)
     except (KeyError, TypeError, ValueError, DataError) as error:
         raise MessageError(f'is no record of a robot: {error}') from None
 
