@@ -78,10 +78,11 @@ def _change(textures: NDArray[np.int8], first: Indices, last: Indices) -> Array:
     """Minus the logarithm of the correlation (P,) of pairs of textures (S, rows, columns) at the
     lowest frequencies, turned to be most alike."""
     columns, changes = textures.shape[2], []
-    for pair in zip(first.tolist(), last.tolist(), strict=True):
-        low = spectra_of(textures[list(pair)])[:, :, 1 : FREQUENCIES + 1]
-        low = low / np.maximum(np.linalg.norm(low, axis=(1, 2), keepdims=True), 1e-9)
-        product = np.append(0.0, (low[0] * low[1].conj()).sum(0)).astype(np.complex64)
+    used, pairs = np.unique([first, last], return_inverse=True)
+    low = spectra_of(textures[used])[:, :, 1 : FREQUENCIES + 1]
+    low = low / np.maximum(np.linalg.norm(low, axis=(1, 2), keepdims=True), 1e-9)
+    for one, other in pairs.reshape(2, -1).T.tolist():
+        product = np.append(0.0, (low[one] * low[other].conj()).sum(0)).astype(np.complex64)
         curve = columns_of(product, _FINER * columns) * (_FINER * columns / 2)
         changes.append(-np.log(max(float(curve.max()), 0.05)))
     return np.array(changes)

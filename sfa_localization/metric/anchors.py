@@ -121,8 +121,9 @@ class Anchors:
         """Rows (K, 3N) whose products with [o, z, -b z] are where the drive puts the robot; 0 of
         points that are near no image.
         """
-        rows = stack.place_rows(stack.rows(self.images), self.placed.astype(float), self.offset)
-        return np.asarray(rows.toarray())
+        rows, placed = stack.rows(self.images), self.placed.astype(float)
+        beside = stack.facing_rows(rows, placed * self.offset)
+        return np.asarray((stack.place_rows(rows, placed) + beside).toarray())
 
     def ties(self, stack: Stack, before: Solution | None = None) -> sparse.csr_array:
         """What is squared (K, 3N) of the used points in [o, z, -b z], over its standard deviation.

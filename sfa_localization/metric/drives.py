@@ -24,7 +24,7 @@ from sfa_localization.features.closures import Closures, Views
 from sfa_localization.features.offsets import Offsets, find_offsets
 from sfa_localization.features.turning import lever_square
 from sfa_localization.metric.anchors import Anchors, Settled, settle
-from sfa_localization.metric.dead_reckoning import OdometryTrack, Way, seconds_since_start
+from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.loops import with_closures
@@ -131,8 +131,7 @@ class Drives:
     def _yaws(self) -> Iterator[Array]:
         """Headings rad of the odometry at the images of each drive."""
         for track, drive in zip(self.tracks(), self.items, strict=True):
-            times = (drive.stamps_ns - track.stamps_ns[0]) * 1e-9
-            yield np.interp(times, seconds_since_start(track.stamps_ns), track.yaw)
+            yield Headings.of(track, drive.stamps_ns, drive.seen).track
 
     @property
     def _camera_yaw(self) -> Array:

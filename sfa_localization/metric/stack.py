@@ -107,18 +107,17 @@ class Stack:
         """Sum (N, ...) of the rows (M, ...) of each segment."""
         return np.asarray(np.add.reduceat(rows, self.first, axis=0))
 
-    def place_rows(self, rows: Indices, shares: Array, ahead: Complex | float = 0.0) -> Any:
+    def place_rows(self, rows: Indices, shares: Array) -> Any:
         """Rows (L, 3N) whose products with [o, z, -b z] are sums of places by `shares`: of images,
-        `rows` (L,) or (L, K) of the stack, and what is `ahead` of them, x + i y m, in their axes.
+        `rows` (L,) or (L, K) of the stack.
         """
-        n, owner, ahead = self.segments, self.owner[rows], np.exp(1j * self.headings[rows]) * ahead
-        drift = self.drift[rows] + 1j * self.times_s[rows] * ahead
-        places = n + owner, shares * (self.path[rows] + ahead)
-        return self.sparse((owner, shares), places, (2 * n + owner, shares * drift))
+        n, owner = self.segments, self.owner[rows]
+        places, drift = shares * self.path[rows], shares * self.drift[rows]
+        return self.sparse((owner, shares), (n + owner, places), (2 * n + owner, drift))
 
-    def facing_rows(self, rows: Indices, shares: Array) -> Any:
+    def facing_rows(self, rows: Indices, shares: Array | Complex) -> Any:
         """The same (L, 3N) of the directions that the images face, exp(i yaw): by how much what is
-        one meter ahead of all images differs from their places."""
+        one meter ahead of all images differs from their places; complex shares turn them."""
         n, owner, facing = self.segments, self.owner[rows], np.exp(1j * self.headings[rows])
         drift = 1j * self.times_s[rows] * facing
         return self.sparse((n + owner, shares * facing), (2 * n + owner, shares * drift))
