@@ -26,7 +26,6 @@ from sfa_localization.data.files import atomic_write, read_regular
 from sfa_localization.data.plain_yaml import LONGEST, load_yaml
 from sfa_localization.data.rejections import quoted
 from sfa_localization.data.settings import Settings, nearest
-from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.nodes.settings import (
@@ -35,6 +34,7 @@ from sfa_localization.nodes.settings import (
     OmnicamNodeConfig,
     SfaNodeConfig,
 )
+from sfa_localization.sfa.settings import NetworkConfig
 
 S = TypeVar('S', bound=Settings)
 SECTIONS: dict[str, tuple[type[Settings], ...]] = {

@@ -34,11 +34,11 @@ from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.messages import read_tilt, read_yaw_rate
 from sfa_localization.data.run import Image, Odometry, Stamps
 from sfa_localization.data.settings import Settings, setting
+from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.closures import STRETCH_M, Views, driven
-from sfa_localization.features.image_features import evenly
-from sfa_localization.features.keyframes import quantized, texture
-from sfa_localization.features.leveling import links_between
+from sfa_localization.keyframes.closures import STRETCH_M, Views, driven
+from sfa_localization.keyframes.leveling import links_between
+from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric.drive_check import ROUTE, is_one_route
 from sfa_localization.metric.motion_check import MotionCheck, check_motion
 from sfa_localization.metric.motion_sources import IMAGES, POSE, late

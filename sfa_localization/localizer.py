@@ -24,19 +24,16 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.messages import LARGEST_VARIANCE
 from sfa_localization.data.run import BATCH, Image, Run, Stamps
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, distance
-from sfa_localization.features.observation import Observation as Observation
-from sfa_localization.features.other_light import OtherLight
 from sfa_localization.fusion.pose_filter import PoseFilter, State, Status, Update
 from sfa_localization.fusion.replay import replay
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
+from sfa_localization.keyframes.observation import Observation as Observation
 from sfa_localization.place_model import PlaceModel, View, require_panorama
 
 UNKNOWN_VARIANCE = LARGEST_VARIANCE
 """Variance, m^2, of the position of an unusable image: the filter leaves it out."""
-# The distance of slow features from keyframes, 1 on average where both variances are right, is
-# averaged over about ten images, outliers cut, each by the share that slow features have in it.
-_LATELY, _FARTHEST = 0.1, 100.0
 
 
 class Observer:
@@ -50,13 +47,12 @@ class Observer:
     def use(self, model: PlaceModel) -> None:
         """Go on with a model, which may know another light than the one before."""
         self.model = model
-        self._apart = 1.0
-        self._light = OtherLight()
+        self._conditions = Conditions()
 
     @property
-    def other_light(self) -> float:
-        """How unlike the light makes all images of late, see `OtherLight.unlike`."""
-        return self._light.unlike
+    def slow_error_factor(self) -> float:
+        """How many times as large as in training the errors of slow features are of late."""
+        return self._conditions.slow_error_factor
 
     def observe(self, stamp_ns: int, panorama: Image) -> Observation:
         """Judge and locate a panorama (H, W, 3) uint8 BGR. Raises ModelError for a wrong size."""
@@ -69,12 +65,10 @@ class Observer:
         if len(panoramas):
             self._require_size(panoramas[0])
         judged = list(map(self._judge, panoramas))
-        located = map(self._locate, self.model.views(panoramas))
+        each = zip(stamps_ns.tolist(), judged, self.model.views(panoramas), strict=True)
         return [
-            self._usable(replace(found, stamp_ns=stamp_ns, problem=problem, turned=turned))
-            for stamp_ns, (problem, turned), found in zip(
-                stamps_ns.tolist(), judged, located, strict=True
-            )
+            self._usable(replace(self._locate(view, problem), stamp_ns=stamp_ns, turned=turned))
+            for stamp_ns, (problem, turned), view in each
         ]
 
     def observe_run(self, run: Run) -> Iterator[Observation]:
@@ -89,28 +83,19 @@ class Observer:
         problem = self.watch.judge(panorama)
         return problem, math.nan if problem else self._gyro.add(panorama)
 
-    def _locate(self, view: View) -> Observation:
-        """Slow features and keyframes together. Where they have lately been farther apart than
-        their covariances allow, the light is another one, and slow features lose their weight.
-        """
-        noise = self.model.keyframes.noise
-        match = self.model.match(view, self._light.pattern)
-        slow = self.model.slow_pose(view, match)
-        if match.known:
-            self._light.add(match, noise)
-        light = self._light.unlike
-        found = self.model.combined(slow, match, light, max(self._apart, 1.0))
-        apart, share = distance(slow, match, noise, light)
-        if np.isfinite(apart):
-            self._apart += _LATELY * share * (min(apart, _FARTHEST) - self._apart)
-        return found
+    def _locate(self, view: View, problem: str) -> Observation:
+        """Located in the conditions of late, which usable images of known places teach."""
+        location = self.model.located(view, self._conditions)
+        if not (problem or self.watch.judge_place(location.explained)):
+            self._conditions.add(location)
+        return replace(self.model.observed(view, location), problem=problem)
 
     def _usable(self, found: Observation) -> Observation:
         """What reaches the filter: of an unusable image, that nothing is known."""
         problem, finite = found.problem, found.finite
         if not finite:
             problem = problem or 'the model gives no finite estimate for this image'
-        problem = problem or self.watch.judge_novelty(found.novelty)
+        problem = problem or self.watch.judge_place(found.explained)
         if not problem:
             return found
         pose = found.pose if finite else np.zeros(3)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,26 @@ from sfa_localization.data.rejections import short_line
 from sfa_localization.data.rig import Rig
 from sfa_localization.data.run import Image
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.image_features import (
+from sfa_localization.keyframes.keyframes import Keyframes
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.location import (
+    Hypothesis,
+    Location,
+    SlowPlace,
+    hypotheses,
+    located,
+)
+from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
+from sfa_localization.keyframes.upright import UprightImage, upright
+from sfa_localization.metric.saved_map import MetricMap
+from sfa_localization.metric.turned_maps import TurnedMaps
+from sfa_localization.sfa.image_features import (
     TURNED_LAYER,
     Spectrum,
     slow_features,
     spectrum,
 )
-from sfa_localization.features.keyframes import Keyframes
-from sfa_localization.features.network import (
+from sfa_localization.sfa.network import (
     Architecture,
     Layer,
     Network,
@@ -38,31 +50,19 @@ from sfa_localization.features.network import (
     check_weights,
     require_size,
 )
-from sfa_localization.features.observation import (
-    UNKNOWN_YAW_VARIANCE,
-    Leveled,
-    Match,
-    Observation,
-    Spectra,
-    combine,
-)
-from sfa_localization.features.rotation_spread import Agreement, disagreement
-from sfa_localization.metric.saved_map import MetricMap
-from sfa_localization.metric.turned_maps import TurnedMaps
 
 FORMAT = 'sfa_localization place model'
-VERSION = 14
+VERSION = 15
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What an image shows before its heading is known: itself `leveled`, its slow features (K,),
-    the `spread` of its views about them, and the `spectrum` (H, J) of the layer that is turned.
+    """What an image shows before its heading is known: itself `upright`, its slow features (K,),
+    and the `spectrum` (H, J) of the layer that is turned.
     """
 
-    leveled: Leveled
+    upright: UprightImage
     slow_features: Array
-    spread: float
     spectrum: Spectrum
 
 
@@ -80,7 +80,6 @@ class PlaceModel:
     metric: MetricMap
     panorama: PanoramaConfig
     keyframes: Keyframes
-    agreement: Agreement
     turned: TurnedMaps | None = None
     quality: dict[str, Any] = field(default_factory=dict)
     error_correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
@@ -96,59 +95,54 @@ class PlaceModel:
 
     @one_core()
     def locate_all(self, panoramas: Image) -> list[Observation]:
-        """What panoramas (T, H, W, 3) show."""
-        seen = [(view, self.match(view)) for view in self.views(panoramas)]
-        return [self.combined(self.slow_pose(view, match), match) for view, match in seen]
+        """What panoramas (T, H, W, 3) show, each by itself."""
+        seen = [(view, self.located(view, Conditions())) for view in self.views(panoramas)]
+        return [self.observed(view, location) for view, location in seen]
 
     def views(self, panoramas: Image) -> list[View]:
         """What the network makes of panoramas (T, H, W, 3), leveled by keyframes."""
         require_size(panoramas, self.network.architecture)
-        level = list(map(self.keyframes.level, panoramas))
+        level = [upright(self.keyframes, image) for image in panoramas]
         maps = self.network.maps(np.stack([image.panorama for image in level]))
-        slow, spread = slow_features(maps), disagreement(maps[-1])
         spectra = spectrum(maps[min(TURNED_LAYER, len(maps) - 1)])
-        return list(map(View, level, slow, spread, spectra))
+        return list(map(View, level, slow_features(maps), spectra))
 
-    def match(self, view: View, pattern: Spectra | None = None) -> Match:
-        """What keyframes show of an image without the `pattern` that the light adds, see
-        `OtherLight`.
+    def located(self, view: View, conditions: Conditions) -> Location:
+        """Where the camera was, by keyframes and slow features in the conditions of late."""
+        image, likely = hypotheses(self.keyframes, view.upright, conditions.pattern)
+        best = max(likely, key=lambda one: one.evidence)
+        tilt = image.tilt + best.fit.changes[:2]
+        slow = self._slow_places(view, likely)
+        return located(likely, slow, conditions.scales, self.keyframes.errors, tilt)
+
+    def _slow_places(self, view: View, likely: Sequence[Hypothesis]) -> list[SlowPlace]:
+        """Where the map puts an image, turned by the heading of each hypothesis; one that is
+        uncertain makes the place so, too.
         """
-        return self.keyframes.match_level(view.leveled, pattern)
-
-    def slow_pose(self, view: View, match: Match) -> Observation:
-        """Where the map puts an image, at the heading that keyframes show; that is not known by it.
-
-        Turned by a heading that is uncertain, or unknown, the place is so, too.
-        """
-        by_yaw: Array | float = 0.0
         if self.turned is None:
-            (position,), (own,) = self.metric.predict(view.slow_features)
-        else:
-            variance = self.keyframes.noise.covariance(match)[2, 2] if match.known else np.inf
-            yaw = match.pose[2:], np.array([min(variance, UNKNOWN_YAW_VARIANCE)])
-            found = self.turned.predict(self.metric, view.spectrum[None], *yaw)
-            (position,), (own,), (by_yaw,) = found
-        covariance = np.diag([0.0, 0.0, UNKNOWN_YAW_VARIANCE])
-        covariance[:2, :2] = own * self.agreement.factor(np.array([view.spread])) + by_yaw
-        return Observation(np.append(position, 0.0), covariance, view.slow_features)
+            places, covariances = self.metric.predict(view.slow_features)
+            return [SlowPlace(places[0], float(covariances[0, 0, 0]))] * len(likely)
+        yaw = np.array([one.fit.yaw for one in likely])
+        variance = self.keyframes.errors.yaw_variance(np.array([one.fit.unlike for one in likely]))
+        spectra = np.repeat(view.spectrum[None], len(yaw), axis=0)
+        places, covariances, by_yaw = self.turned.predict(self.metric, spectra, yaw, variance)
+        variances = np.trace(covariances + by_yaw, axis1=1, axis2=2) / 2
+        return list(map(SlowPlace, places, variances.tolist()))
 
-    def combined(
-        self, slow: Observation, match: Match, light: float = 0.0, doubt: float = 1.0
-    ) -> Observation:
-        """Both together, see `combine`, with what is uncertain of both alike: the scale of the map
-        about its center, how far beyond the keyframes they are, and what no image has shown yet.
-        The pose is that of base_link.
+    def observed(self, view: View, location: Location) -> Observation:
+        """The pose of base_link, with what is uncertain of all alike: the errors of the map, and
+        its scale about its center.
         """
-        noise, center = self.keyframes.noise, self.keyframes.poses[:, :2].mean(0)
-        pose, covariance = combine(slow, match, noise, light, doubt)
-        novelty = noise.novelty(match.score)
-        by_scale = self.rig.wheel_scale.std * (pose[:2] - center)
-        covariance = covariance * max(novelty, 1.0) ** 2
+        errors, center = self.keyframes.errors, self.keyframes.poses[:, :2].mean(0)
+        covariance = (
+            location.covariance + np.diag([errors.map_m, errors.map_m, errors.turn_std]) ** 2
+        )
+        by_scale = self.rig.wheel_scale.std * (location.pose[:2] - center)
         covariance[:2, :2] += np.outer(by_scale, by_scale)
-        covariance[:2, :2] += noise.beyond(match, light) ** 2 * np.eye(2)
-        pose, covariance = self.rig.base(pose, covariance, match.facing)
+        pose, covariance = self.rig.base(location.pose, covariance, location.facing)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        return Observation(pose, covariance, slow.slow_features, novelty, tilt=match.tilt)
+        shown = view.slow_features, location.explained
+        return Observation(pose, covariance, *shown, tilt=location.tilt)
 
     def save(self, path: Path) -> None:
         """Write to `path` completely or not at all; the same model gives the same bytes."""
@@ -184,7 +178,7 @@ class PlaceModel:
         with np.errstate(all='ignore'):
             estimates = self.locate_all(np.concatenate([noise, np.zeros_like(noise)]))
         for estimate in estimates:
-            if not (estimate.finite and np.isfinite(estimate.novelty)):
+            if not (estimate.finite and np.isfinite(estimate.explained)):
                 raise ModelError('its estimates are not finite')
             if np.linalg.eigvalsh(estimate.covariance)[0] <= 0:
                 raise ModelError('its covariances are not positive')
@@ -209,7 +203,6 @@ class PlaceModel:
             arrays |= _prefixed(f'network/{depth}/', {**parts, 'delta': self.network.deltas[depth]})
         arrays |= _prefixed('metric/', self.metric.to_arrays())
         arrays |= _prefixed('keyframes/', self.keyframes.to_arrays())
-        arrays |= _prefixed('agreement/', self.agreement.to_arrays())
         if self.turned is not None:
             arrays |= _prefixed('turned/', self.turned.to_arrays())
         return arrays
@@ -223,7 +216,6 @@ class PlaceModel:
             MetricMap.from_arrays(_under(arrays, 'metric/')),
             panorama,
             Keyframes.from_arrays(_under(arrays, 'keyframes/'), panorama.sphere),
-            Agreement.from_arrays(_under(arrays, 'agreement/')),
             TurnedMaps.from_arrays(turned) if turned else None,
             header['quality'],
             ErrorCorrelation(**header['error_correlation']),

@@ -3,9 +3,9 @@
 """Learn a place model from recorded drives: the paper in eight steps; ground truth is never read.
 
 1  read the drives                                       bags/drives.py
-2  find loop closures, and measure their offsets         features/closures.py, offsets.py
-3  train the SFA hierarchy (section 2)                   features/network_training.py
-4  slow features of all images (section 2.2)             features/image_features.py
+2  find loop closures, and measure their offsets         keyframes/closures.py, offsets.py
+3  train the SFA hierarchy (section 2)                   sfa/network_training.py
+4  slow features of all images (section 2.2)             sfa/image_features.py
 5  cut the odometry into segments (section 3.1)          metric/segments.py
 6  the certified drive, and the map of its features      metric/pose_graph.py, learning.py
 7  learn it again, from maps turned by its headings      metric/turned_maps.py
@@ -25,22 +25,20 @@ from sfa_localization.bags.drives import image_folder, read_drives
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.checkpoint import Checkpoint
-from sfa_localization.features.image_features import ImageFeatures, features_of_runs
-from sfa_localization.features.network import Network
 from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.drives import Maps, anchored, compare_with_map, learn_map, rig_of
 from sfa_localization.metric.keyframe_map import learn_keyframes
 from sfa_localization.metric.learning import (
     MetricResult,
-    correlation_along_drive,
     learn_metric,
-    left_out_agreement,
     with_turned,
 )
 from sfa_localization.metric.motion_check import MotionCheck
 from sfa_localization.metric.segments import Segments
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.sfa.checkpoint import Checkpoint
+from sfa_localization.sfa.image_features import ImageFeatures, features_of_runs
+from sfa_localization.sfa.network import Network
 from sfa_localization.training_input import STEPS as STEPS
 from sfa_localization.training_input import Recipe as Recipe
 from sfa_localization.training_input import TrainingInput, compared, train_hierarchy
@@ -129,10 +127,8 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         images = features_of_runs(network, given.runs, bar.update)
     segments, (first, turned, result) = _maps(given, images, strict)
     given.say(8, 'choose keyframes, and check the map')
-    agreement = left_out_agreement(images.disagreement, result)
-    known = learn_keyframes(
-        given.views, images.disagreement, segments, result, agreement, given.recipe.panorama.sphere
-    )
+    sphere = given.recipe.panorama.sphere
+    known = learn_keyframes(given.views, segments, result, sphere, TURN_RADIUS_M)
     result = replace(result, forecast=result.forecast.improved(known.improvement))
     quality: dict[str, Any] = {'features_used': first.map.features, 'turned': turned is not None}
     quality |= {'delta': network.deltas[-1].tolist(), 'rank': [*map(list, network.ranks)]}
@@ -143,10 +139,9 @@ def _learn(network: Network, given: TrainingInput, strict: bool) -> Trained:
         result.map,
         given.panorama,
         known.keyframes,
-        agreement,
         turned,
         quality,
-        correlation_along_drive(result, segments, TURN_RADIUS_M),
+        known.correlation,
         rig_of(given.drives, segments),
     )
     return Trained(model, given.runs, images.slow, segments, result)

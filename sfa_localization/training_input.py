@@ -16,21 +16,21 @@ from sfa_localization.camera.turns import headings, turns_and_textures
 from sfa_localization.data.events import DELAY_LIMIT_NS
 from sfa_localization.data.progress import announce, progress_bar
 from sfa_localization.data.run import Run
-from sfa_localization.features import mdp_engine
-from sfa_localization.features.checkpoint import Checkpoint
-from sfa_localization.features.closures import Views, find_closures, views_of
-from sfa_localization.features.leveling import leveled_runs
-from sfa_localization.features.network import Architecture, Network, standard_architecture
-from sfa_localization.features.network_training import ImageSequence, train_network
-from sfa_localization.features.settings import NetworkConfig
-from sfa_localization.features.zero_time_edges import edges_between
 from sfa_localization.fusion.camera_clock import camera_clock
+from sfa_localization.keyframes.closures import Views, find_closures, views_of
+from sfa_localization.keyframes.leveling import leveled_runs
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.motion_check import MotionCheck, check_drives
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.odometry_errors import same_scale
 from sfa_localization.metric.points import points_of
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.sfa import mdp_engine
+from sfa_localization.sfa.checkpoint import Checkpoint
+from sfa_localization.sfa.network import Architecture, Network, standard_architecture
+from sfa_localization.sfa.network_training import ImageSequence, train_network
+from sfa_localization.sfa.settings import NetworkConfig
+from sfa_localization.sfa.zero_time_edges import edges_between
 
 logger = logging.getLogger(__name__)
 

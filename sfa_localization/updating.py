@@ -27,14 +27,16 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.progress import progress_bar
 from sfa_localization.data.run import Panoramas, Run
+from sfa_localization.data.statistics import evenly
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.image_features import evenly
-from sfa_localization.features.keyframes import Keyframes, encoded, parts_of, quantized, texture
 from sfa_localization.fusion.camera_clock import camera_clock
 from sfa_localization.fusion.replay import Track
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.smoother import Smoother
 from sfa_localization.fusion.status import Level
+from sfa_localization.keyframes.keyframes import Keyframes, encoded, parts_of
+from sfa_localization.keyframes.texture import quantized, texture
+from sfa_localization.keyframes.training import fit_among
 from sfa_localization.localizer import Localizer, Observation
 from sfa_localization.place_model import PlaceModel
 
@@ -143,8 +145,8 @@ def new_views(
         )
     assert isinstance(localizer.filter, Smoother)
     poses, certain = _smoothed(localizer.filter, model, run)
-    known = model.keyframes.noise.novelty(familiar_score(model))
-    novel = np.array([not one.problem and one.novelty > known for one in seen], bool)
+    known = familiar_part(model)
+    novel = np.array([not one.problem and one.explained < known for one in seen], bool)
     agree = np.array([_agrees(one, pose) for one, pose in zip(seen, poses, strict=True)], bool)
     chosen = np.flatnonzero(np.array(sure, bool) & certain & novel & agree)
     chosen = chosen[_spread(poses[chosen])]
@@ -153,15 +155,14 @@ def new_views(
     return Additions(_textures(level, chosen), model.rig.camera(poses[chosen]))
 
 
-def familiar_score(model: PlaceModel) -> float:
-    """The correlation with its likest neighbor that 19 of 20 keyframes of the training reach."""
-    first = np.flatnonzero(model.keyframes.first)
-    rows = first[evenly(len(first), _SAMPLE)]
-    best = list[float]()
-    for row, spectrum in zip(rows.tolist(), model.keyframes.spectra(rows), strict=True):
-        scores = model.keyframes.correlated(spectrum[None], first)[0][0]
-        best.append(float(scores[first != row].max()))
-    return float(np.quantile(best, _RARELY))
+def familiar_part(model: PlaceModel) -> float:
+    """The part of itself that 19 of 20 keyframes of the training have explained by the others."""
+    keyframes, first = model.keyframes, model.keyframes.first
+    explained = list[float]()
+    for row in np.flatnonzero(first)[evenly(int(first.sum()), _SAMPLE)].tolist():
+        fit = fit_among(keyframes, row, first & (np.arange(len(first)) != row))
+        explained.append(1 / (1 + fit.unlike) if fit else 0.0)
+    return float(np.quantile(explained, _RARELY))
 
 
 def _smoothed(smoother: Smoother, model: PlaceModel, run: Run) -> tuple[Array, NDArray[np.bool_]]:

@@ -87,8 +87,8 @@ _GARDENS = {}
 @pytest.fixture(scope='module')
 def small_network():
     """One layer for panoramas of 160x16, and few inducing points: training takes seconds."""
-    from sfa_localization.features import network
     from sfa_localization.metric import selection
+    from sfa_localization.sfa import network
 
     layer = network.Layer(field=(16, 16), stride=(1, 8), linear=16, outputs=10)
     with pytest.MonkeyPatch.context() as patch:

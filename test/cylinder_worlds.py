@@ -13,10 +13,17 @@ import numpy as np
 from sfa_localization.bags.writer import BagWriter
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import Odometry, PanoramaArray, Run, integrate
-from sfa_localization.features.network import Architecture, Layer
-from sfa_localization.features.network_training import ImageSequence, train_network
-from sfa_localization.features.settings import NetworkConfig
+from sfa_localization.data.sphere import Sphere
+from sfa_localization.keyframes.errors import LeftOut
+from sfa_localization.keyframes.keyframes import Keyframes
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.location import SlowPlace, hypotheses, located
+from sfa_localization.keyframes.training import choose_keyframes, located_without, spread
+from sfa_localization.keyframes.upright import upright
 from sfa_localization.metric.settings import MetricConfig
+from sfa_localization.sfa.network import Architecture, Layer
+from sfa_localization.sfa.network_training import ImageSequence, train_network
+from sfa_localization.sfa.settings import NetworkConfig
 from sfa_localization.training import Recipe, Trained, learn_place
 
 SIZE = (12, 48)
@@ -103,6 +110,24 @@ def run_in(world: Spheres, odometry: Odometry, config: PanoramaConfig, name: str
     """A run whose pictures show the world from the odometry's poses."""
     images = world.panoramas(odometry.poses, config)
     return Run(name, PanoramaArray(odometry.stamps_ns, images), odometry)
+
+
+def learnt_keyframes(textures, poses, path_m, sphere: Sphere, drives) -> Keyframes:
+    """As `choose_keyframes`, with the errors of some that are left out, which all count alike."""
+    keyframes = choose_keyframes(textures, poses, sphere, drives)
+    tried, fits, _ = located_without(keyframes, path_m[spread(poses)])
+    trials = LeftOut.of(fits, keyframes.poses[tried], np.full(len(tried), 1 / len(tried)))
+    return replace(keyframes, errors=trials.learn())
+
+
+def alone(keyframes: Keyframes, image: np.ndarray, conditions: Conditions | None = None):
+    """The `Location` of an image (H, W, 3) by keyframes, without slow features."""
+    conditions = conditions or Conditions()
+    level, likely = hypotheses(keyframes, upright(keyframes, image), conditions.pattern)
+    best = max(likely, key=lambda one: one.evidence)
+    unknown = [SlowPlace(one.fit.place, 1e6) for one in likely]
+    tilt = level.tilt + best.fit.changes[:2]
+    return located(likely, unknown, conditions.scales, keyframes.errors, tilt)
 
 
 PLACE_SIZE = (12, 72)

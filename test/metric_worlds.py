@@ -10,7 +10,7 @@ import numpy as np
 
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import Odometry, Stamps, Trajectory, YawRate, integrate
-from sfa_localization.features.offsets import Offsets
+from sfa_localization.keyframes.offsets import Offsets
 
 RATE = 50
 STEP_NS = 1_000_000_000 // RATE

@@ -1,10 +1,9 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""A stand-in for a trained model that reads pose and novelty off the picture; a drive for it."""
+"""A stand-in for a trained model that reads the pose off the picture; a drive for it."""
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import numpy as np
 from filter_drives import Drive
@@ -14,42 +13,50 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.rig import Rig
-from sfa_localization.features.keyframes import Match, MatchNoise
-from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observation
+from sfa_localization.keyframes.location import Location
+from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE, Observation
+from sfa_localization.keyframes.regression import Fit
 
 SIZE = PanoramaConfig(width=64, height=16)
 STEP_M = 0.05
 UNLIKE_DEFAULT = ErrorCorrelation(0.5, 2.0)
 
 
-def panorama(pose=(0.0, 0.0, 0.0), seed=0, novelty=0.5, level=120, spread=40):
-    """A picture (H, W, 3) of random dots that says where it was taken, to within STEP_M."""
+def panorama(pose=(0.0, 0.0, 0.0), seed=0, explained=0.9, level=120, spread=40):
+    """A picture (H, W, 3) of random dots that says where it was taken, to within STEP_M, and which
+    part of it that place explains, to within 0.01.
+    """
     noise = np.random.default_rng(seed).normal(level, spread, (SIZE.height, SIZE.width, 3))
     image = np.clip(noise, 0, 255).astype(np.uint8)
     x, y = (round(value / STEP_M) for value in pose[:2])
     yaw = round(pose[2] % (2 * math.pi) / (2 * math.pi) * 65535)
     image[0, 0] = x % 256, x // 256, y % 256
     image[0, 1] = y // 256, yaw % 256, yaw // 256
-    image[0, 2] = round(10 * novelty)
+    image[0, 2] = round(100 * explained)
     return image
 
 
-class WithoutKeyframes:
-    """A stand-in for a model that has only `locate`: no keyframe knows any place."""
+def fit_at(place, explained, **more):
+    """What keyframes say of an image at a place (2,); by default it is beside all of them, and so
+    teaches nothing about the light.
+    """
+    numbers = {'unlike': 1 / explained - 1, 'variance': 0.0, 'outward': 1.0, **more}
+    return Fit(np.asarray(place), np.ones(1), np.zeros(3), residual=np.zeros((1, 1)), **numbers)
 
-    keyframes = SimpleNamespace(noise=MatchNoise())
+
+class WithoutKeyframes:
+    """A stand-in for a model that has only `locate`."""
 
     def views(self, images):
         return images
 
-    def match(self, view, pattern=None):
-        return Match(np.zeros(3), 0.0, 0.0, 0.0)
+    def located(self, view, conditions):
+        seen = self.locate(view)
+        fit = fit_at(seen.position, max(seen.explained, 0.01))
+        return Location(seen.pose, seen.covariance, fit, 1 + 0j, conditions.scales, seen.tilt)
 
-    def slow_pose(self, view, match):
+    def observed(self, view, location):
         return self.locate(view)
-
-    def combined(self, slow, match, light=0.0, doubt=1.0):
-        return slow
 
 
 @dataclasses.dataclass
@@ -62,14 +69,15 @@ class PictureReader(WithoutKeyframes):
     rig: Rig = dataclasses.field(default_factory=Rig)
 
     def locate(self, image):
-        a, b, novelty = image[0, :3].astype(int)
+        a, b, explained = image[0, :3].astype(int)
         position = np.array([a[0] + 256 * a[1], a[2] + 256 * b[0]]) * STEP_M
         yaw = math.remainder((b[1] + 256 * b[2]) / 65535 * 2 * math.pi, 2 * math.pi)
-        # As a model does, it is less sure of pictures that are somewhat new.
-        spread = np.diag([0.02, 0.03, 0.002]) * max(novelty[0] / 10, 1.0) ** 2
+        explained = explained[0] / 100
+        # As a model does, it is less sure of pictures that are less familiar.
+        spread = np.diag([0.02, 0.03, 0.002]) * max(0.6 / max(explained, 0.01), 1.0) ** 2
         pose = np.append(position, yaw if self.heading else 0.0)
         spread[2, 2] = spread[2, 2] if self.heading else UNKNOWN_YAW_VARIANCE
-        return Observation(pose, spread, pose, novelty[0] / 10)
+        return Observation(pose, spread, pose, explained)
 
 
 class Recording:
@@ -88,7 +96,7 @@ class Recording:
 
     def _picture(self, k):
         if k < 2 or k in (60, 61):
-            return panorama(self.drive.seen[k], k, novelty=9.0)
+            return panorama(self.drive.seen[k], k, explained=0.05)
         if k in (20, 21):
             return np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
         if k == 30:
@@ -97,7 +105,7 @@ class Recording:
             return panorama(self.drive.seen[40], 40)
         if k == 55:
             return np.zeros((SIZE.height, SIZE.width + 2, 3), np.uint8)
-        return panorama(self.drive.seen[k], k, novelty=2.0 if 63 <= k < 66 else 0.5)
+        return panorama(self.drive.seen[k], k, explained=0.3 if 63 <= k < 66 else 0.9)
 
     def events(self):
         yield from merge_by_stamp(self.drive.stamps_ns[self.kept], self.pictures_ns)

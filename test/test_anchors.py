@@ -25,9 +25,9 @@ from sfa_localization.bags.writer import BagWriter, blank
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align
 from sfa_localization.data.run import PanoramaArray, Points, Run
-from sfa_localization.features.closures import Closures
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.keyframes.closures import Closures
 from sfa_localization.localizer import Localizer
 from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.drives import Drive, Drives, anchored, learn_map

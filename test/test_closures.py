@@ -22,10 +22,9 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import RigidTransform, align, wrap_angle
 from sfa_localization.data.run import PanoramaArray
-from sfa_localization.features.closures import STRETCH_M, Closures, Views, find_closures
-from sfa_localization.features.keyframes import quantized, texture
-from sfa_localization.features.offsets import Offsets, find_offsets
-from sfa_localization.features.zero_time_edges import edges_between
+from sfa_localization.keyframes.closures import STRETCH_M, Closures, Views, find_closures
+from sfa_localization.keyframes.offsets import Offsets, find_offsets
+from sfa_localization.keyframes.texture import quantized, texture
 from sfa_localization.metric import selection
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.metric.links import Links
@@ -36,6 +35,7 @@ from sfa_localization.metric.quadratic_form import schur
 from sfa_localization.metric.segments import cut, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Solution, Stack, tracks
+from sfa_localization.sfa.zero_time_edges import edges_between
 
 CONFIG = PanoramaConfig(width=120, height=24)
 COUNTER = PanoramaConfig(width=120, height=24, clockwise=False)

@@ -57,7 +57,7 @@ def test_evaluate_judges_pictures_by_the_section_of_sfa_node(bag, tmp_path, caps
         },
     }
     assert '; 2 skipped: image is dark' in capsys.readouterr().out
-    watch = {'novelty_limit': 1.5}
+    watch = {'least_explained': 0.4}
     found = evaluated(bag, tmp_path, sfa_node=watch)['counts']['observations']['skipped']
     assert found['image is unlike any of training'] == 4 + 3
 

@@ -11,19 +11,19 @@ from test_rotation import brute_force, views
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import PanoramaArray
-from sfa_localization.features import network_training as hierarchy
-from sfa_localization.features.network import (
+from sfa_localization.sfa import network_training as hierarchy
+from sfa_localization.sfa.network import (
     Network,
     Node,
     expand,
     input_map,
 )
-from sfa_localization.features.network_training import (
+from sfa_localization.sfa.network_training import (
     ImageSequence,
     shards_of,
     train_network,
 )
-from sfa_localization.features.sfa import solve
+from sfa_localization.sfa.slowness import solve
 
 CUT = 1e-7
 """Keeps what float64 and float32 agree on, so that both networks have the same directions."""

@@ -11,10 +11,10 @@ from cylinder_worlds import ARCHITECTURE, drive
 from test_hierarchy import correlations
 
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.features import mdp_engine, mdp_shim
-from sfa_localization.features import network_training as hierarchy
-from sfa_localization.features.network import input_map
-from sfa_localization.features.rotation import unfold
+from sfa_localization.sfa import mdp_engine, mdp_shim
+from sfa_localization.sfa import network_training as hierarchy
+from sfa_localization.sfa.network import input_map
+from sfa_localization.sfa.rotation import unfold
 
 try:
     mdp = mdp_shim.import_mdp()
@@ -54,7 +54,7 @@ def test_shim_leaves_no_patch_behind():
     code = (
         'import inspect, numpy\n'
         'before = set(vars(numpy)), inspect.getfullargspec\n'
-        'from sfa_localization.features.mdp_shim import import_mdp\n'
+        'from sfa_localization.sfa.mdp_shim import import_mdp\n'
         'mdp = import_mdp()\n'
         'assert import_mdp() is mdp\n'
         'gone = set(vars(numpy)) - before[0]\n'

@@ -22,7 +22,7 @@ from metric_worlds import (
 
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import RigidTransform, align, compose, invert, wrap_angle
-from sfa_localization.features.rotation_spread import share_within
+from sfa_localization.data.statistics import share_within
 from sfa_localization.metric import map_fit, paper_solver, selection
 from sfa_localization.metric.basis import expand, missing, monomials
 from sfa_localization.metric.learning import learn_metric
@@ -231,7 +231,7 @@ def test_left_out_segments_calibrate_the_covariance():
     result = noisy_result()[3]
     ratio = (result.left_out**2).sum(1) / result.left_out_variance
     for share, slack in ((0.5, 1e-3), (0.95, 2e-3)):
-        assert share_within(ratio, 2, share, result.forecast.weight) >= share - slack
+        assert share_within(ratio, share, result.forecast.weight) >= share - slack
 
 
 def test_the_same_seed_gives_the_same_bytes():

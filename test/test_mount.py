@@ -19,9 +19,9 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import ConfigError, DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity, Rig
-from sfa_localization.features.closures import Views
-from sfa_localization.features.keyframes import quantized, texture
-from sfa_localization.features.turning import lever_square
+from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.texture import quantized, texture
+from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.dead_reckoning import OdometryTrack
 from sfa_localization.metric.mount import Mount
 from sfa_localization.metric.pose_graph import Graph, graph_poses

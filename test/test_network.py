@@ -11,8 +11,8 @@ from cylinder_worlds import ARCHITECTURE, SIZE
 from test_rotation import views
 
 from sfa_localization.data.errors import ConfigError, ModelError
-from sfa_localization.features.image_features import slow_features
-from sfa_localization.features.network import (
+from sfa_localization.sfa.image_features import slow_features
+from sfa_localization.sfa.network import (
     NORMALIZATIONS,
     Architecture,
     Layer,
@@ -21,7 +21,7 @@ from sfa_localization.features.network import (
     input_map,
     resampled,
 )
-from sfa_localization.features.network import STANDARD_NETWORKS as STANDARD
+from sfa_localization.sfa.network import STANDARD_NETWORKS as STANDARD
 
 
 def random_network(architecture: Architecture, seed: int = 0) -> Network:

@@ -2,27 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which images are used, and what the filter gets of those that are not."""
 
+import itertools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from picture_readers import PictureReader, panorama
+from picture_readers import PictureReader, fit_at, panorama
 
 from sfa_localization.camera.watch import ImageWatch
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.events import IMAGE, ODOMETRY, merge_by_stamp
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import BATCH, Odometry, PanoramaArray, Run
-from sfa_localization.features.observation import (
-    Match,
-    MatchNoise,
-    Observation,
-    combine,
-    distance,
-)
 from sfa_localization.fusion.pose_filter import PoseFilter
+from sfa_localization.keyframes.errors import ErrorModel
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.location import SCALES, Hypothesis, SlowPlace, located
 from sfa_localization.localizer import Localizer, Observer, unusable_covariance
 from sfa_localization.place_model import PlaceModel
 
@@ -59,7 +56,7 @@ def mixed_run(count=3 * BATCH + 5):
     pictures = [panorama((0.1 * k, 2.0, 0.02 * k), seed=k) for k in range(count)]
     pictures[3] = np.zeros_like(pictures[3])
     pictures[BATCH - 3 : BATCH + 6] = [pictures[5]] * 9
-    pictures[30] = panorama((1.0, 2.0, 3.0), seed=30, novelty=9.0)
+    pictures[30] = panorama((1.0, 2.0, 3.0), seed=30, explained=0.05)
     pictures[31] = np.full_like(pictures[3], 90)
     stamps = np.arange(1, count + 1, dtype=np.int64) * 10**8
     still = Odometry(stamps, np.zeros((count, 3)), np.zeros((count, 2)), np.zeros((count, 2)))
@@ -108,126 +105,124 @@ def test_events_come_by_stamp_and_odometry_before_the_picture_of_the_same_stamp(
     assert [event[1] for event in merge_by_stamp(odometry, pictures[:0])] == [ODOMETRY] * 3
 
 
-def slow_at(x: float, std_m: float, yaw: float = 0.0) -> Observation:
-    """Slow features put an image on the x axis."""
-    return Observation(np.array([x, 0.0, yaw]), np.diag([std_m, std_m, 0.1]) ** 2, np.zeros(2))
+# One image, by what keyframes and slow features say of it; test_location.py has the rest.
+
+EXACT = ErrorModel(floor_m=0.0, residual=1.0, outward_m=0.0, slow=1.0, slow_m=0.0, yaw_std=0.1)
+"""Both err by what they claim."""
+AS_TRAINED = np.where(SCALES == 1.0, 1.0, 1e-12)
+NOWHERE = SlowPlace(np.zeros(2), 1e9)
 
 
-def match_at(std_m: float, **more) -> Match:
-    """Keyframes put it at the origin, by what is left of the image."""
-    return Match(**{**MATCHED, 'noise': std_m**2 * np.eye(2), **more})
+def begun(std_m=0.1, unlike=0.25, outward=0.2):
+    """Keyframes put an image at the origin."""
+    fit = fit_at([0.0, 0.0], 1 / (1 + unlike), variance=std_m**2, outward=outward)
+    return Hypothesis(fit, 0)
 
 
-MATCHED = {
-    'pose': np.zeros(3), 'unlike': 0.0, 'variation': 0.05, 'aside': 0.0,
-    'score': 0.9, 'known': True,
-}  # fmt: skip
-EXACT = MatchNoise(floor_m=1e-6, yaw_std=0.1)
+def slow_at(x, std_m=0.1):
+    """Slow features put it on the x axis."""
+    return SlowPlace(np.array([x, 0.0]), std_m**2)
 
 
-def test_two_that_agree_are_weighted_by_their_information_and_keyframes_know_the_yaw():
-    pose, covariance = combine(slow_at(0.2, 0.1, yaw=0.1), match_at(0.2), EXACT)
-    assert pose == pytest.approx([0.16, 0.0, 0.0], abs=1e-6)
-    assert np.diag(covariance) == pytest.approx([0.2**2 * 0.1**2 / 0.05] * 2 + [0.01], rel=1e-3)
+def put(likely, slow, scales=AS_TRAINED, errors=EXACT):
+    """Where an image is, by hypotheses and what slow features say at the heading of each."""
+    return located(likely, slow, scales, errors, np.zeros(2))
 
 
-def test_the_farther_apart_the_less_sure_and_where_they_contradict_keyframes_count():
-    near, far = (combine(slow_at(x, 0.1), match_at(0.1), EXACT)[1][0, 0] for x in (0.0, 0.4))
-    assert far == pytest.approx(near * 0.4**2 / 0.02 / 2, rel=1e-3)
-    for x, doubt in (0.6, 1.0), (0.1, 1.1), (math.nan, 1.0):
-        pose, covariance = combine(slow_at(x, 0.1), match_at(0.1), EXACT, doubt=doubt)
-        assert np.array_equal(pose, np.zeros(3))
-        assert np.array_equal(covariance, EXACT.covariance(match_at(0.1)))
+def stds(location):
+    """Standard deviations along each axis, m, and of the heading, rad."""
+    return np.sqrt(np.diag(location.covariance))
 
 
-def test_an_unknown_place_is_left_to_slow_features():
-    slow = slow_at(3.0, 0.1)
-    pose, covariance = combine(slow, match_at(0.1, known=False), EXACT, doubt=4.0)
-    assert np.array_equal(pose, slow.pose) and covariance == pytest.approx(4.0 * slow.covariance)
-    assert math.isnan(distance(slow, match_at(0.1, known=False), EXACT, 0.0)[0])
+def test_beside_the_keyframes_both_extrapolate_and_the_less_sure_they_are():
+    """An image of which half is unexplained, in the middle, at the border and far beside."""
+    errors = ErrorModel(floor_m=0.02, residual=1.0, outward_m=0.8, slow=1.0, slow_m=0.3)
+    by_keyframes, by_both = (
+        [stds(put([begun(0.01, unlike=1.0, outward=o)], [slow], errors=errors))[0]
+         for o in (0.0, 0.64, 1.0)]
+        for slow in (NOWHERE, slow_at(0.0))
+    )  # fmt: skip
+    own = np.array([np.hypot(np.hypot(0.02, 0.01), 0.8 * o * np.log(2)) for o in (0, 0.64, 1)])
+    other = np.hypot(0.1, 0.3 * np.log(2))
+    assert by_keyframes == pytest.approx(own, rel=1e-4)
+    assert by_both == pytest.approx((own**-2 + other**-2) ** -0.5, rel=1e-4)
 
 
-def test_slow_features_are_no_surer_where_the_place_makes_an_image_unlike():
-    """Beside the trained area both extrapolate; in another light, where keyframes are near, not."""
-    noise, match = MatchNoise(floor_m=0.02, slope_m=1.4), match_at(0.0, unlike=0.6, score=0.75)
-    slow = slow_at(0.3, 0.1)
-    outside, in_light = combine(slow, match, noise), combine(slow, match, noise, 0.58)
-    by_place_m = 1.4 * noise.by_place(match)
-    assert np.sqrt(outside[1][0, 0]) == pytest.approx(0.45 * by_place_m, rel=0.1)
-    assert np.sqrt(in_light[1][0, 0]) < 0.1
-    assert outside[0][0] < 0.9 * 0.3
+# And of many, one after the other.
 
 
 class Matched(PictureReader):
     """A model whose slow features and keyframes are given."""
 
-    def __init__(self, slow: Observation, match: Match, noise: MatchNoise, center=(0.0, 0.0)):
+    def __init__(self, likely, slow, errors=EXACT, center=(0.0, 0.0)):
         super().__init__()
-        self.slow, self.found, self.quality = slow, match, {}
+        self.likely, self.slow = likely, slow
         self.rig = Rig(wheel_scale=Quantity(1.0, 0.01))
-        self.keyframes = SimpleNamespace(noise=noise, poses=np.array([[*center, 0.0]]))
+        self.keyframes = SimpleNamespace(errors=errors, poses=np.array([[*center, 0.0]]))
 
-    def match(self, view, pattern=None):
-        return self.found
+    def views(self, images):
+        return [SimpleNamespace(slow_features=np.zeros(2))] * len(images)
 
-    def slow_pose(self, view, match):
-        return self.slow
+    def located(self, view, conditions):
+        return put(self.likely, self.slow, conditions.scales, self.keyframes.errors)
 
-    combined = PlaceModel.combined
-
-    def told(self, light: float = 0.0) -> np.ndarray:
-        return self.combined(self.slow, self.found, light).covariance
+    observed = PlaceModel.observed
 
 
-def test_the_scale_of_the_map_is_uncertain_by_a_hundredth_about_its_center():
-    slow, match = slow_at(0.0, 0.1), match_at(0.1)
-    more = Matched(slow, match, EXACT, (10.0, 0.0)).told() - Matched(slow, match, EXACT).told()
-    assert np.allclose(more, np.diag([0.1**2, 0.0, 0.0]))
+NEXT = itertools.count(1)
 
 
-def test_beyond_the_keyframes_both_estimates_are_wrong_together_and_light_is_no_distance():
-    noise, slow = MatchNoise(away_m=0.8), slow_at(0.0, 0.1)
-    among, border = (match_at(0.1, unlike=1.0, score=0.7, aside=aside) for aside in (0.2, 0.7))
-    more = Matched(slow, border, noise).told() - Matched(slow, among, noise).told()
-    assert np.diag(more)[:2] == pytest.approx((0.8 * np.log(2.0)) ** 2)
-    assert noise.beyond(among) == noise.beyond(border, 1.0) == 0.0
-    assert 0 < noise.beyond(border, 0.5) < noise.beyond(border)
-
-
-def in_other_light() -> Matched:
-    """Keyframes alone know the place; all images are unlike by their light."""
-    noise, match = MatchNoise(floor_m=0.02, slope_m=0.4), match_at(0.01, unlike=0.6, score=0.7)
-    return Matched(slow_at(0.0, 100.0), match, noise)
-
-
-def test_what_is_unlike_by_light_is_no_uncertain_place_after_some_images():
-    observer = Observer(in_other_light())
-    seen = [observer.observe(k, panorama(seed=k)) for k in range(1, 200)]
-    std = np.array([np.sqrt(one.covariance[0, 0]) for one in seen])
-    assert std[0] == pytest.approx(np.hypot(0.24, 0.0224), rel=0.02)
-    assert np.all(np.diff(std) < 1e-6) and 0.02 < std[-1] < 0.3 * std[0]
-    assert 0.4 < observer.other_light < 0.6
-    observer.use(PictureReader())
-    assert observer.other_light == 0.0, 'another model may know the light'
-
-
-@pytest.mark.parametrize('known', [True, False])
-def test_slow_features_that_contradict_known_places_for_long_do_not_count(known):
-    """Both are as sure of places 0.4 m apart."""
-    match = match_at(0.1, score=0.7 if known else 0.3, known=known)
-    observer = Observer(Matched(slow_at(0.4, 0.1), match, EXACT))
-    seen = [observer.observe(k, panorama(seed=k)).position[0] for k in range(1, 50)]
-    assert seen[0] == pytest.approx(0.2 if known else 0.4, abs=0.02)
-    assert seen[-1] == (0.0 if known else 0.4)
-
-
-@pytest.mark.parametrize(('own_m', 'its_m', 'shown'), [(0.1, 0.6, 0.0), (0.6, 0.1, 36 / 37)])
-def test_slow_features_are_not_blamed_for_errors_of_uncertain_keyframes(own_m, its_m, shown):
-    """Beside all keyframes these err by more than slow features, as they say."""
-    model = Matched(slow_at(0.0, 0.1), match_at(0.1), EXACT)
-    observer = Observer(model)
-    for k in range(1, 50):
-        if k == 30:
-            model.slow, model.found = slow_at(1.0, its_m), match_at(own_m)
+def last_of(count, observer):
+    """What the last of so many images more shows."""
+    for k in itertools.islice(NEXT, count):
         seen = observer.observe(k, panorama(seed=k))
-    assert seen.position[0] == pytest.approx(shown, abs=1e-3)
+    return seen
+
+
+def test_the_errors_of_the_map_and_of_its_scale_about_its_center_are_in_the_covariance():
+    both = [begun()], [slow_at(0.0)]
+    others = {'center': (10.0, 0.0)}, {'errors': replace(EXACT, map_m=0.2, turn_std=0.03)}
+    plain, aside, wrong = (
+        last_of(1, Observer(Matched(*both, **more))).covariance for more in ({}, *others)
+    )
+    assert np.allclose(aside - plain, np.diag([0.1**2, 0.0, 0.0]))
+    assert np.allclose(wrong - plain, np.diag([0.2, 0.2, 0.03]) ** 2)
+
+
+def test_slow_features_that_are_wrong_of_late_lose_their_weight_and_get_it_back():
+    """In another light, which the model of another day may know."""
+    right, wrong = [slow_at(0.1)], [slow_at(3.0)]
+    observer = Observer(model := Matched([begun()], right))
+    assert last_of(30, observer).position[0] == pytest.approx(0.05, abs=0.01)
+    assert observer.slow_error_factor < 1.5
+    model.slow = wrong
+    assert abs(last_of(30, observer).position[0]) < 0.02
+    assert 10 < observer.slow_error_factor < 50
+    model.slow = right
+    assert last_of(50, observer).position[0] == pytest.approx(0.05, abs=0.01)
+    observer.use(model)
+    assert observer.slow_error_factor == Conditions().slow_error_factor
+
+
+def test_slow_features_are_not_blamed_for_errors_of_uncertain_keyframes():
+    """Beside all keyframes these err by more than slow features, as they say."""
+    observer = Observer(model := Matched([begun()], [slow_at(0.0)]))
+    last_of(30, observer)
+    model.likely, model.slow = [begun(0.6)], [slow_at(1.0)]
+    assert last_of(30, observer).position[0] == pytest.approx(36 / 37, abs=0.05)
+
+
+@pytest.mark.parametrize('kind', ['unlike', 'dark', 'repeats'])
+def test_images_that_are_not_used_teach_nothing(kind):
+    """What is nowhere seems to be anywhere, and slow features as wrong."""
+    likely = [begun(unlike=9.0 if kind == 'unlike' else 0.25)]
+    observer = Observer(Matched(likely, [slow_at(3.0)]))
+    picture = panorama()
+    if kind == 'repeats':
+        observer.watch.judge(picture)
+    for k in range(1, 30):
+        seen = observer.observe(
+            k, {'unlike': panorama(seed=k), 'dark': 0 * picture}.get(kind, picture)
+        )
+        assert seen.problem
+    assert observer.slow_error_factor == Conditions().slow_error_factor

@@ -34,7 +34,7 @@ DOMAIN = free_domain()
 
 SEEN = 'sfa/pose_with_covariance'
 # Settings of sfa_node and ekf_node that are not the defaults, and matter here.
-WATCH = {'novelty_limit': 2.5}
+WATCH = {'least_explained': 0.3}
 FILTER = {'measurement_factor': 2.0}
 
 

@@ -24,6 +24,7 @@ TWINS = {
     'heavy tails': (r'(?i)_tail\b|degrees of freedom of student|cauchy|huber|tukey', STATISTICS),
     'quantile by weight': (r'def \w*(quantile|weighted_median)\w*\(', STATISTICS),
     'alignment': (r'def _?align(_\w+)?\(|procrustes|umeyama|kabsch', {'data/geometry.py'}),
+    'errors by likeness': (r'log1p\((\w+\.)?unlike\)', {'keyframes/errors.py'}),
     'events of a drive': (
         r'merge_by_stamp\(', {'data/events.py', 'fusion/replay.py', 'fusion/camera_clock.py'},
     ),

@@ -34,25 +34,26 @@ ROS = {'rclpy', 'ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', '
 # standard library. A module belongs to its folder, or is a room of its own; there is no
 # default, so a new one must be added here, and to the diagram of CONTRIBUTING.
 NUMERIC = {'numpy', 'scipy'}
-CORE = {'data', 'camera', 'features', 'metric', 'fusion', 'bags'}
+CORE = {'data', 'camera', 'sfa', 'keyframes', 'metric', 'fusion', 'bags'}
 ROOMS: dict[str, tuple[set[str], set[str]]] = {
     '__init__': (set(), set()),
     '__main__': ({'cli'}, set()),
     'data': (set(), {'numpy', 'threadpoolctl', 'tqdm', 'yaml'}),
     'camera': ({'data'}, NUMERIC | {'cv2', 'yaml'}),
-    'features': ({'data', 'camera'}, NUMERIC | {'cv2', 'mdp'}),
+    'sfa': ({'data', 'camera', 'keyframes'}, NUMERIC | {'cv2', 'mdp'}),
+    'keyframes': ({'data', 'camera'}, NUMERIC | {'cv2'}),
     'fusion': ({'data'}, NUMERIC | {'filterpy'}),
     'bags': ({'data', 'camera'}, {'numpy', 'rosbags', 'mcap', 'lz4', 'zstandard'}),
-    'metric': ({'data', 'features'}, NUMERIC),
-    'place_model': ({'data', 'camera', 'features', 'metric'}, {'numpy'}),
-    'localizer': ({'data', 'camera', 'features', 'fusion', 'metric', 'place_model'}, {'numpy'}),
+    'metric': ({'data', 'sfa', 'keyframes'}, NUMERIC),
+    'place_model': ({'data', 'camera', 'sfa', 'keyframes', 'metric'}, {'numpy'}),
+    'localizer': ({'data', 'camera', 'keyframes', 'fusion', 'place_model'}, {'numpy'}),
     'simulation': ({'data', 'camera', 'bags'}, NUMERIC | {'cv2', 'trimesh', 'embreex'}),
     'training_input': (CORE, NUMERIC),
     'training': (CORE | {'place_model', 'training_input'}, {'numpy'}),
     'evaluation': (CORE | {'place_model', 'localizer', 'training'}, NUMERIC),
     'tuning': (CORE | {'place_model', 'localizer', 'training', 'evaluation'}, NUMERIC),
     'updating': (CORE - {'metric'} | {'place_model', 'localizer'}, NUMERIC),
-    'inspection': ({'data', 'camera', 'features', 'fusion', 'bags', 'metric'}, NUMERIC | {'cv2'}),
+    'inspection': (CORE - {'sfa'}, NUMERIC | {'cv2'}),
     'filtering': ({'data', 'fusion'}, {'numpy'}),
     'reports': ({'data', 'metric', 'training', 'inspection'}, {'numpy', 'matplotlib'}),
     'nodes': (

@@ -17,7 +17,9 @@ from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError, ModelError
 from sfa_localization.data.geometry import wrap_angle
-from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.location import Hypothesis
+from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
 from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import FORMAT, VERSION, PlaceModel
 
@@ -47,7 +49,7 @@ def test_linear_algebra_keeps_to_one_core(model, pictures, entry, tmp_path, monk
         raise DataError('seen')
 
     names = 'training.read_drives', 'updating.read_drive', 'evaluation.read_drive'
-    for name in (*names, 'features.network.input_map'):
+    for name in (*names, 'sfa.network.input_map'):
         monkeypatch.setattr(f'sfa_localization.{name}', look)
     with threadpool_limits(2), pytest.raises(DataError, match='seen'):
         match entry:
@@ -82,7 +84,7 @@ def test_one_by_one_equals_all_together(model, pictures):
         assert np.allclose(alone.position, together.position, atol=1e-4)
         assert wrap_angle(alone.yaw - together.yaw) == pytest.approx(0, abs=1e-4)
         assert np.allclose(alone.covariance, together.covariance, rtol=1e-2, atol=1e-6)
-        assert alone.novelty == pytest.approx(together.novelty, rel=1e-4)
+        assert alone.explained == pytest.approx(together.explained, rel=1e-4)
 
 
 @pytest.mark.parametrize('clockwise', [True, False])
@@ -96,7 +98,7 @@ def test_rolled_columns_turn_the_robot(clockwise, steps):
         one, other = model.locate(picture), model.locate(np.roll(picture, columns, axis=1))
         assert abs(wrap_angle(other.yaw - one.yaw - turn)) < np.radians(2)
         assert np.abs(other.position - one.position).max() < 0.1
-        assert other.novelty == pytest.approx(one.novelty, abs=0.1)
+        assert other.explained == pytest.approx(one.explained, abs=0.01)
 
 
 def test_covariances_are_positive_definite(model, pictures):
@@ -112,13 +114,13 @@ def test_covariances_are_positive_definite(model, pictures):
     assert foreign > 10 * familiar
 
 
-def test_of_an_image_without_a_known_heading_the_map_knows_little(model, pictures):
+def test_at_an_uncertain_heading_the_map_knows_little(model, pictures):
+    """It is given turned images; the heading is the less certain the less is explained."""
     (view,) = model.views(pictures[:1])
-    match = model.match(view)
-    sure, unsure = (model.slow_pose(view, m) for m in (match, replace(match, known=False)))
-    assert np.isnan(sure.yaw) and sure.covariance[2, 2] == UNKNOWN_YAW_VARIANCE
-    assert np.trace(unsure.covariance[:2, :2]) > 10 * np.trace(sure.covariance[:2, :2])
-    assert np.allclose(model.combined(sure, match).yaw, match.pose[2])
+    sure = Hypothesis(model.located(view, Conditions()).fit, 0)
+    unsure = replace(sure, fit=replace(sure.fit, unlike=100.0))
+    certain, uncertain = (place.variance for place in model._slow_places(view, [sure, unsure]))
+    assert uncertain > 10 * certain
 
 
 def test_symmetric_panoramas_raise_the_variance(model, pictures):
@@ -147,7 +149,7 @@ def test_a_model_is_the_same_after_it_was_saved(model, saved, pictures, tmp_path
         assert np.array_equal(one.position, other.position)
         assert np.allclose(one.covariance, other.covariance, rtol=1e-2)
         assert one.yaw == pytest.approx(other.yaw, abs=1e-5)
-        assert one.novelty == other.novelty
+        assert one.explained == other.explained
     assert again.quality == json.loads(json.dumps(model.quality))
     assert (again.panorama, again.network.ranks) == (model.panorama, model.network.ranks)
     assert again.error_correlation == model.error_correlation != ErrorCorrelation()
@@ -201,7 +203,7 @@ def test_a_damaged_model_is_refused_with_the_remedy(saved):
         data[whole.index(arrays[name].tobytes()) + 9] ^= 16
         saved.write_bytes(data)
         refused(saved, 'damaged.*: copy it again, or train it')
-    names = ('network/1/slow', 'metric/linear', 'keyframes/noise')
+    names = ('network/1/slow', 'metric/linear', 'keyframes/errors')
     for name in (*names, 'turned/axes'):
         saved.write_bytes(whole)
         rewrite(saved, without=name)

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfa_localization.features.rotation import (
+from sfa_localization.sfa.rotation import (
     Field,
     FieldStatistics,
     SampleStatistics,
     unfold,
 )
-from sfa_localization.features.sfa import Statistics
+from sfa_localization.sfa.slowness import Statistics
 
 FIELDS = (
     Field(2, 3, 1),

@@ -13,7 +13,7 @@ from metric_worlds import Drive, drive, meander
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.geometry import wrap_angle
 from sfa_localization.data.run import integrate
-from sfa_localization.features.closures import Closures
+from sfa_localization.keyframes.closures import Closures
 from sfa_localization.metric.dead_reckoning import TURN_SLIDE, OdometryTrack, TurnCorrection
 from sfa_localization.metric.odometry_errors import CLOSURES_MIN, Headings, corrections
 from sfa_localization.metric.segments import cut_track

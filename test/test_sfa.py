@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.features.sfa import Statistics, solve
+from sfa_localization.sfa.slowness import Statistics, solve
 
 PERIODS = (400.0, 130.0, 47.0, 9.0)
 

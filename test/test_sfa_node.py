@@ -10,7 +10,7 @@ import pytest
 from picture_readers import WithoutKeyframes
 
 from sfa_localization.camera.settings import PanoramaConfig
-from sfa_localization.camera.watch import FROZEN_IMAGES, NOVELTY_WARNING
+from sfa_localization.camera.watch import EXPLAINED_WARNING, FROZEN_IMAGES
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.fusion.camera_clock import NEAR_NS
@@ -44,9 +44,9 @@ def panorama(seed=0):
 
 @dataclasses.dataclass
 class FakeModel(WithoutKeyframes):
-    """Says that the position is the first pixel's blue and green; novelty is a thing to set."""
+    """Says that the position is the first pixel's blue and green; `explained` is a thing to set."""
 
-    novelty: float = 0.5
+    explained: float = 0.9
     shift: float = 0.0
     panorama: PanoramaConfig = SIZE
     error_correlation: ErrorCorrelation = KNOWN
@@ -55,7 +55,7 @@ class FakeModel(WithoutKeyframes):
     def locate(self, image):
         pose = np.append(image[0, 0, :2] + self.shift, 0.25)
         spread = np.diag([0.04, 0.09, 0.01])
-        return Observation(pose, spread, np.arange(1.0, 9.0), self.novelty)
+        return Observation(pose, spread, np.arange(1.0, 9.0), self.explained)
 
 
 @pytest.fixture
@@ -91,10 +91,12 @@ def test_all_outputs_carry_the_pictures_stamp_and_the_frame_of_the_map(bench, mo
         assert (pose.position.x, pose.position.y) == (sent[0, 0, 0], sent[0, 0, 1])
         assert read_yaw(pose.orientation) == pytest.approx(0.25)
     assert np.allclose(convert.read_pose(uncertain[0])[2], np.diag([0.04, 0.09, 0.01]))
-    models['a.npz'].novelty = NOVELTY_WARNING + 0.1
+    models['a.npz'].explained = EXPLAINED_WARNING - 0.05
     bench.publish('panorama', message(seed=2))
     assert until(lambda: 'unlike' in node.health()[1])
-    assert node.health()[2]['unlike by light'] == '0 %'
+    told_of = node.health()[2]
+    assert told_of['explained'] == '35 %', 'of the last image'
+    assert told_of['slow feature errors'].endswith(' times as in training')
     bench.publish('panorama', message(seed=3, stamp_ns=5_000_000_001 + NEAR_NS))
     assert until(lambda: len(turned) == 2), 'those between are not used'
     assert read_stamp(turned[1].header.stamp) == 5_000_000_001 + NEAR_NS
@@ -107,7 +109,7 @@ def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     poses = bench.listen(PoseStamped, 'sfa/pose')
     heard = bench.listen(PoseWithCovarianceStamped, 'sfa/pose_with_covariance')
     said = bench.listen(DiagnosticArray, '/diagnostics')
-    models['a.npz'].novelty = 9.0 if kind == 'foreign' else 0.5
+    models['a.npz'].explained = 0.1 if kind == 'foreign' else 0.9
     image = panorama(5) if kind != 'dark' else np.zeros((SIZE.height, SIZE.width, 3), np.uint8)
     for k in range(FROZEN_IMAGES):
         bench.publish('panorama', message(image=image, stamp_ns=100 + k))
@@ -116,7 +118,7 @@ def test_an_unusable_image_gives_no_pose_and_is_reported(bench, models, kind):
     assert covariance[0, 0] == covariance[1, 1] == UNKNOWN_VARIANCE
     assert len(poses) == (1 if kind == 'frozen' else 0)
     assert until(lambda: said and said[-1].status[0].level != b'\x00')
-    models['a.npz'].novelty = 0.5
+    models['a.npz'].explained = 0.9
     bench.publish('panorama', message(seed=77, stamp_ns=200))
     assert until(lambda: poses and read_stamp(poses[-1].header.stamp) == 200)
     refused = node.monitor('panorama').refused

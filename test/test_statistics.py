@@ -16,6 +16,11 @@ def test_a_weight_of_three_is_three_values():
     assert statistics.quantile(np.array([3.0, 1.0, 2.0]), 0.5) == 2.0
 
 
+def test_the_share_within_a_region_is_by_weight():
+    ratio, weight = np.array([1.0, 7.0]), np.array([3.0, 1.0])
+    assert statistics.share_within(ratio, 0.95, weight) == 0.75
+
+
 def test_medians_give_the_standard_deviation_of_normal_numbers_and_vectors():
     pairs = np.random.default_rng(0).standard_normal((100_000, 2))
     for median, factor in (

@@ -25,12 +25,12 @@ from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.errors import DataError, LocalizationError, ModelError
 from sfa_localization.data.run import Count, Odometry, PanoramaArray, Run, integrate
 from sfa_localization.evaluation import evaluate
-from sfa_localization.features import checkpoint as checkpoints
-from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.metric import learning
 from sfa_localization.metric.drive_check import ROUTE
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.reports.summary import summary
+from sfa_localization.sfa import checkpoint as checkpoints
+from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.simulation.drive import simulate
 from sfa_localization.simulation.settings import SimulationConfig
 from sfa_localization.training import learn_place, train

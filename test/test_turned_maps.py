@@ -12,12 +12,12 @@ import pytest
 from scipy.stats import chi2
 
 from sfa_localization.data.errors import DataError
-from sfa_localization.features.image_features import spectrum
 from sfa_localization.metric import learning, selection
 from sfa_localization.metric.learning import MetricResult, learn_turned
 from sfa_localization.metric.segments import cut
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.turned_maps import TurnedMaps, turned_back
+from sfa_localization.sfa.image_features import spectrum
 
 COLUMNS, CHANNELS, ORDERS = 24, 6, 5
 NOISE = 0.25

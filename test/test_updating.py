@@ -16,7 +16,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import align, wrap_angle
 from sfa_localization.data.run import Odometry
 from sfa_localization.place_model import PlaceModel
-from sfa_localization.updating import Additions, extended, familiar_score, new_views
+from sfa_localization.updating import Additions, extended, familiar_part, new_views
 
 
 def repainted(share):
@@ -94,7 +94,7 @@ def test_added_keyframes_are_level():
 def usable(model, run):
     """The share of a run's images that are like those of the model."""
     estimates = model.locate_all(some_images(run))
-    return np.mean([e.novelty <= WatchConfig().novelty_limit for e in estimates])
+    return np.mean([e.explained >= WatchConfig().least_explained for e in estimates])
 
 
 def test_an_updated_model_still_knows_the_place_when_the_season_goes_on():
@@ -110,10 +110,32 @@ def test_an_updated_model_still_knows_the_place_when_the_season_goes_on():
     assert after < 1.05 * before
 
 
+def in_the_sun(seed):
+    """A drive in the trained place; what the light adds is the same wherever the robot is."""
+    here, far = (vars(Spheres.about(of)) for of in (1, 77))
+    away = {name: (0.35 if name == 'colors' else 1000) * far[name] for name in far}
+    world = Spheres(**{name: np.concatenate([here[name], away[name]]) for name in here})
+    return run_in(world, wander(240, seed, hz=4.0), recipe().panorama, 'sun')
+
+
+def test_images_of_another_light_become_keyframes():
+    """Those of the training are explained by each other, and these are less."""
+    model = place().model
+    familiar, new = familiar_part(model), new_views(model, in_the_sun(5))
+    newer, further = extended(model, new, 'sun'), in_the_sun(8)
+    explained = [
+        np.median([e.explained for e in one.locate_all(some_images(further))])
+        for one in (model, newer)
+    ]
+    assert 0.0 < explained[0] < familiar < 1.0 and len(new) > 100
+    assert 1 - explained[1] < 0.2 * (1 - explained[0])
+    assert errors(newer, further).mean() < 0.7 * errors(model, further).mean()
+
+
 def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     model, new, newer = updated()
     assert newer.network is model.network and newer.metric is model.metric
-    assert newer.turned is model.turned and newer.keyframes.noise == model.keyframes.noise
+    assert newer.turned is model.turned and newer.keyframes.errors == model.keyframes.errors
     first = len(model.keyframes.poses)
     np.testing.assert_array_equal(newer.keyframes.values[:first], model.keyframes.values)
     np.testing.assert_array_equal(newer.keyframes.poses[first:], new.poses)
@@ -123,7 +145,7 @@ def test_network_maps_and_first_keyframes_stay_also_in_its_file(tmp_path):
     np.testing.assert_array_equal(read.keyframes.drives, newer.keyframes.drives)
     assert read.keyframes.trained == newer.keyframes.trained == 1
     assert read.quality['updates'] == [{'bag': 'later', 'images': len(new)}]
-    assert familiar_score(read) == pytest.approx(familiar_score(place().model))
+    assert familiar_part(read) == pytest.approx(familiar_part(place().model))
     image = drive().panoramas.read(30, 31)[0]
     np.testing.assert_allclose(read.locate(image).position, newer.locate(image).position)
 

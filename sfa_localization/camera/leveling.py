@@ -3,7 +3,7 @@
 """Panoramas of a robot that rolls and pitches, and what they would be on level ground.
 
 Where an IMU says how the robot lies, panoramas are leveled by it, live and from bags; else by what
-they show (`features/tilt.py`).
+they show (`keyframes/tilt.py`).
 """
 
 from __future__ import annotations

@@ -145,11 +145,12 @@ class CameraConfig(Settings):
 class WatchConfig(Settings):
     """Which images the localization uses, live and offline."""
 
-    novelty_limit: float = setting(
-        3.0,
-        'images of more novelty (1: like those of training) are not used',
-        low=1.0,
-        high=1e6,
+    least_explained: float = setting(
+        0.25,
+        'images of which their place explains a smaller part (1: all) are not used: of foreign '
+        'images 0.1, 0.28 at most',
+        low=0.0,
+        high=1.0,
         live=True,
     )
 

@@ -21,8 +21,9 @@ FROZEN_IMAGES = 5
 """Equal images in a row that mean a frozen camera; fewer also come from a late driver."""
 FROZEN_S = 5.0
 """Seconds of equal images before a camera is reopened, because that interrupts it."""
-NOVELTY_WARNING = 1.5
-"""Novelty worth a warning, although the image is still used: half the default limit."""
+EXPLAINED_WARNING = 0.4
+"""A part of an image that is worth a warning where its place explains no more, although the image
+is still used: of images of which a half is covered it is 0.15 to 0.5."""
 _STRIDE = 3  # every third pixel along each axis is enough, and nine times faster
 
 
@@ -75,6 +76,7 @@ class ImageWatch:
         """Whether the last image repeats one, but not for so long that the camera is frozen."""
         return 0 < self._frozen.repeats < FROZEN_IMAGES - 1
 
-    def judge_novelty(self, novelty: float) -> str:
-        """Why an image of this novelty cannot be used; '' when it can."""
-        return '' if novelty <= self.config.novelty_limit else 'image is unlike any of training'
+    def judge_place(self, explained: float) -> str:
+        """Why an image cannot be used of which its place explains this part; '' when it can."""
+        known = explained >= self.config.least_explained
+        return '' if known else 'image is unlike any of training'

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from sfa_localization.camera.settings import WatchConfig
 from sfa_localization.commands import options
 from sfa_localization.data.errors import ConfigError
-from sfa_localization.features.settings import NetworkConfig
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.sfa.settings import NetworkConfig
 
 if TYPE_CHECKING:
     from sfa_localization.training import Recipe, Trained

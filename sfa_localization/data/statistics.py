@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeVar
 
 import numpy as np
@@ -16,6 +17,8 @@ MEDIAN_TO_STD = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
 LENGTH_TO_STD = float(1.0 / np.sqrt(2.0 * np.log(2.0)))
 """The same of a vector in the plane: along each axis, over the median of its length."""
+# Shares of errors that must lie within the regions of that probability.
+_HALF_AND_MOST = (0.5, 0.95)
 TAIL = 4.0
 """Degrees of freedom of Student's distribution, which errors follow that are now and then far
 larger than usual: wheels slip, places look alike."""
@@ -53,3 +56,30 @@ def parabola_peak(before: NDArray[F], middle: NDArray[F], after: NDArray[F]) -> 
     bend = np.minimum(before - 2 * middle + after, -1e-9)
     peak: NDArray[F] = np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
     return peak
+
+
+def needed_factor(ratio: Array, weight: Array | None = None) -> float:
+    """Factor on variances for which half of the errors in the plane fall inside the 50 % region,
+    and 95 % inside the 95 % region, whichever needs more.
+
+    `ratio` (M,) is the squared error over the variance of one axis; `weight` (M,).
+    """
+    return max(quantile(ratio, share, weight) / region(share) for share in _HALF_AND_MOST)
+
+
+def share_within(ratio: Array, share: float, weight: Array) -> float:
+    """Share by `weight` (M,) of the errors in the plane inside the region of that probability.
+
+    `ratio` (M,) is the squared error over the variance of one axis.
+    """
+    return float(np.average(ratio <= region(share), weights=weight))
+
+
+def region(share: float) -> float:
+    """Square that so many of the lengths of normal errors in the plane do not exceed."""
+    return -2 * math.log1p(-share)
+
+
+def evenly(count: int, most: int) -> NDArray[np.int64]:
+    """Indices (S,) of at most `most` of `count` images, evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

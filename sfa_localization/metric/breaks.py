@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array, Indices, Mask, relative, wrap_angle
 from sfa_localization.data.odometry_steps import beyond, tolerance
 from sfa_localization.data.run import Odometry, Stamps
-from sfa_localization.data.statistics import MEDIAN_TO_STD
-from sfa_localization.features.closures import LIKE
+from sfa_localization.data.statistics import MEDIAN_TO_STD, quantile
+from sfa_localization.keyframes.closures import LIKE
 from sfa_localization.metric.dead_reckoning import pauses, summed
 
 Textures = tuple[Stamps, NDArray[np.int8]]
@@ -27,9 +27,10 @@ Textures = tuple[Stamps, NDArray[np.int8]]
 around the robot."""
 STEP = 0.2
 """m or rad, by odometry, between two images that are compared."""
-STILL = 1 / 20
-"""Images that change by less than this share of what is usual for the motion stand: a standing
-robot's change by 1/500 of it, a driving robot's by 1/5 or more (two gardens)."""
+STILL, STRAIGHT = 1 / 20, 0.25
+"""Images that change by less than this share of what is usual for a way stand: a standing robot's
+change by 1/500 of it, a driving robot's by 1/7 or more (two gardens, four real logs). So much of
+the ways ahead is straight: where the robot also turns, images change more."""
 STANDING, STOOD_S = 0.01, 1.0
 """Wheels slower than this, m/s or rad/s, stand; a robot that stood so long may have been lifted."""
 OTHER = 0.05
@@ -131,8 +132,8 @@ def contradicted(
     if len(rows) < 3:
         return odometry, []
     held, turned = _likeness(textures[rows])
-    change = -np.log(held) / np.diff(odometer[rows])
-    stands = change < STILL * np.median(change)
+    way = np.diff(np.interp(at, summed(seconds), summed(np.hypot(step[:, 0], step[:, 1]))))
+    stands = _stand(-np.log(held), way, way > np.diff(odometer[rows]) / 2)
     stood = np.diff(np.interp(at, summed(seconds), summed(still_s))) > STOOD_S
     other = stood & (turned < min(LIKE, float(np.quantile(turned, OTHER))))
     said = {
@@ -157,6 +158,16 @@ def _apart(stamps_ns: Stamps, stamps: Stamps, odometer: Array) -> tuple[Indices,
         if driven[row] - driven[rows[-1]] >= STEP:
             rows.append(row)
     return np.array(rows, np.int64), driven
+
+
+def _stand(change: Array, way: Array, ahead: Mask) -> Mask:
+    """Which steps (N,) change the images by less than their `way` (N,) m alone would, by the steps
+    that are mostly `ahead`: wheels may well say that a robot turns which does not.
+    """
+    if not ahead.any():
+        return np.zeros(len(way), bool)
+    usual = quantile(change[ahead] / way[ahead], STRAIGHT)
+    return np.asarray(change < STILL * usual * way)
 
 
 def _likeness(textures: NDArray[np.int8]) -> tuple[Array, Array]:

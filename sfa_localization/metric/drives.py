@@ -20,9 +20,9 @@ from sfa_localization.data.geometry import Array
 from sfa_localization.data.rig import Quantity, Rig
 from sfa_localization.data.run import Points, Run, Stamps
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.closures import Closures, Views
-from sfa_localization.features.offsets import Offsets, find_offsets
-from sfa_localization.features.turning import lever_square
+from sfa_localization.keyframes.closures import Closures, Views
+from sfa_localization.keyframes.offsets import Offsets, find_offsets
+from sfa_localization.keyframes.turning import lever_square
 from sfa_localization.metric.anchors import Anchors, Settled, settle
 from sfa_localization.metric.dead_reckoning import OdometryTrack, Way
 from sfa_localization.metric.drive_check import ROUTE

@@ -18,7 +18,7 @@ from sfa_localization.data.geometry import (
     compose,
     invert,
 )
-from sfa_localization.features.image_features import evenly
+from sfa_localization.data.statistics import evenly
 from sfa_localization.metric import phases
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.map_fit import MapFit

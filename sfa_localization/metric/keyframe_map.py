@@ -5,21 +5,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfa_localization.data.geometry import Array, wrap_angle
+from sfa_localization.data.error_correlation import ErrorCorrelation
+from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.closures import Views
-from sfa_localization.features.keyframe_training import fit_keyframes, left_out, spread
-from sfa_localization.features.keyframes import Keyframes
-from sfa_localization.features.observation import UNKNOWN_YAW_VARIANCE, Observation, combine
-from sfa_localization.features.rotation_spread import Agreement, needed_factor, share_within
+from sfa_localization.data.statistics import share_within
+from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.errors import ErrorModel, LeftOut
+from sfa_localization.keyframes.keyframes import Keyframes
+from sfa_localization.keyframes.training import choose_keyframes, located_without, spread
+from sfa_localization.metric.forecast import ground_distances, importance
 from sfa_localization.metric.learning import MetricResult
 from sfa_localization.metric.segments import Segments, assignment
-from sfa_localization.metric.stack import tracks
+from sfa_localization.metric.stack import Stack, tracks
 
 # Between the drives: farther than any stretch.
 _ANOTHER_DRIVE_M = 1e6
@@ -28,16 +29,17 @@ _ENOUGH = 50
 
 @dataclass(frozen=True, slots=True)
 class KeyframeMap:
-    """Keyframes of a map; from parts of the drive that both were learned without:
-    `improvement`, the mean error of slow features and keyframes together over that of slow
-    features alone, `within_95`, the share of errors in the ellipses of 95 %, and `yaw_error`, the
-    mean error of headings, rad.
+    """Keyframes of a map; from images that both were learned without: `improvement`, the mean error
+    of slow features and keyframes together over that of slow features alone, `within_95`, the share
+    of errors in the ellipses of 95 %, `yaw_error`, the mean error of headings, rad, and how errors
+    of neighbors correlate.
     """
 
     keyframes: Keyframes
     improvement: float = 1.0
     within_95: float = 0.95
     yaw_error: float | None = None
+    correlation: ErrorCorrelation = field(default_factory=ErrorCorrelation)
 
     @property
     def quality(self) -> dict[str, float]:
@@ -49,26 +51,43 @@ class KeyframeMap:
 
 
 def learn_keyframes(
-    views: Views,
-    disagreement: Array,
-    segments: Segments,
-    result: MetricResult,
-    agreement: Agreement,
-    sphere: Sphere,
+    views: Views, segments: Segments, result: MetricResult, sphere: Sphere, turn_radius_m: float
 ) -> KeyframeMap:
-    """Keyframes where the certified solution puts the images of `views`; `disagreement` (N,) is
-    that of all images' rotated views. Raises DataError for too few.
+    """Keyframes where the certified solution puts the images of `views`; along the drive a turn
+    counts as `turn_radius_m` per rad. Raises DataError for too few.
     """
     _, seen, row = np.intersect1d(views.images, result.images, return_indices=True)
-    poses = result.poses[row]
-    path = _along_tracks(views, segments)[seen]
-    drives = views.run[seen].astype(np.int32)
-    own = fit_keyframes(views.textures[seen], poses, path, sphere, drives)
-    turn_std = usual_turn_std(result.angle_covariance)
-    keyframes = replace(own, noise=own.noise.with_map(result.map.common_m, turn_std))
+    poses, drives = result.poses[row], views.run[seen].astype(np.int32)
+    keyframes = choose_keyframes(views.textures[seen], poses, sphere, drives)
     kept = spread(poses)
-    variance = result.left_out_variance * agreement.factor(disagreement[result.images])
-    return _judged(keyframes, path[kept], row[kept], result, variance)
+    path, rows = _along_tracks(views, segments)[seen][kept], row[kept]
+    tried, fits, near_m = located_without(keyframes, path)
+    shared = {'map_m': result.map.common_m, 'turn_std': usual_turn_std(result.angle_covariance)}
+    if len(tried) < _ENOUGH:
+        return KeyframeMap(replace(keyframes, errors=replace(ErrorModel(), **shared)))
+    poses, rows = keyframes.poses[tried], rows[tried]
+    ground_m = ground_distances(keyframes.poses[:, :2], np.random.default_rng(0))
+    trials = LeftOut.of(fits, poses, importance(near_m, ground_m))
+    slow, claimed = result.left_out[rows], result.left_out_variance[rows]
+    errors = trials.learn_slow(trials.learn(), slow, claimed)
+    both, variance = trials.fused(errors, slow, claimed)
+    weight, driven, owner = trials.weight, *_driven(segments, turn_radius_m)
+    joint, alone = (float(np.average(np.hypot(*e.T), weights=weight)) for e in (both, slow))
+    return KeyframeMap(
+        replace(keyframes, errors=replace(errors, **shared)),
+        joint / max(alone, 1e-9),
+        share_within((both**2).sum(1) / variance, 0.95, weight),
+        float(np.average(np.abs(trials.turn), weights=weight)),
+        ErrorCorrelation.fit(both, variance, driven[rows], owner[rows]),
+    )
+
+
+def _driven(segments: Segments, turn_radius_m: float) -> tuple[Array, Indices]:
+    """Of the images of all segments the distance driven until each, (M,) m, and the segment."""
+    stack = Stack.of(segments)
+    turns = np.abs(np.diff(stack.headings, prepend=0.0))
+    turns[stack.first] = 0.0
+    return np.cumsum(stack.steps + turn_radius_m * turns), stack.owner
 
 
 def usual_turn_std(covariance: Array) -> float:
@@ -87,36 +106,3 @@ def _along_tracks(views: Views, segments: Segments) -> Array:
         if first != n and (owner == first).any():
             path[owner == n] = path[owner == first].mean()
     return path
-
-
-def _judged(
-    keyframes: Keyframes,
-    path_m: Array,
-    rows: NDArray[np.int64],
-    result: MetricResult,
-    variance: Array,
-) -> KeyframeMap:
-    """Errors of both together where both were left out; keyframe k is row `rows[k]` (K,)."""
-    errors, variances, alone, weights, turned = [], [], [], [], []
-    for k, scores, yaws in left_out(keyframes, path_m):
-        row, place, error = rows[k], keyframes.poses[k, :2], result.left_out[rows[k]]
-        spread = np.diag([variance[row], variance[row], UNKNOWN_YAW_VARIANCE])
-        slow = Observation(np.append(place + error, 0.0), spread, np.zeros(0))
-        match = keyframes.located(keyframes.spectra([k])[0], scores, yaws)
-        pose, covariance = combine(slow, match, keyframes.noise)
-        errors.append(pose[:2] - place)
-        variances.append(np.trace(covariance[:2, :2]) / 2)
-        turned.append(abs(wrap_angle(pose[2] - keyframes.poses[k, 2])))
-        alone.append(error)
-        weights.append(result.forecast.weight[row])
-    if len(errors) < _ENOUGH or not sum(weights) > 0:
-        return KeyframeMap(keyframes)
-    weight, ratio = np.array(weights), (np.array(errors) ** 2).sum(1) / np.array(variances)
-    factor = max(needed_factor(ratio, 2, weight), 1.0)
-    joint, single = (np.average(np.hypot(*np.array(e).T), weights=weight) for e in (errors, alone))
-    return KeyframeMap(
-        replace(keyframes, noise=replace(keyframes.noise, joint_factor=factor)),
-        float(joint / max(single, 1e-9)),
-        share_within(ratio / factor, 2, 0.95, weight),
-        float(np.average(turned, weights=weight)),
-    )

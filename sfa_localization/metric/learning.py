@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import (
     Array,
@@ -25,8 +24,7 @@ from sfa_localization.data.geometry import (
     align_complex,
     wrap_angle,
 )
-from sfa_localization.features.image_features import Spectrum, evenly
-from sfa_localization.features.rotation_spread import Agreement
+from sfa_localization.data.statistics import evenly
 from sfa_localization.metric import paper_solver
 from sfa_localization.metric.drive_check import Diagnostics, check, check_amount, diagnose
 from sfa_localization.metric.fitted_map import (
@@ -45,8 +43,8 @@ from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.selection import LeftOut, choose, leave_out
 from sfa_localization.metric.settings import MetricConfig
-from sfa_localization.metric.stack import Stack
 from sfa_localization.metric.turned_maps import TurnedMaps
+from sfa_localization.sfa.image_features import Spectrum
 
 logger = logging.getLogger(__name__)
 
@@ -54,8 +52,6 @@ LITTLE, OVERFIT = 0.9, 4.0
 """Where features explain less than this share of the places of images left out, whose variance is
 so many times that of the others, a map follows noise: it leaves no residuals, and would bend the
 drive as it likes. Then the drive keeps the shape of its odometry."""
-_LARGEST_SHARE = 0.8
-"""Of the error of an image that its neighbors have too."""
 # Images that the components are found from, evenly along the drives: they are smooth statistics.
 _COMPONENT_IMAGES = 1500
 # Images turned at a time: memory.
@@ -211,34 +207,6 @@ def _result(
         diagnostics=diagnostics,
         graph=fit.problem.graph,
         mount=fit.problem.segments.mount,
-    )
-
-
-def correlation_along_drive(
-    result: MetricResult, segments: Segments, turn_radius_m: float
-) -> ErrorCorrelation:
-    """Correlation of the left-out errors of neighboring images, over the distance between them.
-
-    A turn counts as `turn_radius_m` per rad. The share is bounded: errors of left-out maps are
-    more alike than those of the final map, because each bridges a gap.
-    """
-    stack = Stack.of(segments)
-    turns = np.abs(np.diff(stack.headings, prepend=0.0))
-    turns[stack.first] = 0.0
-    driven = np.cumsum(stack.steps + turn_radius_m * turns)
-    found = ErrorCorrelation.fit(result.left_out, result.left_out_variance, driven, stack.owner)
-    return ErrorCorrelation(min(found.share, _LARGEST_SHARE), found.distance_m)
-
-
-def left_out_agreement(disagreement: Array, result: MetricResult) -> Agreement:
-    """Factor on the variance of positions, from the disagreement (N,) of the views of all images
-    and the left-out errors of a map."""
-    return Agreement.fit(
-        disagreement[result.images],
-        (result.left_out**2).sum(1),
-        result.left_out_variance,
-        axes=2,
-        weight=result.forecast.weight,
     )
 
 

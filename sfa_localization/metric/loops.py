@@ -8,10 +8,10 @@ and is turned by t_k from each; h are the headings in the segments:
     |z_j exp(i h_b) - sum_k c_k exp(i t_k) z_ik exp(i h_ak)|^2       the turn
     |o_j + z_j q_b - sum_k c_k (o_ik + z_ik q_ak)|^2                 the place
 
-Offsets (features/offsets.py) are such mixtures; closures, of which the distance is unknown, tie two
-images with c = 1 where there are none. How well they hold is estimated with the map; neighbors err
-alike, and count for as many as they are worth. A few may be wrong: places can look alike. What does
-not fit loses its weight, so that the form stays quadratic and its solution certified.
+Offsets (keyframes/offsets.py) are such mixtures; closures, of which the distance is unknown, tie
+two images with c = 1 where there are none. How well they hold is estimated with the map; neighbors
+err alike, and count for as many as they are worth. A few may be wrong: places can look alike. What
+does not fit loses its weight, so that the form stays quadratic and its solution certified.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from scipy import sparse
 from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.statistics import LENGTH_TO_STD, MEDIAN_TO_STD, outlier_factor
-from sfa_localization.features.closures import Closures
-from sfa_localization.features.offsets import Offsets
+from sfa_localization.keyframes.closures import Closures
+from sfa_localization.keyframes.offsets import Offsets
 from sfa_localization.metric.dead_reckoning import summed
 from sfa_localization.metric.segments import Segments
 from sfa_localization.metric.stack import Solution, Stack

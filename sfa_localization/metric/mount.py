@@ -18,7 +18,7 @@ with N the normal equations of [o, z, b]. Beside them stands what is known of ro
 sits above base_link, or where it was measured, to 5 mm, and wheels may slip; or, as probable, they
 do not, and it sits anywhere on the robot. With the prior's covariance C, either has the posterior
 covariance (S + C^-1)^-1 = D, the mean D h and the evidence (|D| / |C|)^(1/2) exp(h^T D h / 2),
-times the likelihood of how images change in turns on the spot (features/turning.py); by these both
+times the likelihood of how images change in turns on the spot (keyframes/turning.py); by these both
 are mixed. A drive that never turns where it is seen again does not show l: it stays uncertain.
 """
 
@@ -33,7 +33,7 @@ from scipy import special
 
 from sfa_localization.data.geometry import Array, Complex
 from sfa_localization.data.rig import CAMERA_STD_M, UNKNOWN_YAW_STD, Quantity
-from sfa_localization.features.turning import UNSURE
+from sfa_localization.keyframes.turning import UNSURE
 
 GIVEN_STD_M = 0.005
 """Of a camera's place that was measured on the robot."""

@@ -24,9 +24,8 @@ import numpy as np
 
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Run, Stamps
-from sfa_localization.data.statistics import MEDIAN_TO_STD, outlier_factor
-from sfa_localization.features.closures import Closures, driven
-from sfa_localization.features.image_features import evenly
+from sfa_localization.data.statistics import MEDIAN_TO_STD, evenly, outlier_factor
+from sfa_localization.keyframes.closures import Closures, driven
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,
     OdometryTrack,

@@ -22,7 +22,7 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
 from sfa_localization.data.geometry import Array, Complex
-from sfa_localization.features.image_features import evenly
+from sfa_localization.data.statistics import evenly
 from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.links import Links
 from sfa_localization.metric.loops import Loops, loops_of

@@ -19,8 +19,8 @@ import numpy as np
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, Mask, wrap_angle
 from sfa_localization.data.run import Count, Odometry, Stamps, Trajectory, YawRate
-from sfa_localization.features.closures import Closures
-from sfa_localization.features.offsets import Offsets
+from sfa_localization.keyframes.closures import Closures
+from sfa_localization.keyframes.offsets import Offsets
 from sfa_localization.metric.anchors import Anchors
 from sfa_localization.metric.dead_reckoning import (
     LENGTH,

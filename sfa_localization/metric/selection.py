@@ -11,7 +11,7 @@ import numpy as np
 
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, Indices, align_complex
-from sfa_localization.features.rotation_spread import needed_factor
+from sfa_localization.data.statistics import needed_factor
 from sfa_localization.metric.basis import PAPER_FEATURES, Basis, Monomials, Process, spread
 from sfa_localization.metric.fitted_map import place_variance, plane
 from sfa_localization.metric.forecast import Forecast, ground_distances, importance, nearest_used
@@ -59,7 +59,7 @@ class LeftOut:
     def inflation(self) -> float:
         """Factor on the covariance of the map that makes these consistent, at least 1."""
         ratio = np.abs(self.errors) ** 2 / self.variances
-        return max(needed_factor(ratio, 2, self.forecast.weight), 1.0)
+        return max(needed_factor(ratio, self.forecast.weight), 1.0)
 
 
 def folds(stack: Stack, seed: int) -> Indices:

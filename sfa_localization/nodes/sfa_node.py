@@ -16,7 +16,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.camera.settings import PanoramaConfig, WatchConfig
-from sfa_localization.camera.watch import NOVELTY_WARNING
+from sfa_localization.camera.watch import EXPLAINED_WARNING
 from sfa_localization.data.errors import ConfigError, MessageError
 from sfa_localization.data.settings import Settings
 from sfa_localization.fusion.camera_clock import NEAR_NS
@@ -156,9 +156,11 @@ class SfaNode(LocalizationNode):
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         assert self._observer is not None
-        novelty = self._last.novelty if self._last is not None else 0.0
-        values = {'model': self._config.model, 'novelty': f'{novelty:.2f}'}
-        values['unlike by light'] = f'{100 * self._observer.other_light:.0f} %'
+        values, explained = {'model': self._config.model}, 1.0
+        if self._last is not None:
+            explained, factor = self._last.explained, self._observer.slow_error_factor
+            values['explained'] = f'{100 * explained:.0f} %'
+            values['slow feature errors'] = f'{factor:.1f} times as in training'
         monitor, topic = self.monitor(self._topic), self.shown(self._topic)
         silent = monitor.silent_for_s()
         if math.isinf(silent):
@@ -172,7 +174,7 @@ class SfaNode(LocalizationNode):
             return _ERROR, 'no image has been usable', values
         if self._last is not None and self._last.problem:
             return _WARN if self._observer.watch.repeats else _ERROR, self._last.problem, values
-        if novelty > NOVELTY_WARNING:
+        if explained < EXPLAINED_WARNING:
             return _WARN, 'images are unlike those of training', values
         return _OK, 'locating', values
 

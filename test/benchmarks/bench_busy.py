@@ -23,9 +23,9 @@ from sfa_localization.bags.drives import as_live, read_drive
 from sfa_localization.camera.settings import CameraConfig
 from sfa_localization.data.run import Image, Run
 from sfa_localization.evaluation import evaluate
-from sfa_localization.features.network_training import cores
 from sfa_localization.localizer import Localizer
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.sfa.network_training import cores
 from sfa_localization.training_input import Recipe
 from sfa_localization.updating import new_views
 

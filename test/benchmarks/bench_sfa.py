@@ -27,21 +27,21 @@ from bench_busy import drive_of, images_of
 from sfa_localization.data.errors import ConfigError
 from sfa_localization.data.run import PanoramaArray
 from sfa_localization.data.threads import one_core
-from sfa_localization.features import mdp_engine
-from sfa_localization.features.network import standard_architecture
-from sfa_localization.features.network_training import (
+from sfa_localization.metric.basis import Process
+from sfa_localization.metric.saved_map import MetricMap, squares
+from sfa_localization.place_model import PlaceModel
+from sfa_localization.sfa import mdp_engine
+from sfa_localization.sfa.network import standard_architecture
+from sfa_localization.sfa.network_training import (
     ImageSequence,
     cores,
     shards_of,
     train_network,
 )
-from sfa_localization.metric.basis import Process
-from sfa_localization.metric.saved_map import MetricMap, squares
-from sfa_localization.place_model import PlaceModel
 
 SIZE = (60, 600)
 PAPER_PICTURES = 1773
-CLOSE, LEVELED, NEAR, TILTS, HEADINGS = 110, 16, 64, 11, 3
+CLOSE, LEVELED, NEAR, TILTS, HEADINGS = 64, 16, 64, 11, 1
 """Keyframes that an image is compared with in full, leveled to, and located among; the tilts that
 are tried along each axis, and the headings at which the map is read."""
 ARCHITECTURE = standard_architecture(SIZE, 'panorama')
@@ -197,7 +197,7 @@ def bare_products(model: PlaceModel) -> list[Callable[[], object]]:
         ((LEVELED, few * TILTS), (few * TILTS, TILTS**2)),
         ((NEAR, length), (length, NEAR)),  # keyframes with each other, the image and what turns it
         ((4, length), (length, NEAR)),
-        ((4, NEAR), (NEAR, length)),
+        ((3, NEAR), (NEAR, length)),  # what is left of it
     ]
     if model.turned is not None:
         shapes.append(((HEADINGS, len(model.turned.axes)), model.turned.axes.shape))

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
 CACHE = ROOT / 'build/robustness'
 LEARNING = (
-    'bags', 'camera', 'data', 'features', 'metric', 'place_model.py', 'training.py',
+    'bags', 'camera', 'data', 'keyframes', 'metric', 'sfa', 'place_model.py', 'training.py',
     'training_input.py',
 )  # fmt: skip
 """Rooms that decide what a training gives."""

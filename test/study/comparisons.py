@@ -9,7 +9,7 @@ leave out a part of this package, and are evaluated as the nodes would work.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from unittest.mock import patch
 
 import numpy as np
@@ -17,17 +17,20 @@ import numpy as np
 from sfa_localization.data.errors import LocalizationError
 from sfa_localization.data.run import Odometry, Run
 from sfa_localization.evaluation import evaluate
-from sfa_localization.features.network import (
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.location import Hypothesis, Location
+from sfa_localization.keyframes.observation import UNKNOWN_YAW_VARIANCE
+from sfa_localization.metric.learning import MetricResult, learn_metric
+from sfa_localization.metric.settings import MetricConfig, SegmentConfig
+from sfa_localization.place_model import PlaceModel, View
+from sfa_localization.sfa.network import (
     PAPER_LAYERS,
     Architecture,
     Layer,
     standard_architecture,
 )
-from sfa_localization.features.network_training import LIGHT_STD, ImageSequence, train_network
-from sfa_localization.features.settings import NetworkConfig
-from sfa_localization.metric.learning import MetricResult, learn_metric
-from sfa_localization.metric.settings import MetricConfig, SegmentConfig
-from sfa_localization.place_model import PlaceModel
+from sfa_localization.sfa.network_training import LIGHT_STD, ImageSequence, train_network
+from sfa_localization.sfa.settings import NetworkConfig
 from sfa_localization.training import Recipe
 from study.results import BATCH, Cell, Results
 from study.retrieval import ImageRetrieval
@@ -99,6 +102,22 @@ def _retrieved(study: Study) -> Cell:
     return {'test_supervised': mean_error(found, study.test_truth.poses[:, :2])}
 
 
+class SlowFeaturesAlone(PlaceModel):
+    """A model that reads the place off slow features; what it turns is turned as keyframes say."""
+
+    @classmethod
+    def of(cls, model: PlaceModel) -> SlowFeaturesAlone:
+        return cls(**{part.name: getattr(model, part.name) for part in fields(model)})
+
+    def located(self, view: View, conditions: Conditions) -> Location:
+        found = PlaceModel.located(self, view, conditions)
+        (slow,) = self._slow_places(view, [Hypothesis(found.fit, 0)])
+        claimed, unlike = np.array([slow.variance]), np.array([found.fit.unlike])
+        (variance,) = self.keyframes.errors.slow_variance(claimed, unlike)
+        covariance = np.diag([variance, variance, UNKNOWN_YAW_VARIANCE])
+        return replace(found, pose=np.append(slow.place, 0.0), covariance=covariance)
+
+
 @dataclass(frozen=True, slots=True)
 class Variant:
     """This package with one thing different. `layers` empty: the standard network."""
@@ -141,11 +160,7 @@ class Variant:
 
     def reduced(self, model: PlaceModel) -> PlaceModel:
         """A model without the parts that it does without."""
-        if not self.keyframes:
-            # No correlation is high enough to be believed.
-            noise = replace(model.keyframes.noise, lowest=np.inf)
-            model = replace(model, keyframes=replace(model.keyframes, noise=noise))
-        return model
+        return model if self.keyframes else SlowFeaturesAlone.of(model)
 
     def architecture(self, size: tuple[int, int]) -> Architecture:
         """Its network for panoramas of (rows, columns)."""

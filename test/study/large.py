@@ -18,8 +18,8 @@ from sfa_localization.data.events import ODOMETRY, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align
 from sfa_localization.data.run import Run, Trajectory
 from sfa_localization.evaluation import moved, observed, score
-from sfa_localization.features.observation import Observation
 from sfa_localization.fusion.pose_filter import Level
+from sfa_localization.keyframes.observation import Observation
 from sfa_localization.localizer import Localizer, Observer
 from sfa_localization.place_model import PlaceModel
 from sfa_localization.simulation.settings import SimulationConfig

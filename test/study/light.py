@@ -22,7 +22,7 @@ from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, RigidTransform
 from sfa_localization.data.run import Run, Trajectory
 from sfa_localization.evaluation import evaluate, fit_transform, moved, score
-from sfa_localization.features.closures import Closures
+from sfa_localization.keyframes.closures import Closures
 from sfa_localization.metric.drives import Drives
 from sfa_localization.metric.learning import learn_metric
 from sfa_localization.place_model import PlaceModel
@@ -43,7 +43,7 @@ from study.results import (
     usual_drift,
 )
 from study.retrieval import ImageRetrieval
-from study.trials import STRAIGHT, features_of, slow_of
+from study.trials import STRAIGHT, features_of, slow_of, turned_of
 
 RESULTS = 'matrix.json'
 Condition = tuple[str, str]
@@ -236,11 +236,10 @@ def _summary(scores: Mapping[str, Any]) -> Cell:
 
 def _slow_alone(model: PlaceModel, run: Run, transform: RigidTransform) -> Cell:
     """Scores of the map without the keyframes, but for the headings that these show."""
-    views = (view for batch in run.panoramas.batches(BATCH) for view in model.views(batch))
-    slow = [model.slow_pose(view, model.match(view)) for view in views]
-    poses = np.array([[*one.position, one.yaw] for one in slow])
     truth = _truth(run)
-    return _summary(score(truth, moved(Trajectory(truth.stamps_ns, poses), transform)))
+    places = model.metric.predict(features_of(turned_of(model), run))[0]
+    found = Trajectory(truth.stamps_ns, flat(places))
+    return _summary(score(truth, moved(found, transform)))
 
 
 def _paper_recipe(model: PlaceModel, training: Run) -> Callable[[Run], Cell]:

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfa_localization.data.error_correlation import ErrorCorrelation
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, Complex, RigidTransform, align
 from sfa_localization.data.run import Trajectory
 from sfa_localization.evaluation import evaluate, odometry_from_start
-from sfa_localization.fusion.motion import TURN_RADIUS_M
 from sfa_localization.metric.basis import PAPER_FEATURES, monomials
-from sfa_localization.metric.learning import correlation_along_drive, learn_metric
+from sfa_localization.metric.learning import MetricResult, learn_metric
 from sfa_localization.metric.paper_solver import Lines, descend
-from sfa_localization.metric.segments import assignment
+from sfa_localization.metric.segments import Segments, assignment
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.metric.stack import Stack
 from sfa_localization.place_model import PlaceModel
@@ -91,11 +91,18 @@ def _by_recipe(
     except DataError as error:
         return {'problem': str(error)}, None
     trial = Trial.of(study, result.map, features, rows, rows)
-    fused = trial.fused(correlation_along_drive(result, segments, TURN_RADIUS_M))
+    fused = trial.fused(_correlation(result, segments))
     single = Trajectory(study.test_truth.stamps_ns, flat(trial.laid[1]))
     ekf = mean_distance(fused, study.truth)
     cell = {**trial.errors(), 'ekf': ekf, 'lines': len(segments), 'points': len(rows)}
     return cell, (trial, single, fused)
+
+
+def _correlation(result: MetricResult, segments: Segments) -> ErrorCorrelation:
+    """Of the errors of images that are left out, along straight lines."""
+    stack = Stack.of(segments)
+    found = result.left_out, result.left_out_variance, np.cumsum(stack.steps), stack.owner
+    return ErrorCorrelation.fit(*found)
 
 
 def flat(places: Array) -> Array:

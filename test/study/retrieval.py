@@ -17,8 +17,7 @@ import numpy as np
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array, wrap_angle
 from sfa_localization.data.run import Image
-from sfa_localization.features.keyframes import Texture, normalized, spectrum
-from sfa_localization.features.observation import Spectra
+from sfa_localization.keyframes.texture import Spectra, Texture, normalized, spectrum
 
 COLUMNS, ROWS = 150, 30
 

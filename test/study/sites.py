@@ -12,9 +12,9 @@ from sfa_localization.bags.drives import as_live, image_folder
 from sfa_localization.camera.settings import PanoramaConfig
 from sfa_localization.data.run import Run
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.network import Network, standard_architecture
-from sfa_localization.features.network_training import ImageSequence, train_network
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.sfa.network import Network, standard_architecture
+from sfa_localization.sfa.network_training import ImageSequence, train_network
 from sfa_localization.simulation.drive import drive
 from sfa_localization.simulation.garden import Garden
 from sfa_localization.simulation.settings import SimulationConfig

@@ -22,17 +22,18 @@ from sfa_localization.data.events import IMAGE, merge_by_stamp
 from sfa_localization.data.geometry import Array, RigidTransform, align, compose, invert, rotation
 from sfa_localization.data.run import Image, Run, Trajectory
 from sfa_localization.evaluation import known, score
-from sfa_localization.features.closures import Closures
-from sfa_localization.features.image_features import slow_features
-from sfa_localization.features.network import Network
 from sfa_localization.fusion.pose_filter import PoseFilter
 from sfa_localization.fusion.settings import FilterConfig
+from sfa_localization.keyframes.closures import Closures
+from sfa_localization.keyframes.light import Conditions
 from sfa_localization.metric.basis import PAPER_FEATURES, Basis, expand
 from sfa_localization.metric.drives import Drive, Drives
 from sfa_localization.metric.saved_map import MetricMap
 from sfa_localization.metric.segments import Segments, join
 from sfa_localization.metric.settings import MetricConfig, SegmentConfig
 from sfa_localization.place_model import PlaceModel
+from sfa_localization.sfa.image_features import slow_features
+from sfa_localization.sfa.network import Network
 from sfa_localization.training import Recipe
 from sfa_localization.training_input import drive_of
 from study.results import BATCH, Cell
@@ -139,7 +140,7 @@ def turned_of(model: PlaceModel) -> Features:
 
     def components(images: Image) -> Array:
         views = model.views(images)
-        yaw = np.array([model.match(view).pose[2] for view in views])
+        yaw = np.array([model.located(view, Conditions()).pose[2] for view in views])
         return turned.features(np.stack([view.spectrum for view in views]), yaw)
 
     return components

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import ConfigError, ModelError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
-from sfa_localization.features.rotation import Field, Map, unfold
-from sfa_localization.features.sfa import Solution
+from sfa_localization.sfa.rotation import Field, Map, unfold
+from sfa_localization.sfa.slowness import Solution
 
 Weights = NDArray[np.float32]
 

@@ -23,10 +23,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.sphere import Sphere, rotation
 from sfa_localization.data.statistics import parabola_peak
-from sfa_localization.features.local_regression import columns_of, turned
-from sfa_localization.features.observation import Spectra
-
-Texture = NDArray[np.float32]
+from sfa_localization.keyframes.texture import Spectra, Texture, columns_of, turned
 
 _LARGEST = np.radians(12.0)
 """Of the tilts that are tried, along each axis."""

@@ -17,21 +17,16 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.run import Odometry, Run, Stamps
-from sfa_localization.features.image_features import sample
-from sfa_localization.features.keyframes import (
-    coarse,
-    coarse_scores,
-    correlate,
-    quantized,
-    spectra_of,
-    texture,
-)
-from sfa_localization.features.observation import Spectra
+from sfa_localization.data.statistics import evenly
+from sfa_localization.keyframes.correlation import coarse, coarse_scores, correlate
+from sfa_localization.keyframes.texture import Spectra, quantized, spectra_of, texture
 
 LIKE = 0.55
 """Least correlation of a closure: images of other places reach 0.4, some a little more."""
 STRETCH_M = 6.0
 """Images that are nearer along the same drive are alike because they are neighbors."""
+SAMPLES = 3000
+"""Images that are compared, however long the drives."""
 # Each is the likest of the other, to so many images: neighbors are nearly equally like.
 _NEXT = 1
 # Of the coarse correlation, for the full one.
@@ -128,7 +123,7 @@ def find_closures(views: Views, clockwise: bool) -> Closures:
     if they are like enough; of an even sample, for each is compared with all. `clockwise`: whether
     columns grow clockwise seen from above.
     """
-    views = views.take(sample(len(views.images)))
+    views = views.take(evenly(len(views.images), SAMPLES))
     drives = [_Drive.of(views.take(views.run == run)) for run in np.unique(views.run).tolist()]
     images, turns = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
     step = (2 if clockwise else -2) * np.pi / views.textures.shape[2]

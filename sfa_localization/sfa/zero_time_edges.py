@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Indices
 from sfa_localization.data.run import Image, Panoramas, Stamps
-from sfa_localization.features.closures import Closures
-from sfa_localization.features.image_features import evenly
-from sfa_localization.features.network_training import ImageSequence
+from sfa_localization.data.statistics import evenly
+from sfa_localization.keyframes.closures import Closures
+from sfa_localization.sfa.network_training import ImageSequence
 
 _MOST = 200
 """Edges of a training: enough for statistics, a small part of its time."""

@@ -18,9 +18,9 @@ from sfa_localization.data.array_files import read_arrays, write_arrays
 from sfa_localization.data.errors import ModelError
 from sfa_localization.data.files import is_regular
 from sfa_localization.data.run import Run
-from sfa_localization.features.network import Architecture, Node
-from sfa_localization.features.network_training import Partial
-from sfa_localization.features.sfa import Solution
+from sfa_localization.sfa.network import Architecture, Node
+from sfa_localization.sfa.network_training import Partial
+from sfa_localization.sfa.slowness import Solution
 
 FORMAT = 'sfa_localization training checkpoint'
 VERSION = 1

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import BATCH, Run
-from sfa_localization.features.network import Network
-from sfa_localization.features.rotation import Map
-from sfa_localization.features.rotation_spread import disagreement
+from sfa_localization.sfa.network import Network
+from sfa_localization.sfa.rotation import Map
 
 Spectrum = NDArray[np.complex64]
 
@@ -27,8 +26,6 @@ TURNED_LAYER = 1
 """Layer (0-based), below the top, whose map is turned to locate by: it still holds the heading."""
 HARMONICS = 13
 """Mean and harmonics 1 to 12 over the columns; all 31 of a 60-column map locate no better."""
-# Images that are compared for closures, however long the drives.
-SAMPLES = 3000
 
 
 def slow_features(maps: list[Map]) -> Array:
@@ -56,8 +53,6 @@ class ImageFeatures:
 
     slow: Array
     """(N, K) slow features."""
-    disagreement: Array
-    """(N,) of the rotated views of each image."""
     spectra: Spectrum | None
     """(N, H, J) of the layer that is turned; None in a network without it."""
     variance_shares: dict[str, list[float]]
@@ -69,29 +64,18 @@ class ImageFeatures:
         return {'pictures': len(self.slow), **self.variance_shares}
 
 
-def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """Indices (S,) of at most `most` of `count` images, evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
-
-
-def sample(total: int) -> NDArray[np.int64]:
-    """Those of so many images whose textures are kept."""
-    return evenly(total, SAMPLES)
-
-
 def features_of_runs(
     network: Network,
     runs: Sequence[Run],
     on_images: Callable[[int], object] = lambda count: None,
 ) -> ImageFeatures:
     """Run all images through the network once; `on_images` receives the size of each batch."""
-    slow, spread = [], []
+    slow = list[Array]()
     spectra: list[Spectrum] = []
     shares = _VarianceShares(network.architecture.outputs)
     for images in (batch for run in runs for batch in run.panoramas.batches(BATCH)):
         maps = network.maps(images)
         slow.append(slow_features(maps))
-        spread.append(disagreement(maps[-1]))
         shares.add(maps[-1])
         # The top's own maps hardly show the heading.
         if len(maps) > TURNED_LAYER + 1:
@@ -99,7 +83,6 @@ def features_of_runs(
         on_images(len(images))
     return ImageFeatures(
         np.concatenate(slow),
-        np.concatenate(spread),
         np.concatenate(spectra) if spectra else None,
         shares.result(),
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.run import BATCH, Image, Panoramas, Run
 from sfa_localization.data.threads import one_core
-from sfa_localization.features.network import (
+from sfa_localization.sfa.network import (
     Architecture,
     Network,
     Node,
@@ -31,8 +31,8 @@ from sfa_localization.features.network import (
     input_map,
     linear_stage,
 )
-from sfa_localization.features.rotation import FieldStatistics, Map, SampleStatistics, Sums
-from sfa_localization.features.sfa import Solution, Statistics, solve
+from sfa_localization.sfa.rotation import FieldStatistics, Map, SampleStatistics, Sums
+from sfa_localization.sfa.slowness import Solution, Statistics, solve
 
 SHARD = 64
 """Images whose sums are computed by one task: enough for its products, few enough to balance."""

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Indices, wrap_angle
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.closures import STRETCH_M, Views
-from sfa_localization.features.keyframes import Keyframes
-from sfa_localization.features.observation import MatchNoise
+from sfa_localization.keyframes.closures import STRETCH_M, Views
+from sfa_localization.keyframes.keyframes import Keyframes
 
 # Of the views that are located, along a drive or in a turn, which shows where the camera sits:
 # nearer ones err alike.
@@ -33,7 +32,7 @@ _UNLIKE = 0.5
 class Offsets:
     """R of the images of all drives that lie at the mixture, by `shares` (R, K) of sum 1, of the
     places of `others` (R, K), and are turned by `turn` (R, K) rad from each; `unlike` (R,) is that
-    of the match.
+    of the fit.
     """
 
     images: Indices
@@ -61,7 +60,7 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
         return Offsets.none()
     drives = views.run[known].astype(np.int32)
     own = views.textures[known], poses[known]
-    among = Keyframes.of(*own, MatchNoise(), sphere, drives, rounded=False)
+    among = Keyframes.of(*own, sphere, drives, rounded=False)
     path, found = views.path_m[known], []
     for row in _spaced(path, among.poses[:, 2], drives):
         apart = np.hypot(*(among.poses[:, :2] - among.poses[row, :2]).T)
@@ -70,13 +69,13 @@ def find_offsets(views: Views, poses: Array, sphere: Sphere) -> Offsets:
         near = near[~own][:_AMONG]
         if len(near) < _FEWEST:
             continue
-        match = among.place(among.spectra([row])[0], among.poses[row, 2], near)
-        if match.unlike < _UNLIKE:
+        fit = among.fit(among.spectra([row])[0], among.poses[row, 2], near)
+        if fit.unlike < _UNLIKE:
             shares, turn = np.zeros((2, _AMONG))
             others = np.full(_AMONG, near[0])
-            others[: len(near)], shares[: len(near)] = near, match.shares
-            turn[: len(near)] = match.pose[2] - among.poses[near, 2]
-            found.append((row, others, shares, turn, match.unlike))
+            others[: len(near)], shares[: len(near)] = near, fit.shares
+            turn[: len(near)] = fit.yaw - among.poses[near, 2]
+            found.append((row, others, shares, turn, fit.unlike))
     if not found:
         return Offsets.none()
     rows, others, shares, turn, unlike = map(np.array, zip(*found, strict=True))

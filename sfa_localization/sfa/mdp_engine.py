@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from sfa_localization.data.errors import DataError
 from sfa_localization.data.geometry import Array
 from sfa_localization.data.run import Image
-from sfa_localization.features.mdp_shim import import_mdp
-from sfa_localization.features.network import Architecture, Layer, Network, Node, input_map
-from sfa_localization.features.network_training import (
+from sfa_localization.sfa.mdp_shim import import_mdp
+from sfa_localization.sfa.network import Architecture, Layer, Network, Node, input_map
+from sfa_localization.sfa.network_training import (
     LIGHT_STD,
     RELATIVE_CUT,
     ImageSequence,
@@ -28,8 +28,8 @@ from sfa_localization.features.network_training import (
     require_pairs,
     shards_of,
 )
-from sfa_localization.features.rotation import Field
-from sfa_localization.features.sfa import Solution, signed, whitening
+from sfa_localization.sfa.rotation import Field
+from sfa_localization.sfa.slowness import Solution, signed, whitening
 
 
 def train_network(

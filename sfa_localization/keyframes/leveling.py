@@ -25,16 +25,10 @@ from sfa_localization.camera.leveling import TILTED_RAD, LeveledPanoramas
 from sfa_localization.data.geometry import Complex
 from sfa_localization.data.run import Run
 from sfa_localization.data.sphere import Sphere
-from sfa_localization.features.closures import LIKE, STRETCH_M, Views, views_of
-from sfa_localization.features.image_features import SAMPLES
-from sfa_localization.features.keyframes import (
-    channels,
-    coarse,
-    coarse_scores,
-    correlate,
-    spectra_of,
-)
-from sfa_localization.features.tilt import find_tilt
+from sfa_localization.keyframes.closures import LIKE, SAMPLES, STRETCH_M, Views, views_of
+from sfa_localization.keyframes.correlation import coarse, coarse_scores, correlate
+from sfa_localization.keyframes.texture import channels, spectra_of
+from sfa_localization.keyframes.tilt import find_tilt
 
 _LIKEST = 24
 """Images that each is compared with; of 12 half as much of the tilt is found."""

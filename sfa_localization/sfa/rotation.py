@@ -28,7 +28,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Mask
-from sfa_localization.features.sfa import Statistics
+from sfa_localization.sfa.slowness import Statistics
 
 Map = NDArray[np.float32]
 

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.rig import Quantity
-from sfa_localization.features.closures import Views
-from sfa_localization.features.image_features import evenly
-from sfa_localization.features.keyframes import spectra_of
-from sfa_localization.features.local_regression import columns_of
+from sfa_localization.data.statistics import evenly
+from sfa_localization.keyframes.closures import Views
+from sfa_localization.keyframes.texture import columns_of, spectra_of
 
 SPOT_M, TURNS_RAD = 0.02, (0.3, 1.5)
 """Pairs of images of a turn are so near to each other, and turned by so much."""

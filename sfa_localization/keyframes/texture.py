@@ -1,0 +1,110 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""Textures: what is left of a panorama after its light, small, and as the spectra of its columns.
+
+Local contrast survives another light and season. Brightness also shows the sunlit side of things,
+and seems to move them with the sun; their colors stay.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfa_localization.data.geometry import Array
+from sfa_localization.data.run import Image
+
+Texture = NDArray[np.float32]
+Spectra = NDArray[np.complex64]
+
+_COLUMNS, _ROWS, _COLOR_ROWS = 80, 16, 8
+# Standard deviation of the blur that takes light and its slow changes out, of the columns: 10 deg.
+_BLUR = 1 / 37.5
+# Keeps the noise of dark and of plain surfaces small beside texture: of the brightness (8 bit),
+# and of its logarithm.
+_DARKEST, _FLATTEST = 8.0, 0.1
+# Textures have one byte a number: so many steps are a standard deviation.
+_STEPS = 127 / 4.0
+
+
+def texture(panorama: Image) -> Texture:
+    """Local contrast of a panorama (H, W, 3) uint8, small: (rows, columns), zero mean, unit norm.
+
+    The logarithm of the brightness minus its surroundings, over their standard deviation: what is
+    left of an image after its light. Below it, in half as many rows, the same of red over green
+    and of blue over both; a gray camera has none.
+    """
+    small = _small(panorama, _ROWS, _COLUMNS)
+    few = _small(small, _COLOR_ROWS, _COLUMNS)
+    light = _logarithm(np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.float32))
+    blue, green, red = np.moveaxis(_logarithm(few), 2, 0)
+    colors = np.dstack([red - green, blue - (red + green) / 2])
+    return normalized(np.concatenate([*_contrast(light[:, :, None]), *_contrast(colors)]))
+
+
+def _logarithm(image: Texture) -> Texture:
+    return np.asarray(np.log(image + np.float32(_DARKEST)), np.float32)
+
+
+def _contrast(values: Texture) -> Texture:
+    """Of channels (rows, columns, C): their values minus the surroundings, over their standard
+    deviation there, (C, rows, columns).
+    """
+    width = values.shape[1]
+    margin = max(width // 6, 1)
+    around = cv2.copyMakeBorder(values, 0, 0, margin, margin, cv2.BORDER_WRAP)
+    detail = around - cv2.GaussianBlur(around, (0, 0), width * _BLUR)
+    deviation = np.sqrt(cv2.GaussianBlur(detail * detail, (0, 0), width * _BLUR))
+    contrast = (detail / (deviation + np.float32(_FLATTEST)))[:, margin:-margin]
+    return np.asarray(np.moveaxis(contrast.reshape(*values.shape), 2, 0), np.float32)
+
+
+def _small(image: NDArray[Any], rows: int, columns: int) -> Texture:
+    """An image (H, W) or (H, W, C) of at most so many rows and columns."""
+    size = min(image.shape[1], columns), min(image.shape[0], rows)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def normalized(image: Texture) -> Texture:
+    """An image of zero mean and unit norm."""
+    centered = image - image.mean()
+    return np.asarray(centered / max(float(np.linalg.norm(centered)), 1e-6), np.float32)
+
+
+def spectrum(textures: Texture) -> Spectra:
+    """Fourier coefficients of the columns, (..., rows, F)."""
+    return np.asarray(np.fft.rfft(textures), np.complex64)
+
+
+def channels(rows: int) -> tuple[slice, ...]:
+    """Of a texture's rows those of brightness and of both color differences."""
+    few = min(rows // 3, _COLOR_ROWS)
+    light = rows - 2 * few
+    return slice(0, light), slice(light, light + few), slice(light + few, rows)
+
+
+def quantized(textures: Texture) -> NDArray[np.int8]:
+    """Textures (N, rows, columns) with one byte a pixel."""
+    deviation = np.maximum(np.std(textures, axis=(1, 2), keepdims=True), 1e-6)
+    return np.asarray(np.clip(np.rint(textures * (_STEPS / deviation)), -127, 127), np.int8)
+
+
+def spectra_of(textures: NDArray[np.int8]) -> Spectra:
+    """Spectra (K, rows, F) of quantized textures (K, rows, columns), each of unit norm."""
+    return spectrum(np.stack([normalized(t.astype(np.float32)) for t in textures]))
+
+
+def turned(spectra: Spectra, angle: Array | float) -> Spectra:
+    """Spectra (..., rows, F) of textures whose content is moved by `angle` (...) rad, to the left
+    for positive ones.
+    """
+    phase = np.exp(1j * np.multiply.outer(angle, np.arange(spectra.shape[-1]))).astype(np.complex64)
+    return np.asarray(spectra * phase[..., None, :])
+
+
+def columns_of(spectra: Spectra, columns: int, axis: int = -1) -> Texture:
+    """So many columns of what has these spectra. (SciPy would take as long to import as NumPy.)"""
+    return np.asarray(np.fft.irfft(spectra, columns, axis), np.float32)

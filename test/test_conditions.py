@@ -1,0 +1,104 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The conditions of late: what the light adds to all images, and how wrong slow features are."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from cylinder_worlds import Spheres, alone
+from test_keyframes import CONFIG, COUNTER, learnt, stds, unseen, within
+from test_location import STD, fit_at, locate
+
+from sfa_localization.keyframes.light import Conditions
+from sfa_localization.keyframes.location import Location
+
+
+def repainted(poses, config, share=0.5):
+    """Images of the world with a share of other colors: sun on other sides of things."""
+    world, rng = Spheres.about(1), np.random.default_rng(11)
+    colors = world.colors + share * rng.uniform(-90, 90, world.colors.shape)
+    return Spheres(world.places, world.heights, world.radii, colors).panoramas(poses, config)
+
+
+def sunny(poses, config, share=0.3):
+    """Images of the world and of what is in the sky, in one direction wherever the robot is."""
+    other = Spheres.about(77)
+    far = (1e6 * each for each in (other.places, other.heights, other.radii))
+    sky = Spheres(*far, share * other.colors).panoramas(poses, config) - 128.0
+    return np.clip(Spheres.about(1).panoramas(poses, config) + sky, 0, 255).astype(np.uint8)
+
+
+@cache
+def drive(light, config=CONFIG, **share):
+    """Locations of 110 images in a light, without and with what others before show of it, the
+    poses, and the conditions.
+    """
+    keyframes, conditions = learnt(Spheres.about(1), config), Conditions()
+    plain, adapted, poses = [], [], unseen(150)
+    for image in light(poses, config, **share):
+        plain.append(alone(keyframes, image))
+        adapted.append(alone(keyframes, image, conditions))
+        conditions.add(adapted[-1])
+    return plain[40:], adapted[40:], poses[40:], conditions
+
+
+@pytest.mark.parametrize('light', [repainted, sunny])
+def test_in_another_light_ellipses_are_small_and_hold(light):
+    plain, adapted, poses, _ = drive(light)
+    assert np.median(stds(adapted) ** 2) < 0.7 * np.median(stds(plain) ** 2)
+    assert within(plain, poses) > 0.9
+    assert within(adapted, poses) > 0.9
+
+
+@pytest.mark.parametrize('config', [CONFIG, COUNTER])
+def test_what_the_light_adds_everywhere_moves_no_place(config):
+    """In the light of the training nothing changes."""
+    patterns = []
+    for share, most in ((0.3, 0.75), (0.0, 1.1)):
+        *locations, poses, conditions = drive(sunny, config, share=share)
+        plain, adapted = (
+            np.mean([np.hypot(*(one.pose - pose)[:2]) for one, pose in zip(of, poses, strict=True)])
+            for of in locations
+        )
+        assert adapted < most * plain
+        patterns.append(np.linalg.norm(conditions.pattern))
+    assert patterns[1] < 0.2 * patterns[0]
+
+
+def seen(x, residual, outward=0.2) -> Location:
+    return locate([fit_at(x, residual=residual.astype(np.complex64), outward=outward)])
+
+
+def test_the_pattern_is_a_mean_over_places():
+    """What is unusual about one place, as a visitor there, is none of the others' business."""
+    share, rng, conditions = np.ones((3, 4)), np.random.default_rng(0), Conditions()
+    conditions.add(seen(0.0, share))
+    once = conditions.pattern.copy()
+    for _ in range(100):
+        conditions.add(seen(0.1, share))
+    assert np.array_equal(conditions.pattern, once), 'a robot that stands learns nothing'
+    conditions.add(seen(0.5, share, outward=0.7))
+    assert np.array_equal(conditions.pattern, once), 'nor does one beside the keyframes'
+    conditions.add(seen(0.4, share))
+    assert np.all(conditions.pattern.real > once.real)
+    conditions = Conditions()
+    for k in range(300):
+        known = 0.0 if conditions.pattern is None else conditions.pattern
+        conditions.add(seen(0.3 * k, share + rng.normal(0, 1.0, share.shape) - known))
+    assert np.abs(conditions.pattern.mean() - 1) < 0.15
+    assert np.std(conditions.pattern) < 0.3
+
+
+@pytest.mark.parametrize('claimed', [0.05, 0.1, 0.3])
+def test_slow_features_count_by_how_wrong_they_are_of_late(claimed):
+    conditions, rng = Conditions(), np.random.default_rng(0)
+    for wrong, least, most in ((1.0, 1.0, 1.5), (10.0, 6.0, 15.0), (1.0, 1.0, 1.5)):
+        for _ in range(60):
+            x, slow = STD * rng.normal(), wrong * claimed * rng.normal(size=2)
+            location = locate([fit_at(x, STD * rng.normal())], [slow], claimed, conditions.scales)
+            conditions.add(location)
+        assert least < conditions.slow_error_factor < most
+        moved = locate([fit_at()], [(0.1, 0.0)], claimed, conditions.scales).pose[0] / 0.1
+        by_claim = STD**2 / (STD**2 + claimed**2)
+        assert moved > 0.8 * by_claim if wrong == 1.0 else moved < 0.4 * by_claim

@@ -1,0 +1,132 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""The place of a texture among keyframes whose textures change linearly with the place."""
+
+import numpy as np
+import pytest
+
+from sfa_localization.keyframes.regression import Fit, Neighbors
+from sfa_localization.keyframes.texture import normalized, spectrum, turned
+
+ROWS = 8
+SIZES = pytest.mark.parametrize('columns', [60, 61])
+
+
+def smooth(rng: np.random.Generator, columns: int) -> np.ndarray:
+    """A random texture of the lowest ten frequencies, of zero mean and unit norm."""
+    rough = np.fft.rfft(rng.normal(size=(ROWS, columns)))
+    rough[:, 10:] = 0
+    return normalized(np.fft.irfft(rough, columns).astype(np.float32))
+
+
+class Scene:
+    """Keyframes at `places` (64, 2) m on a square of 1 m, whose textures change linearly with the
+    place, and a texture `strange` that has nothing to do with it.
+    """
+
+    def __init__(self, columns=60):
+        rng, self.columns = np.random.default_rng(4), columns
+        self.base, self.along_x, self.along_y = (smooth(rng, columns) for _ in range(3))
+        basis = np.stack([self.base, self.along_x, self.along_y]).reshape(3, -1)
+        strange = smooth(rng, columns).ravel()
+        strange -= np.linalg.lstsq(basis.T, strange, rcond=None)[0] @ basis
+        self.places = rng.uniform(-0.5, 0.5, (64, 2))
+        self.strange = normalized(strange.reshape(self.base.shape))
+        self.kept = self.keyframes(self.places)
+
+    def seen(self, place, more=0.0):
+        """Spectrum of the texture at a place (2,) m."""
+        x, y = place
+        texture = self.base + 0.3 * x * self.along_x + 0.3 * y * self.along_y
+        return spectrum(normalized(texture + more))
+
+    def keyframes(self, places, more=0.0):
+        return np.stack([self.seen(place, more) for place in places])
+
+    def fit(self, place, more=0.0):
+        return fit_among(self.seen(place, more), self.kept, self.places, self.columns)
+
+
+def fit_among(image, keyframes, places, columns, channels=None, drives=None) -> Fit:
+    """The fit of a spectrum (rows, F) on which roll and pitch have no effect."""
+    channels = channels or (slice(0, keyframes.shape[1]),)
+    drives = np.zeros(len(places), np.int32) if drives is None else drives
+    by_turn = (image * 1j * np.arange(image.shape[1])).astype(np.complex64)
+    changes = np.stack([image, 0 * image, 0 * image, by_turn])
+    return Neighbors.of(keyframes, places, drives, channels, columns).fit(changes)
+
+
+@SIZES
+def test_a_place_between_keyframes_is_found_and_a_rest_of_angle_is_no_matter_of_it(columns):
+    scene = Scene(columns)
+    for place in ((0.0, 0.0), (0.2, -0.3), (-0.4, 0.4)):
+        fit = scene.fit(place)
+        assert np.allclose(fit.place, place, atol=0.01)
+        assert np.abs(fit.changes).max() < 5e-3 and 0 <= fit.unlike < 1e-3
+        assert np.allclose([*fit.shares @ scene.places, fit.shares.sum()], [*fit.place, 1])
+    for angle in (-0.02, 0.03):
+        image = turned(scene.seen((0.1, 0.2))[None], np.array([angle]))[0]
+        fit = fit_among(image, scene.kept, scene.places, columns)
+        assert fit.changes == pytest.approx([0.0, 0.0, angle], rel=0.1)
+        assert np.allclose(fit.place, (0.1, 0.2), atol=0.02)
+
+
+def test_what_no_place_explains_is_unlike_and_moves_little_and_no_texture_is_finite():
+    scene = Scene()
+    for share in (0.5, 1.0):
+        fit = scene.fit((0.2, 0.1), share * scene.strange)
+        assert fit.unlike == pytest.approx(share**2, rel=0.3)
+        assert np.allclose(fit.place, (0.2, 0.1), atol=0.1)
+    for level in (0.0, 1.0):
+        same = np.repeat(spectrum(np.full((ROWS, 60), level, np.float32))[None], 64, axis=0)
+        fit = fit_among(same[0], same, scene.places, 60)
+        assert np.isfinite([*fit.place, *fit.changes, fit.unlike, fit.variance]).all()
+        assert np.abs(fit.place).max() <= 0.5
+
+
+def test_keyframes_along_a_line_in_another_light_show_the_place_across_it():
+    scene, place = Scene(), (0.2, 0.3)
+    light = scene.strange / 2
+    line = np.column_stack([np.linspace(-0.5, 0.5, 12), np.zeros(12)])
+    lit, everywhere = scene.keyframes(line, light), np.concatenate([scene.places, line])
+    drives = np.repeat([0, 1], [64, 12]).astype(np.int32)
+    assert abs(fit_among(scene.seen(place, light), lit, line, 60).place[1]) < 0.01
+    keyframes = np.concatenate([scene.kept, lit])
+    fit = fit_among(scene.seen(place, light), keyframes, everywhere, 60, drives=drives)
+    assert np.hypot(*(fit.place - place)) < 0.15
+
+
+NOISE = spectrum(2 * smooth(np.random.default_rng(9), 60))
+
+
+@pytest.mark.parametrize('spoil', [np.negative, np.zeros_like, lambda image: image + NOISE])
+def test_a_channel_that_shows_something_else_counts_little(spoil):
+    """Two channels of the same scene, the second of the image spoilt."""
+    scene, place = Scene(), np.array([0.3, -0.2])
+    keyframes = np.concatenate([scene.kept] * 2, axis=1)
+    image = np.concatenate([scene.seen(place), spoil(scene.seen(place))])
+    channels = slice(0, ROWS), slice(ROWS, 2 * ROWS)
+    plain = fit_among(image, keyframes, scene.places, 60)
+    fit = fit_among(image, keyframes, scene.places, 60, channels)
+    assert np.hypot(*(fit.place - place)) < 0.03
+    assert fit.unlike < 0.3 * plain.unlike
+
+
+def lit(rng, columns, share):
+    """What a light adds to a texture: other things in each sector of 22.5 degrees."""
+    sectors = np.repeat(rng.normal(size=(ROWS, 16)), -(-columns // 16), axis=1)[:, :columns]
+    return share * normalized((sectors * rng.normal(1.0, 0.3, sectors.shape)).astype(np.float32))
+
+
+@SIZES
+@pytest.mark.parametrize('share', [0.1, 0.5])
+def test_the_variance_is_what_light_moves_the_place_by(columns, share):
+    scene, rng, place = Scene(columns), np.random.default_rng(7), np.array([0.1, -0.2])
+    fits = [scene.fit(place, lit(rng, columns, share)) for _ in range(300)]
+    true = np.mean([np.sum((fit.place - place) ** 2) for fit in fits]) / 2
+    assert 0.6 < np.mean([fit.variance for fit in fits]) / true < 1.7
+
+
+def test_a_place_beside_all_keyframes_is_seen_to_be():
+    inside, border, outside = (Scene().fit((x, 0.0)).outward for x in (0.0, 0.5, 1.5))
+    assert inside < 0.2 and 0.5 < border < 0.9 and outside > 0.9

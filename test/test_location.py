@@ -1,0 +1,81 @@
+# Copyright 2026 The sfa_localization authors
+# SPDX-License-Identifier: Apache-2.0
+"""One mixture of hypotheses by keyframes, and of how wrong slow features may be."""
+
+import numpy as np
+import pytest
+
+from sfa_localization.keyframes.errors import ErrorModel
+from sfa_localization.keyframes.location import SCALES, Hypothesis, Location, SlowPlace, located
+from sfa_localization.keyframes.regression import Fit
+
+STD = 0.1
+ERRORS = ErrorModel(floor_m=STD, residual=0.0, outward_m=0.0, slow=1.0, slow_m=0.0, yaw_std=0.02)
+RIGHT = np.where(SCALES == 1, 1.0, 1e-12)
+"""Slow features err as they claim."""
+
+
+def fit_at(x=0.0, y=0.0, yaw=0.0, unlike=0.1, outward=0.0, residual=None) -> Fit:
+    residual = np.zeros((2, 3), np.complex64) if residual is None else residual
+    of_image = np.zeros(3), unlike, residual, 0.0
+    return Fit(np.array([x, y]), np.ones(1), *of_image, outward, yaw, np.exp(1j * yaw))
+
+
+def locate(fits, slow=((0.0, 0.0),), std=1e3, scales=RIGHT, starts=None) -> Location:
+    """By fits, each of its own start or of those given, and places (1 or N, 2) of slow features."""
+    starts = range(len(fits)) if starts is None else starts
+    likely = [Hypothesis(fit, start) for fit, start in zip(fits, starts, strict=True)]
+    places = [SlowPlace(place, std**2) for place in np.broadcast_to(slow, (len(fits), 2))]
+    return located(likely, places, scales, ERRORS, np.zeros(2))
+
+
+def test_one_hypothesis_and_right_slow_features_are_fused_by_their_information():
+    """By hand: variances of 0.01 and 0.03 m^2 at 0 and 1 m give 0.0075 m^2 at 0.25 m."""
+    location = locate([fit_at(yaw=3.0)], [(1.0, 0.0)], np.sqrt(0.03))
+    assert location.pose == pytest.approx([0.25, 0.0, 3.0])
+    expected = np.diag([0.0075, 0.0075, (1.1 * ERRORS.yaw_std) ** 2])
+    np.testing.assert_allclose(location.covariance, expected, rtol=1e-6)
+    assert location.explained == pytest.approx(1 / 1.1)
+
+
+def test_two_hypotheses_of_equal_evidence_are_held_both():
+    location = locate([fit_at(), fit_at(4.0, 0.0, 2.0)])
+    assert location.pose == pytest.approx([0.0, 0.0, 0.0], abs=1e-4)
+    expected = np.diag([4.0**2 / 2 + STD**2, STD**2, 2.0**2 / 2])
+    np.testing.assert_allclose(location.covariance, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('unlike', 'slow'),
+    [
+        ((0.5, 0.3), [(0.0, 0.0)] * 2),
+        ((0.3, 0.32), [(4.3, 1.0)] * 2),
+        ((0.3, 0.3), [(4.0, 2.0), (4.1, 1.1)]),
+    ],
+)
+def test_what_explains_more_of_an_image_or_agrees_with_slow_features_is_believed(unlike, slow):
+    fits = [fit_at(unlike=unlike[0]), fit_at(4.0, 1.0, 2.0, unlike=unlike[1])]
+    location = locate(fits, slow, 1e3 if unlike[0] > unlike[1] else 0.3)
+    assert np.hypot(*(location.pose[:2] - (4.0, 1.0))) < 0.1
+    assert location.pose[2] == pytest.approx(2.0)
+    assert np.trace(location.covariance[:2, :2]) < 2.5 * STD**2
+
+
+def test_lights_of_the_training_that_put_an_image_apart_make_its_place_uncertain():
+    """Along the axis on which they differ, and not where one of them explains far less."""
+    alike, mostly = (
+        locate([fit_at(-0.2), fit_at(0.2, unlike=unlike)], starts=(0, 0)) for unlike in (0.1, 0.5)
+    )
+    assert alike.pose == pytest.approx(np.zeros(3), abs=1e-6)
+    variances = [np.diag(one.covariance)[:2] / STD**2 for one in (alike, mostly)]
+    np.testing.assert_allclose(variances, [[5.0, 1.0], [1.0, 1.0]], rtol=1e-3)
+    assert mostly.pose[0] == pytest.approx(-0.2, abs=1e-3)
+
+
+def test_slow_features_that_are_far_away_count_less_where_they_may_err_more():
+    even = np.full(len(SCALES), 1 / len(SCALES))
+    for far, most in ((0.1, 0.04), (1.0, 0.03), (3.0, 0.02)):
+        location = locate([fit_at()], [(far, 0.0)], 0.1, even)
+        assert 0 < location.pose[0] < most
+    assert location.covariance[0, 0] == pytest.approx(STD**2, rel=0.1)
+    assert SCALES @ location.scales > 300
