@@ -54,7 +54,7 @@ class CameraClock:
         return CameraClock(self.delay_s, min(self.std_s, found.std_s), True)
 
 
-SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.0, 0.798  # of |x|: sqrt(2 / pi)
+SIGNIFICANT_STDS, _MEAN_OF_NORMAL = 2.5, 0.798  # of |x|: sqrt(2 / pi)
 _STEP_S = 0.02
 _GRID = np.arange(-round(LONGEST_S / _STEP_S), round(LONGEST_S / _STEP_S) + 1) * _STEP_S
 # Images farther apart in time, or with a pause of the odometry between, are not compared. An
