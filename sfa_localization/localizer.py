@@ -67,7 +67,7 @@ class Observer:
         judged = list(map(self._judge, panoramas))
         each = zip(stamps_ns.tolist(), judged, self.model.views(panoramas), strict=True)
         return [
-            self._usable(replace(self._locate(view, problem), stamp_ns=stamp_ns, turned=turned))
+            replace(self._locate(view, problem), stamp_ns=stamp_ns, turned=turned)
             for stamp_ns, (problem, turned), view in each
         ]
 
@@ -86,9 +86,10 @@ class Observer:
     def _locate(self, view: View, problem: str) -> Observation:
         """Located in the conditions of late, which usable images of known places teach."""
         location = self.model.located(view, self._conditions)
-        if not (problem or self.watch.judge_place(location.explained)):
+        found = self._usable(replace(self.model.observed(view, location), problem=problem))
+        if not found.problem:
             self._conditions.add(location)
-        return replace(self.model.observed(view, location), problem=problem)
+        return found
 
     def _usable(self, found: Observation) -> Observation:
         """What reaches the filter: of an unusable image, that nothing is known."""

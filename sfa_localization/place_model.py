@@ -109,9 +109,7 @@ class PlaceModel:
 
     def located(self, view: View, conditions: Conditions) -> Location:
         """Where the camera was, by keyframes and slow features in the conditions of late."""
-        image, likely = hypotheses(self.keyframes, view.upright, conditions.pattern)
-        best = max(likely, key=lambda one: one.evidence)
-        tilt = image.tilt + best.fit.changes[:2]
+        likely, tilt = hypotheses(self.keyframes, view.upright, conditions.pattern)
         slow = self._slow_places(view, likely)
         return located(likely, slow, conditions.scales, self.keyframes.errors, tilt)
 
@@ -141,7 +139,7 @@ class PlaceModel:
         covariance[:2, :2] += np.outer(by_scale, by_scale)
         pose, covariance = self.rig.base(location.pose, covariance, location.facing)
         covariance[2, 2] = min(covariance[2, 2], UNKNOWN_YAW_VARIANCE)
-        shown = view.slow_features, location.explained
+        shown = view.slow_features, location.fit.explained
         return Observation(pose, covariance, *shown, tilt=location.tilt)
 
     def save(self, path: Path) -> None:

@@ -161,7 +161,7 @@ def familiar_part(model: PlaceModel) -> float:
     explained = list[float]()
     for row in np.flatnonzero(first)[evenly(int(first.sum()), _SAMPLE)].tolist():
         fit = fit_among(keyframes, row, first & (np.arange(len(first)) != row))
-        explained.append(1 / (1 + fit.unlike) if fit else 0.0)
+        explained.append(fit.explained if fit else 0.0)
     return float(np.quantile(explained, _RARELY))
 
 

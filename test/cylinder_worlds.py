@@ -123,10 +123,8 @@ def learnt_keyframes(textures, poses, path_m, sphere: Sphere, drives) -> Keyfram
 def alone(keyframes: Keyframes, image: np.ndarray, conditions: Conditions | None = None):
     """The `Location` of an image (H, W, 3) by keyframes, without slow features."""
     conditions = conditions or Conditions()
-    level, likely = hypotheses(keyframes, upright(keyframes, image), conditions.pattern)
-    best = max(likely, key=lambda one: one.evidence)
+    likely, tilt = hypotheses(keyframes, upright(keyframes, image), conditions.pattern)
     unknown = [SlowPlace(one.fit.place, 1e6) for one in likely]
-    tilt = level.tilt + best.fit.changes[:2]
     return located(likely, unknown, conditions.scales, keyframes.errors, tilt)
 
 

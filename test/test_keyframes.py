@@ -87,7 +87,7 @@ def stds(locations: list[Location]) -> np.ndarray:
 
 
 def known(location: Location) -> bool:
-    return location.explained >= WatchConfig().least_explained
+    return location.fit.explained >= WatchConfig().least_explained
 
 
 @pytest.mark.parametrize('config', [CONFIG, COUNTER])
@@ -95,7 +95,7 @@ def test_an_unseen_pose_is_located(config):
     far, turned, locations = errors_at(unseen(), config=config)
     assert np.median(far) < 0.03 and np.mean(far) < 0.05
     assert np.median(turned) < np.radians(2)
-    assert min(location.explained for location in locations) > 0.9
+    assert min(location.fit.explained for location in locations) > 0.9
 
 
 @pytest.mark.parametrize(('seed', 'number', 'covered'), [(1, 150, 0), (0, 60, 30), (0, 60, 60)])
@@ -130,7 +130,7 @@ def test_light_does_not_matter(light):
     far, turned, locations = errors_at(unseen(), change=LIGHTS[light])
     assert np.mean(usual) < 0.03 and np.mean(far) < 0.08
     assert np.median(turned) < np.radians(2)
-    assert min(location.explained for location in locations) > 0.9
+    assert min(location.fit.explained for location in locations) > 0.9
 
 
 STRANGE = {

@@ -35,7 +35,7 @@ def test_one_hypothesis_and_right_slow_features_are_fused_by_their_information()
     assert location.pose == pytest.approx([0.25, 0.0, 3.0])
     expected = np.diag([0.0075, 0.0075, (1.1 * ERRORS.yaw_std) ** 2])
     np.testing.assert_allclose(location.covariance, expected, rtol=1e-6)
-    assert location.explained == pytest.approx(1 / 1.1)
+    assert location.fit.explained == pytest.approx(1 / 1.1)
 
 
 def test_two_hypotheses_of_equal_evidence_are_held_both():

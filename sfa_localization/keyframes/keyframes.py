@@ -17,7 +17,7 @@ from sfa_localization.data.geometry import Array, Indices
 from sfa_localization.data.sphere import Sphere
 from sfa_localization.keyframes.correlation import COARSE, Scores, coarse, least, peaks
 from sfa_localization.keyframes.errors import ErrorModel
-from sfa_localization.keyframes.regression import Fit, Neighbors
+from sfa_localization.keyframes.regression import Fit, Neighbors, vectors_of
 from sfa_localization.keyframes.texture import (
     Spectra,
     Texture,
@@ -168,9 +168,10 @@ class Keyframes:
         """Where the spectrum (rows, F) of an image is among the keyframes of a light about a place
         (2,) m; again about where that is, if it is not near.
         """
-        fit = self.fit(image, yaw, self.around(place, light, among))
+        changes = self._with_changes(image)
+        fit = self._fit(changes, yaw, self.around(place, light, among))
         if np.hypot(*(fit.place - place)) > _NEAR_M:
-            fit = self.fit(image, fit.yaw, self.around(fit.place, light, among))
+            fit = self._fit(changes, fit.yaw, self.around(fit.place, light, among))
         return fit
 
     def fit(self, image: Spectra, yaw: float, rows: Indices) -> Fit:
@@ -178,9 +179,16 @@ class Keyframes:
 
         What roll, pitch and a turn change of it is taken out, and says how much of each it has.
         """
+        return self._fit(self._with_changes(image), yaw, rows)
+
+    def _with_changes(self, image: Spectra) -> Spectra:
+        """Of an image (rows, F) and of its derivatives by roll, pitch and a turn: (4, rows, F)."""
         slopes = derivatives(columns_of(image, self.columns), self.channels, self.sphere)
         by_turn = image * (1j * np.arange(image.shape[1])).astype(np.complex64)
-        changes = np.concatenate([image[None], spectrum(slopes), by_turn[None]])
+        return np.concatenate([image[None], spectrum(slopes), by_turn[None]])
+
+    def _fit(self, changes: Spectra, yaw: float, rows: Indices) -> Fit:
+        """The same of what `_with_changes` gives."""
         fit = self._neighbors(rows).fit(turned(changes, self.sign * yaw))
         facing, turn = complex(fit.shares @ np.exp(1j * self.poses[rows, 2])), float(fit.changes[2])
         residual = turned(fit.residual, -turn)
@@ -194,7 +202,7 @@ class Keyframes:
         neighbors = self._last.pop(key, None)
         if neighbors is None:
             of_rows = self.poses[rows, :2], self.drives[rows], self.channels, self.columns
-            neighbors = Neighbors.of(self.aligned(rows), *of_rows)
+            neighbors = Neighbors(vectors_of(self.aligned(rows), self.columns), *of_rows)
         self._last[key] = neighbors
         if len(self._last) > _KEPT:
             self._last.pop(next(iter(self._last)), None)

@@ -40,8 +40,6 @@ class Conditions:
 
     def add(self, location: Location) -> None:
         """Learn from an image of a known place, located with these conditions."""
-        if not np.isfinite([*location.scales, *location.pose]).all():
-            return
         self.scales = self.scales + _NEWEST * (location.scales - self.scales)
         place, fit = location.pose[:2], location.fit
         # At the border, what no place explains is no matter of the light.

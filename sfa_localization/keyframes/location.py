@@ -83,22 +83,23 @@ class Location:
     scales: Array
     tilt: Array
 
-    @property
-    def explained(self) -> float:
-        """The part of the image that its place explains, 0 to 1."""
-        return 1 / (1 + self.fit.unlike)
-
 
 def hypotheses(
     keyframes: Keyframes, image: UprightImage, pattern: Spectra | None = None
-) -> tuple[UprightImage, list[Hypothesis]]:
-    """Where an image may have been taken, without the `pattern` (rows, F) of its light; and the
-    image after what the likeliest one still shows of its tilt is taken out.
+) -> tuple[list[Hypothesis], Array]:
+    """Where an image may have been taken, without the `pattern` (rows, F) of its light, after what
+    the likeliest one still shows of its tilt is taken out; and its whole tilt, (2,) rad.
     """
     likely = _from_starts(keyframes, image, pattern)
-    best = max(likely, key=lambda one: one.evidence)
-    finer = without(keyframes, image, best.fit.changes[:2])
-    return (image, likely) if finer is image else (finer, _from_starts(keyframes, finer, pattern))
+    finer = without(keyframes, image, _tilt_left(likely))
+    if finer is not image:
+        likely = _from_starts(keyframes, finer, pattern)
+    return likely, finer.tilt + _tilt_left(likely)
+
+
+def _tilt_left(likely: Sequence[Hypothesis]) -> Array:
+    """Roll and pitch (2,) rad that an image shows by the likeliest hypothesis."""
+    return max(likely, key=lambda one: one.evidence).fit.changes[:2]
 
 
 def located(

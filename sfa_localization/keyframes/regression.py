@@ -5,9 +5,9 @@
 Turned to one heading, the textures q_k of N keyframes at places p_k differ by how far things move
 over the panorama, which is about linear in the place over some decimeters. Differences that no
 place makes are projected out: those of the lights of drives, of likeness to the mean, and of roll,
-pitch and heading. Another light takes part of all differences away, which the image gets back.
- With A the Gram matrix of what is
-left, a the products of the image with it, and w the weights of likeness, ridge regression gives
+pitch and heading. Another light takes part of all differences away, which the image gets back. With
+A the Gram matrix of what is left, a the products of the image with it, and w the weights of
+likeness, ridge regression gives
 
     c = (w^(1/2) A w^(1/2) + r I)^-1 w^(1/2) a,     p = sum_k (m_k + c_k) p_k.
 
@@ -63,6 +63,11 @@ class Fit:
     yaw: float = 0.0
     facing: complex = 0j
 
+    @property
+    def explained(self) -> float:
+        """The part of the image that its place explains, 0 to 1."""
+        return 1 / (1 + self.unlike)
+
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
@@ -96,23 +101,11 @@ class Neighbors:
         products = _with(self.vectors, np.zeros((len(self.channels), 0, 0)), self.channels)
         object.__setattr__(self, 'products', products)
 
-    @classmethod
-    def of(
-        cls,
-        spectra: Spectra,
-        places: Array,
-        drives: NDArray[np.int32],
-        channels: tuple[slice, ...],
-        columns: int,
-    ) -> Neighbors:
-        """Of spectra (N, rows, F) at one heading."""
-        return cls(_vectors(spectra, columns), places, drives, channels, columns)
-
     def fit(self, image: Spectra) -> Fit:
         """Of the spectrum of a texture and of its derivatives by roll, pitch and a turn, at the
         heading of the keyframes, (4, rows, F).
         """
-        vectors, count = _vectors(image, self.columns), len(self.vectors)
+        vectors, count = vectors_of(image, self.columns), len(self.vectors)
         products = _with(vectors, self.products, self.channels, self.vectors)
         basis = _Basis.of(products[:, count, :count].sum(axis=0), self.drives, self.places)
         gains = self._gains(products, basis)
@@ -194,7 +187,7 @@ class _Basis:
         return cls(mean / mean.sum(), means, owner.astype(float), places, means.mean(axis=0))
 
 
-def _vectors(spectra: Spectra, columns: int) -> Texture:
+def vectors_of(spectra: Spectra, columns: int) -> Texture:
     """Spectra (M, rows, F) of textures of so many columns as vectors (M, D), whose products are
     those of the textures.
     """
