@@ -139,6 +139,17 @@ def ignored_sections(path: Path | str, node: str) -> list[str]:
     return misspelt + ([] if any(_matches(key, node) for key in keys) else own)
 
 
+def given_names(path: Path | str, node: str) -> set[str]:
+    """Return the parameters that ROS gives from a file to a node of this full name."""
+    sections = _sections(Path(path)).items()
+    return {name for key, values in sections if _matches(key, node) for name in values}
+
+
+def unknown_names(names: Collection[str]) -> list[str]:
+    """Return those parameters that neither this package nor ROS has."""
+    return sorted(name for name in set(names) - all_names() if not _is_of_ros(name))
+
+
 def _node_of(key: str) -> str:
     return key.rpartition('/')[2]
 

@@ -14,7 +14,7 @@ import time
 from unittest import mock
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from ros_domains import free_domain
@@ -71,7 +71,13 @@ def end_process(process):
         process.wait()
 
 
-class Spinner(lifecycle.Executor):
+def end_node(node):
+    """End a node as `run_node` does."""
+    node.teardown()
+    node.destroy_node()
+
+
+class Spinner(SingleThreadedExecutor):
     """Spins in a thread of its own, and ends that first: rclpy destroys what it may wait for."""
 
     def __init__(self, context):
@@ -120,7 +126,7 @@ class Bench:
         """End a node between two callbacks, as its own process would."""
         self.executor.remove_node(node)
         self.nodes.remove(node)
-        assert until(self.executor.create_task(node.destroy_node).done)
+        assert until(self.executor.create_task(end_node, node).done)
 
     def listen(self, kind, topic, qos=None):
         heard = self.heard.setdefault(topic, [])
@@ -155,6 +161,7 @@ class Bench:
 
     def close(self):
         self.executor.shutdown()
-        for node in [*self.nodes, self.node]:
-            node.destroy_node()
+        for node in self.nodes:
+            end_node(node)
+        self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)

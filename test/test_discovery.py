@@ -38,7 +38,7 @@ def announce(bench, node, kind, *names):
 
 def takes_another(node, topic):
     node.discovery.look()
-    return node.shown(topic) != node.resolve_topic_name(topic)
+    return node.full_name(topic) != node.resolve_topic_name(topic)
 
 
 def test_odometry_of_another_name_is_found(bench):
@@ -48,14 +48,14 @@ def test_odometry_of_another_name_is_found(bench):
     message = to_odometry(zero, one, zero[:2], one[:2, :2], STAMP_NS, frames)
     used = node.monitor('odom')
     assert bench.publish_until('/wheel_odometry', message, lambda: used.received)
-    assert node.shown('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
+    assert node.full_name('odom') == '/wheel_odometry', 'diagnostics name the topic that is used'
     announce(bench, node, Odometry, '/odom')
-    assert until(lambda: node.shown('odom') == '/odom'), 'its own name comes first'
+    assert until(lambda: node.full_name('odom') == '/odom'), 'its own name comes first'
     node = bench.run(OmnicamNode)
     heard = bench.listen(Image, 'panorama')
     message = to_image(np.full((60, 600, 3), 90, np.uint8), STAMP_NS, 'camera')
     assert bench.publish_until('/camera/image', message, lambda: heard)
-    assert node.shown('image_raw') == '/camera/image'
+    assert node.full_name('image_raw') == '/camera/image'
 
 
 @pytest.mark.parametrize(('others', 'arguments'), [

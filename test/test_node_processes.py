@@ -4,21 +4,26 @@
 
 import signal
 import subprocess
-from pathlib import Path
 
 import pytest
 import yaml
 
 pytest.importorskip('rclpy')
 
+from builtin_interfaces.msg import Time
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters
 from ros_bench import DEADLINE_S, start_process, until
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
 from sfa_localization.nodes.entry import CANNOT_START, DIED
 from sfa_localization.nodes.lifecycle import latched_qos
 
 pytestmark = pytest.mark.ros
-START = Path(__file__).parents[1] / 'resource/start'
 RUN = 'import sys; from sfa_localization.nodes import entry; sys.exit(entry.{}())'
 
 
@@ -27,11 +32,11 @@ def start():
     """Start a node's process; all are ended with the test."""
     processes = []
 
-    def begin(node, *arguments, before=None):
-        """Its start script; or the same in Python, after other code."""
-        script = [START / node] if before is None else ['-c', f'{before}\n{RUN.format(node)}']
+    def begin(node, *arguments, before=''):
+        """What its executable runs, after other code."""
         words = ['--ros-args', *arguments] if arguments else []
-        process = start_process(*script, *words, stderr=subprocess.PIPE, text=True)
+        code = f'{before}\n{RUN.format(node)}'
+        process = start_process('-c', code, *words, stderr=subprocess.PIPE, text=True)
         processes.append(process)
         return process
 
@@ -58,6 +63,25 @@ def test_a_signal_ends_the_node_with_exit_code_0(bench, start):
         process.send_signal(number)
         code, text = ended(process)
         assert code == 0 and 'Traceback' not in text, text
+
+
+def test_what_rclpy_cannot_handle_itself_ends_nothing(bench, start):
+    """A transition that does not fit, a negative clock, a parameter of an unknown type."""
+    process = start('ekf_node', '-p', 'use_sim_time:=true')
+    for kind, service, request in (
+        (ChangeState, 'change_state', ChangeState.Request(transition=Transition(id=1))),
+        (SetParameters, 'set_parameters', SetParameters.Request(parameters=[
+            ParameterMessage(name='rate_std', value=ParameterValue(type=77))])),
+    ):  # fmt: skip
+        client = bench.node.create_client(kind, f'ekf_node/{service}')
+        assert client.wait_for_service(DEADLINE_S)
+        client.call_async(request)
+    bench.publish('/clock', Clock(clock=Time(sec=-1)))
+    state = bench.call(GetState, 'ekf_node/get_state', GetState.Request()).current_state
+    assert state.label == 'active'
+    process.send_signal(signal.SIGINT)
+    code, text = ended(process)
+    assert code == 0 and 'Traceback' not in text and text.count('rclpy: ') == 3, text
 
 
 # Code that runs before the node's: at some moment the process sends itself a signal.
@@ -108,21 +132,6 @@ def test_a_signal_at_any_moment_ends_with_exit_code_0(start):
         assert not [w for w in ('Traceback', 'internal error', 'refused') if w in text], moment
 
 
-def test_a_start_script_ends_at_ctrl_c_before_its_slow_imports(start):
-    """As soon as it handles signals; before, it is Python that starts."""
-    process = start('sfa_node')
-    status = Path(f'/proc/{process.pid}/status')
-    handled = 1 << (signal.SIGTERM - 1)
-
-    def caught():
-        (line,) = (line for line in status.read_text().splitlines() if line.startswith('SigCgt'))
-        return int(line.split()[1], 16) & handled
-
-    assert until(caught)
-    process.send_signal(signal.SIGINT)
-    assert ended(process) == (0, '')
-
-
 WRONG = [
     ('sfa_node', ['-p', 'model:=/nowhere/model.npz'], '/nowhere/model.npz'),
     ('ekf_node', ['-p', 'speed_std:=.nan'], 'speed_std'),
@@ -145,16 +154,22 @@ def test_a_wrong_parameter_ends_the_node_with_its_name(start, tmp_path):
 
 def test_a_node_that_dies_later_has_another_exit_code_than_one_that_cannot_start(start):
     """Only then a launch starts it again."""
-    died = 'from rclpy.executors import SingleThreadedExecutor as E\nE.spin = lambda self: 1 / 0'
-    code, text = ended(start('ekf_node', before=died))
+    code, text = ended(start('ekf_node', before='import rclpy; rclpy.spin = lambda node: 1 / 0'))
     assert code == DIED and 'ZeroDivisionError' in text
 
 
-def test_a_misspelt_section_is_warned_of(start, tmp_path):
-    """Which sections are: test_config_file.py."""
+def test_misspelt_sections_and_parameters_are_warned_of(start, tmp_path):
+    """Parameters of other nodes are not: ROS gives a section `/**` to all."""
     path = tmp_path / 'parameters.yaml'
-    path.write_text(yaml.safe_dump({'/**/efk_node': {'ros__parameters': {'autostart': False}}}))
-    words = ['--params-file', str(path), '-r', '__ns:=/robot1']
-    code, text = ended(start('ekf_node', *words, before=SEND.format('SIGINT') + MOMENTS['made']))
-    warned = f'{path}: nothing of /**/efk_node is used: this node is /robot1/ekf_node; write'
-    assert code == 0 and warned in text, text
+    sections = {'/**/efk_node': {'autostart': False}, '/**': {'zzz': 1, 'width': 300}}
+    path.write_text(yaml.safe_dump({k: {'ros__parameters': v} for k, v in sections.items()}))
+    words = ['--params-file', str(path), '-p', 'set_initial_pose:=true', '-p', 'rate_std:=0.03']
+    before = SEND.format('SIGINT') + MOMENTS['made']
+    code, text = ended(start('ekf_node', *words, '-r', '__ns:=/robot1', before=before))
+    assert code == 0 and text.count('unknown parameter') == 2, text
+    for warning in (
+        f'{path}: nothing of /**/efk_node is used: this node is /robot1/ekf_node; write',
+        "unknown parameter 'set_initial_pose'; did you mean 'initial_pose'?",
+        "unknown parameter 'zzz'",
+    ):
+        assert warning in text, text

@@ -19,15 +19,13 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterType
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.parameter import Parameter
 from ros_bench import until
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 
 from sfa_localization.nodes import conversions as convert
-from sfa_localization.nodes.ekf_node import EkfNode
-from sfa_localization.nodes.lifecycle import LocalizationNode, latched_qos, sensor_qos
+from sfa_localization.nodes.lifecycle import LocalizationNode, sensor_qos
 
 pytestmark = pytest.mark.ros
 
@@ -112,17 +110,6 @@ def test_a_list_has_real_numbers_also_while_it_is_empty(knobs):
     assert node.describe_parameter('corner').type == doubles
 
 
-def test_a_misspelt_or_older_parameter_is_warned_of_with_the_nearest_name(knobs, bench, capfd):
-    """Those of other nodes are not: a section `/**` of the parameter file is given to all."""
-    knobs(publish_tf=False, gian=0.7, zzz=1, use_sim_time=False, **{'qos_overrides./in.depth': 3})
-    bench.run(EkfNode, start=False, set_initial_pose=True)
-    told = [line.partition(': ')[2] for line in capfd.readouterr().err.splitlines()]
-    assert [line for line in told if line.startswith('unknown')] == [
-        "unknown parameter 'gian'; did you mean 'gain'?", "unknown parameter 'zzz'",
-        "unknown parameter 'set_initial_pose'; did you mean 'initial_pose'?",
-    ]  # fmt: skip
-
-
 class Echo(LocalizationNode):
     """A node whose timers fail at first, also that of its health, and whose service always."""
 
@@ -174,14 +161,6 @@ def test_what_fails_in_callbacks_timers_health_and_services_is_counted_and_ends_
     for _ in range(2):
         answer = bench.call(Trigger, 'echo/fail', Trigger.Request())
         assert not answer.success and answer.message == 'no model; give one'
-
-
-def test_events_of_qos_are_noticed(bench):
-    noticed = []
-    events = PublisherEventCallbacks(incompatible_qos=noticed.append)
-    bench.node.create_publisher(String, 'any', 1, event_callbacks=events)
-    bench.node.create_subscription(String, 'any', print, latched_qos())
-    assert until(lambda: noticed)
 
 
 def test_a_node_starts_itself_unless_told_not_to_and_survives_its_life_cycle_twice(bench):

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from collections import deque
 
+from sfa_localization.data.geometry import Array
 from sfa_localization.fusion.timeline import HISTORY_NS
-from sfa_localization.fusion.track import Pose
 
-Dated = tuple[int, Pose]
-"""A stamp in ns, and map -> odom at it."""
+Dated = tuple[int, Array]
+"""A stamp in ns, and map -> odom (3,) at it."""
 _OFF_GRID_NS = 500
 """Added to the future: stamps of odometry are often whole multiples of its period apart."""
 
@@ -28,7 +28,7 @@ class Broadcast:
         self._newest: Dated | None = None
         self._future_ns: deque[int] = deque()
 
-    def add(self, stamp_ns: int, map_to_odom: Pose, ahead_ns: int) -> list[Dated]:
+    def add(self, stamp_ns: int, map_to_odom: Array, ahead_ns: int) -> list[Dated]:
         """Return the transforms to publish with odometry of this stamp, `ahead_ns` into the future.
 
         A stamp before others is late; beyond the filter's history the clock has gone back.

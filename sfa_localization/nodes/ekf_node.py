@@ -9,6 +9,7 @@ from collections import deque
 from pathlib import Path as FilePath
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs import msg as geometry
 from nav_msgs.msg import Odometry, Path
@@ -19,9 +20,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from sfa_localization.data.errors import MessageError
-from sfa_localization.data.geometry import Array
+from sfa_localization.data.geometry import Array, compose, invert
 from sfa_localization.data.settings import Settings
-from sfa_localization.fusion.motion import wrap
 from sfa_localization.fusion.pose_filter import Level, PoseFilter, State, Status, Update
 from sfa_localization.fusion.settings import FilterConfig
 from sfa_localization.fusion.status import uncertainty
@@ -59,6 +59,7 @@ class EkfNode(LocalizationNode):
     def __init__(self, **options: Any) -> None:
         super().__init__('ekf_node', [EkfNodeConfig, FilterConfig], **options)
         self._jumps: Any = None
+        self._odometry_input: Any = None
         self._begin()
 
     def _begin(self) -> None:
@@ -116,16 +117,11 @@ class EkfNode(LocalizationNode):
     def started(self) -> None:
         self._publish_state()
 
-    def destroy_node(self) -> None:
-        """End the node; the last sure pose is kept."""
-        self.attempt('pose_file', self._save_pose)
-        super().destroy_node()
-
     def teardown(self) -> None:
         self.attempt('pose_file', self._save_pose)
         if self._jumps is not None:
             self._jumps.unregister()
-            self._jumps = None
+        self._jumps = self._odometry_input = None
 
     def settings_changed(self, settings: Settings) -> None:
         if isinstance(settings, EkfNodeConfig):
@@ -135,10 +131,10 @@ class EkfNode(LocalizationNode):
 
     # Inputs.
 
-    def _subscribe_odometry(self, instead: str = '') -> None:
-        self.unsubscribe(_ODOM)
-        receive = self._receive_odometry
-        self.subscribe(Odometry, _ODOM, receive, sensor_qos(100), instead=instead)
+    def _subscribe_odometry(self, substitute: str = '') -> None:
+        self.unsubscribe(self._odometry_input)
+        receive, qos = self._receive_odometry, sensor_qos(100)
+        self._odometry_input = self.subscribe(Odometry, _ODOM, receive, qos, substitute)
 
     def _receive_odometry(self, message: Odometry) -> None:
         stamp_ns, (v, omega, *noise), pose = convert.read_odometry(message)
@@ -153,7 +149,7 @@ class EkfNode(LocalizationNode):
         self._published_s = now_s
         state = self.filter.at(stamp_ns)
         if state is not None:
-            self.tell(self._odometry, self._odometry_message, state)
+            self._publish_odometry(state)
             self._publish_transform(state, pose)
             self._extend_path(state)
 
@@ -166,7 +162,7 @@ class EkfNode(LocalizationNode):
         if covariance.any() and not covariance[2].any():
             covariance[2, 2] = math.inf  # a source without heading leaves its variance 0
         update = self.filter.add_measurement(stamp_ns, pose, covariance)
-        self.tell(self._verdict, self._verdict_message, update)
+        self._publish_verdict(update)
         self._publish_pose(stamp_ns)
         if not update.accepted:
             raise MessageError(update.reason)
@@ -245,37 +241,35 @@ class EkfNode(LocalizationNode):
 
     # Outputs.
 
-    def _odometry_message(self, state: State) -> Odometry:
+    def _publish_odometry(self, state: State) -> None:
         pose, twist = (state.pose, state.pose_covariance), (state.twist, state.twist_covariance)
         frames = self._config.map_frame, self._frames[1]
-        return convert.to_odometry(*pose, *twist, state.stamp_ns, frames)
+        self._odometry.publish(convert.to_odometry(*pose, *twist, state.stamp_ns, frames))
 
     def _publish_transform(self, state: State, odom: Pose) -> None:
         """Publish map -> odom at a stamp of odometry; on /tf also for transform_tolerance after."""
         frames, stamp_ns = (self._config.map_frame, self._frames[0]), state.stamp_ns
-        (x, y, yaw), (odom_x, odom_y, odom_yaw) = state.mean[:3].tolist(), odom
-        turn = wrap(yaw - odom_yaw)
-        c, s = math.cos(turn), math.sin(turn)
-        map_to_odom = x - c * odom_x + s * odom_y, y - s * odom_x - c * odom_y, turn
-        self.tell(self._transform, convert.to_transform, map_to_odom, stamp_ns, frames)
+        map_to_odom = compose(state.pose, invert(np.array(odom)))
+        self._transform.publish(convert.to_transform(map_to_odom, stamp_ns, frames))
         if self._tf is not None:
             ahead_ns = round(self._config.transform_tolerance * 1e9)
             dated = self._broadcast.add(stamp_ns, map_to_odom, ahead_ns)
             transforms = [convert.to_transform(pose, at_ns, frames) for at_ns, pose in dated]
             self._tf.publish(TFMessage(transforms=transforms))
 
-    def _verdict_message(self, update: Update) -> DiagnosticArray:
-        """What became of a measurement: header.stamp is its own, values hold d2 and threshold."""
+    def _publish_verdict(self, update: Update) -> None:
+        """Publish what became of a measurement, at its stamp: its d2, and the gate's threshold."""
         level = _OK if update.accepted else _WARN
         values = {'accepted': str(update.accepted).lower()}
         for name, value in (('d2', update.d2), ('threshold', update.threshold)):
             values[name] = f'{value:.6g}' if math.isfinite(value) else ''
         stamp = convert.to_stamp(max(update.stamp_ns, 0))
-        return self.diagnostic('measurement', level, update.reason, values, stamp)
+        message = self.diagnostic('measurement', level, update.reason, values, stamp)
+        self._verdict.publish(message)
 
     def _publish_pose(self, stamp_ns: int) -> None:
         """Publish the estimate at the stamp of an image."""
-        state = self.filter.at(stamp_ns) if self._pose.get_subscription_count() else None
+        state = self.filter.at(stamp_ns)
         if state is not None:
             pose, frame = (state.pose, state.pose_covariance), self._config.map_frame
             self._pose.publish(convert.to_pose_with_covariance(*pose, stamp_ns, frame))
@@ -285,7 +279,8 @@ class EkfNode(LocalizationNode):
             return
         self._path_ns, frame = state.stamp_ns, self._config.map_frame
         self._path.append(convert.to_pose(state.pose, state.stamp_ns, frame))
-        self.tell(self._trail, lambda: Path(header=self._path[-1].header, poses=list(self._path)))
+        if self._trail.get_subscription_count():
+            self._trail.publish(Path(header=self._path[-1].header, poses=list(self._path)))
 
     def status(self) -> Status:
         """The filter's status, and what the wall clock adds: inputs that do not arrive."""
@@ -293,11 +288,11 @@ class EkfNode(LocalizationNode):
         by_now, running_s = self._by_now(), steady_s() - self._configured_s
         timeout_s = self._config.silence_timeout
         for topic, limit in ((_ODOM, timeout_s), (_IMAGE_POSE, IMAGES_SILENCE * timeout_s)):
-            silent, shown = self.monitor(topic).silent_for_s(), self.shown(topic)
-            if min(silent, running_s) > limit and not self.count_publishers(shown):
-                added.append(f'nobody publishes on {shown}')
+            silent, name = self.monitor(topic).silent_for_s(), self.full_name(topic)
+            if min(silent, running_s) > limit and not self.count_publishers(name):
+                added.append(f'nobody publishes on {name}')
             elif limit < silent < math.inf:
-                added.append(f'nothing on {shown} for {silent:.0f} s')
+                added.append(f'nothing on {name} for {silent:.0f} s')
         if self._paused:
             added.append('paused: images are not fused')
         lost, behind_s = [], self._behind_s()

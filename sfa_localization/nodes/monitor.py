@@ -30,16 +30,15 @@ class Monitor:
         self._arrivals_s: deque[float] = deque(maxlen=_WINDOW)
         self._latencies_s: deque[float] = deque(maxlen=_WINDOW)
 
-    def receive(self) -> float:
-        """Note an arrival; returns its steady time in seconds, for `use`."""
+    def receive(self) -> None:
+        """Count a message that has arrived."""
         self.received += 1
         self._arrivals_s.append(steady_s())
-        return self._arrivals_s[-1]
 
-    def use(self, received_s: float) -> None:
-        """Note that the message that arrived at `received_s` has been processed by now."""
+    def use(self) -> None:
+        """Count the last message as used, and note the time since it arrived."""
         self.used += 1
-        self._latencies_s.append(steady_s() - received_s)
+        self._latencies_s.append(steady_s() - self._arrivals_s[-1])
 
     def silent_for_s(self) -> float:
         """Seconds since the last arrival; infinite before the first."""

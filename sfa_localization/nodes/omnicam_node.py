@@ -59,6 +59,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         self._newest: deque[tuple[int, Image]] = deque(maxlen=1)
         self._tilts: deque[tuple[int, float, float]] = deque(maxlen=_ORIENTATIONS)
         self._level, self._newer_s = True, 0.0
+        self._subscription: Any = None
 
     # Life cycle.
 
@@ -73,7 +74,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         raw = self._config.image_transport == 'raw'
         self._input = 'image_raw' if raw else self.following('image_raw/compressed')
         self.discovery: Discovery | None = None
-        self._instead = ''
+        self._substitute = ''
         if self.settings(CaptureConfig).source == 'topic':
             self.require_input(self._input)
             self._kinds = [ImageMessage, CompressedImage][:: 1 if raw else -1]
@@ -101,7 +102,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         if self._feed is not None:
             self._feed.stop()
             self.destroy_guard_condition(self._arrival)
-        self._feed = self._arrival = self._listening_since_s = None
+        self._feed = self._arrival = self._listening_since_s = self._subscription = None
         self._newest.clear()
         self._tilts.clear()
         self._level, self._newer_s = True, 0.0
@@ -120,18 +121,19 @@ class OmnicamNode(lifecycle.LocalizationNode):
         elif self._listening_since_s is None:
             self._listening_since_s = steady_s()
             kind, qos = self._kinds[0], lifecycle.sensor_qos(1)
-            self.subscribe(kind, self._input, self._use_message, qos, instead=self._instead)
+            self._subscription = self.subscribe(
+                kind, self._input, self._use_message, qos, self._substitute
+            )
 
     def _take(self, topic: str) -> None:
         """Take images from another topic than the expected one, or again from that."""
         self._stop_listening()
         self.require_input(self._input, topic)
-        self._instead = topic
+        self._substitute = topic
 
     def _stop_listening(self) -> None:
-        if self._listening_since_s is not None:
-            self.unsubscribe(self._input)
-        self._listening_since_s = None
+        self.unsubscribe(self._subscription)
+        self._subscription = self._listening_since_s = None
 
     # Images.
 
@@ -176,8 +178,11 @@ class OmnicamNode(lifecycle.LocalizationNode):
     def _publish(self, image: Image, stamp_ns: int, frame: str) -> None:
         panorama, frame = self._leveled(self._unwrapper(image), stamp_ns), frame or 'omnicam'
         self._size = (image.shape[0], image.shape[1])
-        self.tell(self._panoramas, convert.to_image, panorama, stamp_ns, frame)
-        self.tell(self._compressed, convert.to_compressed, panorama, stamp_ns, frame, _JPEG_QUALITY)
+        if self._panoramas.get_subscription_count():
+            self._panoramas.publish(convert.to_image(panorama, stamp_ns, frame))
+        if self._compressed.get_subscription_count():
+            compressed = convert.to_compressed(panorama, stamp_ns, frame, _JPEG_QUALITY)
+            self._compressed.publish(compressed)
         self._frozen.add(image)
 
     # Parameters that change while running.
@@ -226,7 +231,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
         listening_s = steady_s() - self._listening_since_s
         silent_s = min(self.monitor(self._input).silent_for_s(), listening_s)
         if silent_s > self.settings(CaptureConfig).silence_timeout:
-            silent = f'no image on {self.shown(self._input)} for {silent_s:.0f} s'
+            silent = f'no image on {self.full_name(self._input)} for {silent_s:.0f} s'
             return _ERROR, (self.discovery and self.discovery.hint) or silent
         return _OK, ''
 
@@ -248,7 +253,7 @@ class OmnicamNode(lifecycle.LocalizationNode):
 
     def _why_not(self) -> str:
         """Why the last image had no orientation of the robot."""
-        heard, topic = self.monitor(_IMU), self.shown(_IMU)
+        heard, topic = self.monitor(_IMU), self.full_name(_IMU)
         if heard.silent_for_s() > self.settings(CaptureConfig).silence_timeout:
             return f'no message on {topic}'
         if not heard.used:

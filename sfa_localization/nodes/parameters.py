@@ -19,7 +19,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sfa_localization.config import all_names, ignored_sections
+from sfa_localization.config import given_names, ignored_sections, unknown_names
 from sfa_localization.data.errors import ConfigError, LocalizationError
 from sfa_localization.data.settings import Settings, nearest
 
@@ -28,13 +28,19 @@ Current = dict[type[Settings], Settings]
 """The settings in force, by their class."""
 
 
-def declare(node: Node, kind: type[S]) -> S:
-    """Declare every field of `kind` as a parameter of `node`; return the values given to it.
+def declare(node: Node, kinds: Sequence[type[Settings]]) -> Current:
+    """Declare every field of `kinds` as a parameter of `node`; return the values given to it.
 
-    Settings that are not `live` become read-only. Raises ConfigError for a value that is rejected.
+    Settings that are not `live` become read-only. Raises ConfigError for a wrong value.
     """
-    values = {item.name: _declare_field(node, item) for item in dataclasses.fields(kind)}
-    return kind.from_mapping(values, f'parameters of node {node.get_name()!r}')
+    current: Current = {}
+    for kind in kinds:
+        fields = dataclasses.fields(kind)
+        values = {item.name: _declare_field(node, item) for item in fields}
+        current[kind] = kind.from_mapping(values, f'parameters of node {node.get_name()!r}')
+        for item in fields:
+            node.set_descriptor(item.name, _descriptor(item))
+    return current
 
 
 def on_change(
@@ -95,53 +101,40 @@ def typed(item: dataclasses.Field[Any], given: Parameter) -> Parameter:
     return given
 
 
-def warn_of_unknown(node: Node) -> None:
-    """Warn of each value given to the node for a parameter that it does not have.
-
-    Parameters of the other nodes are ignored: a section `/**` gives them to all.
-    """
-    # rclpy has no public way to ask what was given but not declared.
-    given = node._parameter_overrides
-    known = node.list_parameters([], 0).names
-    for name in sorted(set(given) - set(known) - all_names()):
-        if not name.startswith('qos_overrides.'):  # declared with their topics
-            node.get_logger().warning(f'unknown parameter {name!r}{nearest(name, known)}')
-
-
-def warn_of_ignored_files(node: Node, arguments: Sequence[str]) -> None:
-    """Warn of each parameter file among the arguments with sections for the node that are not its.
+def warn_of_arguments(node: Node, words: Sequence[str]) -> None:
+    """Warn of arguments without effect: unknown parameters, and sections for other nodes.
 
     ROS takes `ekf_node:` for a node without namespace, and gives /robot1/ekf_node nothing of it.
     """
-    name = node.get_fully_qualified_name()
-    for flag, path in itertools.pairwise(arguments):
+    name, logger = node.get_fully_qualified_name(), node.get_logger()
+    declared, given = node.list_parameters([], 0).names, set()
+    for flag, value in itertools.pairwise(words):
+        if flag in ('-p', '--param'):
+            given.add(value.partition(':=')[0].rpartition(':')[2])
         if flag != '--params-file':
             continue
         try:
-            keys = ignored_sections(path, name)
-        except ConfigError:  # read by ROS, which is less strict
+            given |= given_names(value, name)
+            keys = ignored_sections(value, name)
+        except ConfigError:  # ROS, which is less strict, has read it
             continue
         if keys:
-            node.get_logger().warning(
-                f'{path}: nothing of {", ".join(keys)} is used: this node is {name}; '
+            logger.warning(
+                f'{value}: nothing of {", ".join(keys)} is used: this node is {name}; '
                 f'write /**/{node.get_name()}: for any namespace'
             )
+    for unknown in unknown_names(given):
+        logger.warning(f'unknown parameter {unknown!r}{nearest(unknown, declared)}')
 
 
 def _declare_field(node: Node, item: dataclasses.Field[Any]) -> Any:
-    default = typed(item, Parameter(item.name, value=item.default))
-    given = node._parameter_overrides.get(item.name, default)
+    """Declare one setting of any type, which the descriptor narrows later; return its value."""
+    node.declare_parameter(item.name, item.default, ParameterDescriptor(dynamic_typing=True))
+    given = node.get_parameter(item.name)
     if isinstance(item.default, tuple) and given.value is None:  # `[]` in a parameter file
         given = Parameter(item.name, value=[])
-    writable, final = _descriptor(item), _descriptor(item)
-    writable.read_only, final.type = False, default.type_.value
-    # By its type alone: an empty list as the value would make it one of bytes.
-    node.declare_parameter(item.name, default.type_, writable, ignore_override=True)
-    result = node.set_parameters([typed(item, given)])[0]
-    if not result.successful:
-        raise ConfigError(f'parameter {item.name!r}: {result.reason}')
-    node.set_descriptor(item.name, final)
-    return node.get_parameter(item.name).value
+    node.set_parameters([typed(item, given)])
+    return typed(item, given).value
 
 
 def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
@@ -152,6 +145,7 @@ def _descriptor(item: dataclasses.Field[Any]) -> ParameterDescriptor:
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     made = ParameterDescriptor(description=f'{meta["doc"]}{unit}', read_only=not meta['live'])
+    made.type = typed(item, Parameter(item.name, value=item.default)).type_.value
     if meta['choices']:
         made.additional_constraints = 'one of: ' + ', '.join(filter(None, meta['choices']))
     low, high = meta['low'], meta['high']

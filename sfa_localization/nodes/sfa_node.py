@@ -144,15 +144,15 @@ class SfaNode(LocalizationNode):
         """An unusable image gets no pose without covariance: it would look like a usable one."""
         frame, slow, stamp_ns = self._config.map_frame, seen.slow_features, seen.stamp_ns
         if np.all(np.isfinite(slow)):
-            self.tell(self._features, convert.to_array, slow, 'slow features')
-            self.tell(self._feature_pose, _feature_pose, slow, stamp_ns)
+            self._features.publish(convert.to_array(slow, 'slow features'))
+            self._feature_pose.publish(_feature_pose(slow, stamp_ns))
         if math.isfinite(seen.turned) and not 0 <= stamp_ns - self._turned_ns < NEAR_NS:
             self._turned_ns = stamp_ns
-            self.tell(self._turned, convert.to_turned, seen.turned, stamp_ns, _TURNED_FRAME)
+            self._turned.publish(convert.to_turned(seen.turned, stamp_ns, _TURNED_FRAME))
         if not seen.problem:
-            self.tell(self._pose, convert.to_pose, seen.pose, stamp_ns, frame)
-        found = seen.pose, seen.covariance, stamp_ns, frame
-        self.tell(self._uncertain, convert.to_pose_with_covariance, *found)
+            self._pose.publish(convert.to_pose(seen.pose, stamp_ns, frame))
+        located = seen.pose, seen.covariance, stamp_ns, frame
+        self._uncertain.publish(convert.to_pose_with_covariance(*located))
 
     def health(self) -> tuple[int, str, dict[str, str]]:
         assert self._observer is not None
@@ -161,7 +161,7 @@ class SfaNode(LocalizationNode):
             explained, factor = self._last.explained, self._observer.slow_error_factor
             values['explained'] = f'{100 * explained:.0f} %'
             values['slow feature errors'] = f'{factor:.1f} times as in training'
-        monitor, topic = self.monitor(self._topic), self.shown(self._topic)
+        monitor, topic = self.monitor(self._topic), self.full_name(self._topic)
         silent = monitor.silent_for_s()
         if math.isinf(silent):
             return _WARN, self.discovery.hint or f'waiting for images on {topic}', values
