@@ -24,13 +24,10 @@ COMMANDS = (
     'demo',
 )
 NODES = ('omnicam_node', 'sfa_node', 'ekf_node')
-# colcon runs `setup.py install` or `develop`, and setup.cfg puts its executables into
+# colcon runs `setup.py install` or `develop`, and setup.cfg puts the executables into
 # lib/sfa_localization, for `ros2 run sfa_localization train`. pip builds a wheel instead, whose
 # executables are on the PATH: it gets the nodes and one command, no `train`, `filter` or `config`.
 IN_WORKSPACE = bool({'install', 'develop'} & set(sys.argv))
-# Those that setuptools writes import for a tenth of a second, and more on a robot, before a node
-# can handle signals. For `develop` they would check every dependency first.
-START = [f'resource/start/{node}' for node in NODES] if 'install' in sys.argv else []
 BAGS = ('bags', 'bags/sample', 'bags/sample_test')
 
 setup(
@@ -50,7 +47,6 @@ setup(
         (f'share/{NAME}/config', glob('config/*.*')),
         *((f'share/{NAME}/{folder}', glob(f'{folder}/*.*')) for folder in BAGS),
     ],
-    scripts=START,
     zip_safe=False,
     python_requires='>=3.10',
     # The robot (the three nodes), the trainer and the evaluation.
@@ -84,7 +80,7 @@ setup(
         'console_scripts': [
             f'{NAME} = {NAME}.cli:main',
             *(f'{command} = {NAME}.cli:executable' for command in COMMANDS if IN_WORKSPACE),
-            *(f'{node} = {NAME}.nodes.entry:{node}' for node in NODES if not START),
+            *(f'{node} = {NAME}.nodes.entry:{node}' for node in NODES),
         ],
     },
 )

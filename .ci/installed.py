@@ -1,10 +1,12 @@
 # Copyright 2026 The sfa_localization authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check an installed workspace: the ament index finds package, files and executables."""
+"""Check an installed workspace: files and executables are in the ament index, and nodes start."""
 
 import shutil
+import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 from ament_index_python import get_package_prefix, get_package_share_directory
@@ -25,6 +27,17 @@ def missing() -> list[str]:
     return [str(path) for path in expected if not path.is_file()]
 
 
+def starts(node: Path) -> bool:
+    """Whether a node warns of a parameter that it does not have, and ends at SIGINT with code 0."""
+    words = [node, '--ros-args', '-p', 'autostart:=false', '-p', 'nonsense:=1']
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        is_made = any("'nonsense'" in line for line in process.stderr)
+        process.send_signal(signal.SIGINT)
+        process.communicate()
+    return is_made and process.returncode == 0
+
+
 def main() -> int:
     """Print the problems, return the exit code."""
     prefix = Path(get_package_prefix(NAME))
@@ -36,7 +49,10 @@ def main() -> int:
     for words in ([folder / 'train', '--help'], [folder / NAME, 'train', '--help']):
         if not problems and subprocess.run(words, stdout=subprocess.PIPE).returncode:
             problems.append(f'fails: {" ".join(map(str, words))}')
-    print('\n'.join(problems) or f'{prefix}: package, files and executables found')
+    if not problems:
+        problems += [f'does not start: {node}' for node in NODES if not starts(folder / node)]
+    built = f'{prefix}, built with setuptools {version("setuptools")}'
+    print('\n'.join(problems) or f'{built}: all files are there, and the nodes start')
     return bool(problems)
 
 
